@@ -1,0 +1,1 @@
+"""LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs."""

@@ -1,0 +1,34 @@
+"""The command line: one file a command, the only place that prints. Heavy imports wait inside the commands."""
+
+import logging
+import sys
+
+import typer
+
+from segslam.types import SegslamError
+
+app = typer.Typer(
+    name="segslam",
+    help="LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def _segslam() -> None:
+    """Map, evaluate, replay and register LiDAR scans."""
+
+
+def main() -> None:
+    """Run a command. Exit status: 0 done, 1 the work failed, 2 bad usage or bad input, 130 interrupted."""
+    from segslam.cli import commands
+
+    logging.basicConfig(level=logging.WARNING, format="segslam: %(levelname)s: %(message)s", stream=sys.stderr)
+    commands.register(app)
+    try:
+        app()
+    except SegslamError as error:
+        print(f"segslam: {error}", file=sys.stderr)
+        sys.exit(2)

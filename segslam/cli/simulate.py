@@ -1,0 +1,5 @@
+"""`segslam simulate`."""
+
+
+def simulate() -> None:
+    """Write a simulated KITTI-format sequence."""

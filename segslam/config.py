@@ -1,0 +1,224 @@
+"""Every parameter, with unit, range and source. Unknown keys are refused with their path; the defaults are complete.
+
+P marks a value of the Segregator paper (Yin et al., ICRA 2023), A one of its authors' program.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+
+from segslam.types import Label, SegslamError
+
+
+def _label_from_name(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    name = value.upper().replace("-", "_")
+    if name not in Label.__members__:
+        raise ValueError(f"no such class; known: {', '.join(label.name.lower() for label in Label)}")
+    return Label[name]
+
+
+LabelName = Annotated[Label, BeforeValidator(_label_from_name), PlainSerializer(lambda label: label.name.lower())]
+"""A class by its name in files, such as `traffic_sign`."""
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class OdometryConfig(Section):
+    """KISS-ICP's own parameters, under its own names."""
+
+    max_range_m: float = Field(100.0, gt=0, description="points farther away are dropped (m)")
+    min_range_m: float = Field(3.0, ge=0, description="points nearer than this are dropped: the car's own roof (m)")
+    voxel_size_m: float = Field(1.0, gt=0, description="edge of the local map's voxels (m)")
+    deskew: bool = Field(True, description="compensate the motion within a sweep, where points carry times")
+
+
+class KeyframeConfig(Section):
+    distance_m: float = Field(2.0, gt=0, description="cut a keyframe after this travel (m)")
+    angle_deg: float = Field(20.0, gt=0, le=180, description="or after this turn (degrees)")
+
+
+class ProximityConfig(Section):
+    min_travel_m: float = Field(50.0, ge=0, description="travel between the two ends of a loop (m)")
+    base_radius_m: float = Field(6.0, gt=0, description="search radius without any drift (m)")
+    drift_ratio: float = Field(0.015, ge=0, description="growth of the radius per metre since the last closure")
+    max_radius_m: float = Field(20.0, gt=0, description="the radius never exceeds this (m)")
+    max_candidates: int = Field(2, ge=1, description="candidates proposed per keyframe")
+    min_gap_m: float = Field(4.0, ge=0, description="no new search within this travel of an accepted loop (m)")
+
+
+class GeometricLabelsConfig(Section):
+    """Labelling by shape alone."""
+
+
+class SegregatorConfig(Section):
+    """Global registration from semantic clusters and point features."""
+
+    cluster_min_points: dict[LabelName, int] = Field(
+        {Label.CAR: 30, Label.TRUNK: 15},
+        description="class -> fewest points of a cluster; these classes give clusters (P: L_SC; A: 30 and 15)",
+    )
+    dcvc_start_radius_m: float = Field(0.35, gt=0, description="first radial bin of DCVC (A) (m)")
+    dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (A) (m)")
+    dcvc_angle_deg: float = Field(1.2, gt=0, description="pitch and azimuth bin of DCVC (A) (degrees)")
+    min_range_m: float = Field(0.5, ge=0, description="nearest point clustered (A) (m)")
+    max_range_m: float = Field(120.0, gt=0, description="farthest point clustered (A) (m)")
+    feature_classes: tuple[LabelName, ...] = Field(
+        (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points (P: L_F)"
+    )
+    feature_voxel_m: float = Field(0.5, gt=0, description="voxel of the class clouds (A) (m)")
+    normal_radius_m: float = Field(1.0, gt=0, description="neighbourhood of normals (A) (m)")
+    feature_radius_m: float = Field(2.5, gt=0, description="neighbourhood of FPFH (A) (m)")
+    patch_radius_m: float = Field(1.0, gt=0, description="neighbourhood of a key point's Gaussian (A) (m)")
+    tuple_similarity: float = Field(0.95, gt=0, lt=1, description="edge ratio of the tuple test (A)")
+    features: Literal["always", "when_few_clusters", "never"] = Field(
+        "when_few_clusters", description="when FPFH correspondences join those of clusters"
+    )
+    gate: Literal["published", "invariant", "lengths"] = Field(
+        "invariant", description="G-TRIM as published, with eigenvalues (rotation-invariant), or lengths only (Segator)"
+    )
+    noise_bound_m: float = Field(0.2, gt=0, description="bound of one measurement (P, A) (m)")
+    length_bound_m: float = Field(0.4, gt=0, description="l-TRIM: greatest difference of two lengths (A: 2 bounds) (m)")
+    shape_bound_m2: float = Field(0.3, gt=0, description="G-TRIM: greatest squared Wasserstein shape distance (m^2)")
+    rotation: Literal["full", "yaw"] = Field("full", description="degrees of freedom of the rotation (yaw: Quatro)")
+    min_clique: int = Field(5, ge=3, description="smallest inlier clique accepted")
+    clique_max_nodes: int = Field(2_000_000, ge=1, description="search nodes after which the best so far is kept")
+    gnc_factor: float = Field(1.4, gt=1, description="growth of GNC's control parameter (A)")
+    gnc_max_iterations: int = Field(100, ge=1, description="(A)")
+    gnc_cost_tolerance: float = Field(1e-6, gt=0, description="stop at this change of cost (A)")
+
+
+class RefineConfig(Section):
+    """Coarse-to-fine GICP."""
+
+    voxel_m: float = Field(0.5, gt=0, description="voxel of the clouds that are aligned (m)")
+    correspondence_m: tuple[float, ...] = Field((2.0, 1.0, 0.5), description="search distance, stage by stage (m)")
+    max_iterations: int = Field(20, ge=1, description="in each stage")
+    max_range_m: float = Field(60.0, gt=0, description="points farther away are left out (m)")
+
+
+class VerifyConfig(Section):
+    """When an alignment is believed."""
+
+    min_inliers: int = Field(5, ge=0, description="clique members that agree with the pose")
+    min_overlap: float = Field(0.5, ge=0, le=1, description="share of points that meet the other surface")
+    inlier_m: float = Field(0.5, gt=0, description="a point this near the other scan meets it (m)")
+    max_rms_m: float = Field(0.25, gt=0, description="of the points that meet (m)")
+    max_coarse_fine_m: float = Field(2.0, gt=0, description="farthest that refinement may move (m)")
+    max_free_space_violation: float = Field(0.1, ge=0, le=1, description="share of points in space seen empty")
+    prior_gate: float = Field(1.5, gt=0, description="distance from the prior, in search radii")
+
+
+class GraphConfig(Section):
+    odometry_sigma_m: float = Field(0.05, gt=0, description="odometry's translation noise per metre^0.5 travelled")
+    odometry_sigma_deg: float = Field(0.15, gt=0, description="odometry's rotation noise per metre^0.5 travelled")
+    closure_sigma_m: float = Field(0.10, gt=0, description="least translation noise of a closure (m)")
+    closure_sigma_deg: float = Field(0.20, gt=0, description="least rotation noise of a closure (degrees)")
+    robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = Field(
+        "cauchy", description="kernel of the closures while running"
+    )
+    final: Literal["none", "gnc"] = Field("gnc", description="last optimisation: as before, or GNC-TLS")
+    inlier_probability: float = Field(
+        0.99, gt=0, lt=1, description="GNC keeps closures within this chi-square quantile"
+    )
+
+
+class LogConfig(Section):
+    voxel_m: float = Field(0.2, ge=0, description="keyframe clouds are thinned to this in the log; 0 keeps all (m)")
+    compression: Literal["none", "lz4", "zstd"] = "zstd"
+
+
+class Config(Section):
+    odometry: OdometryConfig = OdometryConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    proximity: ProximityConfig = ProximityConfig()
+    geometric: GeometricLabelsConfig = GeometricLabelsConfig()
+    segregator: SegregatorConfig = SegregatorConfig()
+    refine: RefineConfig = RefineConfig()
+    verify: VerifyConfig = VerifyConfig()
+    graph: GraphConfig = GraphConfig()
+    log: LogConfig = LogConfig()
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+    """The defaults, changed by a YAML file and then by `section.key=value` texts.
+
+    Raises SegslamError that names the file and key for unreadable YAML, unknown keys and values out of range.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        values = _read_yaml(path)
+    for text in overrides:
+        key, separator, value = text.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not separator or not dot or not name:
+            raise SegslamError(f"--set {text}: write it as section.key=value, for example keyframes.distance_m=1.5")
+        section_values = values.setdefault(section, {})
+        if not isinstance(section_values, dict):
+            raise SegslamError(f"{path}: {section}: expected a section with keys, found {section_values!r}")
+        try:
+            section_values[name] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise SegslamError(f"--set {text}: the value is no valid YAML ({_one_line(error)})") from error
+    source = str(path) if path is not None else "--set"
+    return _validate(values, source if not (path and overrides) else f"{path} and --set")
+
+
+def config_to_yaml(config: Config) -> str:
+    """Every setting as YAML that `load_config` reads back to an equal Config."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def config_from_yaml(text: str, source: str) -> Config:
+    """The Config that a text holds; `source` names it in the SegslamError raised if it holds none."""
+    return _validate(_parse_yaml(text, source), source)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{path}: cannot read the configuration ({error}); name a YAML file") from error
+    return _parse_yaml(text, str(path))
+
+
+def _parse_yaml(text: str, source: str) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SegslamError(f"{source}: no valid YAML ({_one_line(error)})") from error
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise SegslamError(f"{source}: expected sections with keys, found {type(values).__name__}")
+    return values
+
+
+def _validate(values: dict[str, Any], source: str) -> Config:
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise SegslamError(f"{source}: unknown key {key}; {_known_keys(first['loc'])}") from error
+        raise SegslamError(f"{source}: {key}: {first['msg']}, got {first['input']!r}") from error
+
+
+def _known_keys(location: tuple[int | str, ...]) -> str:
+    fields = Config.model_fields
+    if len(location) > 1 and location[0] in fields:
+        section = fields[str(location[0])].annotation
+        if isinstance(section, type) and issubclass(section, Section):
+            fields = section.model_fields
+    return "known here: " + (", ".join(fields) or "none")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

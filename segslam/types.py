@@ -1,0 +1,222 @@
+"""The records that travel between stages, and the array aliases of their fields.
+
+Conventions. `T_a_b` is the pose of frame b in frame a: `p_a = T_a_b @ p_b`. Frames: world, odom, keyframe, lidar.
+Tangents are [rotation rad; translation m] with the perturbation on the right, GTSAM's convention.
+Stamps are integer nanoseconds. Labels are SemanticKITTI learning ids.
+Shapes are checked under pytest only.
+"""
+
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+Points = Float[np.ndarray, "_ 3"]
+"""Points, a row each, in metres."""
+Labels = UInt8[np.ndarray, "_"]
+"""SemanticKITTI learning ids, one a point."""
+Transform = Float[np.ndarray, "4 4"]
+"""A rigid transform T_a_b."""
+Rotation = Float[np.ndarray, "3 3"]
+Tangent = Float[np.ndarray, "6"]
+"""[rotation rad; translation m], right perturbation."""
+Covariances = Float[np.ndarray, "_ 3 3"]
+Information = Float[np.ndarray, "6 6"]
+"""Inverse covariance of a tangent, in the same order."""
+Indices = Int[np.ndarray, "_"]
+IndexPairs = Int[np.ndarray, "_ 2"]
+Vector = Float[np.ndarray, "_"]
+
+
+class SegslamError(Exception):
+    """Bad input or misuse: the message names the file or key and the remedy."""
+
+
+class Label(IntEnum):
+    """SemanticKITTI learning ids; the moving classes are those of its multi-scan task."""
+
+    UNLABELLED = 0
+    CAR = 1
+    BICYCLE = 2
+    MOTORCYCLE = 3
+    TRUCK = 4
+    OTHER_VEHICLE = 5
+    PERSON = 6
+    BICYCLIST = 7
+    MOTORCYCLIST = 8
+    ROAD = 9
+    PARKING = 10
+    SIDEWALK = 11
+    OTHER_GROUND = 12
+    BUILDING = 13
+    FENCE = 14
+    VEGETATION = 15
+    TRUNK = 16
+    TERRAIN = 17
+    POLE = 18
+    TRAFFIC_SIGN = 19
+    MOVING_CAR = 20
+    MOVING_BICYCLIST = 21
+    MOVING_PERSON = 22
+    MOVING_MOTORCYCLIST = 23
+    MOVING_OTHER_VEHICLE = 24
+    MOVING_TRUCK = 25
+
+
+GROUND_LABELS = (Label.ROAD, Label.PARKING, Label.SIDEWALK, Label.OTHER_GROUND, Label.TERRAIN)
+
+
+class RejectReason(StrEnum):
+    """Why there is no registration or no loop, in the order of the pipeline."""
+
+    TOO_FEW_POINTS = "too_few_points"
+    TOO_FEW_CORRESPONDENCES = "too_few_correspondences"
+    SMALL_CLIQUE = "small_clique"
+    DEGENERATE = "degenerate"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    FAR_FROM_PRIOR = "far_from_prior"
+    REFINEMENT_DIVERGED = "refinement_diverged"
+    LOW_OVERLAP = "low_overlap"
+    HIGH_RESIDUAL = "high_residual"
+    FREE_SPACE_VIOLATED = "free_space_violated"
+    INCONSISTENT = "inconsistent"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One sweep. `points` (n, 3) in the LiDAR frame; `labels` (n,) has a row for each, all UNLABELLED if unknown."""
+
+    index: int
+    stamp_ns: int
+    points: Points
+    labels: Labels
+    times: Vector = field(default_factory=lambda: np.empty(0))
+    """Per point, 0 at the sweep's start to 1 at its end; empty if unknown or already motion-compensated."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A scan kept for loop closing. It has no world pose: the graph alone owns those."""
+
+    id: int
+    scan_index: int
+    stamp_ns: int
+    T_odom_keyframe: Transform
+    travel_m: float
+    """Length of the odometry's path from the first scan to here."""
+    points: Points
+    """Motion-compensated, in the keyframe's frame, float32."""
+    labels: Labels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Description:
+    """What matching needs of one scan, in the scan's frame: clusters (k rows) and point features (m rows).
+
+    Each is a Gaussian with a class. Small enough to keep thousands of them.
+    """
+
+    means: Points
+    covariances: Covariances
+    classes: Labels
+    sizes: Indices
+    """Points in each cluster."""
+    feature_points: Points
+    feature_covariances: Covariances
+    feature_classes: Labels
+    feature_descriptors: Float[np.ndarray, "_ 33"]
+    """FPFH, float32."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopCandidate:
+    """A proposal: the new keyframe `source_id` may see what the old `target_id` saw. The prior only gates."""
+
+    source_id: int
+    target_id: int
+    T_target_source_prior: Transform
+    distance_m: float
+    """Between the two positions, by the present estimate."""
+    search_radius_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """The pose of the source in the target: `p_target = T_target_source @ p_source`."""
+
+    T_target_source: Transform
+    num_correspondences: int
+    num_inliers: int
+    rms_m: float
+    """Root mean square distance of the inliers."""
+    information: Information
+    num_edges: int = 0
+    """Edges of the consistency graph (0 where the method has none)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A registration that failed, or a loop that is none. There is no pose to misuse."""
+
+    reason: RejectReason
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """A verified loop, one between-factor to be. `information` is that of `T_target_source`, right perturbation."""
+
+    source_id: int
+    target_id: int
+    T_target_source: Transform
+    coarse: Registration
+    fine: Registration
+    overlap: float
+    """Share of the source's points, within the range both see, that lie on the target's surface."""
+    information: Information
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopAttempt:
+    candidate: LoopCandidate
+    outcome: LoopClosure | Rejected
+    seconds: dict[str, float]
+    """By stage: describe_source, describe_target, match, refine, verify; only those that ran."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphEstimate:
+    """What one optimisation gave."""
+
+    T_world_keyframe: dict[int, Transform]
+    error: float
+    """GTSAM's: half the chi-square, robust kernels included."""
+    closure_weights: dict[tuple[int, int], float]
+    """(source_id, target_id) -> 0 (switched off) to 1 (fully trusted)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """All that one scan caused."""
+
+    scan_index: int
+    stamp_ns: int
+    T_odom_lidar: Transform
+    keyframe: Keyframe | None
+    attempts: tuple[LoopAttempt, ...]
+    estimate: GraphEstimate | None
+    """Present only if this step optimised the graph."""
+    stage_seconds: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Stamped poses, a row a scan. `T_world_lidar` (n, 4, 4); `scan_index` says which scans they are."""
+
+    scan_index: Indices
+    stamp_ns: Indices
+    T_world_lidar: Float[np.ndarray, "_ 4 4"]
+
+    def __len__(self) -> int:
+        return len(self.scan_index)

@@ -1,0 +1,226 @@
+"""Pose files of KITTI and TUM, which rows of two belong together, and the poses of all scans from those of keyframes.
+
+A pose file does not name its frames: the reader hands over T_a_b as the lines hold it.
+"""
+
+import re
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation as ScipyRotation
+
+from segslam import geometry
+from segslam.types import IndexPairs, Indices, SegslamError, Trajectory, Transform
+
+Poses = Float[np.ndarray, "_ 4 4"]
+"""Rigid transforms T_a_b, one a row."""
+PoseFormat = Literal["kitti", "tum"]
+COLUMNS: dict[PoseFormat, int] = {"kitti": 12, "tum": 8}
+LAYOUT: dict[PoseFormat, str] = {
+    "kitti": "KITTI's format has 12 numbers a line, a 3x4 matrix by rows",
+    "tum": "TUM's format has 8 numbers a line: seconds x y z qx qy qz qw",
+}
+ROTATION_TOLERANCE = 0.01  # chosen: above the rounding of any writer met, far below any other kind of matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseFile:
+    """What a pose file holds, a row a pose, in the file's own frames."""
+
+    T_a_b: Poses
+    stamp_ns: Indices | None
+    """None in KITTI's format, where a row's number is the scan's."""
+
+    def __len__(self) -> int:
+        return len(self.T_a_b)
+
+
+def read_poses(path: Path, *, format: PoseFormat | None = None) -> PoseFile:
+    """The poses of a KITTI or TUM file, rotations made exact; the format is told by the columns unless given.
+
+    Empty lines are skipped, and lines from a # on. Raises SegslamError that names the file, and the line if one is
+    broken: another number of columns, no finite number, or a matrix or quaternion that is no rotation.
+    """
+    lines = _number_lines(path)
+    chosen = format or _format_of(path, *lines[0])
+    rows = np.array([_numbers(path, number, fields, chosen) for number, fields in lines])
+    poses = _poses_from_matrices(rows) if chosen == "kitti" else _poses_from_quaternions(rows)
+    _require_rotations(path, [number for number, _ in lines], rows, poses, chosen)
+    stamps = [_nanoseconds(path, number, fields[0]) for number, fields in lines] if chosen == "tum" else None
+    return PoseFile(poses, None if stamps is None else np.array(stamps, dtype=np.int64))
+
+
+def write_kitti(path: Path, T_a_b: Poses) -> None:
+    """A line of 12 numbers a pose, as evo's `kitti` reads it. The poses are in the frame that the file is to have."""
+    np.savetxt(path, T_a_b[:, :3].reshape(-1, 12), fmt="%.12g")
+
+
+def write_tum(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
+    """A line of `seconds x y z qx qy qz qw` a pose, stamps to the nanosecond, as evo's `tum` reads it."""
+    quaternions = ScipyRotation.from_matrix(T_a_b[:, :3, :3]).as_quat().reshape(-1, 4)
+    rows = np.hstack([T_a_b[:, :3, 3], quaternions])
+    lines = [
+        f"{Decimal(int(stamp)).scaleb(-9):f} " + " ".join(f"{value:.12g}" for value in row)
+        for stamp, row in zip(stamp_ns, rows, strict=True)
+    ]
+    path.write_text("".join(line + "\n" for line in lines), encoding="ascii")
+
+
+def camera_from_lidar(T_world_lidar: Poses, T_camera_lidar: Transform) -> Poses:
+    """The LiDAR's poses as KITTI writes them: the camera's, in the frame of the first camera."""
+    return T_camera_lidar @ T_world_lidar @ geometry.inverse(T_camera_lidar)
+
+
+def lidar_from_camera(T_world_camera: Poses, T_camera_lidar: Transform) -> Poses:
+    """Poses as KITTI writes them, as the LiDAR's in the frame of the first LiDAR; undoes `camera_from_lidar`."""
+    return geometry.inverse(T_camera_lidar) @ T_world_camera @ T_camera_lidar
+
+
+def rows_of_same_stamp(stamp_ns_a: Indices, stamp_ns_b: Indices, *, max_difference_ns: int) -> IndexPairs:
+    """Rows (of a, of b) that are each other's nearest in time and at most `max_difference_ns` apart; ascending in a."""
+    if len(stamp_ns_a) == 0 or len(stamp_ns_b) == 0:
+        return np.empty((0, 2), dtype=np.int64)
+    nearest_b = _nearest(stamp_ns_b, stamp_ns_a)
+    nearest_a = _nearest(stamp_ns_a, stamp_ns_b)
+    rows_a = np.arange(len(stamp_ns_a))
+    mutual = nearest_a[nearest_b] == rows_a
+    close = np.abs(stamp_ns_b[nearest_b] - stamp_ns_a) <= max_difference_ns
+    return np.column_stack([rows_a, nearest_b])[mutual & close]
+
+
+def rows_of_same_scan(scan_index_a: Indices, scan_index_b: Indices) -> IndexPairs:
+    """Rows (of a, of b) that hold the same scan, ascending in the scan's number."""
+    _, rows_a, rows_b = np.intersect1d(scan_index_a, scan_index_b, return_indices=True)
+    return np.column_stack([rows_a, rows_b])
+
+
+def take(trajectory: Trajectory, rows: Indices) -> Trajectory:
+    """The named rows."""
+    return Trajectory(trajectory.scan_index[rows], trajectory.stamp_ns[rows], trajectory.T_world_lidar[rows])
+
+
+def travelled_m(T_a_b: Poses) -> np.ndarray:
+    """(n,) length of the path from the first pose to each."""
+    steps = np.linalg.norm(np.diff(T_a_b[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([np.zeros(min(1, len(T_a_b))), np.cumsum(steps)])
+
+
+def corrected_poses(T_odom_lidar: Poses, keyframe_rows: Indices, T_world_keyframe: Poses) -> Poses:
+    """T_world_lidar of every scan, from the odometry of every scan and the corrected poses of the keyframes among them.
+
+    Each of the two keyframes around a scan predicts its pose by the odometry between them; the two predictions are
+    blended on SE(3) by the share of the way travelled. Before the first and after the last keyframe the nearest one
+    predicts alone. `keyframe_rows` ascend. Raises ValueError if there is no keyframe, or not a pose for each.
+    """
+    if len(keyframe_rows) == 0 or len(keyframe_rows) != len(T_world_keyframe):
+        raise ValueError(f"{len(keyframe_rows)} keyframes and {len(T_world_keyframe)} poses of keyframes")
+    corrections = [
+        T_world_k @ geometry.inverse(T_odom_lidar[row])
+        for row, T_world_k in zip(keyframe_rows, T_world_keyframe, strict=True)
+    ]
+    before, after, share = _surroundings(keyframe_rows, travelled_m(T_odom_lidar))
+    poses = [
+        geometry.interpolate(corrections[k] @ T_odom_s, corrections[m] @ T_odom_s, fraction)
+        for T_odom_s, k, m, fraction in zip(T_odom_lidar, before, after, share, strict=True)
+    ]
+    T_world_lidar = np.array(poses)
+    T_world_lidar[keyframe_rows] = T_world_keyframe
+    return T_world_lidar
+
+
+def _surroundings(keyframe_rows: Indices, travel_m: np.ndarray) -> tuple[Indices, Indices, np.ndarray]:
+    """For each scan: the keyframe before it, the one after it, and the share of the way between them, 0 to 1."""
+    rows = np.arange(len(travel_m))
+    last = len(keyframe_rows) - 1
+    position = np.searchsorted(keyframe_rows, rows, side="right")
+    before, after = np.clip(position - 1, 0, last), np.clip(position, 0, last)
+    standing = 1e-9 * rows  # where nothing moves, the share is that of the scans between
+    progress = travel_m + standing
+    start, end = progress[keyframe_rows[before]], progress[keyframe_rows[after]]
+    share = (progress - start) / np.where(before == after, 1.0, end - start)
+    return before, after, np.clip(share, 0.0, 1.0)
+
+
+def _nearest(values: Indices, targets: Indices) -> Indices:
+    order = np.argsort(values, kind="stable")
+    ascending = values[order]
+    right = np.clip(np.searchsorted(ascending, targets), 1, max(len(values) - 1, 1))
+    right = np.minimum(right, len(values) - 1)
+    left = np.maximum(right - 1, 0)
+    closer_left = np.abs(ascending[left] - targets) <= np.abs(ascending[right] - targets)
+    return order[np.where(closer_left, left, right)]
+
+
+def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
+    """(line number, fields) of each line that holds any."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{path}: cannot read the poses ({error}); name a KITTI or TUM trajectory") from error
+    split = (
+        (number, re.split(r"[\s,]+", line.partition("#")[0].strip())) for number, line in enumerate(text.split("\n"), 1)
+    )
+    lines = [(number, fields) for number, fields in split if fields != [""]]
+    if not lines:
+        raise SegslamError(f"{path}: holds no pose; {LAYOUT['kitti']}, {LAYOUT['tum']}")
+    return lines
+
+
+def _format_of(path: Path, number: int, fields: list[str]) -> PoseFormat:
+    for name, columns in COLUMNS.items():
+        if len(fields) == columns:
+            return name
+    raise SegslamError(f"{path}:{number}: found {len(fields)} numbers; {LAYOUT['kitti']}, {LAYOUT['tum']}")
+
+
+def _numbers(path: Path, number: int, fields: list[str], format: PoseFormat) -> list[float]:
+    if len(fields) != COLUMNS[format]:
+        raise SegslamError(f"{path}:{number}: found {len(fields)} numbers; {LAYOUT[format]}: mend or remove the line")
+    try:
+        values = [float(field) for field in fields]
+    except ValueError as error:
+        raise SegslamError(f"{path}:{number}: {error}; {LAYOUT[format]}: mend or remove the line") from error
+    if not np.isfinite(values).all():
+        raise SegslamError(f"{path}:{number}: holds {' '.join(fields)}; every number must be finite")
+    return values
+
+
+def _nanoseconds(path: Path, number: int, seconds: str) -> int:
+    """Exact: a double cannot hold today's seconds to the nanosecond."""
+    try:
+        return int(Decimal(seconds).scaleb(9).to_integral_value())
+    except InvalidOperation as error:
+        raise SegslamError(f"{path}:{number}: {seconds} is no time in seconds") from error
+
+
+def _poses_from_matrices(rows: np.ndarray) -> Poses:
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    poses[:, :3, :3] = [geometry.nearest_rotation(matrix) for matrix in poses[:, :3, :3]]
+    return poses
+
+
+def _poses_from_quaternions(rows: np.ndarray) -> Poses:
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    norms = np.linalg.norm(rows[:, 4:], axis=1)
+    quaternions = np.where(norms[:, None] > 0, rows[:, 4:], [0.0, 0.0, 0.0, 1.0])  # zero is refused with its line, next
+    poses[:, :3, :3] = ScipyRotation.from_quat(quaternions).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return poses
+
+
+def _require_rotations(path: Path, numbers: list[int], rows: np.ndarray, poses: Poses, format: PoseFormat) -> None:
+    if format == "kitti":
+        off = np.abs(rows.reshape(-1, 3, 4)[:, :, :3] - poses[:, :3, :3]).max(axis=(1, 2))
+    else:
+        off = np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0)
+    worst = int(np.argmax(off))
+    if off[worst] > ROTATION_TOLERANCE:
+        what = "3x3 part" if format == "kitti" else "quaternion"
+        raise SegslamError(
+            f"{path}:{numbers[worst]}: the {what} is no rotation, it is off by {off[worst]:.3g}; mend the line"
+        )

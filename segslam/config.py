@@ -37,24 +37,43 @@ class OdometryConfig(Section):
     min_range_m: float = Field(3.0, ge=0, description="points nearer than this are dropped: the car's own roof (m)")
     voxel_size_m: float = Field(1.0, gt=0, description="edge of the local map's voxels (m)")
     deskew: bool = Field(True, description="compensate the motion within a sweep, where points carry times")
+    max_num_threads: int = Field(0, ge=0, description="of KISS-ICP; 0 takes all, 1 repeats to the bit")
+    stamp_tolerance_s: float = Field(0.01, ge=0, description="a given pose this near in time is the scan's (s)")
 
 
 class KeyframeConfig(Section):
-    distance_m: float = Field(2.0, gt=0, description="cut a keyframe after this travel (m)")
+    distance_m: float = Field(2.0, gt=0, description="cut a keyframe this far from the last (m)")
     angle_deg: float = Field(20.0, gt=0, le=180, description="or after this turn (degrees)")
 
 
 class ProximityConfig(Section):
     min_travel_m: float = Field(50.0, ge=0, description="travel between the two ends of a loop (m)")
     base_radius_m: float = Field(6.0, gt=0, description="search radius without any drift (m)")
-    drift_ratio: float = Field(0.015, ge=0, description="growth of the radius per metre since the last closure")
+    drift_ratio: float = Field(0.015, ge=0, description="growth of the radius per metre of chain between the two")
     max_radius_m: float = Field(20.0, gt=0, description="the radius never exceeds this (m)")
+    height_factor: float = Field(2.0, gt=0, description="greatest difference of heights, in search radii")
     max_candidates: int = Field(2, ge=1, description="candidates proposed per keyframe")
+    spread_m: float = Field(8.0, ge=0, description="travel between two candidates of one keyframe (m)")
     min_gap_m: float = Field(4.0, ge=0, description="no new search within this travel of an accepted loop (m)")
 
 
 class GeometricLabelsConfig(Section):
-    """Labelling by shape alone."""
+    """Labelling by shape alone. Heights are above the ground."""
+
+    max_range_m: float = Field(70.0, gt=0, description="points farther away in x or y stay unlabelled (m)")
+    ground_cell_m: float = Field(1.0, gt=0, description="edge of the cells of the ground's surface (m)")
+    max_slope: float = Field(0.2, gt=0, description="steepest that the ground rises between cells")
+    ground_height_m: float = Field(0.15, gt=0, description="points lower than this are ground (m)")
+    upright_low_m: float = Field(0.4, ge=0, description="bottom of the band where poles and trunks are looked for (m)")
+    upright_high_m: float = Field(2.4, gt=0, description="top of that band (m)")
+    upright_core_m: float = Field(0.3, gt=0, description="poles and trunks lie within this radius (m)")
+    upright_clear_m: float = Field(0.7, gt=0, description="and nothing else within this one (m)")
+    upright_min_m: float = Field(1.2, gt=0, description="least height of a pole or trunk within the band (m)")
+    upright_min_share: float = Field(0.7, gt=0, le=1, description="share of its occupied heights that stand clear")
+    box_top_m: tuple[float, float] = Field((1.0, 2.2), description="lowest and highest top of a car (m)")
+    box_length_m: tuple[float, float] = Field((1.5, 6.0), description="shortest and longest side seen of a car (m)")
+    box_max_width_m: float = Field(2.6, gt=0, description="widest car (m)")
+    wall_thickness_m: float = Field(0.08, gt=0, description="standard deviation of a wall's points across it (m)")
 
 
 class SegregatorConfig(Section):
@@ -78,8 +97,9 @@ class SegregatorConfig(Section):
     patch_radius_m: float = Field(1.0, gt=0, description="neighbourhood of a key point's Gaussian (A) (m)")
     tuple_similarity: float = Field(0.95, gt=0, lt=1, description="edge ratio of the tuple test (A)")
     features: Literal["always", "when_few_clusters", "never"] = Field(
-        "when_few_clusters", description="when FPFH correspondences join those of clusters"
+        "when_few_clusters", description="when a scan is given FPFH key points"
     )
+    few_clusters: int = Field(12, ge=0, description="fewer clusters than this are few")
     gate: Literal["published", "invariant", "lengths"] = Field(
         "invariant", description="G-TRIM as published, with eigenvalues (rotation-invariant), or lengths only (Segator)"
     )
@@ -98,20 +118,25 @@ class RefineConfig(Section):
     """Coarse-to-fine GICP."""
 
     voxel_m: float = Field(0.5, gt=0, description="voxel of the clouds that are aligned (m)")
-    correspondence_m: tuple[float, ...] = Field((2.0, 1.0, 0.5), description="search distance, stage by stage (m)")
+    correspondence_m: tuple[float, ...] = Field((1.0, 0.5), description="search distance, stage by stage (m)")
     max_iterations: int = Field(20, ge=1, description="in each stage")
     max_range_m: float = Field(60.0, gt=0, description="points farther away are left out (m)")
+    min_points: int = Field(100, ge=10, description="fewest points, and fewest pairs, that can be aligned")
+    information_scale: float = Field(1.0, gt=0, description="Hessian to information: calibrated on simulated truth")
 
 
 class VerifyConfig(Section):
     """When an alignment is believed."""
 
-    min_inliers: int = Field(5, ge=0, description="clique members that agree with the pose")
-    min_overlap: float = Field(0.5, ge=0, le=1, description="share of points that meet the other surface")
-    inlier_m: float = Field(0.5, gt=0, description="a point this near the other scan meets it (m)")
-    max_rms_m: float = Field(0.25, gt=0, description="of the points that meet (m)")
+    min_inliers: int = Field(5, ge=0, description="clique members that agree with the coarse pose")
+    min_overlap: float = Field(0.3, ge=0, le=1, description="share of points that meet the other surface")
+    inlier_m: float = Field(0.5, gt=0, description="a point this near the other surface meets it (m)")
+    max_range_m: float = Field(50.0, gt=0, description="points farther from the other sensor are out of its reach (m)")
+    max_rms_m: float = Field(0.135, gt=0, description="of the points that meet, to the other surface's planes (m)")
+    max_free_space_violation: float = Field(0.02, ge=0, le=1, description="share of points in space seen empty")
+    free_space_margin_m: float = Field(1.0, gt=0, description="a point this far before a return violates it (m)")
+    free_space_margin_ratio: float = Field(0.02, ge=0, description="and this much more per metre of range")
     max_coarse_fine_m: float = Field(2.0, gt=0, description="farthest that refinement may move (m)")
-    max_free_space_violation: float = Field(0.1, ge=0, le=1, description="share of points in space seen empty")
     prior_gate: float = Field(1.5, gt=0, description="distance from the prior, in search radii")
 
 

@@ -1,0 +1,169 @@
+"""Semantic clusters: labelled points -> Gaussians.
+
+Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator: Global Point Cloud Registration with Semantic and Geometric Cues", ICRA 2023,
+section III-A. The segmentation is the dynamic curved-voxel clustering (DCVC) of Zhou, Guo, Gan, Yang, "T-LOAM: Truncated
+Least Squares LiDAR-Only Odometry and Mapping in Real Time", TGRS 2021: points fall in voxels of range, pitch and
+azimuth around the sensor, and occupied voxels that touch (26 neighbours) form one cluster.
+
+Differs from T-LOAM and the Segregator authors' program: azimuth wraps, and clusters are the connected components
+proper. Theirs let only points that have no cluster yet join clusters, so what is split depends on the points' order.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from segslam.config import SegregatorConfig
+from segslam.points import EMPTY, canonical_order, find_key, hash_keys, within_range
+from segslam.types import Covariances, Indices, Label, Labels, Points, Vector
+
+FIRST_RADIUS_M = 5.0
+"""The first radial bin starts here, or at the nearest point of the class if that is nearer (the authors' program)."""
+
+
+class Clusters(NamedTuple):
+    """Gaussians, a row each: centre (m), covariance (m^2, normalised by n), class, number of points."""
+
+    means: Points
+    covariances: Covariances
+    classes: Labels
+    sizes: Indices
+
+
+NO_CLUSTERS = Clusters(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.uint8), np.empty(0, np.int64))
+
+
+def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfig) -> Clusters:
+    """The clusters of each class in `config.cluster_min_points`: by class, then from the largest to the smallest.
+
+    Centres are in the frame of `points`, whose origin is the sensor. Points that are NaN or out of range take no part.
+    The result does not depend on the order of the points.
+    """
+    chosen = np.flatnonzero(np.isin(labels, [int(label) for label in config.cluster_min_points]))
+    chosen = chosen[within_range(points[chosen], config.min_range_m, config.max_range_m)]
+    chosen = chosen[canonical_order(points[chosen])]
+    points, labels = points[chosen].astype(np.float64), labels[chosen]
+    parts = [
+        _class_clusters(points[labels == label], label, min_points, config)
+        for label, min_points in sorted(config.cluster_min_points.items())
+    ]
+    return Clusters(*(np.concatenate(columns) for columns in zip(NO_CLUSTERS, *parts, strict=True)))
+
+
+def curved_voxel_clusters(points: Points, *, start_m: float, step_m: float, angle_deg: float) -> Indices:
+    """(n,) the cluster of each point by DCVC, numbered from 0. The points are finite and none is at the origin.
+
+    Radial bin k, from 1, is `start_m - k * step_m` deep; the first starts at the nearest point, 5 m away at most. Bins of
+    pitch and azimuth are `angle_deg` wide (azimuth: the nearest width that divides the circle).
+    """
+    if not len(points):
+        return np.empty(0, np.int64)
+    polar = _polar(points)
+    num_azimuth = max(1, round(360.0 / angle_deg))
+    cells = np.empty((len(points), 3), np.int64)
+    cells[:, 0] = _radial_bins(polar[:, 0], start_m, step_m)
+    cells[:, 1] = np.floor((polar[:, 1] - min(0.0, polar[:, 1].min())) / math.radians(angle_deg) + 0.5)
+    cells[:, 2] = np.floor(polar[:, 2] / (2.0 * math.pi / num_azimuth) + 0.5).astype(np.int64) % num_azimuth
+    num_radial = (
+        cells[:, 0].max() + 2
+    )  # one more than occupied: the neighbours of the outermost bins have keys of their own
+    keys, voxel_of_point = np.unique(
+        (cells[:, 1] * num_radial + cells[:, 0]) * num_azimuth + cells[:, 2], return_inverse=True
+    )
+    return _components(keys, num_radial, num_azimuth)[voxel_of_point]
+
+
+def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, Covariances, Indices]:
+    """Mean, covariance (normalised by n) and number of the points of each group. A group has a point at least."""
+    sizes = np.bincount(group, minlength=num_groups)
+    means = _group_sums(points, group, num_groups) / sizes[:, None]
+    centred = points - means[group]
+    products = (centred[:, :, None] * centred[:, None, :]).reshape(-1, 9)
+    covariances = _group_sums(products, group, num_groups) / sizes[:, None]
+    return means, covariances.reshape(-1, 3, 3), sizes
+
+
+def _class_clusters(points: Points, label: Label, min_points: int, config: SegregatorConfig) -> Clusters:
+    cluster = curved_voxel_clusters(
+        points,
+        start_m=config.dcvc_start_radius_m,
+        step_m=config.dcvc_radius_step_m,
+        angle_deg=config.dcvc_angle_deg,
+    )
+    large = np.bincount(cluster) >= min_points
+    kept = large[cluster]
+    renumbered = np.cumsum(large) - 1
+    means, covariances, sizes = gaussians(points[kept], renumbered[cluster[kept]], int(large.sum()))
+    order = np.lexsort((*means.T, -sizes))
+    return Clusters(means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[order])
+
+
+def _polar(points: Points) -> Points:
+    """Range (m), pitch and azimuth (rad) of each point, a row each."""
+    distance = np.sqrt((points**2).sum(axis=1))
+    pitch = np.arcsin(points[:, 2] / distance)
+    return np.column_stack((distance, pitch, np.arctan2(points[:, 1], points[:, 0])))
+
+
+def _radial_bins(distance: Vector, start_m: float, step_m: float) -> Indices:
+    """The radial bin of each distance. The bins start at the nearest, but no farther than `FIRST_RADIUS_M`."""
+    first = min(FIRST_RADIUS_M, distance.min())
+    bounds = [first]
+    while bounds[-1] <= distance.max():
+        bounds.append(bounds[-1] + start_m - len(bounds) * step_m)
+    return np.searchsorted(bounds[1:], distance, side="right")
+
+
+def _group_sums(rows: np.ndarray, group: Indices, num_groups: int) -> np.ndarray:
+    return np.column_stack([np.bincount(group, weights=column, minlength=num_groups) for column in rows.T])
+
+
+@njit("int64(int64[:], int64)", cache=True, nogil=True)
+def _root(parent, node):
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
+
+
+@njit("void(int64[:], int64, int64)", cache=True, nogil=True)
+def _join(parent, a, b):
+    a, b = _root(parent, a), _root(parent, b)
+    parent[max(a, b)] = min(a, b)
+
+
+@njit("int64[:](int64[:])", cache=True, nogil=True)
+def _numbered(parent):
+    number = np.empty(len(parent), np.int64)
+    count = 0
+    for node in range(len(parent)):
+        root = _root(parent, node)
+        if root == node:
+            number[node] = count
+            count += 1
+        else:
+            number[node] = number[root]
+    return number
+
+
+@njit("int64[:](int64[:], int64, int64)", cache=True, nogil=True)
+def _components(keys, num_radial, num_azimuth):
+    """The connected component of each voxel, numbered from 0 by its first voxel.
+
+    Keys are distinct: (pitch * num_radial + radial) * num_azimuth + azimuth. Azimuth wraps.
+    """
+    table, _ = hash_keys(keys)
+    parent = np.arange(len(keys))
+    for voxel in range(len(keys)):
+        row, azimuth = keys[voxel] // num_azimuth, keys[voxel] % num_azimuth
+        for pitch_step in range(0, 2):
+            for radial_step in range(-1, 2):
+                for azimuth_step in range(-1, 2):
+                    neighbour_row = row + pitch_step * num_radial + radial_step
+                    neighbour_azimuth = (azimuth + azimuth_step) % num_azimuth
+                    neighbour = find_key(table, keys, neighbour_row * num_azimuth + neighbour_azimuth)
+                    if neighbour != EMPTY:
+                        _join(parent, voxel, neighbour)
+    return _numbered(parent)

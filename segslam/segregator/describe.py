@@ -1,0 +1,31 @@
+"""What matching needs of one scan, computed once and kept."""
+
+from segslam.config import SegregatorConfig
+from segslam.segregator.clusters import semantic_clusters
+from segslam.segregator.features import NO_FEATURES, point_features
+from segslam.types import Description, Labels, Points
+
+
+def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
+    """The semantic clusters and point features of a scan, in its frame, whose origin is the sensor.
+
+    Points that are NaN or out of range take no part; a scan without usable points has an empty description. The result
+    does not depend on the order of the points. Raises ValueError unless there is one label for each point.
+    """
+    if len(points) != len(labels):
+        raise ValueError(f"{len(points)} points but {len(labels)} labels; give one label for each point")
+    clusters = semantic_clusters(points, labels, config=config)
+    wanted = config.features == "always" or (
+        config.features == "when_few_clusters" and len(clusters.sizes) < config.few_clusters
+    )
+    features = point_features(points, labels, config=config) if wanted else NO_FEATURES
+    return Description(
+        means=clusters.means,
+        covariances=clusters.covariances,
+        classes=clusters.classes,
+        sizes=clusters.sizes,
+        feature_points=features.points,
+        feature_covariances=features.covariances,
+        feature_classes=features.classes,
+        feature_descriptors=features.descriptors,
+    )

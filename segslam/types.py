@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 Points = Float[np.ndarray, "_ 3"]
 """Points, a row each, in metres."""
@@ -27,10 +27,15 @@ Information = Float[np.ndarray, "6 6"]
 Indices = Int[np.ndarray, "_"]
 IndexPairs = Int[np.ndarray, "_ 2"]
 Vector = Float[np.ndarray, "_"]
+Mask = Bool[np.ndarray, "_"]
 
 
 class SegslamError(Exception):
     """Bad input or misuse: the message names the file or key and the remedy."""
+
+
+class BadScan(SegslamError):
+    """One scan that cannot be used, the others are unaffected: report it, skip it, count it."""
 
 
 class Label(IntEnum):
@@ -164,17 +169,28 @@ class Rejected:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """A registration that was refined and verified; `fine.T_target_source` is the pose."""
+
+    coarse: Registration
+    fine: Registration
+    overlap: float
+    """Share of the points within reach of the other scan that lie on its surface; of the two ways, the smaller."""
+    rms_m: float
+    """Of those points, to the planes of the other surface."""
+    free_space_violation: float
+    """Share of the points that stand where the other scan saw empty space."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LoopClosure:
     """A verified loop, one between-factor to be. `information` is that of `T_target_source`, right perturbation."""
 
     source_id: int
     target_id: int
     T_target_source: Transform
-    coarse: Registration
-    fine: Registration
-    overlap: float
-    """Share of the source's points, within the range both see, that lie on the target's surface."""
     information: Information
+    alignment: Alignment
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,10 +8,11 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "segslam"
 LAYERS = (  # top first; a room is a module or a folder
     {"cli"},
-    {"experiments", "report"},
+    {"experiments", "report", "runs"},
     {"slam", "log", "map", "evaluation"},
-    {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "semantics",
-     "simulation"},
+    {"alignment"},
+    {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "simulation"},
+    {"semantics"},  # below datasets, whose scans come with labels
     {"trajectory"},
     {"geometry", "points"},
     {"types", "config"},

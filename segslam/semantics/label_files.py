@@ -1,0 +1,126 @@
+"""Labels from files: SemanticKITTI's `.label` format, one file a scan with the scan's name, in any of the encodings."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from segslam.semantics.encodings import Encoding, Histogram, Ids, detect_encoding, to_labels
+from segslam.types import BadScan, Label, Labels, SegslamError
+
+logger = logging.getLogger(__name__)
+
+FILES_LOOKED_AT = 8  # chosen: what the encoding is told from, spread over the drive
+
+
+@dataclass(frozen=True, slots=True)
+class LabelFiles:
+    """A folder of `.label` files, named like the scans."""
+
+    folder: Path
+    encoding: Encoding
+
+    def read(self, name: str, num_points: int) -> Labels:
+        """The labels of the scan `name`, all UNLABELLED if it has no file.
+
+        Raises BadScan if the file is broken, has not `num_points` labels, or ids that its encoding does not have.
+        """
+        file = self.folder / f"{name}.label"
+        if not file.exists():
+            return unlabelled(num_points)
+        ids = read_ids(file)
+        if len(ids) != num_points:
+            raise BadScan(f"{file}: {len(ids)} labels for {num_points} points; labels and scan are not of one sweep")
+        try:
+            return to_labels(ids, self.encoding)
+        except SegslamError as error:
+            raise BadScan(f"{file}: {error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class LabelSource:
+    """Where the labels of a drive come from."""
+
+    files: LabelFiles | None
+    geometric: bool
+    """Scans that no file labels are to be labelled by shape, when they become keyframes."""
+
+    def read(self, name: str, num_points: int) -> Labels:
+        """The labels of the scan `name` by file, all UNLABELLED where there is none. Raises BadScan as `LabelFiles`."""
+        return self.files.read(name, num_points) if self.files else unlabelled(num_points)
+
+
+def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelSource:
+    """What `--labels` names: `auto`, `none`, `geometric`, or a folder of `.label` files.
+
+    `beside` is the folder that relative ones start from, and where `auto` looks for `labels/`; without it, `auto` is
+    `geometric`. Raises SegslamError for a folder that is missing or labels none of the scans, and for files whose
+    encoding is neither given nor to be told.
+    """
+    if source in ("none", "geometric"):
+        return LabelSource(None, geometric=source == "geometric")
+    if source.startswith("network:"):
+        raise SegslamError(
+            f"--labels {source}: networks are not run by this version; name a folder of their .label files"
+        )
+    if source == "auto":
+        if not _labelled(beside / "labels", scan_names):
+            return LabelSource(None, geometric=True)
+        return LabelSource(_open_folder(beside / "labels", scan_names, encoding), geometric=True)
+    folder = beside / Path(source).expanduser()
+    if not folder.is_dir():
+        raise SegslamError(f"--labels {source}: no folder {folder}; name one, or auto, none, geometric")
+    if not _labelled(folder, scan_names):
+        raise SegslamError(
+            f"{folder}: no .label file for any of the {len(scan_names)} scans; they are named like the scans"
+        )
+    return LabelSource(_open_folder(folder, scan_names, encoding), geometric=False)
+
+
+def read_ids(file: Path) -> Ids:
+    """The class ids of a `.label` file: its lower 16 bits, the upper are instances. Raises BadScan if it is broken."""
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise BadScan(f"{file}: cannot read the labels ({error})") from error
+    if len(content) % 4:
+        raise BadScan(f"{file}: {len(content)} bytes are no multiple of 4 (uint32): truncated; fetch the file again")
+    return np.frombuffer(content, dtype="<u4") & 0xFFFF
+
+
+def unlabelled(num_points: int) -> Labels:
+    """No knowledge of any point."""
+    return np.full(num_points, Label.UNLABELLED, dtype=np.uint8)
+
+
+def _labelled(folder: Path, scan_names: Sequence[str]) -> list[str]:
+    return [name for name in scan_names if (folder / f"{name}.label").is_file()]
+
+
+def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelFiles:
+    named = _labelled(folder, scan_names)
+    if len(named) < len(scan_names):
+        logger.warning("%s: %d of %d scans have no label file", folder, len(scan_names) - len(named), len(scan_names))
+    return LabelFiles(folder, encoding or _encoding_of(folder, named))
+
+
+def _encoding_of(folder: Path, names: list[str]) -> Encoding:
+    rows = np.unique(np.linspace(0, len(names) - 1, FILES_LOOKED_AT).astype(int))
+    num_points_of_id = sum(
+        (_histogram(folder / f"{names[row]}.label") for row in rows), np.zeros(2**16, dtype=np.int64)
+    )
+    try:
+        return detect_encoding(num_points_of_id)
+    except SegslamError as error:
+        raise SegslamError(f"{folder}: {error}") from error
+
+
+def _histogram(file: Path) -> Histogram:
+    """Points of each id; none for a broken file, which is its own scan's failure when that is read."""
+    try:
+        ids = read_ids(file)
+    except BadScan:
+        ids = np.empty(0, dtype=np.uint32)
+    return np.bincount(ids, minlength=2**16)

@@ -96,6 +96,8 @@ class SegregatorConfig(Section):
     feature_radius_m: float = Field(2.5, gt=0, description="neighbourhood of FPFH (A) (m)")
     patch_radius_m: float = Field(1.0, gt=0, description="neighbourhood of a key point's Gaussian (A) (m)")
     tuple_similarity: float = Field(0.95, gt=0, lt=1, description="edge ratio of the tuple test (A)")
+    tuple_trials_per_pair: int = Field(100, ge=1, description="random triples drawn for each mutual pair (A)")
+    tuple_seed: int = Field(0, ge=0, description="of the random triples")
     features: Literal["always", "when_few_clusters", "never"] = Field(
         "when_few_clusters", description="when a scan is given FPFH key points"
     )
@@ -106,9 +108,13 @@ class SegregatorConfig(Section):
     noise_bound_m: float = Field(0.2, gt=0, description="bound of one measurement (P, A) (m)")
     length_bound_m: float = Field(0.4, gt=0, description="l-TRIM: greatest difference of two lengths (A: 2 bounds) (m)")
     shape_bound_m2: float = Field(0.3, gt=0, description="G-TRIM: greatest squared Wasserstein shape distance (m^2)")
+    solver: Literal["joint", "decoupled"] = Field(
+        "joint", description="rotation and translation together, or one after the other (A)"
+    )
     rotation: Literal["full", "yaw"] = Field("full", description="degrees of freedom of the rotation (yaw: Quatro)")
     min_clique: int = Field(5, ge=3, description="smallest inlier clique accepted")
     clique_max_nodes: int = Field(2_000_000, ge=1, description="search nodes after which the best so far is kept")
+    max_cliques: int = Field(8, ge=1, description="maximum cliques tried; the pose with most inliers is kept")
     gnc_factor: float = Field(1.4, gt=1, description="growth of GNC's control parameter (A)")
     gnc_max_iterations: int = Field(100, ge=1, description="(A)")
     gnc_cost_tolerance: float = Field(1e-6, gt=0, description="stop at this change of cost (A)")
@@ -143,6 +149,7 @@ class VerifyConfig(Section):
 class GraphConfig(Section):
     odometry_sigma_m: float = Field(0.05, gt=0, description="odometry's translation noise per metre^0.5 travelled")
     odometry_sigma_deg: float = Field(0.15, gt=0, description="odometry's rotation noise per metre^0.5 travelled")
+    turn_m: float = Field(5.0, ge=0, description="a turn of one radian adds as much noise as this travel (m)")
     closure_sigma_m: float = Field(0.10, gt=0, description="least translation noise of a closure (m)")
     closure_sigma_deg: float = Field(0.20, gt=0, description="least rotation noise of a closure (degrees)")
     robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = Field(

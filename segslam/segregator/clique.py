@@ -1,0 +1,238 @@
+"""Maximum cliques by branch and bound on bitsets.
+
+Vertices are taken in degeneracy order, each with its later neighbours only, and dropped by core number (Rossi,
+Gleich, Gebremedhin, "Parallel maximum clique algorithms with applications to network analysis", SISC 2015). Each such
+neighbourhood is searched with greedy colouring as the upper bound (San Segundo, Rodriguez-Losada, Jimenez, "An exact
+bit-parallel algorithm for the maximum clique problem", C&OR 2011).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from segslam.segregator.consistency import Bits
+from segslam.types import Indices
+
+_FLOOR, _SIZE, _FOUND, _NODES = range(4)  # what `state` holds: only larger cliques count; size and number of those kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CliqueSearch:
+    """The largest cliques found, all of one size, each with its vertices in ascending order."""
+
+    cliques: tuple[Indices, ...]
+    proved: bool
+    """That none is larger: false if the search was stopped at its bound of nodes, with the best so far."""
+
+
+def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> CliqueSearch:
+    """Up to `max_cliques` cliques of the greatest size.
+
+    With fewer found than asked for and the search proved and not stopped, these are all there are, so that the set
+    does not depend on how vertices are numbered. The order is that of the search, the same on every run.
+    `max_nodes` bounds the work of finding the size, and again that of listing.
+    """
+    if len(adjacency) == 0:
+        return CliqueSearch((), True)
+    order, core_numbers = _degeneracy_order(adjacency)
+    first, proved = _search(adjacency, order, core_numbers, 0, 1, max_nodes)
+    if max_cliques == 1:
+        return CliqueSearch((np.sort(first[0]),), proved)
+    listed, _ = _search(adjacency, order, core_numbers, first.shape[1] - 1, max_cliques, max_nodes)
+    return CliqueSearch(tuple(np.sort(clique) for clique in listed), proved)
+
+
+@njit("uint64(uint64)", cache=True, nogil=True, inline="always")
+def _count_bits(word):
+    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@njit("int64(uint64)", cache=True, nogil=True, inline="always")
+def _lowest_bit(word):
+    """Position of the lowest bit set; `word` is not 0."""
+    return np.int64(_count_bits((word & (~word + np.uint64(1))) - np.uint64(1)))
+
+
+@njit("int64(uint64[::1], int64[::1])", cache=True, nogil=True)
+def _members(row, out):
+    """Writes the positions of the bits set in `row`, ascending, and returns how many."""
+    count = 0
+    for w in range(len(row)):
+        word = row[w]
+        while word:
+            out[count] = 64 * w + _lowest_bit(word)
+            count += 1
+            word &= word - np.uint64(1)
+    return count
+
+
+@njit("UniTuple(int64[::1], 2)(uint64[:, ::1])", cache=True, nogil=True)
+def _degeneracy_order(adjacency):
+    """Vertices as repeatedly taken with the fewest neighbours left, and the core number of each vertex."""
+    count = len(adjacency)
+    neighbours = np.empty(count, np.int64)
+    degree = np.empty(count, np.int64)
+    for v in range(count):
+        degree[v] = _members(adjacency[v], neighbours)
+    starts = np.zeros(degree.max() + 2, np.int64)  # of the vertices of each degree in `order`
+    for v in range(count):
+        starts[degree[v] + 1] += 1
+    starts = np.cumsum(starts)
+    order, place = np.empty(count, np.int64), np.empty(count, np.int64)
+    cursor = starts.copy()
+    for v in range(count):
+        place[v] = cursor[degree[v]]
+        order[place[v]] = v
+        cursor[degree[v]] += 1
+    for step in range(count):
+        v = order[step]
+        for k in range(_members(adjacency[v], neighbours)):
+            u = neighbours[k]
+            if degree[u] > degree[v]:  # swap u to the front of its degree, then that front moves past it
+                front = max(starts[degree[u]], step + 1)
+                other = order[front]
+                order[front], order[place[u]] = u, other
+                place[other], place[u] = place[u], front
+                starts[degree[u]] = front + 1
+                degree[u] -= 1
+    return order, degree
+
+
+@njit("uint64[:, ::1](uint64[:, ::1], int64[::1])", cache=True, nogil=True)
+def _induced(adjacency, vertices):
+    """The adjacency among some vertices, renumbered as listed."""
+    count = len(vertices)
+    local = np.zeros((count, (count + 63) // 64), np.uint64)
+    for i in range(count):
+        row = adjacency[vertices[i]]
+        for j in range(i):
+            v = vertices[j]
+            bit = (row[v >> 6] >> np.uint64(v & 63)) & np.uint64(1)
+            local[i, j >> 6] |= bit << np.uint64(j & 63)
+            local[j, i >> 6] |= bit << np.uint64(i & 63)
+    return local
+
+
+@njit(
+    "Tuple((int64, int64[::1], int64[::1]))(uint64[:, ::1], uint64[::1], int64, int64, int64[::1], int64[::1])",
+    cache=True,
+    nogil=True,
+)
+def _colour(adjacency, candidates, spare, top, branches, bounds):
+    """Pushes the candidates that could begin a clique of more than `spare`, each with a bound of its size.
+
+    The candidates are split into independent sets one after the other; a clique among the first k sets has at most k
+    members. Those of the first `spare` sets need no branch of their own.
+    """
+    words = len(candidates)
+    uncoloured = candidates.copy()
+    colour = 0
+    left = True
+    while left:
+        colour += 1
+        left = False
+        independent = uncoloured.copy()
+        for w in range(words):
+            while independent[w]:
+                bit = _lowest_bit(independent[w])
+                v = 64 * w + bit
+                uncoloured[w] &= ~(np.uint64(1) << np.uint64(bit))
+                independent[w] &= ~(np.uint64(1) << np.uint64(bit))
+                for u in range(w, words):
+                    independent[u] &= ~adjacency[v, u]
+                if colour > spare:
+                    if top == len(branches):
+                        branches, bounds = np.append(branches, branches), np.append(bounds, bounds)
+                    branches[top], bounds[top] = v, colour
+                    top += 1
+            left |= uncoloured[w] != 0
+    return top, branches, bounds
+
+
+@njit("void(int64[::1], int64[:, ::1], int64[::1])", cache=True, nogil=True)
+def _keep(clique, found, state):
+    """Into a room for one it comes in place of the smaller one there, and raises the floor."""
+    state[_SIZE] = len(clique)
+    if len(found) == 1:
+        found[0, : len(clique)] = clique
+        state[_FLOOR], state[_FOUND] = len(clique), 1
+    else:
+        found[state[_FOUND], : len(clique)] = clique
+        state[_FOUND] += 1
+
+
+@njit("void(uint64[:, ::1], int64, int64[::1], int64[:, ::1], int64[::1], int64)", cache=True, nogil=True)
+def _search_neighbourhood(adjacency, root, names, found, state, max_nodes):
+    """Adds to `found` the cliques of `root` and some of its neighbours; `names` are theirs in the whole graph."""
+    count, words = adjacency.shape
+    candidates = np.zeros((count + 1, words), np.uint64)  # by depth: adjacent to all that were chosen above it
+    for k in range(count):
+        candidates[0, k >> 6] |= np.uint64(1) << np.uint64(k & 63)
+    clique = np.empty(count + 1, np.int64)
+    clique[0] = root
+    starts = np.zeros(count + 2, np.int64)  # by depth: where its branches begin on the stack
+    branches, bounds = np.empty(2 * count + 1, np.int64), np.empty(2 * count + 1, np.int64)
+    depth = 0
+    if count == 0:
+        _keep(clique[:1], found, state)
+        return
+    top, branches, bounds = _colour(adjacency, candidates[0], state[_FLOOR] - 1, 0, branches, bounds)
+    while depth >= 0:
+        if top == starts[depth] or depth + 1 + bounds[top - 1] <= state[_FLOOR]:
+            top = starts[depth]
+            depth -= 1
+            continue
+        state[_NODES] += 1
+        top -= 1
+        v = branches[top]
+        clique[depth + 1] = names[v]
+        candidates[depth, v >> 6] &= ~(np.uint64(1) << np.uint64(v & 63))
+        left = np.uint64(0)
+        for w in range(words):
+            candidates[depth + 1, w] = candidates[depth, w] & adjacency[v, w]
+            left |= candidates[depth + 1, w]
+        if left:
+            depth += 1
+            starts[depth] = top
+            top, branches, bounds = _colour(
+                adjacency, candidates[depth], state[_FLOOR] - depth - 1, top, branches, bounds
+            )
+        elif depth + 2 > state[_FLOOR]:
+            _keep(clique[: depth + 2], found, state)
+        if state[_NODES] >= max_nodes or (len(found) > 1 and state[_FOUND] == len(found)):
+            return
+
+
+@njit("Tuple((int64[:, ::1], boolean))(uint64[:, ::1], int64[::1], int64[::1], int64, int64, int64)",
+      cache=True, nogil=True)  # fmt: skip
+def _search(adjacency, order, core_numbers, floor, room, max_nodes):
+    """Cliques larger than `floor`, a row each, and whether the search came to its end.
+
+    With room for one, each clique found raises the floor, so that the last is a largest one. With room for more they
+    all have the size floor + 1, which must be the greatest there is.
+    """
+    count = len(adjacency)
+    place = np.empty(count, np.int64)
+    for step in range(count):
+        place[order[step]] = step
+    found = np.empty((room, core_numbers.max() + 1), np.int64)
+    state = np.array([floor, floor, 0, 0])
+    neighbours, later = np.empty(count, np.int64), np.empty(count, np.int64)
+    for step in range(count - 1, -1, -1):
+        v = order[step]
+        num_later = 0
+        if core_numbers[v] >= state[_FLOOR]:
+            for k in range(_members(adjacency[v], neighbours)):
+                if place[neighbours[k]] > step:
+                    later[num_later] = place[neighbours[k]]
+                    num_later += 1
+        if num_later >= state[_FLOOR]:
+            candidates = order[np.sort(later[:num_later])[::-1]]
+            _search_neighbourhood(_induced(adjacency, candidates), v, candidates, found, state, max_nodes)
+        if state[_NODES] >= max_nodes or (room > 1 and state[_FOUND] == room):
+            break
+    return found[: state[_FOUND], : state[_SIZE]].copy(), state[_NODES] < max_nodes

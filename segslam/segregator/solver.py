@@ -1,0 +1,162 @@
+"""Pose from matched points, some of them wrong: truncated least squares by graduated non-convexity.
+
+Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020, Algorithm 1 with
+the TLS surrogate, eq. (11)-(14). The inner fit is Horn's closed form (JOSA A 1987) in its SVD shape.
+The decoupled solver is that of TEASER (Yang, Shi, Carlone, T-RO 2021), which Segregator's authors use.
+
+| here | paper |
+|---|---|
+| control | mu |
+| bound_m | c bar |
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import SegregatorConfig
+from segslam.types import Mask, Points, Rejected, RejectReason, Rotation, Transform, Vector
+
+Fitted = TypeVar("Fitted")
+AlignRotation = Callable[[Points, Points, Vector], Rotation]
+"""The rotation R that minimises sum w |b - R a|^2 over rows a, b, w."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseFit:
+    T_target_source: Transform
+    inliers: Mask
+    """Rows within the bound of the pose."""
+    rms_m: float
+    """Of the inliers' distances."""
+
+
+def solve_pose(source: Points, target: Points, *, config: SegregatorConfig) -> PoseFit | Rejected:
+    """The pose under which the most rows of `source`, moved, meet those of `target`; `config` names the solver.
+
+    Row i of `source` matches row i of `target`. Returns `Rejected(DEGENERATE)` where the points, or those that the
+    pose agrees with, are fewer than 3 or within the noise bound of a line (for yaw: fewer than 2, or of a vertical).
+    """
+    align = rotation_between if config.rotation == "full" else yaw_between
+    if not _fixes_rotation(source, config):
+        return _degenerate(len(source))
+    solve = solve_joint if config.solver == "joint" else solve_decoupled
+    T_target_source = solve(source, target, align, config=config)
+    squared = _squared_distances(source, target, T_target_source)
+    inliers = squared <= config.noise_bound_m**2
+    if not _fixes_rotation(source[inliers], config):
+        return _degenerate(int(inliers.sum()))
+    return PoseFit(T_target_source, inliers, math.sqrt(squared[inliers].mean()))
+
+
+def solve_joint(source: Points, target: Points, align: AlignRotation, *, config: SegregatorConfig) -> Transform:
+    """Minimises sum min(|b - R a - t|^2, bound^2) over rotation and translation together."""
+
+    def fit(weights: Vector) -> tuple[Transform, Vector]:
+        T_target_source = weighted_pose(source, target, weights, align)
+        return T_target_source, _squared_distances(source, target, T_target_source)
+
+    return graduated_non_convexity(fit, len(source), bound_m=config.noise_bound_m, config=config)
+
+
+def solve_decoupled(source: Points, target: Points, align: AlignRotation, *, config: SegregatorConfig) -> Transform:
+    """Rotation from the differences of rows that follow each other, then the translation, one axis at a time.
+
+    The last row is followed by the first. A difference carries two measurements, hence twice the bound.
+    """
+    source_steps, target_steps = np.roll(source, -1, axis=0) - source, np.roll(target, -1, axis=0) - target
+
+    def fit(weights: Vector) -> tuple[Rotation, Vector]:
+        R = align(source_steps, target_steps, weights)
+        return R, np.sum((target_steps - source_steps @ R.T) ** 2, axis=1)
+
+    R = graduated_non_convexity(fit, len(source), bound_m=2 * config.noise_bound_m, config=config)
+    offsets = target - source @ R.T
+    return geometry.transform(R, [vote(axis, bound_m=config.noise_bound_m) for axis in offsets.T])
+
+
+def graduated_non_convexity(
+    fit: Callable[[Vector], tuple[Fitted, Vector]], num_rows: int, *, bound_m: float, config: SegregatorConfig
+) -> Fitted:
+    """The last fit of a sequence whose weights turn from all one to those of truncated least squares.
+
+    `fit` gives, for weights of the rows, the weighted least-squares solution and every row's squared residual.
+    """
+    weights = np.ones(num_rows)
+    fitted, squared = fit(weights)
+    control = 1.0 / (2.0 * squared.max() / bound_m**2 - 1.0) if 2.0 * squared.max() > bound_m**2 else 0.0
+    if control == 0.0:  # every residual is small: the convex problem is the true one
+        return fitted
+    previous_cost = weights @ squared
+    for _ in range(config.gnc_max_iterations):
+        weights = tls_weights(squared, control, bound_m)
+        if not weights.any():  # the growing control left nothing: the rows agree on no pose
+            break
+        fitted, squared = fit(weights)
+        cost = weights @ squared
+        if abs(cost - previous_cost) < config.gnc_cost_tolerance:
+            break
+        previous_cost = cost
+        control *= config.gnc_factor
+    return fitted
+
+
+def tls_weights(squared: Vector, control: float, bound_m: float) -> Vector:
+    """Weight in [0, 1] of each squared residual (m^2), falling where it nears the bound."""
+    between = bound_m * np.sqrt(control * (control + 1.0) / np.maximum(squared, np.finfo(float).tiny)) - control
+    return np.clip(between, 0.0, 1.0)  # Eq. (14): its outer cases are where the middle one leaves [0, 1]
+
+
+def weighted_pose(source: Points, target: Points, weights: Vector, align: AlignRotation) -> Transform:
+    """Rotation by `align` about the weighted centroids, and the translation that joins these."""
+    source_centre, target_centre = weights @ source / weights.sum(), weights @ target / weights.sum()
+    R = align(source - source_centre, target - target_centre, weights)
+    return geometry.transform(R, target_centre - R @ source_centre)
+
+
+def rotation_between(source: Points, target: Points, weights: Vector) -> Rotation:
+    """The rotation R that minimises sum w |b - R a|^2 over all rotations."""
+    return geometry.nearest_rotation(target.T @ (weights[:, None] * source))
+
+
+def yaw_between(source: Points, target: Points, weights: Vector) -> Rotation:
+    """The same over turns about z alone."""
+    x, y = source[:, 0], source[:, 1]
+    cosine = weights @ (target[:, 0] * x + target[:, 1] * y)
+    sine = weights @ (target[:, 1] * x - target[:, 0] * y)
+    return geometry.yaw(math.atan2(sine, cosine))
+
+
+def vote(values: Vector, *, bound_m: float) -> float:
+    """The mean of the values within the bound of a centre, at the centre of least cost.
+
+    Cost: squared residuals inside plus the bound for each value outside. That penalty is the bound and not its square,
+    as in the authors' program: agreement with more values is then worth more than closeness to fewer.
+    """
+    ends = np.sort(np.concatenate([values - bound_m, values + bound_m]))
+    inside = np.abs(values - (ends[1:, None] + ends[:-1, None]) / 2) <= bound_m
+    inside = inside[inside.any(axis=1)]
+    means = inside @ values / inside.sum(axis=1)
+    residuals = np.where(inside, (values - means[:, None]) ** 2, bound_m)
+    return float(means[np.argmin(residuals.sum(axis=1))])
+
+
+def _squared_distances(source: Points, target: Points, T_target_source: Transform) -> Vector:
+    return np.sum((target - geometry.apply(T_target_source, source)) ** 2, axis=1)
+
+
+def _fixes_rotation(points: Points, config: SegregatorConfig) -> bool:
+    """Whether points lie farther than the noise bound, in the root mean square, from any line (yaw: vertical)."""
+    if len(points) < (3 if config.rotation == "full" else 2):
+        return False
+    centred = points - points.mean(axis=0)
+    off_line = np.linalg.svd(centred, compute_uv=False)[1:] if config.rotation == "full" else centred[:, :2]
+    return float(np.linalg.norm(off_line)) > config.noise_bound_m * math.sqrt(len(points))
+
+
+def _degenerate(num_points: int) -> Rejected:
+    return Rejected(RejectReason.DEGENERATE, f"{num_points} points that fix no rotation")

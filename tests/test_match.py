@@ -1,0 +1,167 @@
+"""Matching two descriptions: known answers, symmetries, failures, real scans."""
+
+import numpy as np
+import pytest
+
+from segslam import geometry
+from segslam.config import SegregatorConfig
+from segslam.segregator.match import hypotheses, match
+from segslam.types import Description, Label, Registration, Rejected, RejectReason, Transform
+
+T_TRUE = geometry.transform(geometry.yaw(2.2), [7.0, -12.0, 0.4])
+
+
+def description(means: np.ndarray, covariances: np.ndarray, classes: np.ndarray) -> Description:
+    return Description(
+        means=means,
+        covariances=covariances,
+        classes=classes.astype(np.uint8),
+        sizes=np.full(len(means), 50),
+        feature_points=np.empty((0, 3)),
+        feature_covariances=np.empty((0, 3, 3)),
+        feature_classes=np.empty(0, np.uint8),
+        feature_descriptors=np.empty((0, 33)),
+    )
+
+
+def street(seed: int, count: int = 16) -> Description:
+    rng = np.random.default_rng(seed)
+    means = rng.uniform([-40, -40, -1], [40, 40, 1], size=(count, 3))
+    roots = rng.normal(scale=0.4, size=(count, 3, 3))
+    return description(means, roots @ np.swapaxes(roots, 1, 2), rng.choice([Label.CAR, Label.TRUNK], count))
+
+
+def moved(T_a_b: Transform, scan: Description) -> Description:
+    R = T_a_b[:3, :3]
+    return description(geometry.apply(T_a_b, scan.means), R @ scan.covariances @ R.T, scan.classes)
+
+
+def permuted(scan: Description, order: np.ndarray) -> Description:
+    return description(scan.means[order], scan.covariances[order], scan.classes[order])
+
+
+def seen_again(scan: Description, seed: int, noise_m: float = 0.05, lost: int = 5, new: int = 6) -> Description:
+    """The scan from T_TRUE: some clusters gone, others new, the rest measured with noise."""
+    rng = np.random.default_rng(seed)
+    kept = rng.permutation(len(scan.means))[lost:]
+    old, strange = moved(T_TRUE, permuted(scan, kept)), street(seed + 1000, new)
+    return description(
+        np.concatenate([old.means + rng.normal(scale=noise_m, size=old.means.shape), strange.means]),
+        np.concatenate([old.covariances, strange.covariances]),
+        np.concatenate([old.classes, strange.classes]),
+    )
+
+
+def error(registration: Registration | Rejected, T_target_source: Transform) -> tuple[float, float]:
+    """Metres and degrees."""
+    assert isinstance(registration, Registration)
+    difference = registration.T_target_source @ geometry.inverse(T_target_source)
+    return geometry.distance(difference), np.degrees(geometry.angle(difference))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_exact_copy_gives_the_exact_pose_and_all_clusters_as_inliers(seed: int) -> None:
+    scan = street(seed)
+    registration = match(scan, moved(T_TRUE, scan), config=SegregatorConfig())
+    assert np.allclose(registration.T_target_source, T_TRUE, atol=1e-9)
+    assert registration.num_inliers == len(scan.means)
+    assert registration.rms_m < 1e-9
+
+
+@pytest.mark.parametrize("gate", ["invariant", "lengths"])
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_and_strangers_leave_the_pose_within_the_noise(gate: str, seed: int) -> None:
+    scan = street(seed)
+    registration = match(scan, seen_again(scan, seed), config=SegregatorConfig(gate=gate))
+    metres, degrees = error(
+        registration, T_TRUE
+    )  # 11 points of 0.05 m noise over 40 m: 0.05 m / sqrt(11), 0.04 degrees
+    assert metres < 0.08
+    assert degrees < 0.3
+
+
+def test_swapping_the_scans_inverts_the_pose() -> None:
+    source = street(3)
+    target = seen_again(source, 3)
+    forth = match(source, target, config=SegregatorConfig())
+    back = match(target, source, config=SegregatorConfig())
+    assert np.allclose(forth.T_target_source @ back.T_target_source, np.eye(4), atol=1e-6)
+    assert forth.num_inliers == back.num_inliers
+
+
+def test_moving_the_target_multiplies_the_pose_on_the_left() -> None:
+    source = street(4)
+    target = seen_again(source, 4)
+    T_new_old = geometry.exp(geometry.tangent(rotation_rad=[0.3, -0.2, 1.0], translation_m=[5.0, 6.0, 7.0]))
+    before = match(source, target, config=SegregatorConfig())
+    after = match(source, moved(T_new_old, target), config=SegregatorConfig())
+    assert np.allclose(after.T_target_source, T_new_old @ before.T_target_source, atol=1e-6)
+
+
+def test_order_of_clusters_changes_nothing() -> None:
+    source = street(5)
+    target = seen_again(source, 5)
+    rng = np.random.default_rng(0)
+    before = match(source, target, config=SegregatorConfig())
+    after = match(
+        permuted(source, rng.permutation(len(source.means))),
+        permuted(target, rng.permutation(len(target.means))),
+        config=SegregatorConfig(),
+    )
+    assert np.allclose(after.T_target_source, before.T_target_source, atol=1e-9)
+
+
+def test_same_input_gives_the_same_bits() -> None:
+    source = street(6)
+    target = seen_again(source, 6)
+    poses = [match(source, target, config=SegregatorConfig()).T_target_source for _ in range(3)]
+    assert np.array_equal(poses[0], poses[1])
+    assert np.array_equal(poses[0], poses[2])
+
+
+def test_first_hypothesis_is_the_match_and_inliers_never_rise_after_it() -> None:
+    source = street(7)
+    target = seen_again(source, 7)
+    ranked = hypotheses(source, target, config=SegregatorConfig())
+    best = match(source, target, config=SegregatorConfig())
+    assert np.array_equal(ranked[0].T_target_source, best.T_target_source)
+    assert np.all(np.diff([registration.num_inliers for registration in ranked]) <= 0)
+
+
+def test_information_predicts_the_scatter_of_the_pose() -> None:
+    scan = street(8)
+    errors = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        target = moved(T_TRUE, scan)
+        noisy = description(
+            target.means + rng.normal(scale=0.07, size=target.means.shape), target.covariances, target.classes
+        )
+        registration = match(scan, noisy, config=SegregatorConfig())
+        xi = geometry.log(geometry.inverse(T_TRUE) @ registration.T_target_source)
+        errors.append(xi @ registration.information @ xi)
+    assert 3.0 < np.mean(errors) < 9.0  # 6 for a noise known exactly, less by its floor
+
+
+def test_no_clusters_are_too_few_correspondences() -> None:
+    empty = street(0, count=0)
+    for source, target in [(empty, empty), (street(1), empty), (empty, street(1))]:
+        outcome = match(source, target, config=SegregatorConfig())
+        assert outcome.reason is RejectReason.TOO_FEW_CORRESPONDENCES
+
+
+def test_classes_that_do_not_meet_are_too_few_correspondences() -> None:
+    scan = street(2)
+    other = description(scan.means, scan.covariances, np.full(len(scan.means), Label.POLE))
+    assert match(scan, other, config=SegregatorConfig()).reason is RejectReason.TOO_FEW_CORRESPONDENCES
+
+
+def test_scans_of_different_places_have_a_small_clique() -> None:
+    outcome = match(street(10), street(11), config=SegregatorConfig())
+    assert outcome.reason is RejectReason.SMALL_CLIQUE
+
+
+def test_clusters_on_a_line_are_degenerate() -> None:
+    scan = street(12)
+    row = description(scan.means * [1.0, 0.0, 0.0], scan.covariances, scan.classes)
+    assert match(row, row, config=SegregatorConfig()).reason is RejectReason.DEGENERATE

@@ -4,15 +4,18 @@ Tangents are [rotation rad; translation m]; `exp` and `log` are those of SE(3), 
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.types import Points, Rotation, Tangent, Transform
 
+Triple = float | Sequence[float] | np.ndarray
+"""Three numbers, or one for all three."""
 
-def transform(rotation: Rotation, translation: ArrayLike) -> Transform:
+
+def transform(rotation: Rotation, translation: Triple) -> Transform:
     """The 4x4 matrix of a rotation and a translation (m)."""
     T_a_b = np.eye(4)
     T_a_b[:3, :3] = rotation
@@ -37,7 +40,7 @@ def yaw(angle_rad: float) -> Rotation:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def tangent(*, rotation_rad: ArrayLike, translation_m: ArrayLike) -> Tangent:
+def tangent(*, rotation_rad: Triple, translation_m: Triple) -> Tangent:
     """A tangent from its named halves; scalars spread over the three axes. Also serves for standard deviations."""
     return np.concatenate([np.broadcast_to(np.asarray(half, dtype=float), 3) for half in (rotation_rad, translation_m)])
 

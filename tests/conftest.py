@@ -1,10 +1,16 @@
 """Shapes of array arguments and records are checked while testing; real data is found or its tests skip."""
 
+import json
 import os
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
+import hypothesis
+import numpy as np
 import pytest
 from jaxtyping import install_import_hook
+from kiss_icp.pybind import kiss_icp_pybind
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -18,7 +24,9 @@ def _modules_checked() -> list[str]:
     ]
 
 
-install_import_hook(_modules_checked(), "beartype.beartype")
+install_import_hook(_modules_checked(), "checker.check")
+hypothesis.settings.register_profile("steady", deadline=None)  # a slow machine is no failure
+hypothesis.settings.load_profile("steady")
 
 
 @pytest.fixture(scope="session")
@@ -28,3 +36,31 @@ def data_dir() -> Path:
     if not (folder / "kitti").is_dir():
         pytest.skip(f"no real data at {folder}; set SEGSLAM_DATA")
     return folder
+
+
+@dataclass(frozen=True)
+class Pair:
+    source: int
+    target: int
+    T_target_source: np.ndarray
+
+
+class RealPairs:
+    """The reference pairs of real scans of KITTI 00, corrected for the vertical angle by kiss_icp's own function."""
+
+    def __init__(self, kitti: Path) -> None:
+        self._velodyne = kitti / "sequences" / "00" / "velodyne"
+        rows = json.loads((kitti / "reference_pairs.json").read_text())
+        self.pairs = [Pair(row["source"], row["target"], np.array(row["T_target_source"])) for row in rows]
+
+    @cache  # noqa: B019  (a session's fixture: lives as long as the tests)
+    def points(self, index: int) -> np.ndarray:
+        """(n, 3) float64 of one scan, without the vehicle's own roof."""
+        raw = np.fromfile(self._velodyne / f"{index:06d}.bin", np.float32).reshape(-1, 4)[:, :3].astype(float)
+        points = np.asarray(kiss_icp_pybind._correct_kitti_scan(kiss_icp_pybind._Vector3dVector(raw)))
+        return points[np.linalg.norm(points, axis=1) > 3.0]
+
+
+@pytest.fixture(scope="session")
+def real_pairs(data_dir: Path) -> RealPairs:
+    return RealPairs(data_dir / "kitti")

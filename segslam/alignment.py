@@ -1,0 +1,91 @@
+"""Two scans, from points to a verified pose: describe and prepare each once, then match, refine and verify a pair."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import perf_counter
+
+from segslam import geometry, refine, segregator, verify
+from segslam.config import Config, VerifyConfig
+from segslam.types import Alignment, Description, Labels, Points, Registration, Rejected, RejectReason
+
+Labeller = Callable[[Points], Labels]
+
+
+class Stopwatch:
+    """Seconds by stage; a stage entered twice adds up."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        started = perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + perf_counter() - started
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedScan:
+    """All that aligning a scan needs, made once a scan."""
+
+    description: Description
+    surface: refine.Surface
+    view: verify.View
+
+
+def prepare_scan(points: Points, labels: Labels, *, config: Config) -> PreparedScan:
+    """Describe a scan and make its surface ready; `points` in the scan's own frame."""
+    return PreparedScan(
+        description=segregator.describe(points, labels, config=config.segregator),
+        surface=refine.prepare(points, config=config.refine),
+        view=verify.view(points),
+    )
+
+
+def align(
+    source: PreparedScan,
+    target: PreparedScan,
+    *,
+    config: Config,
+    gate: Callable[[Registration], Rejected | None] = lambda coarse: None,
+    watch: Stopwatch | None = None,
+) -> Alignment | Rejected:
+    """The pose of the source in the target, found with no initial guess, refined and verified; or why there is none.
+
+    `gate` may turn down a coarse pose before it is refined.
+    """
+    watch = watch or Stopwatch()
+    with watch("match"):
+        coarse = segregator.match(source.description, target.description, config=config.segregator)
+    if isinstance(coarse, Rejected):
+        return coarse
+    if turned_down := gate(coarse):
+        return turned_down
+    with watch("refine"):
+        fine = refine.refine(source.surface, target.surface, coarse.T_target_source, config=config.refine)
+    if isinstance(fine, Rejected):
+        return fine
+    with watch("verify"):
+        return _verified(source, target, coarse, fine, config=config.verify)
+
+
+def _verified(
+    source: PreparedScan, target: PreparedScan, coarse: Registration, fine: Registration, *, config: VerifyConfig
+) -> Alignment | Rejected:
+    moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ fine.T_target_source)
+    if moved_m > config.max_coarse_fine_m:
+        detail = f"moved {moved_m:.2f} m > {config.max_coarse_fine_m} m"
+        return Rejected(RejectReason.REFINEMENT_DIVERGED, detail)
+    found = verify.agreement(
+        (source.surface, source.view), (target.surface, target.view), fine.T_target_source, config=config
+    )
+    return verify.rejection(coarse, found, config=config) or Alignment(
+        coarse=coarse,
+        fine=fine,
+        overlap=found.overlap,
+        rms_m=found.rms_m,
+        free_space_violation=found.free_space_violation,
+    )

@@ -1,0 +1,82 @@
+"""Coarse-to-fine alignment: GICP from a coarse pose, the search distance shrinking stage by stage.
+
+The only importer of small_gicp. Its tangents are [rotation; translation] with the perturbation on the right, as ours.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import small_gicp
+
+from segslam import geometry
+from segslam.config import RefineConfig
+from segslam.points import within_range
+from segslam.types import Points, Registration, Rejected, RejectReason, Transform
+
+NUM_NEIGHBOURS = 10
+"""For the covariance of a point; small_gicp's default."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A scan made ready for alignment: thinned points with covariances, and their search tree."""
+
+    cloud: Any
+    tree: Any
+
+    @property
+    def points(self) -> Points:
+        """(n, 3), in the scan's frame."""
+        return self.cloud.points()[:, :3]
+
+    def __len__(self) -> int:
+        return self.cloud.size()
+
+    def distances_m(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) each: from points of this frame to the nearest point of the surface, and to the plane through it."""
+        nearest, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
+        to_plane = np.einsum("ij,ij->i", points - self.points[nearest], self.cloud.normals()[nearest, :3])
+        return np.sqrt(squared), np.abs(to_plane)
+
+
+def prepare(points: Points, *, config: RefineConfig) -> Surface:
+    """The surface that a scan saw within `max_range_m`. May hold no points; `refine` then rejects."""
+    near = points[within_range(points, 0.0, config.max_range_m)].astype(np.float64)
+    cloud, tree = small_gicp.preprocess_points(near, config.voxel_m, NUM_NEIGHBOURS, 1)
+    return Surface(cloud, tree)
+
+
+def refine(
+    source: Surface, target: Surface, T_target_source: Transform, *, config: RefineConfig
+) -> Registration | Rejected:
+    """The pose near `T_target_source` that aligns the source with the target (GICP, Segal et al. 2009).
+
+    `information` is the Hessian of the last stage times `config.information_scale`; `rms_m` is point to plane.
+    Rejects TOO_FEW_POINTS, and REFINEMENT_DIVERGED where no pairs remain or the last stage does not converge.
+    """
+    if min(len(source), len(target)) < config.min_points:
+        sizes = f"{len(source)} and {len(target)} points, {config.min_points} needed"
+        return Rejected(RejectReason.TOO_FEW_POINTS, sizes)
+    for correspondence_m in config.correspondence_m:
+        result = small_gicp.align(
+            target.cloud,
+            source.cloud,
+            target.tree,
+            T_target_source,
+            max_correspondence_distance=correspondence_m,
+            max_iterations=config.max_iterations,
+            num_threads=1,
+        )
+        T_target_source = result.T_target_source
+        if result.num_inliers < config.min_points or not np.isfinite(T_target_source).all():
+            return Rejected(RejectReason.REFINEMENT_DIVERGED, f"{result.num_inliers} pairs at {correspondence_m} m")
+    to_point, to_plane = target.distances_m(geometry.apply(T_target_source, source.points))
+    paired = to_plane[to_point < config.correspondence_m[-1]]
+    return Registration(
+        T_target_source=T_target_source,
+        num_correspondences=len(source),
+        num_inliers=int(result.num_inliers),
+        rms_m=float(np.sqrt(np.mean(paired**2))),
+        information=(result.H + result.H.T) / 2 * config.information_scale,
+    )

@@ -44,6 +44,8 @@ class OdometryConfig(Section):
 class KeyframeConfig(Section):
     distance_m: float = Field(2.0, gt=0, description="cut a keyframe this far from the last (m)")
     angle_deg: float = Field(20.0, gt=0, le=180, description="or after this turn (degrees)")
+    voxel_m: float = Field(0.2, gt=0, description="thinning of a keyframe, cluster classes excepted (m)")
+    resolution_m: float = Field(0.004, gt=0, description="rounding of a keyframe: 16 bits must log it (m)")
 
 
 class ProximityConfig(Section):
@@ -95,6 +97,9 @@ class SegregatorConfig(Section):
     normal_radius_m: float = Field(1.0, gt=0, description="neighbourhood of normals (A) (m)")
     feature_radius_m: float = Field(2.5, gt=0, description="neighbourhood of FPFH (A) (m)")
     patch_radius_m: float = Field(1.0, gt=0, description="neighbourhood of a key point's Gaussian (A) (m)")
+    max_features_per_class: int = Field(
+        500, ge=1, description="key points of a class: those with most neighbours; 1,000 in all take 180 kB"
+    )
     tuple_similarity: float = Field(0.95, gt=0, lt=1, description="edge ratio of the tuple test (A)")
     tuple_trials_per_pair: int = Field(100, ge=1, description="random triples drawn for each mutual pair (A)")
     tuple_seed: int = Field(0, ge=0, description="of the random triples")

@@ -1,0 +1,55 @@
+"""When a scan becomes a keyframe, and which of its points are kept."""
+
+import math
+from collections.abc import Collection
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import KeyframeConfig
+from segslam.points import voxel_first
+from segslam.types import Label, Labels, Points, Transform
+
+
+class KeyframeSelector:
+    """Cuts a keyframe where the last one is far enough away, or the sensor has turned enough since."""
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self._config = config
+        self._T_odom_last: Transform | None = None
+        self._T_odom_keyframe: Transform | None = None
+        self.travel_m = 0.0
+        """Length of the path through all scans so far."""
+
+    def update(self, T_odom_lidar: Transform) -> bool:
+        """Whether the next scan is a keyframe; the first is.
+
+        Far means the straight distance from the last keyframe: a standing sensor's jitter adds to the path, not to it.
+        """
+        if self._T_odom_last is not None:
+            self.travel_m += geometry.distance(geometry.inverse(self._T_odom_last) @ T_odom_lidar)
+        self._T_odom_last = T_odom_lidar
+        is_keyframe = self._T_odom_keyframe is None or self._is_far(
+            geometry.inverse(self._T_odom_keyframe) @ T_odom_lidar
+        )
+        if is_keyframe:
+            self._T_odom_keyframe = T_odom_lidar
+        return is_keyframe
+
+    def _is_far(self, T_keyframe_lidar: Transform) -> bool:
+        distance_m, angle_rad = geometry.distance(T_keyframe_lidar), geometry.angle(T_keyframe_lidar)
+        return distance_m >= self._config.distance_m or angle_rad >= math.radians(self._config.angle_deg)
+
+
+def thin(
+    points: Points, labels: Labels, *, config: KeyframeConfig, whole_classes: Collection[Label]
+) -> tuple[Points, Labels]:
+    """What a keyframe keeps of a scan: all points of `whole_classes`, one a voxel of the others; float32, rounded.
+
+    Every later stage works on these points and the log holds exactly these, so that a replay repeats the run.
+    """
+    is_whole = np.isin(labels, np.array([int(label) for label in whole_classes], dtype=np.uint8))
+    others = np.flatnonzero(~is_whole)
+    kept = np.sort(np.concatenate([np.flatnonzero(is_whole), others[voxel_first(points[others], config.voxel_m)]]))
+    rounded = np.round(points[kept].astype(np.float64) / config.resolution_m) * config.resolution_m
+    return rounded.astype(np.float32), labels[kept]

@@ -1,5 +1,48 @@
 """`segslam simulate`."""
 
+from pathlib import Path
+from typing import Annotated
 
-def simulate() -> None:
-    """Write a simulated KITTI-format sequence."""
+import typer
+
+from segslam.cli.console import QuietOption, progress, say
+from segslam.types import SegslamError
+
+SENSORS = ("hdl64", "os1-64", "vlp16")
+
+
+def simulate(
+    out: Annotated[Path, typer.Argument(help="Folder to write; it becomes KITTI's: sequences/NN/..., poses/NN.txt.")],
+    sequence: Annotated[str, typer.Option(help="Name of the sequence to write.")] = "00",
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="Drive along this KITTI pose file (camera frame), levelled; else a made-up loop of streets."),
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; all of the drive unless given.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same scans.")] = 0,
+    sensor: Annotated[str, typer.Option(help=f"One of {', '.join(SENSORS)}.")] = "hdl64",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a sequence that was simulated here.")] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Simulate a labelled drive in KITTI's format, with exact poses.
+
+    Example: segslam simulate streets --sequence 06 --poses kitti/poses/06.txt --frames 300 --seed 1
+    """
+    if sensor not in SENSORS:
+        raise SegslamError(f"--sensor {sensor}: no such sensor; known: {', '.join(SENSORS)}")
+    from segslam import simulation
+
+    config = simulation.SimulationConfig.model_validate({"sensor": {"name": sensor}})
+    drive = simulation.made_up_drive(frames) if poses is None else simulation.read_drive(poses, sequence=sequence)
+    drive = simulation.first_frames(drive, frames)
+    simulation.prepare_folder(out, sequence, overwrite=overwrite)
+    say(f"building the streets of {len(drive.time_s)} scans", quiet=quiet)
+    written = simulation.write_drive(out, sequence, drive, config=config, seed=seed)
+    last = 0
+    try:
+        for done in progress(written, total=len(drive.time_s), title="simulate", quiet=quiet):
+            last = done
+    except KeyboardInterrupt:
+        say(f"stopped: the first {last} scans are complete in {out / 'sequences' / sequence}", quiet=quiet)
+        raise typer.Exit(130) from None
+    say(f"{last} scans in {out / 'sequences' / sequence}, true poses in {out / 'poses' / sequence}.txt", quiet=quiet)

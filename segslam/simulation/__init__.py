@@ -1,0 +1,36 @@
+"""Labelled street worlds, the LiDARs that drive through them, and KITTI-format sequences with exact truth."""
+
+from segslam.simulation.drive import drive_sweeps, leftover_motion, simulate_drive
+from segslam.simulation.files import prepare_folder, write_drive, write_sequence
+from segslam.simulation.levelling import level, upright
+from segslam.simulation.routes import made_up_loop
+from segslam.simulation.sensor import Sensor, Sweep, make_sensor, sweep
+from segslam.simulation.settings import SensorConfig, SimulationConfig, WorldConfig
+from segslam.simulation.tracks import Drive, first_frames, made_up_drive, read_drive
+from segslam.simulation.world import Hits, World, build_world
+
+__all__ = [
+    "Drive",
+    "Hits",
+    "Sensor",
+    "SensorConfig",
+    "SimulationConfig",
+    "Sweep",
+    "World",
+    "WorldConfig",
+    "build_world",
+    "drive_sweeps",
+    "first_frames",
+    "leftover_motion",
+    "level",
+    "made_up_drive",
+    "made_up_loop",
+    "make_sensor",
+    "prepare_folder",
+    "read_drive",
+    "simulate_drive",
+    "sweep",
+    "upright",
+    "write_drive",
+    "write_sequence",
+]

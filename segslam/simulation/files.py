@@ -1,0 +1,96 @@
+"""Simulated sequences in KITTI's format, so that the reader of real data reads them back as the truth."""
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from segslam import geometry
+from segslam.simulation.drive import drive_sweeps
+from segslam.simulation.sensor import Sweep
+from segslam.simulation.settings import SimulationConfig
+from segslam.simulation.tracks import Drive, parse_calib
+from segslam.simulation.world import build_world
+from segslam.trajectory import camera_from_lidar
+from segslam.types import Label, SegslamError
+
+SETTINGS_FILE = "simulation.json"
+KITTI_VERTICAL_ANGLE_RAD = np.radians(0.205)  # what readers of KITTI's scans add to each vertical angle
+# SemanticKITTI's raw ids.
+RAW_ID = {
+    Label.UNLABELLED: 0, Label.CAR: 10, Label.BICYCLE: 11, Label.MOTORCYCLE: 15, Label.TRUCK: 18,
+    Label.OTHER_VEHICLE: 20, Label.PERSON: 30, Label.BICYCLIST: 31, Label.MOTORCYCLIST: 32, Label.ROAD: 40,
+    Label.PARKING: 44, Label.SIDEWALK: 48, Label.OTHER_GROUND: 49, Label.BUILDING: 50, Label.FENCE: 51,
+    Label.VEGETATION: 70, Label.TRUNK: 71, Label.TERRAIN: 72, Label.POLE: 80, Label.TRAFFIC_SIGN: 81,
+    Label.MOVING_CAR: 252, Label.MOVING_BICYCLIST: 253, Label.MOVING_PERSON: 254, Label.MOVING_MOTORCYCLIST: 255,
+    Label.MOVING_OTHER_VEHICLE: 259, Label.MOVING_TRUCK: 258,
+}  # fmt: skip
+RAW_IDS = np.array([RAW_ID[label] for label in Label], dtype=np.uint32)
+
+
+def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
+    """Make room for a sequence. One that is there is refused, or removed if it was simulated and may be overwritten.
+
+    Raises SegslamError that names what is there: real data is never removed.
+    """
+    folder, poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
+    there = next((path for path in (folder, poses) if path.exists()), None)
+    if there is not None and not (folder / SETTINGS_FILE).is_file():
+        raise SegslamError(f"{there}: is there and was not simulated here; choose another folder or --sequence")
+    if there is not None and not overwrite:
+        raise SegslamError(f"{there}: is there already; choose another folder or --sequence, or pass --overwrite")
+    for path in (folder, poses):
+        if path.is_dir():
+            shutil.rmtree(path)
+        path.unlink(missing_ok=True)
+    try:
+        for part in (folder / "velodyne", folder / "labels", poses.parent):
+            part.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SegslamError(f"{out}: cannot write there ({error}); choose another folder") from error
+
+
+def write_drive(out: Path, sequence: str, drive: Drive, *, config: SimulationConfig, seed: int) -> Iterator[int]:
+    """Simulate a drive into a prepared folder, with the settings beside the scans; yields how many are complete."""
+    settings = {"seed": seed, "config": config.model_dump(mode="json")}
+    (out / "sequences" / sequence / SETTINGS_FILE).write_text(json.dumps(settings, indent=1) + "\n")
+    world = build_world(drive.T_world_lidar, drive.time_s, config=config.world, seed=seed)
+    sweeps = drive_sweeps(world, drive.T_world_lidar, drive.time_s, config=config.sensor, seed=seed)
+    yield from write_sequence(out, sequence, drive, sweeps)
+
+
+def write_sequence(out: Path, sequence: str, drive: Drive, sweeps: Iterable[Sweep]) -> Iterator[int]:
+    """Write sweep after sweep into a prepared folder, yielding how many are complete.
+
+    Stopped at any moment, what is there is a shorter sequence: a scan appears whole, after its labels, time and pose.
+    Poses are the camera's, in the frame of the first.
+    """
+    folder = out / "sequences" / sequence
+    (folder / "calib.txt").write_text(drive.calib)
+    T_camera_lidar = parse_calib(drive.calib, source="calib")
+    T_first_lidar = geometry.inverse(drive.T_world_lidar[0]) @ drive.T_world_lidar
+    T_first_camera = camera_from_lidar(T_first_lidar, T_camera_lidar)
+    with (folder / "times.txt").open("w") as times, (out / "poses" / f"{sequence}.txt").open("w") as poses:
+        for index, one in enumerate(sweeps):
+            print(f"{drive.time_s[index]:.6e}", file=times, flush=True)
+            print(" ".join(f"{value:.9e}" for value in T_first_camera[index, :3].ravel()), file=poses, flush=True)
+            _write_scan(folder, f"{index:06d}", one)
+            yield index + 1
+
+
+def _write_scan(folder: Path, name: str, one: Sweep) -> None:
+    raw = RAW_IDS[one.labels] | one.instances.astype(np.uint32) << 16
+    raw.astype("<u4").tofile(folder / "labels" / f"{name}.label")
+    part = folder / "velodyne" / f"{name}.part"
+    np.column_stack([uncorrected(one.points), one.intensity]).astype("<f4").tofile(part)
+    part.replace(part.with_suffix(".bin"))
+
+
+def uncorrected(points: np.ndarray) -> np.ndarray:
+    """Points with their vertical angles lowered by what readers of KITTI's scans add to them."""
+    flat = np.hypot(points[:, 0], points[:, 1])
+    c, s = np.cos(KITTI_VERTICAL_ANGLE_RAD), np.sin(KITTI_VERTICAL_ANGLE_RAD)
+    scale = c + s * points[:, 2] / np.maximum(flat, 1e-9)
+    return np.column_stack([points[:, 0] * scale, points[:, 1] * scale, c * points[:, 2] - s * flat])

@@ -1,0 +1,121 @@
+"""The ground under a drive: smooth through the road the car was on, a kerb beside it, terrain beyond."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+
+from segslam.simulation.mesh import Mesh, mesh
+from segslam.types import Label, Labels, Vector
+
+CELL_M = 0.5  # chosen: kerbs are this sharp
+COARSE = 4  # cells to a triangle's side away from the road
+MARGIN_M = 85.0  # chosen: a little beyond the range that returns much
+ROAD_M, SIDEWALK_M = 5.6, 8.0  # chosen: half width of the road, and distance from its middle to the gardens
+KERB_M = 0.12
+FINE_M = 9.0  # chosen: triangles are small this near the path
+SCALES_M = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0)  # chosen: from the lie of the land down to the road under one car length
+
+Raster = Float[np.ndarray, "_ _"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """Rasters of CELL_M over x (rows) and y (columns) from `origin`."""
+
+    origin: Float[np.ndarray, "2"]
+    distance_m: Raster
+    """To the nearest point of the driven path."""
+    height_m: Raster
+    labels: np.ndarray
+
+    def cells(self, x: Vector, y: Vector) -> np.ndarray:
+        """(2, n) row and column of the nearest node, kept within the raster."""
+        nearest = np.rint(np.stack([x - self.origin[0], y - self.origin[1]]) / CELL_M).astype(np.int64)
+        return np.clip(nearest, 0, np.array(self.height_m.shape)[:, None] - 1)
+
+    def label_at(self, x: Vector, y: Vector) -> Labels:
+        row, column = self.cells(x, y)
+        return self.labels[row, column]
+
+    def distance_at(self, x: Vector, y: Vector) -> Vector:
+        """To the driven path, to about CELL_M / 3."""
+        row, column = self.cells(x, y)
+        return self.distance_m[row, column]
+
+    def height_at(self, x: Vector, y: Vector) -> Vector:
+        at = np.stack([x - self.origin[0], y - self.origin[1]]) / CELL_M
+        return map_coordinates(self.height_m, at, order=1, mode="nearest")
+
+
+def ground_of(path: np.ndarray, rng: np.random.Generator) -> Ground:
+    """The ground whose road runs through `path` (n, 3), points of the road at most a metre apart."""
+    origin = np.floor(path[:, :2].min(axis=0) - MARGIN_M)
+    span = np.ceil(path[:, :2].max(axis=0) + MARGIN_M) - origin
+    blocks = np.ceil(span / (CELL_M * COARSE)).astype(int)
+    distance = _distance_m((path[:, :2] - origin) / CELL_M, tuple(blocks * COARSE + 1))
+    coarse = _through(path[:, 2], (path[:, :2] - origin) / (CELL_M * COARSE), tuple(blocks + 1))
+    coarse += _relief(rng, distance[::COARSE, ::COARSE])
+    kerb = np.clip((distance - ROAD_M) / CELL_M, 0.0, 1.0) * KERB_M
+    labels = np.select([distance < ROAD_M, distance < SIDEWALK_M], [Label.ROAD, Label.SIDEWALK], Label.TERRAIN)
+    return Ground(origin, distance, _refined(coarse) + kerb, labels.astype(np.uint8))
+
+
+def _distance_m(at: np.ndarray, shape: tuple[int, ...]) -> Raster:
+    """From each node to the nearest of the fractional nodes `at`, to about CELL_M / 3."""
+    row, column = np.rint(at).astype(int).T
+    away = np.ones(shape, dtype=bool)
+    away[row, column] = False
+    return distance_transform_edt(away) * CELL_M
+
+
+def _through(heights: Vector, at: np.ndarray, shape: tuple[int, ...]) -> Raster:
+    """A smooth surface through the heights at fractional nodes `at`: what each scale leaves over, the next corrects."""
+    row, column = np.rint(at).astype(int).T
+    weight = np.zeros(shape)
+    np.add.at(weight, (row, column), 1.0)
+    surface = np.full(shape, heights.mean())
+    for scale in SCALES_M:
+        left_over = np.zeros(shape)
+        np.add.at(left_over, (row, column), heights - map_coordinates(surface, at.T, order=1))
+        sigma = scale / (CELL_M * COARSE)
+        spread = gaussian_filter(weight, sigma, truncate=3.0)
+        surface += gaussian_filter(left_over, sigma, truncate=3.0) / (spread + 0.02 / sigma)
+    return surface
+
+
+def _relief(rng: np.random.Generator, distance: Raster) -> Raster:
+    """Bumps of lawns and gardens (m), none on the road; a node each 2 m."""
+    rough = gaussian_filter(rng.normal(size=distance.shape), 0.5) * 0.05
+    rolling = gaussian_filter(rng.normal(size=distance.shape), 5.0) * 4.0
+    return (rough + rolling) * np.clip((distance - SIDEWALK_M) / 10.0, 0.0, 1.0)
+
+
+def _refined(coarse: Raster) -> Raster:
+    """Bilinear between the coarse nodes."""
+    along = [np.linspace(0, size - 1, (size - 1) * COARSE + 1) for size in coarse.shape]
+    return map_coordinates(coarse, np.stack(np.meshgrid(*along, indexing="ij")), order=1)
+
+
+def ground_mesh(ground: Ground) -> Mesh:
+    """Triangles of CELL_M near the road and of COARSE cells elsewhere, within MARGIN_M of the path.
+
+    Where fine meets coarse the kerb is past, so the fine nodes lie on the coarse edge and no ray slips through.
+    """
+    corners = ground.distance_m[::COARSE, ::COARSE]
+    nearest = np.minimum.reduce([corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:]])
+    fine = nearest < FINE_M
+    near = np.kron(fine, np.ones((COARSE, COARSE), dtype=bool))
+    blocks = np.argwhere(~fine & (nearest < MARGIN_M)) * COARSE
+    triangles = np.concatenate([_cells(np.argwhere(near), 1), _cells(blocks, COARSE)])
+    nodes, flat = np.unique(triangles @ [ground.height_m.shape[1], 1], return_inverse=True)
+    row, column = np.divmod(nodes, ground.height_m.shape[1])
+    xy = np.column_stack([row, column]) * CELL_M + ground.origin
+    return mesh(np.column_stack([xy, ground.height_m[row, column]]), flat.reshape(-1, 3), Label.TERRAIN)
+
+
+def _cells(corner: np.ndarray, size: int) -> np.ndarray:
+    """(2 k, 3, 2) nodes of the two triangles of each cell, `corner` (k, 2) its lowest row and column."""
+    a, b, c, d = (corner + np.array(step) * size for step in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])

@@ -1,0 +1,56 @@
+"""What can be chosen about the simulated street world and the sensor that drives through it."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from segslam.config import Section
+
+SensorName = Literal["hdl64", "os1-64", "vlp16"]
+
+
+class WorldConfig(Section):
+    """What stands along the streets. Densities are per 100 m and side; what does not fit is left out."""
+
+    cars: float = Field(9.0, ge=0, le=16, description="parked cars")
+    trees: float = Field(7.0, ge=0, le=30, description="trees beside the road")
+    lamps: float = Field(2.5, ge=0, le=20, description="street lamps")
+    signs: float = Field(2.5, ge=0, le=20, description="traffic signs")
+    built: float = Field(0.6, ge=0, le=1, description="share of the lots that hold a building")
+    hedged: float = Field(0.45, ge=0, le=1, description="share of the lots that a hedge closes towards the street")
+    fenced: float = Field(0.25, ge=0, le=1, description="share of the lots that a fence closes towards the street")
+    equal_tree_rows: bool = Field(
+        False, description="plant like trees at one distance, so that they tell no place apart"
+    )
+    parked_cars_gone: float = Field(
+        0.0, ge=0, le=1, description="share of parking places whose car is gone or another one at a later visit"
+    )
+    moving_cars: float = Field(1.0, ge=0, le=10, description="moving cars per 100 m of the drive")
+    sensor_height_m: float = Field(1.73, gt=0, description="of the sensor above its road, KITTI's (m)")
+
+
+class SensorConfig(Section):
+    """The sensor and what is wrong with it. A sigma of 0 switches its error off."""
+
+    name: SensorName = "hdl64"
+    range_sigma_m: float = Field(0.02, ge=0, description="noise of each range (m)")
+    dropout: float = Field(0.02, ge=0, lt=1, description="share of the returns lost at random")
+    beam_angle_sigma_deg: float = Field(
+        0.02, ge=0, description="leftover error of each beam's vertical angle (degrees)"
+    )
+    beam_range_sigma_m: float = Field(0.01, ge=0, description="leftover error of each beam's range (m)")
+    vertical_angle_error_deg: float = Field(
+        0.0, ge=-1, le=1, description="leftover error of all vertical angles: the points lie too low by it (degrees)"
+    )
+    sweep_rotation_sigma_deg: float = Field(
+        0.1, ge=0, description="turn within one sweep that nobody compensated (degrees)"
+    )
+    sweep_translation_sigma_m: float = Field(
+        0.02, ge=0, description="translation within one sweep that nobody compensated (m)"
+    )
+    sweep_correlation_s: float = Field(2.0, gt=0, description="time in which that motion changes (s)")
+
+
+class SimulationConfig(Section):
+    world: WorldConfig = WorldConfig()
+    sensor: SensorConfig = SensorConfig()

@@ -1,0 +1,134 @@
+"""A labelled street world that rays can be cast into: one scene that stands still, and cars that come and go."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import open3d as o3d
+
+from segslam.simulation.ground import Ground, ground_mesh, ground_of
+from segslam.simulation.mesh import Flags, Instances, Mesh, as_instance, merge
+from segslam.simulation.settings import WorldConfig
+from segslam.simulation.streets import Site, frontages, furnish
+from segslam.simulation.traffic import VIEW_M, MovingCar, ParkedCar, Route, meshes_at, moving_cars, parked_cars
+from segslam.trajectory import Poses
+from segslam.types import Label, Labels, Points, Transform, Vector
+
+NUMBERED = (Label.CAR, Label.TRUCK, Label.TRUNK, Label.POLE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """What each ray met first. `range_m` is infinite where it met nothing; the rest means nothing there."""
+
+    range_m: Vector
+    labels: Labels
+    instances: Instances
+    cos_incidence: Vector
+    """Of the angle between the ray and the surface's normal, 0 to 1."""
+    glass: Flags
+
+
+class World:
+    """Streets along one drive. Made by `build_world`; the same arguments make the same world."""
+
+    def __init__(
+        self, ground: Ground, static: Mesh, route: Route, parked: list[ParkedCar], moving: list[MovingCar]
+    ) -> None:
+        self.ground = ground
+        self.static = static
+        self._scene = _scene(static)
+        self._route = route
+        self._parked = parked
+        self._moving = moving
+
+    def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
+        """What rays from the sensor's origin meet; `directions` (n, 3) are unit vectors in the LiDAR frame."""
+        turned = directions @ T_world_lidar[:3, :3].T
+        rays = np.empty((len(directions), 6), dtype=np.float32)
+        rays[:, :3] = T_world_lidar[:3, 3]
+        rays[:, 3:] = turned
+        hits = _cast(self._scene, self.static, rays)
+        hits = _relabelled(hits, self.ground, rays)
+        changing = merge(list(self._changing(time_s, T_world_lidar[:2, 3])))
+        if len(changing.triangles) == 0:
+            return hits
+        return _nearer(hits, _cast(_scene(changing), changing, rays))
+
+    def _changing(self, time_s: float, near_xy: np.ndarray) -> Iterator[Mesh]:
+        for car in self._parked:
+            if car.start_s <= time_s < car.end_s and np.hypot(*(near_xy - car.at)) < VIEW_M:
+                yield car.mesh
+        yield from meshes_at(self._moving, self._route, time_s, near_xy)
+
+
+def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> World:
+    """Streets along a drive whose poses are level (`levelling.level`), z up, `time_s` (n,) ascending.
+
+    Every pose of the drive stands `config.sensor_height_m` above its road; no thing stands on any piece of the path.
+    """
+    rng = np.random.default_rng([seed, 1])
+    route = _route(T_world_lidar, time_s, config.sensor_height_m)
+    path = _every_metre(route)
+    ground = ground_of(path, rng)
+    site = Site(ground)
+    sides = frontages(path[:, :2])
+    parked = [car for side in sides for car in parked_cars(site, side, route, config, rng)]
+    things = [thing for side in sides for thing in furnish(site, side, config, rng)]
+    standing = [car.mesh for car in parked if not car.changes]
+    static = merge([ground_mesh(ground), *_numbered([*standing, *things])])
+    changing = [car for car in parked if car.changes]
+    return World(ground, static, route, changing, moving_cars(route, config, rng))
+
+
+def _route(T_world_lidar: Poses, time_s: Vector, height_m: float) -> Route:
+    """The road right under the sensor, pose by pose."""
+    at = T_world_lidar[:, :3, 3] - [0.0, 0.0, height_m]
+    steps = np.linalg.norm(np.diff(at[:, :2], axis=0), axis=1)
+    return Route(at, np.asarray(time_s, dtype=np.float64), np.concatenate([[0.0], np.cumsum(steps)]))
+
+
+def _every_metre(route: Route) -> np.ndarray:
+    """(n, 3) the route at equal steps of at most a metre."""
+    length = route.travel_m[-1]
+    stations = np.linspace(0.0, length, int(np.ceil(length)) + 2)
+    moving = np.concatenate([[True], np.diff(route.travel_m) > 1e-6])
+    return np.column_stack([np.interp(stations, route.travel_m[moving], route.at[moving, axis]) for axis in range(3)])
+
+
+def _numbered(things: list[Mesh]) -> list[Mesh]:
+    """Each thing with its own number on its triangles of classes that are counted, as SemanticKITTI's instances."""
+    return [as_instance(thing, number, only=NUMBERED) for number, thing in enumerate(things, start=1)]
+
+
+def _scene(part: Mesh) -> o3d.t.geometry.RaycastingScene:
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(_tensor(part.vertices, np.float32), _tensor(part.triangles, np.uint32))
+    return scene
+
+
+def _tensor(values: np.ndarray, dtype: type) -> o3d.core.Tensor:
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=dtype))
+
+
+def _cast(scene: o3d.t.geometry.RaycastingScene, part: Mesh, rays: np.ndarray) -> Hits:
+    answer = scene.cast_rays(_tensor(rays, np.float32))
+    range_m = answer["t_hit"].numpy()
+    hit = np.where(np.isfinite(range_m), answer["primitive_ids"].numpy(), 0)
+    cos = np.abs(np.einsum("ij,ij->i", answer["primitive_normals"].numpy(), rays[:, 3:]))
+    return Hits(range_m, part.labels[hit], part.instances[hit], cos, part.glass[hit])
+
+
+def _relabelled(hits: Hits, ground: Ground, rays: np.ndarray) -> Hits:
+    """Terrain as what it is at each point: road, sidewalk, ..."""
+    rows = np.flatnonzero((hits.labels == Label.TERRAIN) & np.isfinite(hits.range_m))
+    at = rays[rows, :2] + hits.range_m[rows, None] * rays[rows, 3:5]
+    labels = hits.labels.copy()
+    labels[rows] = ground.label_at(at[:, 0], at[:, 1])
+    return replace(hits, labels=labels)
+
+
+def _nearer(a: Hits, b: Hits) -> Hits:
+    """Ray by ray the hit that comes first."""
+    first = b.range_m < a.range_m
+    return Hits(*(np.where(first, getattr(b, field.name), getattr(a, field.name)) for field in fields(Hits)))

@@ -37,7 +37,7 @@ class OdometryConfig(Section):
     min_range_m: float = Field(3.0, ge=0, description="points nearer than this are dropped: the car's own roof (m)")
     voxel_size_m: float = Field(1.0, gt=0, description="edge of the local map's voxels (m)")
     deskew: bool = Field(True, description="compensate the motion within a sweep, where points carry times")
-    max_num_threads: int = Field(0, ge=0, description="of KISS-ICP; 0 takes all, 1 repeats to the bit")
+    max_num_threads: int = Field(1, ge=0, description="of KISS-ICP, for the process; 0: all; 1 repeats to the bit")
     stamp_tolerance_s: float = Field(0.01, ge=0, description="a given pose this near in time is the scan's (s)")
 
 
@@ -167,8 +167,8 @@ class GraphConfig(Section):
 
 
 class LogConfig(Section):
-    voxel_m: float = Field(0.2, ge=0, description="keyframe clouds are thinned to this in the log; 0 keeps all (m)")
-    compression: Literal["none", "lz4", "zstd"] = "zstd"
+    view_every: int = Field(6, ge=1, description="every n-th point of a keyframe is drawn; all are kept for replay")
+    compression: Literal["none", "lz4", "zstd"] = Field("zstd", description="of the chunks of the log")
 
 
 class Config(Section):

@@ -34,7 +34,11 @@ class Odometry(Protocol):
 
 
 class KissOdometry:
-    """KISS-ICP, scan to local map. Its threaded sums repeat to millimetres; with one thread they repeat exactly."""
+    """KISS-ICP, scan to local map.
+
+    With one thread it repeats to the bit, with more to millimetres. The number of threads is that of the first made in
+    a process: KISS-ICP keeps it.
+    """
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config

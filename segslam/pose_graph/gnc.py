@@ -75,7 +75,7 @@ def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> gtsam.Values:
     control = problem.inlier_bound / (2.0 * worst - problem.inlier_bound)
     for _ in range(MAX_STEPS):
         weights = tls_weights(squared_errors(problem.closures, values), control, problem.inlier_bound)
-        if np.isin(weights, (0.0, 1.0)).all():
+        if np.minimum(weights, 1.0 - weights).max() < NEGLIGIBLE_WEIGHT:
             break
         graph = problem.weighted(weights)
         values = values.retract(graph.linearize(values).optimize())
@@ -85,9 +85,9 @@ def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> gtsam.Values:
 
 def tls_weights(squared: Vector, control: float, inlier_bound: float) -> Vector:
     """(k,) 0 to 1, the surrogate's weights of truncated least squares."""
-    between = np.sqrt(inlier_bound * control * (control + 1.0) / np.maximum(squared, np.finfo(float).tiny)) - control
-    weights = np.where(squared >= (control + 1.0) / control * inlier_bound, 0.0, between)
-    return np.where(squared <= control / (control + 1.0) * inlier_bound, 1.0, weights)
+    low, high = inlier_bound * control / (control + 1.0), inlier_bound * (control + 1.0) / control
+    weights = np.sqrt(inlier_bound * control * (control + 1.0) / np.clip(squared, low, high)) - control
+    return np.clip(weights, 0.0, 1.0)
 
 
 def _settle(problem: TruncatedProblem, values: gtsam.Values) -> tuple[gtsam.Values, Vector]:

@@ -38,7 +38,7 @@ def closure_information(information: Information, config: GraphConfig) -> Inform
     """A closure's information once the least noise of any closure is added to its covariance.
 
     The registration's information knows the shape of the uncertainty; what it cannot know (two scans that saw the place
-    differently, a leftover vertical angle) is the least noise. Where the registration knows nothing, a millionth of the
+    differently, a leftover vertical angle) is the least noise. Where the registration knows nothing, a billionth of the
     least noise's information keeps the sum positive definite.
     Raises ValueError if `information` is not symmetric positive semidefinite.
     """
@@ -47,7 +47,7 @@ def closure_information(information: Information, config: GraphConfig) -> Inform
     sigmas = geometry.tangent(rotation_rad=math.radians(config.closure_sigma_deg), translation_m=config.closure_sigma_m)
     least = np.diag(sigmas**-2.0)
     total = information @ np.linalg.solve(information + least, least)  # inverse(inverse(I) + inverse(L)), I may be flat
-    return (total + total.T) / 2 + 1e-6 * least
+    return (total + total.T) / 2 + 1e-9 * least
 
 
 def is_positive_semidefinite(matrix: Information) -> bool:

@@ -1,0 +1,282 @@
+"""Loops of known truth, with known drift and known lies."""
+
+import itertools
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from segslam import geometry
+from segslam.config import GraphConfig
+from segslam.pose_graph import PoseGraph
+from segslam.pose_graph.closures import Closure, pose3, squared_errors
+from segslam.pose_graph.gnc import tls_weights
+from segslam.pose_graph.noise import closure_information, inlier_bound, odometry
+from segslam.types import Alignment, GraphEstimate, LoopClosure, Registration, SegslamError
+
+CONFIG = GraphConfig()
+CLOSURE_SIGMAS = geometry.tangent(rotation_rad=np.radians(0.1), translation_m=0.05)
+
+
+def circle(num: int, *, rounds: float = 2.0, radius_m: float = 30.0) -> np.ndarray:
+    """(n, 4, 4) poses on a circle that is driven `rounds` times, gently up and down; the first is the identity."""
+    poses = []
+    for angle in np.linspace(0.0, 2.0 * np.pi * rounds, num):
+        position = [radius_m * np.sin(angle), radius_m * (1.0 - np.cos(angle)), 2.0 * np.sin(angle)]
+        poses.append(geometry.transform(geometry.yaw(angle), position))
+    return np.array(poses)
+
+
+def travel_m(poses: np.ndarray) -> np.ndarray:
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def drifted(T_world: np.ndarray, *, step: np.ndarray) -> np.ndarray:
+    """Odometry that adds the same tangent to every motion."""
+    T_odom = [T_world[0]]
+    for T_a, T_b in itertools.pairwise(T_world):
+        T_odom.append(T_odom[-1] @ geometry.inverse(T_a) @ T_b @ geometry.exp(step))
+    return np.array(T_odom)
+
+
+def closure(source_id: int, target_id: int, T_target_source: np.ndarray) -> LoopClosure:
+    registration = Registration(T_target_source, 20, 20, 0.1, np.diag(CLOSURE_SIGMAS**-2.0))
+    alignment = Alignment(registration, registration, 0.9, 0.1, 0.0)
+    return LoopClosure(source_id, target_id, T_target_source, registration.information, alignment)
+
+
+def true_closure(T_world: np.ndarray, source_id: int, target_id: int) -> LoopClosure:
+    return closure(source_id, target_id, geometry.inverse(T_world[target_id]) @ T_world[source_id])
+
+
+def graph_of(T_odom: np.ndarray, closures: list[LoopClosure], config: GraphConfig = CONFIG) -> PoseGraph:
+    graph = PoseGraph(config)
+    for i, (T_odom_keyframe, travel) in enumerate(zip(T_odom, travel_m(T_odom), strict=True)):
+        graph.add_keyframe(i, T_odom_keyframe, float(travel))
+    for loop in closures:
+        graph.add_closure(loop)
+    return graph
+
+
+def greatest_error_m(T_world: np.ndarray, estimate: GraphEstimate) -> float:
+    poses = np.array([estimate.T_world_keyframe[i] for i in range(len(T_world))])
+    return float(np.linalg.norm(poses[:, :3, 3] - T_world[:, :3, 3], axis=1).max())
+
+
+TRUTH = circle(120)
+DRIFT = drifted(TRUTH, step=geometry.tangent(rotation_rad=[0, 0, 0.0015], translation_m=[0.01, 0, 0.01]))
+LOOPS = [(source, source - 60) for source in range(62, 120, 6)]  # the second round meets the first
+TRUE_LOOPS = [true_closure(TRUTH, source, target) for source, target in LOOPS]
+LIES = [
+    closure(70, 30, geometry.transform(geometry.yaw(1.0), [3.0, 2.0, 0.0])),
+    closure(95, 5, geometry.transform(geometry.yaw(-2.0), [0.0, 1.0, 0.5])),
+    closure(110, 80, geometry.transform(np.eye(3), [0.0, 0.0, 0.0])),
+]
+
+
+def test_without_closures_the_estimate_is_the_odometry() -> None:
+    graph = graph_of(DRIFT, [])
+    np.testing.assert_allclose(graph.T_world_keyframes, DRIFT, atol=1e-9)
+    np.testing.assert_allclose(graph.finish().T_world_keyframe[119], DRIFT[119], atol=1e-9)
+
+
+@pytest.mark.parametrize("final", ["none", "gnc"])
+def test_a_graph_without_noise_stays_put(final: str) -> None:
+    graph = graph_of(TRUTH, TRUE_LOOPS, GraphConfig(final=final))
+    for estimate in (graph.optimize(), graph.finish()):
+        assert estimate.error < 1e-9
+        np.testing.assert_allclose(graph.T_world_keyframes, TRUTH, atol=1e-9)
+        assert min(estimate.closure_weights.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("robust", ["none", "huber", "cauchy", "geman-mcclure"])
+def test_closures_pull_the_drift_back(robust: str) -> None:
+    graph = graph_of(DRIFT, TRUE_LOOPS, GraphConfig(robust=robust))
+    before = float(np.linalg.norm(DRIFT[:, :3, 3] - TRUTH[:, :3, 3], axis=1).max())
+    assert before > 5.0, "else there is nothing to pull"
+    assert greatest_error_m(TRUTH, graph.optimize()) < 0.2 * before
+    assert greatest_error_m(TRUTH, graph.finish()) < 0.2 * before
+
+
+def test_a_closure_points_from_source_to_target() -> None:
+    """The one closure of a chain that says nothing itself decides: T_world_source = T_world_target T_target_source."""
+    loose = GraphConfig(odometry_sigma_m=100.0, odometry_sigma_deg=90.0, robust="none", closure_sigma_m=1e-3)
+    T_target_source = geometry.transform(geometry.yaw(0.7), [1.0, 2.0, 0.3])
+    graph = graph_of(circle(5, rounds=0.1), [closure(4, 0, T_target_source)], loose)
+    graph.optimize()
+    np.testing.assert_allclose(graph.T_world_keyframe(4), T_target_source, atol=1e-3)
+
+
+def test_a_closure_told_from_the_other_end_is_its_inverse() -> None:
+    swapped = [closure(c.target_id, c.source_id, geometry.inverse(c.T_target_source)) for c in TRUE_LOOPS]
+    config = GraphConfig(robust="none", final="none")
+    first, second = graph_of(DRIFT, TRUE_LOOPS, config), graph_of(DRIFT, swapped, config)
+    first.optimize()
+    second.optimize()
+    # the information of a tangent is bound to its end; both ends differ by the last centimetres of a good fit
+    np.testing.assert_allclose(first.T_world_keyframes, second.T_world_keyframes, atol=0.02)
+
+
+def test_gnc_switches_lies_off_and_keeps_the_truth() -> None:
+    graph = graph_of(DRIFT, TRUE_LOOPS + LIES)
+    graph.optimize()
+    estimate = graph.finish()
+    assert [estimate.closure_weights[lie.source_id, lie.target_id] for lie in LIES] == [0.0, 0.0, 0.0]
+    assert [estimate.closure_weights[pair] for pair in LOOPS] == [1.0] * len(LOOPS)
+    honest = graph_of(DRIFT, TRUE_LOOPS).finish()
+    np.testing.assert_allclose(graph.T_world_keyframes[119], honest.T_world_keyframe[119], atol=1e-4)
+
+
+def test_gnc_keeps_the_truth_among_twice_as_many_lies() -> None:
+    rng = np.random.default_rng(0)
+    lies = []
+    for _ in range(2 * len(LOOPS)):
+        target, source = np.sort(rng.choice(120, 2, replace=False))
+        T_target_source = geometry.transform(geometry.yaw(rng.uniform(-np.pi, np.pi)), rng.normal(0.0, 3.0, 3))
+        lies.append(closure(int(source), int(target), T_target_source))
+    weights = graph_of(DRIFT, TRUE_LOOPS + lies).finish().closure_weights
+    assert [weights[pair] for pair in LOOPS] == [1.0] * len(LOOPS)
+    assert sum(weights.values()) == len(LOOPS)
+
+
+def test_gnc_may_refuse_all() -> None:
+    estimate = graph_of(TRUTH, LIES).finish()
+    assert set(estimate.closure_weights.values()) == {0.0}
+    assert greatest_error_m(TRUTH, estimate) < 1e-6, "odometry was right, and is what is left"
+
+
+def test_a_robust_kernel_limits_what_a_lie_can_do_while_running() -> None:
+    lie = LIES[:1]
+    least_squares = graph_of(TRUTH, TRUE_LOOPS + lie, GraphConfig(robust="none")).optimize()
+    robust = graph_of(TRUTH, TRUE_LOOPS + lie, GraphConfig(robust="cauchy")).optimize()
+    assert greatest_error_m(TRUTH, robust) < 0.05 * greatest_error_m(TRUTH, least_squares)
+    assert robust.closure_weights[70, 30] < 0.05
+    assert min(robust.closure_weights[pair] for pair in LOOPS) > 0.95
+    assert set(least_squares.closure_weights.values()) == {1.0}
+
+
+def test_optimising_again_changes_nothing() -> None:
+    graph = graph_of(DRIFT, TRUE_LOOPS)
+    first = graph.optimize()
+    second = graph.optimize()
+    assert second.error == pytest.approx(first.error, rel=1e-6)
+    np.testing.assert_allclose(first.T_world_keyframe[119], second.T_world_keyframe[119], atol=1e-3)
+
+
+def test_closures_one_by_one_lead_where_all_at_once_do() -> None:
+    config = GraphConfig(robust="none")
+    at_once = graph_of(DRIFT, TRUE_LOOPS, config)
+    at_once.optimize()
+    graph = graph_of(DRIFT, [], config)
+    for loop in TRUE_LOOPS:
+        graph.add_closure(loop)
+        graph.optimize()
+    np.testing.assert_allclose(graph.T_world_keyframes, at_once.T_world_keyframes, atol=1e-3)
+
+
+def test_a_keyframe_after_an_optimisation_follows_it_by_odometry() -> None:
+    graph = graph_of(DRIFT[:119], TRUE_LOOPS[:-1])
+    graph.optimize()
+    T_world_118 = graph.T_world_keyframe(118)
+    graph.add_keyframe(119, DRIFT[119], float(travel_m(DRIFT)[119]))
+    expected = T_world_118 @ geometry.inverse(DRIFT[118]) @ DRIFT[119]
+    np.testing.assert_allclose(graph.T_world_keyframe(119), expected, atol=1e-9)
+    np.testing.assert_allclose(graph.T_world_keyframes[119], expected, atol=1e-9)
+
+
+def test_moving_the_odometry_moves_the_world() -> None:
+    T_new_odom = geometry.transform(geometry.yaw(1.0), [100.0, -50.0, 7.0])
+    first, second = graph_of(DRIFT, TRUE_LOOPS), graph_of(T_new_odom @ DRIFT, TRUE_LOOPS)
+    first.optimize()
+    second.optimize()
+    np.testing.assert_allclose(second.T_world_keyframes, T_new_odom @ first.T_world_keyframes, atol=1e-5)
+
+
+def test_rotations_rounded_in_a_file_do_not_stop_the_solver() -> None:
+    rounded = np.round(DRIFT, 5)
+    estimate = graph_of(rounded, TRUE_LOOPS).optimize()
+    exact = graph_of(DRIFT, TRUE_LOOPS).optimize()
+    np.testing.assert_allclose(estimate.T_world_keyframe[119], exact.T_world_keyframe[119], atol=5e-3)
+
+
+def test_the_written_graph_is_read_back_by_gtsam(tmp_path: Path) -> None:
+    graph = graph_of(DRIFT, TRUE_LOOPS, GraphConfig(robust="none"))
+    estimate = graph.optimize()
+    graph.write_g2o(tmp_path / "graph.g2o")
+    factors, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
+    assert factors.size() == 119 + len(LOOPS)
+    assert factors.error(values) == pytest.approx(estimate.error, rel=1e-3), "g2o keeps six digits"
+    np.testing.assert_allclose(values.atPose3(119).matrix(), graph.T_world_keyframe(119), atol=1e-4)
+
+
+def test_keyframes_must_come_in_order() -> None:
+    graph = graph_of(TRUTH[:3], [])
+    with pytest.raises(ValueError, match="expected 3, got 4"):
+        graph.add_keyframe(4, np.eye(4), 0.0)
+
+
+def test_a_closure_with_an_unknown_keyframe_is_refused() -> None:
+    graph = graph_of(TRUTH[:3], [])
+    with pytest.raises(SegslamError, match="keyframes 0 to 2, not 9"):
+        graph.add_closure(closure(9, 0, np.eye(4)))
+
+
+@pytest.mark.parametrize("value", [np.nan, -1.0])
+def test_an_information_that_is_none_is_refused(value: float) -> None:
+    with pytest.raises(ValueError, match="positive semidefinite"):
+        closure_information(np.diag([1.0, 1.0, 1.0, 1.0, 1.0, value]), CONFIG)
+
+
+def test_the_least_noise_is_added_to_a_closures_covariance() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6))
+    covariance = 1e-3 * (root @ root.T + np.eye(6))
+    sigmas = geometry.tangent(rotation_rad=np.radians(CONFIG.closure_sigma_deg), translation_m=CONFIG.closure_sigma_m)
+    found = closure_information(np.linalg.inv(covariance), CONFIG)
+    np.testing.assert_allclose(np.linalg.inv(found), covariance + np.diag(sigmas**2), rtol=1e-4)
+
+
+def test_a_closure_that_knows_nothing_of_one_direction_constrains_the_others() -> None:
+    information = np.diag([1e6, 1e6, 1e6, 0.0, 1e4, 1e4])  # a corridor along x
+    found = closure_information(information, CONFIG)
+    assert np.linalg.eigvalsh(found).min() > 0.0
+    assert found[3, 3] < 1e-3 < 10.0 < found[4, 4]
+
+
+def test_odometry_noise_grows_with_the_way_and_with_turns() -> None:
+    ahead = geometry.transform(np.eye(3), [2.0, 0.0, 0.0])
+    around = geometry.transform(geometry.yaw(1.0), [2.0, 0.0, 0.0])
+    sigmas = [odometry(travel, T, CONFIG).sigmas() for travel, T in ((2.0, ahead), (8.0, ahead), (2.0, around))]
+    np.testing.assert_allclose(sigmas[1], 2.0 * sigmas[0], rtol=1e-9)
+    np.testing.assert_allclose(sigmas[2] / sigmas[0], np.sqrt((2.0 + CONFIG.turn_m) / 2.0), rtol=1e-9)
+    expected = geometry.tangent(
+        rotation_rad=np.radians(CONFIG.odometry_sigma_deg), translation_m=CONFIG.odometry_sigma_m
+    )
+    np.testing.assert_allclose(sigmas[0], np.sqrt(2.0) * expected)
+
+
+def test_a_standing_sensor_still_has_noise() -> None:
+    assert odometry(0.0, np.eye(4), CONFIG).sigmas().min() > 0.0
+
+
+def test_the_inlier_bound_is_the_chi_square_quantile() -> None:
+    assert inlier_bound(GraphConfig(inlier_probability=0.99)) == pytest.approx(16.8119, abs=1e-4), "tables, 6 degrees"
+
+
+def test_the_squared_error_is_twice_gtsams() -> None:
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose3())
+    values.insert(1, pose3(geometry.transform(np.eye(3), [0.3, 0.0, 0.0])))
+    edge = Closure(0, 1, gtsam.Pose3(), np.diag([1.0, 1.0, 1.0, 100.0, 1.0, 1.0]))
+    np.testing.assert_allclose(squared_errors([edge], values), [9.0])
+    assert edge.factor(weight=0.5).error(values) == pytest.approx(9.0 / 4.0)
+
+
+def test_graduated_weights_lie_between_least_squares_and_the_cut() -> None:
+    squared = np.array([0.0, 0.5, 1.0, 2.0, 50.0])
+    np.testing.assert_allclose(tls_weights(squared, 1e6, 1.0), [1.0, 1.0, 0.5, 0.0, 0.0], atol=1e-6)
+    nearly_convex = tls_weights(squared, 1e-3, 1.0)
+    assert (np.diff(nearly_convex) <= 0.0).all()
+    assert nearly_convex[-1] > 0.0, "at first even the worst has a say"

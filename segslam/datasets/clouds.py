@@ -1,0 +1,46 @@
+"""One scan from one file: .bin, .npy, .ply, .pcd."""
+
+from pathlib import Path
+
+import numpy as np
+
+from segslam.datasets.kitti import read_bin
+from segslam.types import Points, SegslamError
+
+
+def read_cloud(file: Path) -> Points:
+    """The points of a file, as stored: .bin (float32 x y z intensity), .npy (n, 3 or more), .ply, .pcd.
+
+    Raises SegslamError (BadScan for a broken .bin) that names the file.
+    """
+    if not file.is_file():
+        raise SegslamError(f"{file}: no such file; name a scan (.bin, .npy, .ply, .pcd)")
+    match file.suffix:
+        case ".bin":
+            return read_bin(file)
+        case ".npy":
+            return _read_npy(file)
+        case ".ply" | ".pcd":
+            return _read_by_open3d(file)
+    raise SegslamError(f"{file}: {file.suffix or 'no ending'} is no known format; give .bin, .npy, .ply or .pcd")
+
+
+def _read_npy(file: Path) -> Points:
+    try:
+        values = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise SegslamError(f"{file}: cannot be read ({error}); save an array by numpy.save") from error
+    if values.ndim != 2 or values.shape[1] < 3 or values.dtype.kind not in "fiu":
+        raise SegslamError(f"{file}: holds {values.dtype} of shape {values.shape}; expected (n, 3) numbers, x y z")
+    return values[:, :3].astype(np.float64)
+
+
+def _read_by_open3d(file: Path) -> Points:
+    import open3d
+
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        cloud = open3d.io.read_point_cloud(str(file))
+    points = np.asarray(cloud.points)
+    if not len(points):
+        raise SegslamError(f"{file}: no points could be read; is it a whole {file.suffix} file?")
+    return points

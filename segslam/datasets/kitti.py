@@ -1,0 +1,174 @@
+"""KITTI odometry (Geiger et al. 2012) and all that is written like it: scans, calibration, times, true poses, labels.
+
+A scan's number is that of its file, and its row in times.txt and in the poses; numbers may be missing. The poses are
+the left camera's, in the frame of the first one; they leave this file as the LiDAR's.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from segslam import geometry
+from segslam.datasets.scans import make_scan, read_stamps, selected_rows, usable_scans
+from segslam.semantics.encodings import Encoding
+from segslam.semantics.label_files import LabelSource, open_labels
+from segslam.trajectory import lidar_from_camera, read_poses
+from segslam.types import BadScan, Indices, Points, Scan, SegslamError, Trajectory, Transform
+
+VERTICAL_ANGLE_DEG = 0.205
+"""By which KITTI's scans have their beams too low; value as in KISS-ICP (Vizzo et al., RA-L 2023)."""
+LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
+"""What calib.txt calls T_camera_lidar: in KITTI's odometry, object and tracking benchmark."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KittiSequence:
+    """The selected scans of one drive, a row each."""
+
+    name: str
+    scan_files: tuple[Path, ...]
+    scan_index: Indices
+    stamp_ns: Indices
+    labels: LabelSource
+    T_camera_lidar: Transform
+    reference: Trajectory | None
+
+    def __len__(self) -> int:
+        return len(self.scan_files)
+
+    def __getitem__(self, row: int) -> Scan:
+        """The scan, its vertical angle corrected. Raises BadScan if the file or its labels cannot be used."""
+        file = self.scan_files[row]
+        points = read_bin(file)
+        labels = self.labels.read(file.stem, len(points))
+        return make_scan(
+            file, int(self.scan_index[row]), int(self.stamp_ns[row]), correct_vertical_angle(points), labels
+        )
+
+    def __iter__(self) -> Iterator[Scan]:
+        return usable_scans(self)
+
+
+def is_kitti(data: Path) -> bool:
+    """Whether the folder holds KITTI sequences, or is one."""
+    return (data / "sequences").is_dir() or _is_sequence(data)
+
+
+def open_kitti(
+    data: Path, *, sequence: str, labels: str, encoding: Encoding | None, frames: str | None
+) -> KittiSequence:
+    """The sequence `sequence` of a folder with `sequences/`, or the one that the folder itself is.
+
+    Raises SegslamError that names what is missing: the sequence, its scans, its calibration or its times.
+    """
+    folder, poses_file = _find_sequence(data, sequence)
+    files, numbers = _numbered_scans(folder / "velodyne")
+    stamps = _stamps_of(folder / "times.txt", numbers)
+    T_camera_lidar = read_calibration(folder / "calib.txt")
+    rows = selected_rows(numbers, frames, folder / "velodyne")
+    chosen = tuple(files[row] for row in rows)
+    return KittiSequence(
+        name=f"kitti/{folder.name}",
+        scan_files=chosen,
+        scan_index=numbers[rows],
+        stamp_ns=stamps[rows],
+        labels=open_labels(labels, beside=folder, scan_names=[file.stem for file in chosen], encoding=encoding),
+        T_camera_lidar=T_camera_lidar,
+        reference=_reference(poses_file, numbers[rows], stamps[rows], T_camera_lidar),
+    )
+
+
+def read_bin(file: Path) -> Points:
+    """x, y, z of a velodyne file (float32 x y z intensity), as stored. Raises BadScan if it is broken."""
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise BadScan(f"{file}: cannot read the scan ({error})") from error
+    if len(content) % 16:
+        raise BadScan(
+            f"{file}: {len(content)} bytes are no multiple of 16 (float32 x y z intensity): truncated; "
+            "fetch the file again"
+        )
+    return np.frombuffer(content, dtype="<f4").reshape(-1, 4)[:, :3]
+
+
+def correct_vertical_angle(points: Points) -> Points:
+    """The points at the same range and azimuth, their elevation raised by 0.205 degrees; of the same dtype."""
+    cosine, sine = math.cos(math.radians(VERTICAL_ANGLE_DEG)), math.sin(math.radians(VERTICAL_ANGLE_DEG))
+    x, y, z = np.ascontiguousarray(points.T)
+    horizontal = np.maximum(np.hypot(x, y), np.finfo(x.dtype).tiny)  # a point straight above has no azimuth to keep
+    stretch = cosine - sine * z / horizontal
+    return np.stack([x * stretch, y * stretch, sine * horizontal + cosine * z], axis=1)
+
+
+def read_calibration(file: Path) -> Transform:
+    """T_camera_lidar of a calib.txt. Raises SegslamError if the file or the entry is missing or broken."""
+    try:
+        lines = file.read_text(encoding="ascii").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{file}: cannot read the calibration ({error}); KITTI's calib.txt belongs there") from error
+    for number, line in enumerate(lines, start=1):
+        key, _, values = line.replace(":", " ", 1).strip().partition(" ")
+        if key in LIDAR_KEYS:
+            return _rigid(values.split(), f"{file}:{number}")
+    raise SegslamError(
+        f"{file}: no line begins with any of {', '.join(LIDAR_KEYS)}; add KITTI's line `Tr:`, 12 numbers"
+    )
+
+
+def _rigid(texts: list[str], place: str) -> Transform:
+    try:
+        matrix = np.array(texts, dtype=float).reshape(3, 4)
+    except ValueError as error:
+        raise SegslamError(f"{place}: expected 12 numbers, a 3x4 matrix by rows ({error})") from error
+    if not np.isfinite(matrix).all():
+        raise SegslamError(f"{place}: every number must be finite")
+    return geometry.transform(geometry.nearest_rotation(matrix[:, :3]), matrix[:, 3])
+
+
+def _is_sequence(folder: Path) -> bool:
+    return (folder / "velodyne").is_dir() and ((folder / "calib.txt").exists() or folder.parent.name == "sequences")
+
+
+def _find_sequence(data: Path, sequence: str) -> tuple[Path, Path]:
+    """The sequence's folder and where its true poses would be."""
+    if not (data / "sequences").is_dir() and _is_sequence(data):
+        folder = data.resolve()
+        return folder, folder.parent.parent / "poses" / f"{folder.name}.txt"
+    name = sequence.zfill(2)
+    folder = data / "sequences" / name
+    if not folder.is_dir():
+        known = ", ".join(sorted(other.name for other in (data / "sequences").glob("*") if other.is_dir())) or "none"
+        raise SegslamError(f"{folder}: no such sequence; {data / 'sequences'} has: {known}")
+    return folder, data / "poses" / f"{name}.txt"
+
+
+def _numbered_scans(velodyne: Path) -> tuple[list[Path], Indices]:
+    files = [file for file in velodyne.glob("*.bin") if not file.name.startswith(".")]
+    if not files:
+        raise SegslamError(f"{velodyne}: no .bin file there; put KITTI's scans there, 000000.bin and so on")
+    misnamed = [file for file in files if not file.stem.isdecimal()]
+    if misnamed:
+        raise SegslamError(f"{misnamed[0]}: the name is no scan number; rename the file, for example 000000.bin")
+    files.sort(key=lambda file: int(file.stem))
+    return files, np.array([int(file.stem) for file in files])
+
+
+def _stamps_of(times_file: Path, numbers: Indices) -> Indices:
+    stamps = read_stamps(times_file)
+    if numbers[-1] >= len(stamps):
+        raise SegslamError(
+            f"{times_file}: {len(stamps)} lines, but there is a scan {numbers[-1]}; line n + 1 is the time of scan n"
+        )
+    return stamps[numbers]
+
+
+def _reference(poses_file: Path, numbers: Indices, stamps: Indices, T_camera_lidar: Transform) -> Trajectory | None:
+    if not poses_file.exists():
+        return None
+    poses = lidar_from_camera(read_poses(poses_file, format="kitti").T_a_b, T_camera_lidar)
+    posed = numbers < len(poses)
+    return Trajectory(numbers[posed], stamps[posed], poses[numbers[posed]])

@@ -1,0 +1,210 @@
+"""All other recordings, through kiss_icp's readers: folders of clouds, rosbag, mcap, pcap and the data sets it names.
+
+A scan's number is its place in the recording.
+"""
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam.datasets.scans import ASSUMED_PERIOD_NS, make_scan, read_stamps, selected_rows, usable_scans
+from segslam.semantics.encodings import Encoding
+from segslam.semantics.label_files import LabelSource, open_labels
+from segslam.trajectory import read_poses
+from segslam.types import BadScan, Indices, Scan, SegslamError, Trajectory, Vector
+
+KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
+READ_IN_ORDER = ("mcap", "rosbag")
+"""Recordings that kiss_icp reads message by message: it gives the next scan, whichever is asked for."""
+LOADER_ERRORS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    ImportError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    StopIteration,
+    SystemExit,
+    TypeError,
+    ValueError,
+)
+"""What kiss_icp's readers end in when data are missing or broken."""
+
+
+class Recording:
+    """The selected scans of a recording. Where it is read in order, going back starts it again."""
+
+    T_camera_lidar = None
+
+    def __init__(
+        self,
+        kind: str,
+        source: Path,
+        loader: Any,
+        *,
+        labels: str,
+        encoding: Encoding | None,
+        frames: str | None,
+    ) -> None:
+        beside = _beside(source)
+        self.name = f"{kind}/{beside.resolve().name}"
+        self._source = source
+        self._loader = loader
+        self._in_order = kind in READ_IN_ORDER
+        self._next = 0
+        self._stamps = _whole_stamps(beside / "times.txt", len(loader)) if kind == "generic" else None
+        self.scan_index = selected_rows(np.arange(len(loader)), frames, source)
+        names = [self._file(int(index)).stem for index in self.scan_index]
+        self.labels: LabelSource = open_labels(labels, beside=beside, scan_names=names, encoding=encoding)
+        self.reference = self._reference(beside / "poses.txt" if kind == "generic" else None)
+
+    def __len__(self) -> int:
+        return len(self.scan_index)
+
+    def __getitem__(self, row: int) -> Scan:
+        """The scan. Raises BadScan if kiss_icp's reader fails on it or its labels cannot be used."""
+        index = int(self.scan_index[row])
+        file = self._file(index)
+        points, times = self._read(index, file)
+        labels = self.labels.read(file.stem, len(points))
+        return make_scan(file, index, self._stamp_ns(index), points, labels, _from_0_to_1(times, len(points)))
+
+    def __iter__(self) -> Iterator[Scan]:
+        return usable_scans(self)
+
+    def _read(self, index: int, file: Path) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):
+                self._go_to(index)
+                item = self._loader[index]
+            points, times = item if isinstance(item, tuple) else (item, np.empty(0))
+            return np.asarray(points, dtype=np.float64).reshape(-1, 3), np.asarray(times, dtype=np.float64).ravel()
+        except LOADER_ERRORS as error:
+            raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
+
+    def _go_to(self, index: int) -> None:
+        """Read over what lies before, where a recording can only be read in order."""
+        if not self._in_order:
+            return
+        if index < self._next:
+            self._loader.reset()
+            self._next = 0
+        while self._next < index:
+            self._next += 1
+            with contextlib.suppress(*LOADER_ERRORS):  # a broken scan that nobody asked for
+                self._loader[self._next - 1]
+        self._next += 1
+
+    def _stamp_ns(self, index: int) -> int:
+        """Of the scan, which has been read: some readers know it only then."""
+        if self._stamps is not None:
+            return int(self._stamps[index])
+        if not hasattr(self._loader, "get_frames_timestamps"):
+            return index * ASSUMED_PERIOD_NS
+        seconds = self._loader.get_frames_timestamps()[-1 if self._in_order else index]
+        return round(float(np.squeeze(seconds)) * 1e9)
+
+    def _file(self, index: int) -> Path:
+        """The file of a scan; in recordings of many scans a name made of its number."""
+        files = getattr(self._loader, "scan_files", None)
+        return Path(str(files[index])) if files is not None else self._source / f"{index:06d}"
+
+    def _reference(self, poses_file: Path | None) -> Trajectory | None:
+        if poses_file is not None and poses_file.exists():
+            poses = read_poses(poses_file, format="kitti").T_a_b
+        else:
+            poses = np.asarray(getattr(self._loader, "gt_poses", np.empty((0, 4, 4))), dtype=float)
+        posed = self.scan_index[self.scan_index < len(poses)]
+        if len(posed) == 0:
+            return None
+        return Trajectory(posed, np.array([self._stamp_ns(int(index)) for index in posed]), poses[posed])
+
+
+def open_recording(
+    data: Path,
+    *,
+    kind: str | None,
+    sequence: str,
+    topic: str,
+    labels: str,
+    encoding: Encoding | None,
+    frames: str | None,
+) -> Recording:
+    """A recording by the name of its kind in kiss_icp, or by what the file or folder looks like.
+
+    Raises SegslamError with the reader's own complaint if it cannot be opened, or holds no scan.
+    """
+    from kiss_icp.datasets import available_dataloaders, dataset_factory
+
+    kinds = sorted({"kitti", *available_dataloaders()})
+    if kind is not None and kind not in kinds:
+        raise SegslamError(f"--dataset {kind}: no such kind of data; known: {', '.join(kinds)}")
+    kind = kind or _kind_of(data)
+    source = _scans_folder(data) if kind == "generic" else data
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of kiss_icp's sources, which it parses to find its readers
+            loader = dataset_factory(kind, source, sequence=sequence, topic=topic)
+            num_scans = len(loader)
+    except LOADER_ERRORS as error:
+        complaint = " ".join(said.getvalue().split()) or _reason(error)
+        raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset") from error
+    if num_scans == 0:
+        raise SegslamError(f"{data}: holds no scan that the reader for {kind} data finds; see --dataset")
+    return Recording(kind, source, loader, labels=labels, encoding=encoding, frames=frames)
+
+
+def _kind_of(data: Path) -> str:
+    if data.is_file() and data.suffix in KIND_OF_SUFFIX:
+        return KIND_OF_SUFFIX[data.suffix]
+    if (data / "metadata.yaml").exists() or any(data.glob("*.bag")):
+        return "rosbag"
+    if data.is_dir() and _has_clouds(_scans_folder(data)):
+        return "generic"
+    raise SegslamError(
+        f"{data}: found neither sequences/ nor velodyne/ (KITTI), nor clouds (.bin .ply .pcd ...), nor a rosbag, .mcap "
+        "or .pcap; name the folder that holds them, or the kind by --dataset"
+    )
+
+
+def _scans_folder(data: Path) -> Path:
+    return data / "velodyne" if not _has_clouds(data) and (data / "velodyne").is_dir() else data
+
+
+def _has_clouds(folder: Path) -> bool:
+    from kiss_icp.datasets import supported_file_extensions
+
+    suffixes = {f".{extension}" for extension in supported_file_extensions()}
+    return any(file.suffix in suffixes for file in folder.iterdir())
+
+
+def _beside(source: Path) -> Path:
+    """Where the times, poses and labels of a folder of scans are looked for."""
+    return source.resolve().parent if source.resolve().name == "velodyne" else source
+
+
+def _whole_stamps(times_file: Path, num_scans: int) -> Indices | None:
+    if not times_file.exists():
+        return None
+    stamps = read_stamps(times_file)
+    if len(stamps) != num_scans:
+        raise SegslamError(f"{times_file}: {len(stamps)} lines for {num_scans} scans; mend or remove the file")
+    return stamps
+
+
+def _from_0_to_1(times: np.ndarray, num_points: int) -> Vector:
+    """Per-point times over one sweep; none where they are missing, of another number than the points, or all equal."""
+    if len(times) != num_points or num_points == 0 or np.ptp(times) == 0:
+        return np.empty(0)
+    return (times - times.min()) / np.ptp(times)
+
+
+def _reason(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

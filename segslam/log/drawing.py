@@ -1,0 +1,144 @@
+"""What a viewer shows of a run, step by step, in Foxglove's own messages."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import Message
+
+from segslam import geometry
+from segslam.config import LogConfig
+from segslam.log import foxglove, schema
+from segslam.log.records import to_json
+from segslam.types import GraphEstimate, Keyframe, LoopAttempt, Rejected, RejectReason, Step, Transform, Vector
+
+ACCEPTED_COLOR = "#2ca02cff"
+REJECTED_COLORS = {
+    RejectReason.TOO_FEW_POINTS: "#c7c7c7ff",
+    RejectReason.TOO_FEW_CORRESPONDENCES: "#7f7f7fff",
+    RejectReason.SMALL_CLIQUE: "#1f77b4ff",
+    RejectReason.DEGENERATE: "#17becfff",
+    RejectReason.TOO_FEW_INLIERS: "#9467bdff",
+    RejectReason.FAR_FROM_PRIOR: "#e377c2ff",
+    RejectReason.REFINEMENT_DIVERGED: "#8c564bff",
+    RejectReason.LOW_OVERLAP: "#bcbd22ff",
+    RejectReason.HIGH_RESIDUAL: "#ffbb78ff",
+    RejectReason.FREE_SPACE_VIOLATED: "#ff7f0eff",
+    RejectReason.INCONSISTENT: "#d62728ff",
+}
+"""Cold colours for what failed early, warm ones for what failed late."""
+
+PATH_GROWTH = 1.05
+"""Chosen: a path is written again when it has grown by this factor, so that all its versions together stay linear in
+its length (some 20 times the last one) and a viewer that jumps in time finds one at most 5 % too short."""
+
+VIEW_GRID_M = 2.0**-5
+"""Chosen: points to look at are rounded to 3 cm, in binary, which halves their size after compression."""
+
+Topical = tuple[str, Message]
+
+
+class Drawing:
+    """Follows the steps of a run and turns each into messages by topic."""
+
+    def __init__(self, config: LogConfig) -> None:
+        self._config = config
+        self._T_odom_keyframe: dict[int, Transform] = {}
+        self._T_world_keyframe: Mapping[int, Transform] = {}
+        self._T_world_odom = np.eye(4)
+        self._num_on_path = 0
+
+    def draw(self, step: Step) -> Iterator[Topical]:
+        """The messages of the next step."""
+        if not self._num_on_path:
+            yield self._odom_in_world(step.stamp_ns)
+        yield (
+            schema.TRANSFORMS,
+            foxglove.frame_transform(step.T_odom_lidar, parent=schema.ODOM, child=schema.LIDAR, stamp_ns=step.stamp_ns),
+        )
+        if step.keyframe is not None:
+            yield from self._keyframe(step.keyframe)
+        if step.estimate is not None:
+            yield from self.estimate(step.estimate, stamp_ns=step.stamp_ns)
+        yield from self._attempts(step.attempts, step.stamp_ns)
+
+    def estimate(self, estimate: GraphEstimate, *, stamp_ns: int) -> Iterator[Topical]:
+        """The corrected path, where odom lies now, and the closures."""
+        self._T_world_keyframe = estimate.T_world_keyframe
+        last = max(estimate.T_world_keyframe)
+        self._T_world_odom = estimate.T_world_keyframe[last] @ geometry.inverse(self._T_odom_keyframe[last])
+        yield self._odom_in_world(stamp_ns)
+        path = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
+        yield schema.TRAJECTORY, path
+        yield schema.GRAPH, self._graph(estimate, stamp_ns)
+
+    def _odom_in_world(self, stamp_ns: int) -> Topical:
+        return schema.TRANSFORMS, foxglove.frame_transform(
+            self._T_world_odom, parent=schema.WORLD, child=schema.ODOM, stamp_ns=stamp_ns
+        )
+
+    def _keyframe(self, keyframe: Keyframe) -> Iterator[Topical]:
+        self._T_odom_keyframe[keyframe.id] = keyframe.T_odom_keyframe
+        stamp_ns, some = keyframe.stamp_ns, slice(None, None, self._config.view_every)
+        points = np.round(keyframe.points[some] / VIEW_GRID_M) * VIEW_GRID_M
+        yield (
+            schema.POINTS,
+            foxglove.point_cloud(points, keyframe.labels[some], frame=schema.LIDAR, stamp_ns=stamp_ns),
+        )
+        if len(self._T_odom_keyframe) >= PATH_GROWTH * self._num_on_path:
+            self._num_on_path = len(self._T_odom_keyframe)
+            path = foxglove.poses_in_frame(self._T_odom_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
+            yield schema.ODOMETRY, path
+
+    def _attempts(self, attempts: tuple[LoopAttempt, ...], stamp_ns: int) -> Iterator[Topical]:
+        for topic, wanted in ((schema.ACCEPTED, False), (schema.REJECTED, True)):
+            entities = [
+                self._attempt(attempt, stamp_ns)
+                for attempt in attempts
+                if isinstance(attempt.outcome, Rejected) is wanted
+            ]
+            if entities:
+                yield topic, foxglove.scene(entities)
+
+    def _attempt(self, attempt: LoopAttempt, stamp_ns: int) -> foxglove.SceneEntity:
+        outcome, pair = attempt.outcome, (attempt.candidate.source_id, attempt.candidate.target_id)
+        color = REJECTED_COLORS[outcome.reason] if isinstance(outcome, Rejected) else ACCEPTED_COLOR
+        return foxglove.entity(
+            f"{pair[0]} to {pair[1]}",
+            foxglove.line([self._position(keyframe_id) for keyframe_id in pair], [color]),
+            numbers_and_words(to_json(attempt)),
+            frame=schema.WORLD,
+            stamp_ns=stamp_ns,
+        )
+
+    def _graph(self, estimate: GraphEstimate, stamp_ns: int) -> foxglove.SceneUpdate:
+        ends = [self._position(keyframe_id) for pair in estimate.closure_weights for keyframe_id in pair]
+        colors = [weight_color(weight) for weight in estimate.closure_weights.values()]
+        about = {"error": f"{estimate.error:g}", "closures": str(len(colors))}
+        lines = foxglove.line(ends, colors)
+        return foxglove.scene([foxglove.entity("closures", lines, about, frame=schema.WORLD, stamp_ns=stamp_ns)])
+
+    def _position(self, keyframe_id: int) -> Vector:
+        """In world, by the last estimate, or by odometry since."""
+        if keyframe_id in self._T_world_keyframe:
+            return self._T_world_keyframe[keyframe_id][:3, 3]
+        return (self._T_world_odom @ self._T_odom_keyframe[keyframe_id])[:3, 3]
+
+
+def weight_color(weight: float) -> str:
+    """Green for a closure of weight 1, red for 0."""
+    green = round(255 * min(max(weight, 0.0), 1.0))
+    return f"#{255 - green:02x}{green:02x}30ff"
+
+
+def numbers_and_words(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """What of a record is short enough to read on a click: its numbers and texts, keys joined by dots, no arrays."""
+    flat: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= numbers_and_words(value, f"{prefix}{key}.")
+        elif isinstance(value, float):
+            flat[prefix + key] = f"{value:.4g}"
+        elif not isinstance(value, list):
+            flat[prefix + key] = str(value)
+    return flat

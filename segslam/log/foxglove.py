@@ -1,0 +1,126 @@
+"""Foxglove's own messages, made of records and read back: transforms, point clouds, poses, lines."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.timestamp_pb2 import Timestamp
+from scipy.spatial.transform import Rotation as ScipyRotation
+
+from segslam import geometry
+from segslam.types import Labels, Points, Transform, Vector
+
+_POINT = np.dtype([("xyz", "<f4", 3), ("label", "u1")])
+_POINT_FIELDS = [
+    PackedElementField(name="x", offset=0, type=PackedElementField.FLOAT32),
+    PackedElementField(name="y", offset=4, type=PackedElementField.FLOAT32),
+    PackedElementField(name="z", offset=8, type=PackedElementField.FLOAT32),
+    PackedElementField(name="label", offset=12, type=PackedElementField.UINT8),
+]
+
+
+def frame_transform(T_parent_child: Transform, *, parent: str, child: str, stamp_ns: int) -> FrameTransform:
+    """Where frame `child` is in `parent`."""
+    pose = _pose(T_parent_child)
+    return FrameTransform(
+        timestamp=_timestamp(stamp_ns),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=pose.position,
+        rotation=pose.orientation,
+    )
+
+
+def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) -> PointCloud:
+    """Points as float32, with their labels."""
+    rows = np.empty(len(points), _POINT)
+    rows["xyz"], rows["label"] = points, labels
+    return PointCloud(
+        timestamp=_timestamp(stamp_ns),
+        frame_id=frame,
+        pose=_pose(np.eye(4)),
+        point_stride=_POINT.itemsize,
+        fields=_POINT_FIELDS,
+        data=rows.tobytes(),
+    )
+
+
+def poses_in_frame(T_frame_each: Iterable[Transform], *, frame: str, stamp_ns: int) -> PosesInFrame:
+    """A path; `transforms` gives back its poses to the last digits of float64."""
+    stack = np.array(list(T_frame_each)).reshape(-1, 4, 4)
+    return PosesInFrame(timestamp=_timestamp(stamp_ns), frame_id=frame, poses=_poses(stack))
+
+
+def transforms(poses: PosesInFrame) -> list[Transform]:
+    """The poses of a path as matrices."""
+    if not poses.poses:
+        return []
+    quaternions = [[q.x, q.y, q.z, q.w] for q in (pose.orientation for pose in poses.poses)]
+    positions = [[p.x, p.y, p.z] for p in (pose.position for pose in poses.poses)]
+    rotations = ScipyRotation.from_quat(quaternions).as_matrix()
+    return [geometry.transform(R, t) for R, t in zip(rotations, positions, strict=True)]
+
+
+def line(points: Sequence[Vector], colors: Sequence[str], *, width_px: float = 2.0) -> LinePrimitive:
+    """Segments between each two points, one colour (#rrggbbaa) a segment, as wide at any distance."""
+    return LinePrimitive(
+        type=LinePrimitive.LINE_LIST,
+        thickness=width_px,
+        scale_invariant=True,
+        pose=_pose(np.eye(4)),
+        points=[Point3(x=x, y=y, z=z) for x, y, z in np.asarray(points).tolist()],
+        colors=[_color(color) for color in colors for _ in range(2)],
+    )
+
+
+def entity(
+    identity: str, lines: LinePrimitive, metadata: Mapping[str, str], *, frame: str, stamp_ns: int
+) -> SceneEntity:
+    """Lines that stay until another entity of the same identity replaces them; the metadata shows on a click."""
+    return SceneEntity(
+        timestamp=_timestamp(stamp_ns),
+        frame_id=frame,
+        id=identity,
+        metadata=[KeyValuePair(key=key, value=value) for key, value in metadata.items()],
+        lines=[lines],
+    )
+
+
+def scene(entities: Iterable[SceneEntity]) -> SceneUpdate:
+    return SceneUpdate(entities=entities)
+
+
+def _poses(T_frame_each: np.ndarray) -> list[Pose]:
+    if len(T_frame_each) == 0:
+        return []
+    quaternions = ScipyRotation.from_matrix(T_frame_each[:, :3, :3]).as_quat().tolist()
+    return [
+        Pose(position=Vector3(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
+        for (tx, ty, tz), (x, y, z, w) in zip(T_frame_each[:, :3, 3].tolist(), quaternions, strict=True)
+    ]
+
+
+def _pose(T_frame_body: Transform) -> Pose:
+    return _poses(T_frame_body[np.newaxis])[0]
+
+
+def _timestamp(stamp_ns: int) -> Timestamp:
+    seconds, nanos = divmod(stamp_ns, 1_000_000_000)
+    return Timestamp(seconds=seconds, nanos=nanos)
+
+
+def _color(text: str) -> Color:
+    red, green, blue, alpha = (byte / 255 for byte in bytes.fromhex(text.removeprefix("#")))
+    return Color(r=red, g=green, b=blue, a=alpha)

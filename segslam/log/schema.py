@@ -1,0 +1,59 @@
+"""What a log holds: topics, frames, metadata, and the version of all that."""
+
+import json
+from typing import Any
+
+from segslam.log.records import json_schema
+from segslam.types import GraphEstimate, Step, Trajectory
+
+VERSION = 1
+"""Raised whenever a reader of the version before would misread a log."""
+
+STEP = "/step"
+"""segslam.Step (JSON): all of a step but what `records.BULK` names, written after all other messages of the step."""
+ESTIMATE = "/estimate"
+"""segslam.Estimate (JSON): what an optimisation gave, and the keyframes whose poses the /trajectory before it holds."""
+RESULT = "/result"
+"""segslam.Result (JSON): the trajectory of every scan, once, after the last step and the last estimate."""
+TRANSFORMS = "/tf"
+"""foxglove.FrameTransform: lidar in odom at every scan, odom in world after every optimisation."""
+KEYFRAME = "/keyframe"
+"""segslam.KeyframePoints (protobuf): all points of the step's keyframe, for replay. See `cloud`."""
+POINTS = "/points"
+"""foxglove.PointCloud: some of each keyframe's points in the lidar frame, with labels, to look at."""
+ODOMETRY = "/odometry"
+"""foxglove.PosesInFrame: the keyframes by odometry alone, in a world that starts where odom does."""
+TRAJECTORY = "/trajectory"
+"""foxglove.PosesInFrame: the keyframes in world, after every optimisation."""
+ACCEPTED = "/loops/accepted"
+REJECTED = "/loops/rejected"
+"""foxglove.SceneUpdate: a line from each keyframe tried to the one it was tried against; a click shows the outcome."""
+GRAPH = "/graph"
+"""foxglove.SceneUpdate: all closures after every optimisation, green where trusted, red where switched off."""
+
+WORLD, ODOM, LIDAR = "world", "odom", "lidar"
+"""Frames."""
+
+RUN_METADATA = "segslam"
+"""Metadata record: schema_version, dataset, sequence, python, platform."""
+CONFIG_METADATA = "segslam.config"
+"""Metadata record: the effective settings under the key `yaml`."""
+PACKAGES_METADATA = "segslam.packages"
+"""Metadata record: package -> version."""
+
+
+def json_schemas() -> dict[str, dict[str, Any]]:
+    """Topic -> JSON Schema of its messages, for those that are no schema of Foxglove's."""
+    estimate = json_schema(GraphEstimate)
+    estimate["properties"]["keyframe_ids"] = {"type": "array", "items": {"type": "integer"}}
+    estimate["required"].append("keyframe_ids")
+    return {
+        STEP: json_schema(Step) | {"title": "segslam.Step"},
+        ESTIMATE: estimate | {"title": "segslam.Estimate"},
+        RESULT: json_schema(Trajectory) | {"title": "segslam.Result"},
+    }
+
+
+def schema_text(schema: dict[str, Any]) -> bytes:
+    """The bytes of a JSON Schema in the file; a log whose bytes differ is of another version."""
+    return json.dumps(schema).encode()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from segslam.segregator.consistency import Bits
+from segslam.segregator.bits import Bits, count_bits, lowest_bit, members
 from segslam.types import Indices
 
 _FLOOR, _SIZE, _FOUND, _NODES = range(4)  # what `state` holds: only larger cliques count; size and number of those kept
@@ -29,45 +29,18 @@ class CliqueSearch:
 def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> CliqueSearch:
     """Up to `max_cliques` cliques of the greatest size.
 
-    With fewer found than asked for and the search proved and not stopped, these are all there are, so that the set
-    does not depend on how vertices are numbered. The order is that of the search, the same on every run.
-    `max_nodes` bounds the work of finding the size, and again that of listing.
+    Fewer than that are all there are, so that the set does not depend on how vertices are numbered; the order is that
+    of the search, the same on every run. `max_nodes` bounds the work of finding the size, and again that of listing;
+    if it stops either, at least one clique is given.
     """
     if len(adjacency) == 0:
         return CliqueSearch((), True)
     order, core_numbers = _degeneracy_order(adjacency)
-    first, proved = _search(adjacency, order, core_numbers, 0, 1, max_nodes)
-    if max_cliques == 1:
-        return CliqueSearch((np.sort(first[0]),), proved)
-    listed, _ = _search(adjacency, order, core_numbers, first.shape[1] - 1, max_cliques, max_nodes)
-    return CliqueSearch(tuple(np.sort(clique) for clique in listed), proved)
-
-
-@njit("uint64(uint64)", cache=True, nogil=True, inline="always")
-def _count_bits(word):
-    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
-
-
-@njit("int64(uint64)", cache=True, nogil=True, inline="always")
-def _lowest_bit(word):
-    """Position of the lowest bit set; `word` is not 0."""
-    return np.int64(_count_bits((word & (~word + np.uint64(1))) - np.uint64(1)))
-
-
-@njit("int64(uint64[::1], int64[::1])", cache=True, nogil=True)
-def _members(row, out):
-    """Writes the positions of the bits set in `row`, ascending, and returns how many."""
-    count = 0
-    for w in range(len(row)):
-        word = row[w]
-        while word:
-            out[count] = 64 * w + _lowest_bit(word)
-            count += 1
-            word &= word - np.uint64(1)
-    return count
+    cliques, proved = _search(adjacency, order, core_numbers, 0, 1, max_nodes)
+    if proved and max_cliques > 1:
+        listed, _ = _search(adjacency, order, core_numbers, cliques.shape[1] - 1, max_cliques, max_nodes)
+        cliques = listed if len(listed) else cliques
+    return CliqueSearch(tuple(np.sort(clique) for clique in cliques), proved)
 
 
 @njit("UniTuple(int64[::1], 2)(uint64[:, ::1])", cache=True, nogil=True)
@@ -77,7 +50,7 @@ def _degeneracy_order(adjacency):
     neighbours = np.empty(count, np.int64)
     degree = np.empty(count, np.int64)
     for v in range(count):
-        degree[v] = _members(adjacency[v], neighbours)
+        degree[v] = members(adjacency[v], neighbours)
     starts = np.zeros(degree.max() + 2, np.int64)  # of the vertices of each degree in `order`
     for v in range(count):
         starts[degree[v] + 1] += 1
@@ -90,7 +63,7 @@ def _degeneracy_order(adjacency):
         cursor[degree[v]] += 1
     for step in range(count):
         v = order[step]
-        for k in range(_members(adjacency[v], neighbours)):
+        for k in range(members(adjacency[v], neighbours)):
             u = neighbours[k]
             if degree[u] > degree[v]:  # swap u to the front of its degree, then that front moves past it
                 front = max(starts[degree[u]], step + 1)
@@ -138,7 +111,7 @@ def _colour(adjacency, candidates, spare, top, branches, bounds):
         independent = uncoloured.copy()
         for w in range(words):
             while independent[w]:
-                bit = _lowest_bit(independent[w])
+                bit = lowest_bit(independent[w])
                 v = 64 * w + bit
                 uncoloured[w] &= ~(np.uint64(1) << np.uint64(bit))
                 independent[w] &= ~(np.uint64(1) << np.uint64(bit))
@@ -207,6 +180,30 @@ def _search_neighbourhood(adjacency, root, names, found, state, max_nodes):
             return
 
 
+@njit("int64[::1](uint64[:, ::1], int64)", cache=True, nogil=True)
+def _greedy_clique(adjacency, start):
+    """A clique grown from one vertex by whichever candidate leaves the most candidates."""
+    count, words = adjacency.shape
+    clique, rows = np.empty(count, np.int64), np.empty(count, np.int64)
+    clique[0], size = start, 1
+    candidates = adjacency[start].copy()
+    num_rows = members(candidates, rows)
+    while num_rows:
+        best, most = rows[0], -1
+        for k in range(num_rows):
+            left = 0
+            for w in range(words):
+                left += np.int64(count_bits(candidates[w] & adjacency[rows[k], w]))
+            if left > most:
+                best, most = rows[k], left
+        clique[size] = best
+        size += 1
+        for w in range(words):
+            candidates[w] &= adjacency[best, w]
+        num_rows = members(candidates, rows)
+    return clique[:size]
+
+
 @njit("Tuple((int64[:, ::1], boolean))(uint64[:, ::1], int64[::1], int64[::1], int64, int64, int64)",
       cache=True, nogil=True)  # fmt: skip
 def _search(adjacency, order, core_numbers, floor, room, max_nodes):
@@ -221,16 +218,19 @@ def _search(adjacency, order, core_numbers, floor, room, max_nodes):
         place[order[step]] = step
     found = np.empty((room, core_numbers.max() + 1), np.int64)
     state = np.array([floor, floor, 0, 0])
+    if room == 1:
+        _keep(_greedy_clique(adjacency, order[count - 1]), found, state)
     neighbours, later = np.empty(count, np.int64), np.empty(count, np.int64)
     for step in range(count - 1, -1, -1):
         v = order[step]
         num_later = 0
         if core_numbers[v] >= state[_FLOOR]:
-            for k in range(_members(adjacency[v], neighbours)):
+            for k in range(members(adjacency[v], neighbours)):
                 if place[neighbours[k]] > step:
                     later[num_later] = place[neighbours[k]]
                     num_later += 1
         if num_later >= state[_FLOOR]:
+            state[_NODES] += num_later  # what making this neighbourhood costs, in nodes
             candidates = order[np.sort(later[:num_later])[::-1]]
             _search_neighbourhood(_induced(adjacency, candidates), v, candidates, found, state, max_nodes)
         if state[_NODES] >= max_nodes or (room > 1 and state[_FOUND] == room):

@@ -17,15 +17,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import UInt64
 from numba import njit
 
 from segslam.config import SegregatorConfig
+from segslam.segregator.bits import Bits, pairs, part
 from segslam.segregator.correspondences import Correspondences
 from segslam.types import IndexPairs
-
-Bits = UInt64[np.ndarray, "_ _"]
-"""Adjacency, a row a vertex: bit k of word w says whether there is an edge to vertex 64 w + k."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,10 +30,8 @@ class ConsistencyGraph:
     """A vertex for each correspondence."""
 
     adjacency: Bits
-    num_edges: int
-
-    def __len__(self) -> int:
-        return len(self.adjacency)
+    edges: IndexPairs
+    """Joined pairs i < j, in ascending order."""
 
 
 def consistency_graph(correspondences: Correspondences, *, config: SegregatorConfig) -> ConsistencyGraph:
@@ -48,116 +43,115 @@ def consistency_graph(correspondences: Correspondences, *, config: SegregatorCon
         correspondences.target_index,
         config.length_bound_m,
     )
+    joined = pairs(adjacency)
     if config.gate != "lengths":
-        keep_similar = _keep_similar_spectra if config.gate == "invariant" else _keep_similar_shapes
-        keep_similar(
-            adjacency,
-            correspondences.source_covariances,
-            correspondences.target_covariances,
-            config.shape_bound_m2,
-        )
-    return ConsistencyGraph(adjacency, int(np.bitwise_count(adjacency).sum()) // 2)
-
-
-def edges(graph: ConsistencyGraph) -> IndexPairs:
-    """Joined pairs i < j, in ascending order."""
-    flags = np.unpackbits(graph.adjacency.view(np.uint8), axis=1, count=len(graph), bitorder="little")
-    return np.argwhere(np.triu(flags, 1))
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _joined(adjacency, i, j):
-    return (adjacency[i, j >> 6] >> np.uint64(j & 63)) & np.uint64(1)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _join(adjacency, i, j):
-    adjacency[i, j >> 6] |= np.uint64(1) << np.uint64(j & 63)
-    adjacency[j, i >> 6] |= np.uint64(1) << np.uint64(i & 63)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _part(adjacency, i, j):
-    adjacency[i, j >> 6] &= ~(np.uint64(1) << np.uint64(j & 63))
-    adjacency[j, i >> 6] &= ~(np.uint64(1) << np.uint64(i & 63))
-
-
-@njit("UniTuple(float64, 3)(float64[:, ::1])", cache=True, nogil=True)
-def _spectrum(m):
-    """Eigenvalues, descending, of a 3x3 matrix known to have real ones at or above 0 (rounding below 0 is cut).
-
-    Roots of the characteristic polynomial by Viete's formula for three real roots.
-    """
-    mean = (m[0, 0] + m[1, 1] + m[2, 2]) / 3.0
-    minors = (
-        m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0] + m[0, 0] * m[2, 2] - m[0, 2] * m[2, 0]
-        + m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
-    )  # fmt: skip
-    determinant = (
-        m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
-        - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
-        + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
-    )
-    p = mean * mean - minors / 3.0
-    if p <= 0.0:
-        return (max(mean, 0.0), max(mean, 0.0), max(mean, 0.0))
-    q = mean * mean * mean - 0.5 * mean * minors + 0.5 * determinant
-    third = math.acos(min(1.0, max(-1.0, q / (p * math.sqrt(p))))) / 3.0
-    reach = 2.0 * math.sqrt(p)
-    first = mean + reach * math.cos(third)
-    last = mean + reach * math.cos(third + 2.0 * math.pi / 3.0)
-    return (max(first, 0.0), max(3.0 * mean - first - last, 0.0), max(last, 0.0))
+        shape_gate = spectral_distances if config.gate == "invariant" else shape_distances
+        distances = shape_gate(joined, correspondences.source_covariances, correspondences.target_covariances)
+        kept = distances <= config.shape_bound_m2
+        part(adjacency, joined[~kept])
+        joined = joined[kept]
+    return ConsistencyGraph(adjacency, joined)
 
 
 @njit("uint64[:, ::1](float64[:, ::1], float64[:, ::1], int64[::1], int64[::1], float64)", cache=True, nogil=True)
 def _length_consistent(source, target, source_index, target_index, bound):
+    """Bits of the pairs with abs(a - b) <= bound for their lengths a, b, and with four ends.
+
+    Tested as (a^2 + b^2 - bound^2)^2 <= 4 a^2 b^2, which needs no root, a row at a time, so that it runs in SIMD.
+    """
     count = len(source)
-    adjacency = np.zeros((count, (count + 63) // 64), np.uint64)
+    words = (count + 63) // 64
+    adjacency = np.zeros((count, words), np.uint64)
+    source_x, source_y, source_z = source[:, 0].copy(), source[:, 1].copy(), source[:, 2].copy()
+    target_x, target_y, target_z = target[:, 0].copy(), target[:, 1].copy(), target[:, 2].copy()
+    joined = np.zeros(64 * words, np.uint8)
     for i in range(count):
-        for j in range(i + 1, count):
-            if source_index[i] == source_index[j] or target_index[i] == target_index[j]:
-                continue
-            a = math.sqrt(
-                (source[i, 0] - source[j, 0]) ** 2
-                + (source[i, 1] - source[j, 1]) ** 2
-                + (source[i, 2] - source[j, 2]) ** 2
-            )
-            b = math.sqrt(
-                (target[i, 0] - target[j, 0]) ** 2
-                + (target[i, 1] - target[j, 1]) ** 2
-                + (target[i, 2] - target[j, 2]) ** 2
-            )
-            if abs(a - b) <= bound:
-                _join(adjacency, i, j)
+        for j in range(count):
+            a = (source_x[j] - source_x[i]) ** 2 + (source_y[j] - source_y[i]) ** 2 + (source_z[j] - source_z[i]) ** 2
+            b = (target_x[j] - target_x[i]) ** 2 + (target_y[j] - target_y[i]) ** 2 + (target_z[j] - target_z[i]) ** 2
+            excess = a + b - bound * bound
+            apart = (source_index[j] != source_index[i]) & (target_index[j] != target_index[i])
+            joined[j] = ((excess <= 0.0) | (excess * excess <= 4.0 * a * b)) & apart
+        for w in range(words):
+            for k in range(64):
+                adjacency[i, w] |= np.uint64(joined[64 * w + k]) << np.uint64(k)
     return adjacency
 
 
-@njit("void(uint64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], float64)", cache=True, nogil=True)
-def _keep_similar_spectra(adjacency, source_covariances, target_covariances, bound):
-    """Drops the edges whose summed covariances have unlike eigenvalues on the two sides."""
-    for i in range(len(adjacency)):
-        for j in range(i + 1, len(adjacency)):
-            if _joined(adjacency, i, j):
-                a = _spectrum(source_covariances[i] + source_covariances[j])
-                b = _spectrum(target_covariances[i] + target_covariances[j])
-                difference = 0.0
-                for k in range(3):
-                    difference += (math.sqrt(a[k]) - math.sqrt(b[k])) ** 2
-                if not difference <= bound:
-                    _part(adjacency, i, j)
+@njit("float64(UniTuple(float64, 6), UniTuple(float64, 6))", cache=True, nogil=True)
+def _inner(a, b):
+    """tr(A B) of symmetric matrices given as xx, yy, zz, xy, xz, yz."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + 2.0 * (a[3] * b[3] + a[4] * b[4] + a[5] * b[5])
 
 
-@njit("void(uint64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], float64)", cache=True, nogil=True)
-def _keep_similar_shapes(adjacency, source_covariances, target_covariances, bound):
-    """Drops the edges whose summed covariances, taken as if in one frame, are far apart in Wasserstein distance."""
-    for i in range(len(adjacency)):
-        for j in range(i + 1, len(adjacency)):
-            if _joined(adjacency, i, j):
-                a = source_covariances[i] + source_covariances[j]
-                b = target_covariances[i] + target_covariances[j]
-                product = _spectrum(a @ b)  # has the eigenvalues of a^1/2 b a^1/2
-                difference = a[0, 0] + a[1, 1] + a[2, 2] + b[0, 0] + b[1, 1] + b[2, 2]
-                for k in range(3):
-                    difference -= 2.0 * math.sqrt(product[k])
-                if not difference <= bound:
-                    _part(adjacency, i, j)
+@njit("UniTuple(float64, 6)(UniTuple(float64, 6))", cache=True, nogil=True)
+def _adjugate(m):
+    xx, yy, zz, xy, xz, yz = m
+    return (
+        yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy, xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
+    )  # fmt: skip
+
+
+@njit("UniTuple(float64, 6)(float64[:, :, ::1], int64, int64)", cache=True, nogil=True)
+def _sum(covariances, i, j):
+    a, b = covariances[i], covariances[j]
+    return (
+        a[0, 0] + b[0, 0], a[1, 1] + b[1, 1], a[2, 2] + b[2, 2], a[0, 1] + b[0, 1], a[0, 2] + b[0, 2], a[1, 2] + b[1, 2]
+    )  # fmt: skip
+
+
+@njit("UniTuple(float64, 3)(float64, float64, float64)", cache=True, nogil=True)
+def _root_eigenvalues(trace, minors, determinant):
+    """Square roots, descending, of the eigenvalues of a 3x3 matrix that has real ones at or above 0.
+
+    From the characteristic polynomial, by Viete's formula for three real roots; rounding below 0 is cut.
+    """
+    mean = trace / 3.0
+    p = max(mean * mean - minors / 3.0, 0.0)
+    q = mean * mean * mean - 0.5 * mean * minors + 0.5 * determinant
+    reach = math.sqrt(p)
+    turn = math.acos(min(1.0, max(-1.0, q / (p * reach)))) / 3.0 if p > 0.0 else 0.0
+    first = mean + 2.0 * reach * math.cos(turn)
+    last = mean + 2.0 * reach * math.cos(turn + 2.0 * math.pi / 3.0)
+    return (math.sqrt(first), math.sqrt(max(trace - first - last, 0.0)), math.sqrt(max(last, 0.0)))
+
+
+@njit("float64(UniTuple(float64, 6), UniTuple(float64, 6))", cache=True, nogil=True)
+def _spectral_distance(a, b):
+    adjugate_a, adjugate_b = _adjugate(a), _adjugate(b)
+    roots_a = _root_eigenvalues(
+        a[0] + a[1] + a[2], adjugate_a[0] + adjugate_a[1] + adjugate_a[2], _inner(a, adjugate_a) / 3.0
+    )
+    roots_b = _root_eigenvalues(
+        b[0] + b[1] + b[2], adjugate_b[0] + adjugate_b[1] + adjugate_b[2], _inner(b, adjugate_b) / 3.0
+    )
+    return (roots_a[0] - roots_b[0]) ** 2 + (roots_a[1] - roots_b[1]) ** 2 + (roots_a[2] - roots_b[2]) ** 2
+
+
+@njit("float64(UniTuple(float64, 6), UniTuple(float64, 6))", cache=True, nogil=True)
+def _shape_distance(a, b):
+    """a^1/2 b a^1/2 has the eigenvalues of a b, whose invariants follow from those of a and b."""
+    adjugate_a, adjugate_b = _adjugate(a), _adjugate(b)
+    determinant = _inner(a, adjugate_a) * _inner(b, adjugate_b) / 9.0
+    roots = _root_eigenvalues(_inner(a, b), _inner(adjugate_a, adjugate_b), determinant)
+    return a[0] + a[1] + a[2] + b[0] + b[1] + b[2] - 2.0 * (roots[0] + roots[1] + roots[2])
+
+
+@njit("float64[::1](int64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])", cache=True, nogil=True)
+def spectral_distances(pairs, source_covariances, target_covariances):
+    """Of each pair, between its summed covariances on the two sides (m^2): the invariant gate."""
+    distances = np.empty(len(pairs))
+    for row in range(len(pairs)):
+        i, j = pairs[row]
+        distances[row] = _spectral_distance(_sum(source_covariances, i, j), _sum(target_covariances, i, j))
+    return distances
+
+
+@njit("float64[::1](int64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])", cache=True, nogil=True)
+def shape_distances(pairs, source_covariances, target_covariances):
+    """The same for covariances taken as if in one frame: the published gate."""
+    distances = np.empty(len(pairs))
+    for row in range(len(pairs)):
+        i, j = pairs[row]
+        distances[row] = _shape_distance(_sum(source_covariances, i, j), _sum(target_covariances, i, j))
+    return distances

@@ -125,10 +125,14 @@ def concatenate(first: Correspondences, second: Correspondences) -> Corresponden
 
 
 def _mutual_nearest_of_class(source: Description, target: Description, label: Label) -> IndexPairs:
-    source_rows = np.flatnonzero(source.feature_classes == label)
-    target_rows = np.flatnonzero(target.feature_classes == label)
+    source_rows, target_rows = _described_rows(source, label), _described_rows(target, label)
     pairs = mutual_nearest(source.feature_descriptors[source_rows], target.feature_descriptors[target_rows])
     return np.column_stack([source_rows[pairs[:, 0]], target_rows[pairs[:, 1]]])
+
+
+def _described_rows(description: Description, label: Label) -> Indices:
+    """Key points of a class, but for those without neighbours, whose descriptors are all zero and so all alike."""
+    return np.flatnonzero((description.feature_classes == label) & description.feature_descriptors.any(axis=1))
 
 
 def _collect(source: Description, target: Description, pairs: IndexPairs) -> Correspondences:

@@ -75,7 +75,7 @@ def register(
         num_inliers=int(fit.inliers.sum()),
         rms_m=fit.rms_m,
         information=point_information(source[fit.inliers], sigma_m=_axis_sigma(fit, config)),
-        num_edges=graph.num_edges,
+        num_edges=len(graph.edges),
     )
 
 

@@ -1,0 +1,64 @@
+"""Adjacency as bits: what the consistency graph and the clique search share."""
+
+import numpy as np
+from jaxtyping import UInt64
+from numba import njit
+
+Bits = UInt64[np.ndarray, "_ _"]
+"""A row a vertex: bit k of word w says whether there is an edge to vertex 64 w + k."""
+
+
+@njit("uint64(uint64)", cache=True, nogil=True, inline="always")
+def count_bits(word):
+    """How many bits are set, added up in fields of 2, 4 and 8 bits."""
+    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@njit("int64(uint64)", cache=True, nogil=True, inline="always")
+def lowest_bit(word):
+    """Position of the lowest bit set; `word` is not 0."""
+    return np.int64(count_bits((word & (~word + np.uint64(1))) - np.uint64(1)))
+
+
+@njit("int64(uint64[::1], int64[::1])", cache=True, nogil=True)
+def members(row, out):
+    """Writes the positions of the bits set in `row`, ascending, and returns how many."""
+    count = 0
+    for w in range(len(row)):
+        word = row[w]
+        while word:
+            out[count] = 64 * w + lowest_bit(word)
+            count += 1
+            word &= word - np.uint64(1)
+    return count
+
+
+@njit("int64[:, ::1](uint64[:, ::1])", cache=True, nogil=True)
+def pairs(adjacency):
+    """Joined vertices i < j, a row each, in ascending order."""
+    count = len(adjacency)
+    degrees = np.int64(0)
+    for i in range(count):
+        for w in range(adjacency.shape[1]):
+            degrees += np.int64(count_bits(adjacency[i, w]))
+    found = np.empty((degrees // 2, 2), np.int64)
+    neighbours = np.empty(count, np.int64)
+    row = 0
+    for i in range(count):
+        for k in range(members(adjacency[i], neighbours)):
+            if neighbours[k] > i:
+                found[row, 0], found[row, 1] = i, neighbours[k]
+                row += 1
+    return found
+
+
+@njit("void(uint64[:, ::1], int64[:, ::1])", cache=True, nogil=True)
+def part(adjacency, parted):
+    """Takes away the edges between the vertices of each row."""
+    for row in range(len(parted)):
+        i, j = parted[row]
+        adjacency[i, j >> 6] &= ~(np.uint64(1) << np.uint64(j & 63))
+        adjacency[j, i >> 6] &= ~(np.uint64(1) << np.uint64(i & 63))

@@ -7,6 +7,7 @@ from time import perf_counter
 
 from segslam import geometry, refine, segregator, verify
 from segslam.config import Config, VerifyConfig
+from segslam.semantics import geometric_labels
 from segslam.types import Alignment, Description, Labels, Points, Registration, Rejected, RejectReason
 
 Labeller = Callable[[Points], Labels]
@@ -24,7 +25,10 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + perf_counter() - started
+            self.add(stage, perf_counter() - started)
+
+    def add(self, stage: str, seconds: float) -> None:
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,11 +40,36 @@ class PreparedScan:
     view: verify.View
 
 
+def register(
+    source_points: Points,
+    target_points: Points,
+    *,
+    source_labels: Labels | None = None,
+    target_labels: Labels | None = None,
+    config: Config | None = None,
+) -> Alignment | Rejected:
+    """The pose of one scan in another, with no initial guess, each in its own sensor's frame (z up, metres).
+
+    Labels are learning ids, a row a point; scans without are labelled by shape. The pose is `fine.T_target_source`.
+    """
+    config = config or Config()
+    source, target = (
+        prepare_scan(points, shape_labels(points, config=config) if labels is None else labels, config=config)
+        for points, labels in ((source_points, source_labels), (target_points, target_labels))
+    )
+    return align(source, target, config=config)
+
+
+def shape_labels(points: Points, *, config: Config) -> Labels:
+    """Labels by shape alone."""
+    return geometric_labels(points, config=config.geometric)
+
+
 def prepare_scan(points: Points, labels: Labels, *, config: Config) -> PreparedScan:
     """Describe a scan and make its surface ready; `points` in the scan's own frame."""
     return PreparedScan(
         description=segregator.describe(points, labels, config=config.segregator),
-        surface=refine.prepare(points, config=config.refine),
+        surface=refine.prepare(refine.thin(points, config=config.refine), config=config.refine),
         view=verify.view(points),
     )
 

@@ -40,10 +40,18 @@ class Surface:
         return np.sqrt(squared), np.abs(to_plane)
 
 
-def prepare(points: Points, *, config: RefineConfig) -> Surface:
-    """The surface that a scan saw within `max_range_m`. May hold no points; `refine` then rejects."""
+def thin(points: Points, *, config: RefineConfig) -> Points:
+    """What alignment needs of a scan: one mean point a voxel within `max_range_m`, float32; some 100 KB."""
     near = points[within_range(points, 0.0, config.max_range_m)].astype(np.float64)
-    cloud, tree = small_gicp.preprocess_points(near, config.voxel_m, NUM_NEIGHBOURS, 1)
+    return small_gicp.voxelgrid_sampling(near, config.voxel_m, 1).points()[:, :3].astype(np.float32)
+
+
+def prepare(thinned: Points, *, config: RefineConfig) -> Surface:
+    """The surface through points that `thin` left. May hold none; `refine` then rejects."""
+    cloud = small_gicp.PointCloud(thinned.astype(np.float64))
+    tree = small_gicp.KdTree(cloud)
+    if len(thinned) >= config.min_points:
+        small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, 1)
     return Surface(cloud, tree)
 
 

@@ -4,10 +4,14 @@ from streets import corner, small_move
 
 from segslam import geometry
 from segslam.config import RefineConfig
-from segslam.refine import prepare, refine
+from segslam.refine import Surface, prepare, refine, thin
 from segslam.types import Registration, Rejected, RejectReason
 
 CONFIG = RefineConfig()
+
+
+def surface(points: np.ndarray) -> Surface:
+    return prepare(thin(points, config=CONFIG), config=CONFIG)
 
 
 def _error(T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
@@ -19,8 +23,8 @@ def _error(T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
 def test_a_coarse_pose_is_sharpened_to_centimetres(seed: int) -> None:
     rng = np.random.default_rng(seed)
     T_target_source = geometry.transform(geometry.yaw(rng.uniform(-np.pi, np.pi)), [6.0, -3.0, 0.1])
-    source = prepare(geometry.apply(geometry.inverse(T_target_source), corner(rng)), config=CONFIG)
-    target = prepare(corner(rng), config=CONFIG)
+    source = surface(geometry.apply(geometry.inverse(T_target_source), corner(rng)))
+    target = surface(corner(rng))
     coarse = T_target_source @ small_move(rng, rotation_deg=0.7, translation_m=0.2)
     found = refine(source, target, coarse, config=CONFIG)
     assert isinstance(found, Registration)
@@ -34,7 +38,7 @@ def test_information_has_the_axes_of_the_scene() -> None:
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-20, 20, (5000, 2)), rng.normal(0, 0.01, 5000)])
     raised = floor + np.array([0.0, 0.0, 0.1])
-    found = refine(prepare(floor, config=CONFIG), prepare(raised, config=CONFIG), np.eye(4), config=CONFIG)
+    found = refine(surface(floor), surface(raised), np.eye(4), config=CONFIG)
     assert isinstance(found, Registration)
     np.testing.assert_allclose(found.information, found.information.T)
     variances = np.diag(found.information)
@@ -44,16 +48,16 @@ def test_information_has_the_axes_of_the_scene() -> None:
 
 @pytest.mark.parametrize("points", [np.empty((0, 3)), np.zeros((1000, 3)), np.full((5, 3), 1.0)])
 def test_too_few_points_are_rejected(points: np.ndarray) -> None:
-    surface = prepare(points, config=CONFIG)
-    found = refine(surface, surface, np.eye(4), config=CONFIG)
+    few = surface(points)
+    found = refine(few, few, np.eye(4), config=CONFIG)
     assert isinstance(found, Rejected)
     assert found.reason is RejectReason.TOO_FEW_POINTS
 
 
 def test_scans_that_do_not_meet_are_rejected() -> None:
     rng = np.random.default_rng(1)
-    surface = prepare(corner(rng), config=CONFIG)
-    found = refine(surface, surface, geometry.transform(np.eye(3), [500.0, 0.0, 0.0]), config=CONFIG)
+    seen = surface(corner(rng))
+    found = refine(seen, seen, geometry.transform(np.eye(3), [500.0, 0.0, 0.0]), config=CONFIG)
     assert isinstance(found, Rejected)
     assert found.reason is RejectReason.REFINEMENT_DIVERGED
 
@@ -62,7 +66,7 @@ def test_scans_that_do_not_meet_are_rejected() -> None:
 def test_real_pairs_are_refined_to_the_reference(real_pairs) -> None:
     for pair in real_pairs.pairs:
         rng = np.random.default_rng(pair.source)
-        source, target = (prepare(real_pairs.points(index), config=CONFIG) for index in (pair.source, pair.target))
+        source, target = (surface(real_pairs.points(index)) for index in (pair.source, pair.target))
         coarse = pair.T_target_source @ small_move(rng, rotation_deg=0.5, translation_m=0.15)
         found = refine(source, target, coarse, config=CONFIG)
         assert isinstance(found, Registration)

@@ -10,6 +10,7 @@ from segslam.types import Registration, RejectReason
 from segslam.verify import NUM_COLUMNS, NUM_ROWS, Agreement, View, agreement, free_space_violation, rejection, view
 
 CONFIG = VerifyConfig()
+REFINE = RefineConfig()
 RIGHT = Agreement(overlap=0.9, rms_m=0.05, free_space_violation=0.0)
 
 
@@ -18,7 +19,7 @@ def _registration(num_inliers: int = 10) -> Registration:
 
 
 def _prepared(points: np.ndarray) -> tuple[refine.Surface, View]:
-    return refine.prepare(points, config=RefineConfig()), view(points)
+    return refine.prepare(refine.thin(points, config=REFINE), config=REFINE), view(points)
 
 
 def _ring(radius_m: float, *, azimuths_deg: tuple[float, float] = (-180.0, 180.0)) -> np.ndarray:

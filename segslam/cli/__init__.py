@@ -26,7 +26,7 @@ def main() -> None:
     from segslam.cli import commands
 
     logging.basicConfig(level=logging.WARNING, format="segslam: %(levelname)s: %(message)s", stream=sys.stderr)
-    commands.register(app)
+    commands.add_all(app)
     try:
         app()
     except SegslamError as error:

@@ -3,8 +3,9 @@
 import json
 import sys
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -12,6 +13,23 @@ Item = TypeVar("Item")
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="YAML file with the settings that differ.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", help="One setting, as section.key=value; may be repeated.")
+]
+DatasetOption = Annotated[
+    str | None, typer.Option("--dataset", help="Kind of data: kitti, or a reader of kiss-icp; else found from DATA.")
+]
+SequenceOption = Annotated[str, typer.Option("--sequence", help="Which sequence of the data set.")]
+FramesOption = Annotated[str | None, typer.Option("--frames", help="Scans A:B by number, B not included.")]
+LabelsOption = Annotated[
+    str,
+    typer.Option("--labels", help="auto (labels/ where there is one, else geometric), none, geometric, or a folder."),
+]
+EncodingOption = Annotated[
+    Literal["raw", "learning", "learning-0"] | None,
+    typer.Option("--encoding", help="Of label files whose ids cannot tell: raw, learning (0-19), learning-0 (0-18)."),
+]
 
 
 def print_json(values: dict[str, Any]) -> None:

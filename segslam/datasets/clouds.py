@@ -39,7 +39,7 @@ def _read_by_open3d(file: Path) -> Points:
     import open3d
 
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        cloud = open3d.io.read_point_cloud(str(file))
+        cloud = open3d.io.read_point_cloud(file)
     points = np.asarray(cloud.points)
     if not len(points):
         raise SegslamError(f"{file}: no points could be read; is it a whole {file.suffix} file?")

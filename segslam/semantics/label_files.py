@@ -28,15 +28,7 @@ class LabelFiles:
         Raises BadScan if the file is broken, has not `num_points` labels, or ids that its encoding does not have.
         """
         file = self.folder / f"{name}.label"
-        if not file.exists():
-            return unlabelled(num_points)
-        ids = read_ids(file)
-        if len(ids) != num_points:
-            raise BadScan(f"{file}: {len(ids)} labels for {num_points} points; labels and scan are not of one sweep")
-        try:
-            return to_labels(ids, self.encoding)
-        except SegslamError as error:
-            raise BadScan(f"{file}: {error}") from error
+        return read_labels(file, num_points, self.encoding) if file.exists() else unlabelled(num_points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +82,28 @@ def read_ids(file: Path) -> Ids:
     return np.frombuffer(content, dtype="<u4") & 0xFFFF
 
 
+def read_labels(file: Path, num_points: int, encoding: Encoding) -> Labels:
+    """The labels of a scan of `num_points`.
+
+    Raises BadScan if the file is missing, broken or of another length, or has ids that the encoding does not have.
+    """
+    ids = read_ids(file)
+    if len(ids) != num_points:
+        raise BadScan(f"{file}: {len(ids)} labels for {num_points} points; labels and scan are not of one sweep")
+    try:
+        return to_labels(ids, encoding)
+    except SegslamError as error:
+        raise BadScan(f"{file}: {error}") from error
+
+
+def encoding_of(files: Sequence[Path]) -> Encoding:
+    """The encoding of some label files, told from all together. Raises SegslamError if it cannot be told."""
+    try:
+        return detect_encoding(sum((_histogram(file) for file in files), np.zeros(2**16, dtype=np.int64)))
+    except SegslamError as error:
+        raise SegslamError(f"{files[0].parent}: {error}") from error
+
+
 def unlabelled(num_points: int) -> Labels:
     """No knowledge of any point."""
     return np.full(num_points, Label.UNLABELLED, dtype=np.uint8)
@@ -103,18 +117,13 @@ def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | N
     named = _labelled(folder, scan_names)
     if len(named) < len(scan_names):
         logger.warning("%s: %d of %d scans have no label file", folder, len(scan_names) - len(named), len(scan_names))
-    return LabelFiles(folder, encoding or _encoding_of(folder, named))
+    return LabelFiles(folder, encoding or encoding_of(_spread(folder, named)))
 
 
-def _encoding_of(folder: Path, names: list[str]) -> Encoding:
+def _spread(folder: Path, names: list[str]) -> list[Path]:
+    """Files to tell the encoding from, spread over the drive."""
     rows = np.unique(np.linspace(0, len(names) - 1, FILES_LOOKED_AT).astype(int))
-    num_points_of_id = sum(
-        (_histogram(folder / f"{names[row]}.label") for row in rows), np.zeros(2**16, dtype=np.int64)
-    )
-    try:
-        return detect_encoding(num_points_of_id)
-    except SegslamError as error:
-        raise SegslamError(f"{folder}: {error}") from error
+    return [folder / f"{names[row]}.label" for row in rows]
 
 
 def _histogram(file: Path) -> Histogram:

@@ -1,0 +1,5 @@
+"""`python -m segslam`."""
+
+from segslam.cli import main
+
+main()

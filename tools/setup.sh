@@ -1,0 +1,45 @@
+# Sourced by the other scripts: makes all that segslam needs on a fresh Debian or Ubuntu machine, and reuses it after.
+# Sets PYTHON to the interpreter of the virtual environment (.venv, or the folder that SEGSLAM_VENV names).
+# Usage: . tools/setup.sh [EXTRA]        EXTRA: an extra of pyproject.toml, such as dev
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+venv=${SEGSLAM_VENV:-$root/.venv}
+extra=${1:-}
+
+install_packages() {
+    local sudo=
+    [ "$(id -u)" = 0 ] || sudo=sudo
+    echo "installing system packages: $*" >&2
+    $sudo apt-get update -qq >&2
+    DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "$@" >&2
+}
+
+system_packages() {
+    local missing=()
+    # What Open3D's wheel loads, by the library that it asks for.
+    for pair in libusb-1.0.so.0=libusb-1.0-0 libGL.so.1=libgl1 libEGL.so.1=libegl1 libgomp.so.1=libgomp1; do
+        ldconfig -p | grep -q "${pair%%=*}" || missing+=("${pair##*=}")
+    done
+    python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3 python3-venv)
+    if [ ${#missing[@]} -gt 0 ]; then
+        command -v apt-get >/dev/null || { echo "setup: install by hand: ${missing[*]}" >&2; return 1; }
+        install_packages "${missing[@]}"
+    fi
+}
+
+python_packages() {
+    local wanted stamp="$venv/.segslam-installed"
+    wanted=$(cat "$root/pyproject.toml" <(printf '%s\n%s\n' "$root" "$extra") | sha256sum)
+    grep -qsxF "$wanted" "$stamp" && return
+    python3 -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || {
+        echo "setup: segslam runs on Python 3.11 to 3.13, python3 is $(python3 --version)" >&2
+        return 1
+    }
+    [ -x "$venv/bin/python" ] || python3 -m venv "$venv"
+    echo "installing Python packages into $venv" >&2
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$root${extra:+[$extra]}" >&2
+    echo "$wanted" >> "$stamp"
+}
+
+system_packages && python_packages || exit 1
+PYTHON=$venv/bin/python

@@ -161,6 +161,31 @@ def test_a_run_without_an_end_has_no_result(whole: Path) -> None:
     assert read_log(whole).result() is None
 
 
+def test_the_reference_and_the_calibration_are_kept_for_a_replay(steps: list[Step], tmp_path: Path) -> None:
+    _, reference = _result(steps)
+    T_camera_lidar = steps[3].T_odom_lidar
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG, reference=reference, T_camera_lidar=T_camera_lidar) as log:
+        log.write(steps[0])
+    log = read_log(tmp_path / "log.mcap")
+    _assert_same(reference, log.reference())
+    np.testing.assert_array_equal(T_camera_lidar, log.T_camera_lidar)
+    path = _decoded(tmp_path / "log.mcap", schema.GROUND_TRUTH)[0].poses
+    assert len(path) == len(reference)
+    first = path[0].position
+    np.testing.assert_allclose([first.x, first.y, first.z], 0, atol=1e-12)
+
+
+def test_a_log_without_ground_truth_has_no_reference_and_no_calibration(whole: Path) -> None:
+    assert read_log(whole).reference() is None
+    assert read_log(whole).T_camera_lidar is None
+
+
+def test_steps_are_counted_with_an_index_and_without(steps: list[Step], whole: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[: _boundaries(whole)[22] + 5])
+    assert (read_log(whole).num_steps(), read_log(cut).num_steps()) == (len(steps), 23)
+
+
 def test_settings_and_versions_are_in_the_metadata(steps: list[Step], tmp_path: Path) -> None:
     config = Config.model_validate({"verify": {"min_overlap": 0.37}})
     log = read_log(_write(tmp_path / "log.mcap", steps[:1], config))
@@ -201,17 +226,18 @@ def test_any_mcap_reader_finds_the_index_and_the_checksums_in_order(steps: list[
 
 
 def test_own_messages_agree_with_the_json_schemas_in_the_file(steps: list[Step], tmp_path: Path) -> None:
-    with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
+    estimate, trajectory = _result(steps)
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG, reference=trajectory) as log:
         for step in steps:
             log.write(step)
-        log.write_result(*_result(steps))
+        log.write_result(estimate, trajectory)
     topics = set()
     with (tmp_path / "log.mcap").open("rb") as stream:
         for found, channel, message in make_reader(stream).iter_messages():
             if found.encoding == "jsonschema":
                 jsonschema.validate(json.loads(message.data), json.loads(found.data))
                 topics.add(channel.topic)
-    assert topics == {schema.STEP, schema.ESTIMATE, schema.RESULT}
+    assert topics == {schema.STEP, schema.ESTIMATE, schema.RESULT, schema.REFERENCE}
 
 
 def test_fields_left_out_of_the_json_exist() -> None:

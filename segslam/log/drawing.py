@@ -10,7 +10,17 @@ from segslam import geometry
 from segslam.config import LogConfig
 from segslam.log import foxglove, schema
 from segslam.log.records import to_json
-from segslam.types import GraphEstimate, Keyframe, LoopAttempt, Rejected, RejectReason, Step, Transform, Vector
+from segslam.types import (
+    GraphEstimate,
+    Keyframe,
+    LoopAttempt,
+    Rejected,
+    RejectReason,
+    Step,
+    Trajectory,
+    Transform,
+    Vector,
+)
 
 ACCEPTED_COLOR = "#2ca02cff"
 REJECTED_COLORS = {
@@ -123,6 +133,13 @@ class Drawing:
         if keyframe_id in self._T_world_keyframe:
             return self._T_world_keyframe[keyframe_id][:3, 3]
         return (self._T_world_odom @ self._T_odom_keyframe[keyframe_id])[:3, 3]
+
+
+def ground_truth(reference: Trajectory, *, stamp_ns: int) -> Topical:
+    """The true path, from the origin of world on."""
+    T_first_true = geometry.inverse(reference.T_world_lidar[0])
+    path = (T_first_true @ T_true_lidar for T_true_lidar in reference.T_world_lidar)
+    return schema.GROUND_TRUTH, foxglove.poses_in_frame(path, frame=schema.WORLD, stamp_ns=stamp_ns)
 
 
 def weight_color(weight: float) -> str:

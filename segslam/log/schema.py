@@ -15,6 +15,8 @@ ESTIMATE = "/estimate"
 """segslam.Estimate (JSON): what an optimisation gave, and the keyframes whose poses the /trajectory before it holds."""
 RESULT = "/result"
 """segslam.Result (JSON): the trajectory of every scan, once, after the last step and the last estimate."""
+REFERENCE = "/reference"
+"""segslam.Reference (JSON): the true poses of the scans, where they are known, before the first step."""
 TRANSFORMS = "/tf"
 """foxglove.FrameTransform: lidar in odom at every scan, odom in world after every optimisation."""
 KEYFRAME = "/keyframe"
@@ -25,6 +27,8 @@ ODOMETRY = "/odometry"
 """foxglove.PosesInFrame: the keyframes by odometry alone, in a world that starts where odom does."""
 TRAJECTORY = "/trajectory"
 """foxglove.PosesInFrame: the keyframes in world, after every optimisation."""
+GROUND_TRUTH = "/ground_truth"
+"""foxglove.PosesInFrame: the reference in world, moved so that it starts where odom does."""
 ACCEPTED = "/loops/accepted"
 REJECTED = "/loops/rejected"
 """foxglove.SceneUpdate: a line from each keyframe tried to the one it was tried against; a click shows the outcome."""
@@ -35,7 +39,7 @@ WORLD, ODOM, LIDAR = "world", "odom", "lidar"
 """Frames."""
 
 RUN_METADATA = "segslam"
-"""Metadata record: schema_version, dataset, sequence, python, platform."""
+"""Metadata record: schema_version, dataset, sequence, python, platform, and T_camera_lidar (JSON) for KITTI."""
 CONFIG_METADATA = "segslam.config"
 """Metadata record: the effective settings under the key `yaml`."""
 PACKAGES_METADATA = "segslam.packages"
@@ -51,6 +55,7 @@ def json_schemas() -> dict[str, dict[str, Any]]:
         STEP: json_schema(Step) | {"title": "segslam.Step"},
         ESTIMATE: estimate | {"title": "segslam.Estimate"},
         RESULT: json_schema(Trajectory) | {"title": "segslam.Result"},
+        REFERENCE: json_schema(Trajectory) | {"title": "segslam.Reference"},
     }
 
 

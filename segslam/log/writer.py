@@ -19,9 +19,9 @@ from mcap_protobuf.schema import register_schema
 from segslam.config import Config, config_to_yaml
 from segslam.log import schema
 from segslam.log.cloud import KeyframePoints, keyframe_points
-from segslam.log.drawing import Drawing
+from segslam.log.drawing import Drawing, ground_truth
 from segslam.log.records import to_json
-from segslam.types import GraphEstimate, Keyframe, SegslamError, Step, Trajectory
+from segslam.types import GraphEstimate, Keyframe, SegslamError, Step, Trajectory, Transform
 
 PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
 """Whose versions a log records: those that its figures depend on."""
@@ -31,6 +31,7 @@ PROTOBUF_TOPICS = {
     schema.POINTS: PointCloud,
     schema.ODOMETRY: PosesInFrame,
     schema.TRAJECTORY: PosesInFrame,
+    schema.GROUND_TRUTH: PosesInFrame,
     schema.ACCEPTED: SceneUpdate,
     schema.REJECTED: SceneUpdate,
     schema.GRAPH: SceneUpdate,
@@ -46,7 +47,17 @@ class LogWriter:
     SegslamError and leaves a file that ends with the last complete step.
     """
 
-    def __init__(self, path: Path, *, config: Config, dataset: str = "", sequence: str = "") -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        config: Config,
+        dataset: str = "",
+        sequence: str = "",
+        T_camera_lidar: Transform | None = None,
+        reference: Trajectory | None = None,
+    ) -> None:
+        """`reference` holds true poses and `T_camera_lidar` the calibration, for KITTI: a replay has nothing else."""
         self._path = path
         self._drawing = Drawing(config.log)
         self._resolution_m = config.keyframes.resolution_m
@@ -62,9 +73,11 @@ class LogWriter:
         )
         with self._guarded():
             self._mcap.start(library=f"segslam {version('segslam')}")
-            for name, data in _metadata(config, dataset, sequence).items():
+            for name, data in _metadata(config, dataset, sequence, T_camera_lidar).items():
                 self._mcap.add_metadata(name, data)
             self._channels = _register_channels(self._mcap)
+            if reference is not None and len(reference):
+                self._add_reference(reference)
 
     def write(self, step: Step) -> None:
         """Add a step. Raises SegslamError if the disk is full or fails; what was complete before stays readable."""
@@ -103,6 +116,12 @@ class LogWriter:
 
     def _add(self, topic: str, data: bytes) -> None:
         self._mcap.add_message(self._channels[topic], self._stamp_ns, data, self._stamp_ns)
+
+    def _add_reference(self, reference: Trajectory) -> None:
+        self._stamp_ns = int(reference.stamp_ns[0])
+        topic, path = ground_truth(reference, stamp_ns=self._stamp_ns)
+        self._add(topic, path.SerializeToString())
+        self._add(schema.REFERENCE, _json(to_json(reference)))
 
     def _add_points(self, keyframe: Keyframe) -> None:
         message = keyframe_points(keyframe.points, keyframe.labels, resolution_m=self._resolution_m)
@@ -177,7 +196,10 @@ def _register_channels(mcap: Writer) -> dict[str, int]:
     return protobuf | own
 
 
-def _metadata(config: Config, dataset: str, sequence: str) -> dict[str, dict[str, str]]:
+def _metadata(
+    config: Config, dataset: str, sequence: str, T_camera_lidar: Transform | None
+) -> dict[str, dict[str, str]]:
+    calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
     return {
         schema.RUN_METADATA: {
             "schema_version": str(schema.VERSION),
@@ -185,6 +207,7 @@ def _metadata(config: Config, dataset: str, sequence: str) -> dict[str, dict[str
             "sequence": sequence,
             "python": platform.python_version(),
             "platform": platform.platform(),
+            **calibration,
         },
         schema.CONFIG_METADATA: {"yaml": config_to_yaml(config)},
         schema.PACKAGES_METADATA: {name: _version(name) for name in PACKAGES},

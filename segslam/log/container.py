@@ -1,0 +1,110 @@
+"""MCAP files as they come: whole, cut in mid-record by a kill or a full disk, or damaged by a power failure."""
+
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
+
+_DAMAGE = (ValueError, struct.error, McapError, ZstdError, RuntimeError)
+"""What reading damaged data raises: a wrong checksum, a short field, data that zstd or lz4 cannot decompress."""
+_RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode and length, before each record."""
+
+
+class CutError(Exception):
+    """The file ends, or makes no sense, from this byte on."""
+
+    def __init__(self, offset: int) -> None:
+        super().__init__(f"byte {offset}")
+        self.offset = offset
+
+
+class Stored(NamedTuple):
+    """A message."""
+
+    topic: str
+    schema: Schema
+    data: bytes
+
+
+def messages(path: Path) -> Iterator[Stored]:
+    """Each message in the order of the file. Raises CutError at a cut, after what is whole before it."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    with path.open("rb") as stream:
+        for offset, opcode, body in _records(stream):
+            for record in _records_of_chunk(offset, body) if opcode == Opcode.CHUNK else ():
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    channel = channels[record.channel_id]
+                    yield Stored(channel.topic, schemas[channel.schema_id], record.data)
+
+
+def metadata(path: Path) -> dict[str, dict[str, str]]:
+    """The metadata before the first message, by name. Raises CutError, or OSError if the file cannot be opened."""
+    found: dict[str, dict[str, str]] = {}
+    with path.open("rb") as stream:
+        for _, opcode, body in _records(stream):
+            if opcode == Opcode.CHUNK:
+                break
+            if opcode == Opcode.METADATA:
+                record = Metadata.read(ReadDataStream(BytesIO(body)))
+                found[record.name] = record.metadata
+    return found
+
+
+def count(path: Path, topic: str) -> int:
+    """How many messages a topic has: by the index where the file has one, or else by reading."""
+    with path.open("rb") as stream, suppress(*_DAMAGE):
+        summary = make_reader(stream).get_summary()
+        if summary is not None and summary.statistics is not None:
+            counts = summary.statistics.channel_message_counts
+            return sum(counts.get(channel.id, 0) for channel in summary.channels.values() if channel.topic == topic)
+    number = 0
+    with suppress(CutError):
+        for message in messages(path):
+            number += message.topic == topic
+    return number
+
+
+def _records(stream: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
+    """Offset, opcode and body of each record from the start of a file to the end of its data.
+
+    Raises CutError for a record that is not whole, and for a file that is not MCAP.
+    """
+    if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        raise CutError(0)
+    while True:
+        offset, head = stream.tell(), stream.read(_RECORD_HEAD.size)
+        if len(head) < _RECORD_HEAD.size:
+            raise CutError(offset)
+        opcode, length = _RECORD_HEAD.unpack(head)
+        if opcode not in set(Opcode):  # after a power failure: a page that was never written reads as zeros
+            raise CutError(offset)
+        body = stream.read(length)
+        if len(body) < length:
+            raise CutError(offset)
+        if opcode == Opcode.DATA_END:
+            return
+        yield offset, opcode, body
+
+
+def _records_of_chunk(offset: int, body: bytes) -> list[object]:
+    try:
+        return list(breakup_chunk(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True))
+    except _DAMAGE as error:
+        raise CutError(offset) from error

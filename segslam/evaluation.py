@@ -1,0 +1,161 @@
+"""How far an estimate is from the truth. Rows of the two belong together; both are poses of the same body.
+
+Absolute errors are what remains after the rigid motion, without scale, that best lays the estimate on the truth.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation as ScipyRotation
+
+from segslam import geometry
+from segslam.trajectory import Poses, travelled_m
+from segslam.types import IndexPairs, Points, Transform, Vector
+
+Flags = Bool[np.ndarray, "_"]
+
+Z_UP = (0.0, 0.0, 1.0)
+"""Upwards in a LiDAR's frames."""
+CAMERA_UP = (0.0, -1.0, 0.0)
+"""Upwards in KITTI's camera frames, x right, y down, z ahead."""
+MIN_POSES = 3  # fewer are aligned without error, whatever they are
+LINE_TOLERANCE = 1e-6  # share of the spread across the main direction below which positions are on a line
+
+SEGMENT_LENGTHS_M = tuple(range(100, 801, 100))
+SEGMENT_STEP = 10
+"""Scans between the starts of KITTI's segments."""
+
+FALSE_LOOP_M = 2.0
+FALSE_LOOP_DEG = 5.0
+REVISIT_M = 4.0
+"""A keyframe this near to an older one sees what that one saw."""
+REVISIT_MIN_TRAVEL_M = 50.0
+FOUND_WITHIN_M = 10.0  # chosen: a closure corrects the drift of the revisit around it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseErrors:
+    """Of each row: metres and degrees."""
+
+    translation_m: Vector
+    rotation_deg: Vector
+
+
+def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, float, float] = Z_UP) -> dict[str, float]:
+    """The figures of `metrics.json` that two trajectories give, those that can be known.
+
+    ate_m, are_deg, height_m: root mean squares after alignment; the last along `up` of the reference's frame.
+    rpe_m, rpe_deg: root mean squares of the motion from each row to the next. kitti_translation_percent,
+    kitti_rotation_deg_per_100m: means over KITTI's segments, left out if the drive is shorter than 100 m.
+    Nothing at all for fewer than 3 rows; no are_deg and height_m for positions on a line, about which they may turn.
+    """
+    if len(reference) < MIN_POSES:
+        return {}
+    T_reference_estimate = align(estimate[:, :3, 3], reference[:, :3, 3])
+    aligned = T_reference_estimate @ estimate
+    absolute = pose_errors(aligned, reference)
+    relative = relative_errors(estimate, reference)
+    metrics = {
+        "ate_m": _rms(absolute.translation_m),
+        "rpe_m": _rms(relative.translation_m),
+        "rpe_deg": _rms(relative.rotation_deg),
+    }
+    if not _on_a_line(reference[:, :3, 3]):
+        metrics["are_deg"] = _rms(absolute.rotation_deg)
+        metrics["height_m"] = _rms((aligned - reference)[:, :3, 3] @ np.array(up))
+    segments = segment_errors(estimate, reference)
+    if len(segments.translation_m):
+        metrics["kitti_translation_percent"] = float(100 * segments.translation_m.mean())
+        metrics["kitti_rotation_deg_per_100m"] = float(100 * segments.rotation_deg.mean())
+    return metrics
+
+
+def align(source: Points, target: Points) -> Transform:
+    """T_target_source that brings matched points together in least squares (Umeyama, PAMI 1991, with scale 1).
+
+    For points on a line the turn about it is arbitrary. Raises ValueError for no points, or another number of them.
+    """
+    if len(source) == 0 or source.shape != target.shape:
+        raise ValueError(f"cannot align {len(source)} points with {len(target)}")
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    covariance = (target - target_mean).T @ (source - source_mean) / len(source)  # Eq. (38)
+    u, _, vt = np.linalg.svd(covariance)
+    keep_handedness = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # Eq. (43)
+    rotation = u @ keep_handedness @ vt  # Eq. (40)
+    return geometry.transform(rotation, target_mean - rotation @ source_mean)  # Eq. (41)
+
+
+def pose_errors(estimate: Poses, reference: Poses) -> PoseErrors:
+    """Distance and angle between poses of the same frame, row by row."""
+    difference = np.linalg.inv(reference) @ estimate
+    return PoseErrors(np.linalg.norm(difference[:, :3, 3], axis=1), _angles_deg(difference))
+
+
+def relative_errors(estimate: Poses, reference: Poses) -> PoseErrors:
+    """Errors of the motion from each row to the next, one row fewer than the poses."""
+    motions = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (estimate, reference))
+    return pose_errors(*motions)
+
+
+def segment_errors(estimate: Poses, reference: Poses) -> PoseErrors:
+    """KITTI's errors of segments of 100 to 800 m (Geiger et al. 2012): both fields are per metre of the segment.
+
+    A segment starts at every tenth row and ends at the first that is farther along the true path than its length.
+    """
+    travel_m = travelled_m(reference)
+    starts, lengths = np.meshgrid(np.arange(0, len(reference), SEGMENT_STEP), SEGMENT_LENGTHS_M, indexing="ij")
+    ends = np.searchsorted(travel_m, travel_m[starts] + lengths, side="right")
+    inside = ends < len(reference)
+    starts, ends, lengths = starts[inside], ends[inside], lengths[inside]
+    motions = (np.linalg.inv(poses[starts]) @ poses[ends] for poses in (estimate, reference))
+    errors = pose_errors(*motions)
+    return PoseErrors(errors.translation_m / lengths, errors.rotation_deg / lengths)
+
+
+def loop_metrics(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> dict[str, float]:
+    """How many accepted loops are false, and how many revisits have a true one.
+
+    `reference` has a row a keyframe, in order of time; `rows` names the (source, target) of each closure in it.
+    A closure is false if off by more than 2 m or 5 degrees. loop_precision is left out without closures; loop_recall,
+    the share of revisiting keyframes with a true closure at most 10 m of travel away, without revisits.
+    """
+    truth = np.linalg.inv(reference[rows[:, 1]]) @ reference[rows[:, 0]]
+    errors = pose_errors(T_target_source, truth)
+    false = (errors.translation_m > FALSE_LOOP_M) | (errors.rotation_deg > FALSE_LOOP_DEG)
+    metrics: dict[str, float] = {"num_loops_false": int(false.sum())}
+    if len(rows):
+        metrics["loop_precision"] = float(1 - false.mean())
+    revisiting = np.flatnonzero(revisits(reference))
+    if len(revisiting):
+        travel_m = travelled_m(reference)
+        closed_m = travel_m[rows[~false, 0]]
+        away_m = np.abs(travel_m[revisiting, None] - closed_m[None]).min(axis=1, initial=np.inf)
+        metrics["loop_recall"] = float((away_m <= FOUND_WITHIN_M).mean())
+    return metrics
+
+
+def revisits(reference: Poses) -> Flags:
+    """Which poses lie within 4 m of one that was left at least 50 m of travel before."""
+    travel_m = travelled_m(reference)
+    near = cKDTree(reference[:, :3, 3]).query_pairs(REVISIT_M, output_type="ndarray")  # the older row first
+    far_in_travel = travel_m[near[:, 1]] - travel_m[near[:, 0]] >= REVISIT_MIN_TRAVEL_M
+    result = np.zeros(len(reference), dtype=bool)
+    result[near[far_in_travel, 1]] = True
+    return result
+
+
+def _on_a_line(positions: Points) -> bool:
+    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    return bool(spread[1] <= LINE_TOLERANCE * spread[0])
+
+
+def _angles_deg(T_a_b: Poses) -> Vector:
+    if len(T_a_b) == 0:
+        return np.empty(0)
+    return np.degrees(ScipyRotation.from_matrix(T_a_b[:, :3, :3]).magnitude())
+
+
+def _rms(values: Vector) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

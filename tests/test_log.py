@@ -24,7 +24,7 @@ from segslam.config import Config
 from segslam.log import LogWriter, read_log, schema
 from segslam.log.cloud import keyframe_points, points_and_labels
 from segslam.log.drawing import REJECTED_COLORS, weight_color
-from segslam.log.records import BULK, json_schema
+from segslam.log.records import BULK, codec
 from segslam.types import (
     Alignment,
     GraphEstimate,
@@ -243,7 +243,24 @@ def test_own_messages_agree_with_the_json_schemas_in_the_file(steps: list[Step],
 def test_fields_left_out_of_the_json_exist() -> None:
     for record, names in BULK.items():
         assert names <= {field.name for field in fields(record)}
-        assert not names & set(json_schema(record)["properties"])
+        assert not names & set(codec(record).schema["properties"])
+
+
+def test_schemas_keep_to_what_foxglove_parses() -> None:
+    """Its parser wants `properties` in every object, and arrays of numbers, texts or objects only."""
+
+    def check(values: dict[str, Any]) -> None:
+        assert values["type"] in {"boolean", "integer", "number", "string", "object", "array"}
+        if values["type"] == "object":
+            for inner in values["properties"].values():
+                check(inner)
+        if values["type"] == "array":
+            assert values["items"]["type"] != "array"
+            check(values["items"])
+
+    for values in schema.json_schemas().values():
+        assert values["type"] == "object"
+        check(values)
 
 
 def _decoded(path: Path, topic: str) -> list[Any]:
@@ -284,12 +301,12 @@ def test_each_attempt_is_a_line_between_its_keyframes_with_its_outcome(steps: li
     assert len(entities) == len(rejected) > 0
     for entity in entities:
         metadata = {pair.key: pair.value for pair in entity.metadata}
-        assert metadata["outcome.reason"] == "low_overlap"
-        assert metadata["outcome.detail"] == "0.31 < 0.5"
+        assert metadata["outcome.Rejected.reason"] == "low_overlap"
+        assert metadata["outcome.Rejected.detail"] == "0.31 < 0.5"
         assert len(entity.lines[0].points) == 2
     accepted = [entity for message in _decoded(whole, schema.ACCEPTED) for entity in message.entities]
     assert len(accepted) == len(attempts) - len(rejected) > 0
-    assert {pair.key: pair.value for pair in accepted[0].metadata}["outcome.alignment.overlap"] == "0.71"
+    assert {pair.key: pair.value for pair in accepted[0].metadata}["outcome.LoopClosure.alignment.overlap"] == "0.71"
     step = next(step for step in steps if step.estimate is not None)
     ends = [[point.x, point.y, point.z] for point in accepted[0].lines[0].points]
     source_id = step.attempts[0].candidate.source_id
@@ -461,3 +478,38 @@ def test_a_step_that_contradicts_its_schema_is_refused(tmp_path: Path) -> None:
     log = read_log(_foreign(tmp_path / "broken.mcap", metadata, step_schema))
     with pytest.raises(SegslamError, match="not as segslam writes it"):
         list(log.steps())
+
+
+LAYOUT = json.loads((Path(__file__).parents[1] / "configs" / "foxglove_layout.json").read_text())
+
+
+def _panels(node: str | dict[str, Any]) -> list[str]:
+    return [node] if isinstance(node, str) else _panels(node["first"]) + _panels(node["second"])
+
+
+def test_the_layout_shows_each_of_its_panels_once() -> None:
+    assert sorted(_panels(LAYOUT["layout"])) == sorted(LAYOUT["configById"])
+
+
+def test_the_layout_draws_all_that_the_log_has_to_draw(whole: Path) -> None:
+    with whole.open("rb") as stream:
+        channels = make_reader(stream).get_summary().channels.values()
+    frames = {schema.WORLD, schema.ODOM, schema.LIDAR}
+    topics = {channel.topic for channel in channels if channel.message_encoding == "protobuf"}
+    panel = LAYOUT["configById"]["3D!segslam"]
+    assert set(panel["topics"]) == topics - {schema.TRANSFORMS, schema.KEYFRAME}
+    assert {name.removeprefix("frame:") for name in panel["transforms"]} == frames
+    assert panel["followTf"] in frames
+
+
+def test_the_layout_plots_numbers_that_the_log_has() -> None:
+    schemas = schema.json_schemas()
+    plots = [panel for name, panel in LAYOUT["configById"].items() if name.startswith("Plot!")]
+    for path in (path["value"] for panel in plots for path in panel["paths"]):
+        topic, *keys = path.split(".")
+        values = schemas[topic]
+        for key in keys:
+            name, is_array, _ = key.partition("[:]")
+            values = values["properties"].get(name) or values["additionalProperties"]
+            values = values["items"] if is_array else values
+        assert values["type"] in {"number", "integer"}

@@ -9,7 +9,7 @@ from google.protobuf.message import Message
 from segslam import geometry
 from segslam.config import LogConfig
 from segslam.log import foxglove, schema
-from segslam.log.records import to_json
+from segslam.log.records import codec
 from segslam.types import (
     GraphEstimate,
     Keyframe,
@@ -60,8 +60,6 @@ class Drawing:
 
     def draw(self, step: Step) -> Iterator[Topical]:
         """The messages of the next step."""
-        if not self._num_on_path:
-            yield self._odom_in_world(step.stamp_ns)
         yield (
             schema.TRANSFORMS,
             foxglove.frame_transform(step.T_odom_lidar, parent=schema.ODOM, child=schema.LIDAR, stamp_ns=step.stamp_ns),
@@ -69,10 +67,12 @@ class Drawing:
         if step.keyframe is not None:
             yield from self._keyframe(step.keyframe)
         if step.estimate is not None:
-            yield from self.estimate(step.estimate, stamp_ns=step.stamp_ns)
+            yield from self.draw_estimate(step.estimate, stamp_ns=step.stamp_ns)
+        else:
+            yield self._odom_in_world(step.stamp_ns)
         yield from self._attempts(step.attempts, step.stamp_ns)
 
-    def estimate(self, estimate: GraphEstimate, *, stamp_ns: int) -> Iterator[Topical]:
+    def draw_estimate(self, estimate: GraphEstimate, *, stamp_ns: int) -> Iterator[Topical]:
         """The corrected path, where odom lies now, and the closures."""
         self._T_world_keyframe = estimate.T_world_keyframe
         last = max(estimate.T_world_keyframe)
@@ -83,6 +83,7 @@ class Drawing:
         yield schema.GRAPH, self._graph(estimate, stamp_ns)
 
     def _odom_in_world(self, stamp_ns: int) -> Topical:
+        """Wanted at every step: viewers interpolate, and a correction would begin before the step that made it."""
         return schema.TRANSFORMS, foxglove.frame_transform(
             self._T_world_odom, parent=schema.WORLD, child=schema.ODOM, stamp_ns=stamp_ns
         )
@@ -116,7 +117,7 @@ class Drawing:
         return foxglove.entity(
             f"{pair[0]} to {pair[1]}",
             foxglove.line([self._position(keyframe_id) for keyframe_id in pair], [color]),
-            numbers_and_words(to_json(attempt)),
+            numbers_and_words(codec(LoopAttempt).encode(attempt)),
             frame=schema.WORLD,
             stamp_ns=stamp_ns,
         )

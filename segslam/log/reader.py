@@ -17,7 +17,7 @@ from segslam.log import container, schema
 from segslam.log.cloud import KeyframePoints, points_and_labels
 from segslam.log.container import CutError
 from segslam.log.foxglove import transforms
-from segslam.log.records import from_json
+from segslam.log.records import codec
 from segslam.types import GraphEstimate, Keyframe, SegslamError, Step, Trajectory, Transform
 
 logger = logging.getLogger(__name__)
@@ -135,7 +135,7 @@ def _step(parts: Parts) -> Step:
         points, labels = points_and_labels(KeyframePoints.FromString(parts[schema.KEYFRAME]))
         keyframe = {"points": points, "labels": labels}
     estimate = _estimate(parts) if schema.ESTIMATE in parts else None
-    return from_json(Step, json.loads(parts[schema.STEP]), {Step: {"estimate": estimate}, Keyframe: keyframe})
+    return codec(Step).decode(json.loads(parts[schema.STEP]), {Step: {"estimate": estimate}, Keyframe: keyframe})
 
 
 def _estimate(parts: Parts) -> GraphEstimate:
@@ -143,8 +143,8 @@ def _estimate(parts: Parts) -> GraphEstimate:
     values = json.loads(parts[schema.ESTIMATE])
     poses = transforms(PosesInFrame.FromString(parts[schema.TRAJECTORY]))
     T_world_keyframe = dict(zip(values["keyframe_ids"], poses, strict=True))
-    return from_json(GraphEstimate, values, {GraphEstimate: {"T_world_keyframe": T_world_keyframe}})
+    return codec(GraphEstimate).decode(values, {GraphEstimate: {"T_world_keyframe": T_world_keyframe}})
 
 
 def _trajectory(data: bytes) -> Trajectory:
-    return from_json(Trajectory, json.loads(data), {})
+    return codec(Trajectory).decode(json.loads(data), {})

@@ -1,22 +1,28 @@
 """Records as JSON with a JSON Schema, and back without loss: Python's JSON keeps every digit of a float64.
 
-Each record becomes an object with a key for each of its fields: the records of `segslam.types` define the format.
-Arrays are nested lists, row by row; a mapping with tuples for keys becomes rows [key ..., value]. What is bulky travels
-in binary messages beside the JSON, which leaves it out: see `BULK`.
+Each record becomes an object with a key for each of its fields: the records of `segslam.types` define the format. What
+is bulky travels in binary messages beside the JSON, which leaves it out: see `BULK`. The rest keeps to what Foxglove's
+schema parser knows, which is neither arrays in arrays nor alternatives:
+
+- an array of numbers is a flat list, row by row;
+- a field that is None is left out;
+- one of several records is an object with one key, the record's name;
+- a mapping with tuples for keys is a list of objects with a `key` and a `value`.
 """
 
-import types
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from functools import cache
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from jaxtyping import AbstractArray
 
 from segslam.types import GraphEstimate, Keyframe, Step
 
+Json = dict[str, Any]
 Bulk = Mapping[type, Mapping[str, Any]]
 """Values of the fields that the JSON leaves out, by record."""
 
@@ -27,103 +33,117 @@ BULK: Mapping[type, frozenset[str]] = {
 }
 """Fields that the JSON leaves out."""
 
-_NUMBERS = {bool: "boolean", int: "integer", float: "number", str: "string"}
+_NUMBERS_AND_TEXTS = {bool: "boolean", int: "integer", float: "number", str: "string"}
 
 
-def to_json(value: Any) -> Any:
-    """A record, or the value of one of its fields, as what `json` writes."""
-    if _is_record(value):
-        record: Any = type(value)
-        return {name: to_json(getattr(value, name)) for name in _hints(record)}
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Mapping) and value and isinstance(next(iter(value)), tuple):
-        return [[*key, to_json(item)] for key, item in value.items()]
-    if isinstance(value, Mapping):
-        return {key: to_json(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [to_json(item) for item in value]
-    return value
+@dataclass(frozen=True, slots=True)
+class Codec:
+    """How values of one type are written and read."""
 
-
-def from_json(hint: Any, value: Any, bulk: Bulk) -> Any:
-    """The value of type `hint` that `to_json` wrote, with what it left out.
-
-    Raises ValueError, TypeError or KeyError where the JSON does not hold such a value, or `bulk` lacks what it needs.
-    """
-    if _is_record(hint):
-        return _record_from_json(hint, value, bulk)
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return from_json(_alternative(arguments, value), value, bulk)
-    if origin is tuple:
-        return tuple(from_json(arguments[0], item, bulk) for item in value)
-    if origin is dict and get_origin(arguments[0]) is tuple:
-        return {tuple(row[:-1]): from_json(arguments[1], row[-1], bulk) for row in value}
-    if origin is dict:
-        return {key: from_json(arguments[1], item, bulk) for key, item in value.items()}
-    if _is_array(hint):
-        return np.asarray(value, dtype=np.float64 if "float64" in hint.dtypes else np.int64)
-    return None if value is None else hint(value)
-
-
-def json_schema(hint: Any) -> dict[str, Any]:
-    """The JSON Schema of what `to_json` makes of a `hint`."""
-    if _is_record(hint):
-        properties = {name: json_schema(field) for name, field in _hints(hint).items()}
-        return {"title": hint.__name__, "type": "object", "properties": properties, "required": list(properties)}
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return {"oneOf": [json_schema(argument) for argument in arguments]}
-    if origin is tuple:
-        return {"type": "array", "items": json_schema(arguments[0])}
-    if origin is dict and get_origin(arguments[0]) is tuple:
-        return {"type": "array", "items": {"type": "array", "items": {"type": "number"}}}
-    if origin is dict:
-        return {"type": "object", "additionalProperties": json_schema(arguments[1])}
-    if _is_array(hint):
-        return _array_schema(hint)
-    if issubclass(hint, Enum):
-        return {"type": "string", "enum": [member.value for member in hint]}
-    return {"type": "null"} if hint is types.NoneType else {"type": _NUMBERS[hint]}
-
-
-def _record_from_json(record: Any, value: Any, bulk: Bulk) -> Any:
-    hints = _hints(record)
-    values = {name: from_json(hints[name], value[name], bulk) for name in hints}
-    return record(**values, **(bulk[record] if record in BULK else {}))
-
-
-def _alternative(hints: tuple[Any, ...], value: Any) -> Any:
-    """Which of the types of a union a value is of: a record is known by its keys."""
-    if value is None:
-        return types.NoneType
-    for hint in hints:
-        if _is_record(hint) and set(value) == set(_hints(hint)):
-            return hint
-    raise ValueError(f"no such record: {', '.join(map(str, value))}")
+    encode: Callable[[Any], Any]
+    """Value -> what `json` writes."""
+    decode: Callable[[Any, Bulk], Any]
+    """What `json` read -> value. Raises ValueError, TypeError or KeyError if it is none, or the bulk is missing."""
+    schema: Json
+    """JSON Schema of what `encode` makes."""
 
 
 @cache
-def _hints(record: Any) -> dict[str, Any]:
-    """The fields of a record that its JSON holds, with their types."""
+def codec(hint: Any) -> Codec:
+    """How values of the type `hint`, a record or the type of a record's field, are written and read."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if is_dataclass(hint):
+        return _record(hint)
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+        return _array(hint)
+    if origin is UnionType:
+        return _one_of(arguments)
+    if origin is tuple:
+        return _tuple(codec(arguments[0]))
+    if origin is dict and get_origin(arguments[0]) is tuple:
+        return _mapping_by_tuples(codec(arguments[0]), codec(arguments[1]))
+    if origin is dict:
+        return _mapping_by_names(codec(arguments[1]))
+    if issubclass(hint, Enum):
+        values = {"type": "string", "enum": [member.value for member in hint]}
+        return Codec(lambda member: member.value, lambda value, _: hint(value), values)
+    return Codec(hint, lambda value, _: hint(value), {"type": _NUMBERS_AND_TEXTS[hint]})
+
+
+def _record(record: Any) -> Codec:
     hints = get_type_hints(record)
-    return {field.name: hints[field.name] for field in fields(record) if field.name not in BULK.get(record, ())}
+    names = [field.name for field in fields(record) if field.name not in BULK.get(record, ())]
+    optional = {name for name in names if NoneType in get_args(hints[name])}
+    codecs = {name: codec(hints[name]) for name in names}
+
+    def encode(value: Any) -> Json:
+        present = ((name, getattr(value, name)) for name in names)
+        return {name: codecs[name].encode(item) for name, item in present if item is not None}
+
+    def decode(value: Json, bulk: Bulk) -> Any:
+        absent = dict.fromkeys(optional - set(value))
+        present = {name: codecs[name].decode(value[name], bulk) for name in names if name not in absent}
+        return record(**absent, **present, **(bulk[record] if record in BULK else {}))
+
+    schema = {
+        "title": record.__name__,
+        "type": "object",
+        "properties": {name: codecs[name].schema for name in names},
+        "required": [name for name in names if name not in optional],
+    }
+    return Codec(encode, decode, schema)
 
 
-def _is_record(value_or_hint: Any) -> bool:
-    return is_dataclass(value_or_hint)
+def _array(hint: Any) -> Codec:
+    """Of the shape that the hint names; at most one dimension may be free."""
+    sizes = hint.dim_str.split()
+    shape = [int(size) if size.isdigit() else -1 for size in sizes]
+    dtype, kind = (np.float64, "number") if "float64" in hint.dtypes else (np.int64, "integer")
+    return Codec(
+        lambda array: array.ravel().tolist(),
+        lambda numbers, _: np.array(numbers, dtype).reshape(shape),
+        {"type": "array", "items": {"type": kind}, "description": f"shape {' x '.join(sizes)}, row by row"},
+    )
 
 
-def _is_array(hint: Any) -> bool:
-    return isinstance(hint, type) and issubclass(hint, AbstractArray)
+def _one_of(hints: tuple[Any, ...]) -> Codec:
+    """A record or None, which the record around it leaves out; or one of several records."""
+    records = {hint.__name__: codec(hint) for hint in hints if hint is not NoneType}
+    if len(records) == 1:
+        return next(iter(records.values()))
+
+    def encode(value: Any) -> Json:
+        name = type(value).__name__
+        return {name: records[name].encode(value)}
+
+    def decode(value: Json, bulk: Bulk) -> Any:
+        [(name, item)] = value.items()
+        return records[name].decode(item, bulk)
+
+    properties = {name: record.schema for name, record in records.items()}
+    return Codec(encode, decode, {"type": "object", "properties": properties})
 
 
-def _array_schema(hint: Any) -> dict[str, Any]:
-    """Nested arrays of numbers; a dimension of fixed size says so."""
-    schema: dict[str, Any] = {"type": "number" if "float64" in hint.dtypes else "integer"}
-    for size in reversed(hint.dim_str.split()):
-        schema = {"type": "array", "items": schema}
-        if size.isdigit():
-            schema |= {"minItems": int(size), "maxItems": int(size)}
-    return schema
+def _tuple(item: Codec) -> Codec:
+    return Codec(
+        lambda values: [item.encode(value) for value in values],
+        lambda values, bulk: tuple(item.decode(value, bulk) for value in values),
+        {"type": "array", "items": item.schema},
+    )
+
+
+def _mapping_by_tuples(key: Codec, value: Codec) -> Codec:
+    properties = {"key": key.schema, "value": value.schema}
+    return Codec(
+        lambda items: [{"key": key.encode(k), "value": value.encode(v)} for k, v in items.items()],
+        lambda rows, bulk: {key.decode(row["key"], bulk): value.decode(row["value"], bulk) for row in rows},
+        {"type": "array", "items": {"type": "object", "properties": properties}},
+    )
+
+
+def _mapping_by_names(value: Codec) -> Codec:
+    return Codec(
+        lambda items: {name: value.encode(item) for name, item in items.items()},
+        lambda items, bulk: {name: value.decode(item, bulk) for name, item in items.items()},
+        {"type": "object", "properties": {}, "additionalProperties": value.schema},
+    )

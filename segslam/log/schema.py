@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from segslam.log.records import json_schema
+from segslam.log.records import codec
 from segslam.types import GraphEstimate, Step, Trajectory
 
 VERSION = 1
@@ -48,14 +48,14 @@ PACKAGES_METADATA = "segslam.packages"
 
 def json_schemas() -> dict[str, dict[str, Any]]:
     """Topic -> JSON Schema of its messages, for those that are no schema of Foxglove's."""
-    estimate = json_schema(GraphEstimate)
-    estimate["properties"]["keyframe_ids"] = {"type": "array", "items": {"type": "integer"}}
-    estimate["required"].append("keyframe_ids")
+    estimate = codec(GraphEstimate).schema
+    keyframe_ids = {"keyframe_ids": {"type": "array", "items": {"type": "integer"}}}
+    estimate = estimate | {"properties": estimate["properties"] | keyframe_ids}
     return {
-        STEP: json_schema(Step) | {"title": "segslam.Step"},
+        STEP: codec(Step).schema | {"title": "segslam.Step"},
         ESTIMATE: estimate | {"title": "segslam.Estimate"},
-        RESULT: json_schema(Trajectory) | {"title": "segslam.Result"},
-        REFERENCE: json_schema(Trajectory) | {"title": "segslam.Reference"},
+        RESULT: codec(Trajectory).schema | {"title": "segslam.Result"},
+        REFERENCE: codec(Trajectory).schema | {"title": "segslam.Reference"},
     }
 
 

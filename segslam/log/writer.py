@@ -20,7 +20,7 @@ from segslam.config import Config, config_to_yaml
 from segslam.log import schema
 from segslam.log.cloud import KeyframePoints, keyframe_points
 from segslam.log.drawing import Drawing, ground_truth
-from segslam.log.records import to_json
+from segslam.log.records import codec
 from segslam.types import GraphEstimate, Keyframe, SegslamError, Step, Trajectory, Transform
 
 PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
@@ -89,15 +89,15 @@ class LogWriter:
                 self._add_points(step.keyframe)
             if step.estimate is not None:
                 self._add_estimate(step.estimate)
-            self._add(schema.STEP, _json(to_json(step)))
+            self._add(schema.STEP, _json(codec(Step).encode(step)))
 
     def write_result(self, estimate: GraphEstimate, trajectory: Trajectory) -> None:
         """Add what the last optimisation gave, and the pose of every scan that follows from it."""
         with self._guarded():
-            for topic, message in self._drawing.estimate(estimate, stamp_ns=self._stamp_ns):
+            for topic, message in self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns):
                 self._add(topic, message.SerializeToString())
             self._add_estimate(estimate)
-            self._add(schema.RESULT, _json(to_json(trajectory)))
+            self._add(schema.RESULT, _json(codec(Trajectory).encode(trajectory)))
 
     def close(self) -> None:
         """Write the index. Without it the log can be read as well, only not searched."""
@@ -121,14 +121,15 @@ class LogWriter:
         self._stamp_ns = int(reference.stamp_ns[0])
         topic, path = ground_truth(reference, stamp_ns=self._stamp_ns)
         self._add(topic, path.SerializeToString())
-        self._add(schema.REFERENCE, _json(to_json(reference)))
+        self._add(schema.REFERENCE, _json(codec(Trajectory).encode(reference)))
 
     def _add_points(self, keyframe: Keyframe) -> None:
         message = keyframe_points(keyframe.points, keyframe.labels, resolution_m=self._resolution_m)
         self._add(schema.KEYFRAME, message.SerializeToString())
 
     def _add_estimate(self, estimate: GraphEstimate) -> None:
-        self._add(schema.ESTIMATE, _json(to_json(estimate) | {"keyframe_ids": list(estimate.T_world_keyframe)}))
+        keyframe_ids = {"keyframe_ids": list(estimate.T_world_keyframe)}
+        self._add(schema.ESTIMATE, _json(codec(GraphEstimate).encode(estimate) | keyframe_ids))
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:

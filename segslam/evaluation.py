@@ -21,7 +21,7 @@ Z_UP = (0.0, 0.0, 1.0)
 CAMERA_UP = (0.0, -1.0, 0.0)
 """Upwards in KITTI's camera frames, x right, y down, z ahead."""
 MIN_POSES = 3  # fewer are aligned without error, whatever they are
-LINE_TOLERANCE = 1e-6  # share of the spread across the main direction below which positions are on a line
+LINE_TOLERANCE = 1e-6  # share of the spread along a line; rounding has less across it
 
 SEGMENT_LENGTHS_M = tuple(range(100, 801, 100))
 SEGMENT_STEP = 10
@@ -49,7 +49,8 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
     ate_m, are_deg, height_m: root mean squares after alignment; the last along `up` of the reference's frame.
     rpe_m, rpe_deg: root mean squares of the motion from each row to the next. kitti_translation_percent,
     kitti_rotation_deg_per_100m: means over KITTI's segments, left out if the drive is shorter than 100 m.
-    Nothing at all for fewer than 3 rows; no are_deg and height_m for positions on a line, about which they may turn.
+    Nothing at all for fewer than 3 rows; no are_deg and height_m for positions that leave one line by no more than their
+    error does, for the turn about it is then anyone's.
     """
     if len(reference) < MIN_POSES:
         return {}
@@ -57,12 +58,13 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
     aligned = T_reference_estimate @ estimate
     absolute = pose_errors(aligned, reference)
     relative = relative_errors(estimate, reference)
+    ate_m = _rms(absolute.translation_m)
     metrics = {
-        "ate_m": _rms(absolute.translation_m),
+        "ate_m": ate_m,
         "rpe_m": _rms(relative.translation_m),
         "rpe_deg": _rms(relative.rotation_deg),
     }
-    if not _on_a_line(reference[:, :3, 3]):
+    if not _on_a_line(reference[:, :3, 3], ate_m):
         metrics["are_deg"] = _rms(absolute.rotation_deg)
         metrics["height_m"] = _rms((aligned - reference)[:, :3, 3] @ np.array(up))
     segments = segment_errors(estimate, reference)
@@ -146,9 +148,9 @@ def revisits(reference: Poses) -> Flags:
     return result
 
 
-def _on_a_line(positions: Points) -> bool:
-    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-    return bool(spread[1] <= LINE_TOLERANCE * spread[0])
+def _on_a_line(positions: Points, error_m: float) -> bool:
+    along, across, _ = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
+    return bool(across <= max(error_m, LINE_TOLERANCE * along))
 
 
 def _angles_deg(T_a_b: Poses) -> Vector:

@@ -41,8 +41,19 @@ def new_folder(folder: Path) -> Path:
 class Run:
     """Maps the scans of a data set into a folder."""
 
-    def __init__(self, folder: Path, slam: Slam, *, dataset: str, T_camera_lidar: Transform | None = None) -> None:
-        """`T_camera_lidar`, for KITTI, turns the KITTI-format poses into the camera frame of its ground truth."""
+    def __init__(
+        self,
+        folder: Path,
+        slam: Slam,
+        *,
+        dataset: str,
+        T_camera_lidar: Transform | None = None,
+        reference: Trajectory | None = None,
+    ) -> None:
+        """`T_camera_lidar`, for KITTI, turns the KITTI-format poses into the camera frame of its ground truth.
+
+        `reference` goes to the log, for whoever scores or repeats the run from its folder.
+        """
         self.folder = folder
         self.num_scans_skipped = 0
         self._slam = slam
@@ -50,7 +61,13 @@ class Run:
         self._started = perf_counter()
         self._stage_ms: dict[str, list[float]] = defaultdict(list)
         (folder / "config.yaml").write_text(config_to_yaml(slam.config), encoding="utf-8")
-        self._log = LogWriter(folder / "log.mcap", config=slam.config, dataset=dataset)
+        self._log = LogWriter(
+            folder / "log.mcap",
+            config=slam.config,
+            dataset=dataset,
+            T_camera_lidar=T_camera_lidar,
+            reference=reference,
+        )
 
     def map(self, dataset: Dataset) -> Iterator[Step | BadScan]:
         """Process and log each scan; a bad one is reported, counted and skipped."""

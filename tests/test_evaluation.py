@@ -174,6 +174,7 @@ def test_figures_that_cannot_be_known_are_left_out() -> None:
     straight = np.tile(np.eye(4), (20, 1, 1))
     straight[:, 0, 3] = np.arange(20)
     assert set(trajectory_metrics(straight, straight)) == {"ate_m", "rpe_m", "rpe_deg"}
+    assert set(trajectory_metrics(_noisy(straight, 13), straight)) == {"ate_m", "rpe_m", "rpe_deg"}
 
 
 def test_relative_errors_are_those_of_single_steps() -> None:

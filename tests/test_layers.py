@@ -8,7 +8,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "segslam"
 LAYERS = (  # top first; a room is a module or a folder
     {"cli"},
-    {"experiments", "report", "runs"},
+    {"experiments", "report"},
+    {"runs", "results"},
     {"slam", "log", "map", "evaluation"},
     {"alignment"},
     {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "simulation"},

@@ -59,7 +59,13 @@ def map_command(
     scans = open_dataset(data, sequence=sequence, dataset=dataset, labels=labels, encoding=encoding, frames=frames)
     given = _given_odometry(odometry, scans, settings_now.odometry) if odometry else None
     slam = Slam(settings_now, odometry=given, labeller=_labeller(scans))
-    run = Run(new_folder(out), slam, dataset=scans.name, T_camera_lidar=scans.T_camera_lidar)
+    run = Run(
+        new_folder(out),
+        slam,
+        dataset=scans.name,
+        T_camera_lidar=scans.T_camera_lidar,
+        reference=scans.reference,
+    )
     interrupted = _process(run, scans, quiet=quiet)
     metrics = finish(run, scans.reference, json=json, quiet=quiet)
     if interrupted:

@@ -33,14 +33,14 @@ def simulate(
     from segslam import simulation
 
     config = simulation.SimulationConfig.model_validate({"sensor": {"name": sensor}})
-    drive = simulation.made_up_drive(frames) if poses is None else simulation.read_drive(poses, sequence=sequence)
-    drive = simulation.first_frames(drive, frames)
+    drive = simulation.made_up_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
+    total = min(frames or len(drive.time_s), len(drive.time_s))
     simulation.prepare_folder(out, sequence, overwrite=overwrite)
-    say(f"building the streets of {len(drive.time_s)} scans", quiet=quiet)
-    written = simulation.write_drive(out, sequence, drive, config=config, seed=seed)
+    say(f"building the streets of {total} scans", quiet=quiet)
+    written = simulation.write_drive(out, sequence, drive, config=config, seed=seed, num_frames=total)
     last = 0
     try:
-        for done in progress(written, total=len(drive.time_s), title="simulate", quiet=quiet):
+        for done in progress(written, total=total, title="simulate", quiet=quiet):
             last = done
     except KeyboardInterrupt:
         say(f"stopped: the first {last} scans are complete in {out / 'sequences' / sequence}", quiet=quiet)

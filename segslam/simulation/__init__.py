@@ -6,7 +6,7 @@ from segslam.simulation.levelling import level, upright
 from segslam.simulation.routes import made_up_loop
 from segslam.simulation.sensor import Sensor, Sweep, make_sensor, sweep
 from segslam.simulation.settings import SensorConfig, SimulationConfig, WorldConfig
-from segslam.simulation.tracks import Drive, first_frames, made_up_drive, read_drive
+from segslam.simulation.tracks import Drive, made_up_drive, read_drive
 from segslam.simulation.world import Hits, World, build_world
 
 __all__ = [
@@ -20,7 +20,6 @@ __all__ = [
     "WorldConfig",
     "build_world",
     "drive_sweeps",
-    "first_frames",
     "leftover_motion",
     "level",
     "made_up_drive",

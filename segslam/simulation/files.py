@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -52,13 +53,24 @@ def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
         raise SegslamError(f"{out}: cannot write there ({error}); choose another folder") from error
 
 
-def write_drive(out: Path, sequence: str, drive: Drive, *, config: SimulationConfig, seed: int) -> Iterator[int]:
-    """Simulate a drive into a prepared folder, with the settings beside the scans; yields how many are complete."""
+def write_drive(
+    out: Path,
+    sequence: str,
+    drive: Drive,
+    *,
+    config: SimulationConfig,
+    seed: int,
+    num_frames: int | None = None,
+) -> Iterator[int]:
+    """Simulate the first scans of a drive (None: all) into a prepared folder; yields how many are complete.
+
+    The world is that of the whole drive, so fewer scans are the same scans. Settings and seed are kept beside them.
+    """
     settings = {"seed": seed, "config": config.model_dump(mode="json")}
     (out / "sequences" / sequence / SETTINGS_FILE).write_text(json.dumps(settings, indent=1) + "\n")
     world = build_world(drive.T_world_lidar, drive.time_s, config=config.world, seed=seed)
     sweeps = drive_sweeps(world, drive.T_world_lidar, drive.time_s, config=config.sensor, seed=seed)
-    yield from write_sequence(out, sequence, drive, sweeps)
+    yield from write_sequence(out, sequence, drive, islice(sweeps, num_frames))
 
 
 def write_sequence(out: Path, sequence: str, drive: Drive, sweeps: Iterable[Sweep]) -> Iterator[int]:

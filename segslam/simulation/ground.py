@@ -12,7 +12,8 @@ from segslam.types import Label, Labels, Vector
 CELL_M = 0.5  # chosen: kerbs are this sharp
 COARSE = 4  # cells to a triangle's side away from the road
 MARGIN_M = 85.0  # chosen: a little beyond the range that returns much
-ROAD_M, SIDEWALK_M = 5.6, 8.0  # chosen: half width of the road, and distance from its middle to the gardens
+LANE_M = 1.2  # chosen: the sensor drives this far to the right of its street's middle
+ROAD_M, SIDEWALK_M = 5.4, 7.4  # chosen: half width of the road, and distance from its middle to the gardens
 KERB_M = 0.12
 FINE_M = 9.0  # chosen: triangles are small this near the path
 SCALES_M = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0)  # chosen: from the lie of the land down to the road under one car length
@@ -25,8 +26,10 @@ class Ground:
     """Rasters of CELL_M over x (rows) and y (columns) from `origin`."""
 
     origin: Float[np.ndarray, "2"]
-    distance_m: Raster
-    """To the nearest point of the driven path."""
+    path_m: Raster
+    """Distance to the nearest point of the driven path."""
+    street_m: Raster
+    """Distance to the middle of the nearest street."""
     height_m: Raster
     labels: np.ndarray
 
@@ -39,27 +42,30 @@ class Ground:
         row, column = self.cells(x, y)
         return self.labels[row, column]
 
-    def distance_at(self, x: Vector, y: Vector) -> Vector:
-        """To the driven path, to about CELL_M / 3."""
-        row, column = self.cells(x, y)
-        return self.distance_m[row, column]
-
     def height_at(self, x: Vector, y: Vector) -> Vector:
         at = np.stack([x - self.origin[0], y - self.origin[1]]) / CELL_M
         return map_coordinates(self.height_m, at, order=1, mode="nearest")
+
+
+def middle_of_street(path: np.ndarray) -> np.ndarray:
+    """(n, 2) the street's middle beside a path (n, 2 or 3) whose points are at most a metre apart."""
+    tangent = np.gradient(path[:, :2], axis=0)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    return path[:, :2] + LANE_M * np.column_stack([-tangent[:, 1], tangent[:, 0]])
 
 
 def ground_of(path: np.ndarray, rng: np.random.Generator) -> Ground:
     """The ground whose road runs through `path` (n, 3), points of the road at most a metre apart."""
     origin = np.floor(path[:, :2].min(axis=0) - MARGIN_M)
     span = np.ceil(path[:, :2].max(axis=0) + MARGIN_M) - origin
-    blocks = np.ceil(span / (CELL_M * COARSE)).astype(int)
-    distance = _distance_m((path[:, :2] - origin) / CELL_M, tuple(blocks * COARSE + 1))
-    coarse = _through(path[:, 2], (path[:, :2] - origin) / (CELL_M * COARSE), tuple(blocks + 1))
-    coarse += _relief(rng, distance[::COARSE, ::COARSE])
-    kerb = np.clip((distance - ROAD_M) / CELL_M, 0.0, 1.0) * KERB_M
-    labels = np.select([distance < ROAD_M, distance < SIDEWALK_M], [Label.ROAD, Label.SIDEWALK], Label.TERRAIN)
-    return Ground(origin, distance, _refined(coarse) + kerb, labels.astype(np.uint8))
+    blocks = [int(blocks) for blocks in np.ceil(span / (CELL_M * COARSE))]
+    path_m = _distance_m((path[:, :2] - origin) / CELL_M, (blocks[0] * COARSE + 1, blocks[1] * COARSE + 1))
+    street_m = _distance_m((middle_of_street(path) - origin) / CELL_M, path_m.shape)
+    coarse = _through(path[:, 2], (path[:, :2] - origin) / (CELL_M * COARSE), (blocks[0] + 1, blocks[1] + 1))
+    coarse += _relief(rng, street_m[::COARSE, ::COARSE])
+    kerb = np.clip((street_m - ROAD_M) / CELL_M, 0.0, 1.0) * KERB_M
+    labels = np.select([street_m < ROAD_M, street_m < SIDEWALK_M], [Label.ROAD, Label.SIDEWALK], Label.TERRAIN)
+    return Ground(origin, path_m, street_m, _refined(coarse) + kerb, labels.astype(np.uint8))
 
 
 def _distance_m(at: np.ndarray, shape: tuple[int, ...]) -> Raster:
@@ -103,7 +109,7 @@ def ground_mesh(ground: Ground) -> Mesh:
 
     Where fine meets coarse the kerb is past, so the fine nodes lie on the coarse edge and no ray slips through.
     """
-    corners = ground.distance_m[::COARSE, ::COARSE]
+    corners = ground.street_m[::COARSE, ::COARSE]
     nearest = np.minimum.reduce([corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:]])
     fine = nearest < FINE_M
     near = np.kron(fine, np.ones((COARSE, COARSE), dtype=bool))

@@ -25,7 +25,7 @@ def bush(rng: np.random.Generator, width_m: float, height_m: float) -> Mesh:
     """A round shrub that reaches the ground."""
     count = int(40 + 45 * width_m * height_m)
     half = _ball(rng, count, hollow=0.6) * [width_m / 2, width_m / 2, height_m / 2] + [0.0, 0.0, height_m / 2]
-    return leaves(half, 0.35, rng)
+    return leaves(half, 0.45, rng)
 
 
 def hedge(rng: np.random.Generator, length_m: float, width_m: float, height_m: float) -> Mesh:
@@ -37,7 +37,7 @@ def hedge(rng: np.random.Generator, length_m: float, width_m: float, height_m: f
     return leaves(
         centres * [length_m, width_m, height_m * 1.0] * np.column_stack([np.ones(count), swell, swell])
         + [0.0, 0.0, height_m / 2],
-        0.33,
+        0.42,
         rng,
     )
 

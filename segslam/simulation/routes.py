@@ -6,37 +6,49 @@ from scipy.ndimage import gaussian_filter1d
 from segslam.trajectory import Poses
 from segslam.types import Vector
 
-# Two blocks that share the street from (0, 0) to (70, 0): driven eastwards, then westwards after the eastern block, and
-# eastwards again when all starts over after the western block.
-CORNERS_M = ((0, 0), (70, 0), (70, 48), (120, 48), (120, 0), (0, 0), (-52, 0), (-52, -40), (0, -40))
-LANE_M = 1.6  # chosen: the car keeps to the right of the street's middle
-TURN_M = 4.0  # chosen: corners are rounded by a Gaussian of this width
-SPEED_M_S, PERIOD_S = 12.0, 0.1
+# Two blocks that share the street from (0, 0) to (40, 0): driven eastwards, then westwards after the eastern block, and
+# eastwards again after the western one. Then all starts over.
+CORNERS_M = ((0, 0), (40, 0), (40, 33), (74, 33), (74, 0), (0, 0), (-33, 0), (-33, -32), (0, -32), (0, 0))
+SHARED_M = 40.0
+STEP_M = 0.25
+LANE_M = 1.4  # chosen: the car keeps to the right of the street's middle
+TURN_M = 5.0  # chosen: corners are rounded by a Gaussian of this width
+SPEED_M_S, TURN_M_S2, PERIOD_S = 14.0, 5.0, 0.1  # chosen: fastest, and the sideways acceleration that slows a turn
 
 
-def made_up_loop(num_frames: int | None = None) -> tuple[Poses, Vector]:
+def made_up_loop(num_frames: int = 0) -> tuple[Poses, Vector]:
     """(T_world_lidar, seconds) of a drive at 10 Hz with a street driven in both directions and again in the first.
 
-    One round unless a number of frames is asked for; more than one round repeats it.
+    One round and the shared street once more, some 300 scans, or as many scans as asked for if that is more.
     """
-    corners = np.array([*CORNERS_M, CORNERS_M[0]], dtype=float)
-    lengths = np.abs(np.diff(corners, axis=0)).sum(axis=1)
-    ends = np.concatenate([[0.0], np.cumsum(lengths)])
-    steps = np.arange(0.0, ends[-1], 0.25)
-    street = np.column_stack([np.interp(steps, ends, corners[:, axis]) for axis in (0, 1)])
-    lane = _rounded(street)
-    travel = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lane, axis=0, append=lane[:1]), axis=1))])
-    count = int(travel[-1] / (SPEED_M_S * PERIOD_S)) if num_frames is None else num_frames
-    closed = np.concatenate([lane, lane[:1]])
-    at = np.arange(count) * SPEED_M_S * PERIOD_S
-    xy = np.column_stack([np.interp(at % travel[-1], travel, closed[:, axis]) for axis in (0, 1)])
-    ahead = np.column_stack([np.interp((at + 0.5) % travel[-1], travel, closed[:, axis]) for axis in (0, 1)])
-    return _poses(xy, ahead - xy), np.arange(count) * PERIOD_S
+    corners = np.array(CORNERS_M, dtype=float)
+    ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    stations = np.arange(0.0, ends[-1], STEP_M)
+    lane = _rounded(np.column_stack([np.interp(stations, ends, corners[:, axis]) for axis in (0, 1)]))
+    shared = int(SHARED_M / STEP_M)
+    rounds = 1 + int(np.ceil(num_frames * SPEED_M_S * PERIOD_S / ends[-1]))
+    path = np.tile(lane, (rounds + 1, 1))
+    time = np.concatenate([[0.0], np.cumsum(_seconds(path))])
+    enough = max(time[len(lane) + shared], num_frames * PERIOD_S) if num_frames else time[len(lane) + shared]
+    moments = np.arange(0.0, enough, PERIOD_S)
+    xy, ahead = (
+        np.column_stack([np.interp(moments + later, time, path[:, axis]) for axis in (0, 1)]) for later in (0.0, 0.02)
+    )
+    return _poses(xy, ahead - xy), moments
+
+
+def _seconds(path: np.ndarray) -> Vector:
+    """(n - 1,) time from point to point, slower where the path turns."""
+    steps = np.diff(path, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    turns = np.abs(np.gradient(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])))) / lengths
+    bend = gaussian_filter1d(turns, TURN_M / STEP_M, mode="nearest")
+    return lengths / np.minimum(SPEED_M_S, np.sqrt(TURN_M_S2 / np.maximum(bend, 1e-9)))
 
 
 def _rounded(street: np.ndarray) -> np.ndarray:
     """The right lane of a closed street, corners rounded."""
-    smooth = gaussian_filter1d(street, TURN_M / 0.25, axis=0, mode="wrap")
+    smooth = gaussian_filter1d(street, TURN_M / STEP_M, axis=0, mode="wrap")
     tangent = np.gradient(np.concatenate([smooth[-1:], smooth, smooth[:1]]), axis=0)[1:-1]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     return smooth + LANE_M * np.column_stack([tangent[:, 1], -tangent[:, 0]])

@@ -33,7 +33,7 @@ INTENSITY = {
     Label.TRAFFIC_SIGN: (0.6, 0.25), Label.MOVING_CAR: (0.15, 0.18),
 }  # fmt: skip
 SIGNAL = 35.0  # chosen: so strong that a road (0.2 bright, met flat) is seen to some 50 m, as on real scans
-GLASS_PASSES = 0.7  # chosen: share of rays that a car's window swallows
+GLASS_PASSES = 0.6  # chosen: share of rays that a car's window swallows
 
 
 @dataclass(frozen=True, slots=True, eq=False)

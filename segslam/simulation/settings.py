@@ -12,13 +12,15 @@ SensorName = Literal["hdl64", "os1-64", "vlp16"]
 class WorldConfig(Section):
     """What stands along the streets. Densities are per 100 m and side; what does not fit is left out."""
 
-    cars: float = Field(9.0, ge=0, le=16, description="parked cars")
+    cars: float = Field(5.0, ge=0, le=16, description="parked cars")
     trees: float = Field(7.0, ge=0, le=30, description="trees beside the road")
     lamps: float = Field(2.5, ge=0, le=20, description="street lamps")
     signs: float = Field(2.5, ge=0, le=20, description="traffic signs")
-    built: float = Field(0.6, ge=0, le=1, description="share of the lots that hold a building")
-    hedged: float = Field(0.45, ge=0, le=1, description="share of the lots that a hedge closes towards the street")
-    fenced: float = Field(0.25, ge=0, le=1, description="share of the lots that a fence closes towards the street")
+    clutter: float = Field(2.0, ge=0, le=20, description="bins, switch boxes and the like, of no class")
+    built: float = Field(0.65, ge=0, le=1, description="share of the lots that hold a building")
+    courts: float = Field(0.1, ge=0, le=1, description="share of the lots that are paved courts with parked cars")
+    hedged: float = Field(0.6, ge=0, le=1, description="share of the lots that a hedge closes towards the street")
+    fenced: float = Field(0.2, ge=0, le=1, description="share of the lots that a fence closes towards the street")
     equal_tree_rows: bool = Field(
         False, description="plant like trees at one distance, so that they tell no place apart"
     )

@@ -31,14 +31,9 @@ class Drive:
     calib: str
 
 
-def made_up_drive(num_frames: int | None = None) -> Drive:
-    """One round of the made-up loop, or as many scans as asked for, with KITTI's nominal calibration."""
+def made_up_drive(num_frames: int = 0) -> Drive:
+    """The made-up loop with KITTI's nominal calibration: one round, or more if it takes more to fill so many scans."""
     return Drive(*made_up_loop(num_frames), NOMINAL_CALIB)
-
-
-def first_frames(drive: Drive, num_frames: int | None) -> Drive:
-    """The first scans of a drive; all of it for None or for more than there are."""
-    return Drive(drive.T_world_lidar[:num_frames], drive.time_s[:num_frames], drive.calib)
 
 
 def read_drive(poses_file: Path, *, sequence: str) -> Drive:

@@ -8,11 +8,11 @@ import numpy as np
 from segslam.simulation import vehicles
 from segslam.simulation.mesh import Mesh, as_instance, placed
 from segslam.simulation.settings import WorldConfig
-from segslam.simulation.streets import CAR_M, Frontage, Site
+from segslam.simulation.site import Frontage, Site, Spot
 from segslam.types import Label, Vector
 
-SLOT_M = 6.0
-LANE_M = 2.9  # chosen: oncoming traffic passes this far to the left
+CAR_M, SLOT_M = 4.4, 6.0  # chosen: from the street's middle to a parked car's; room that one takes
+LANE_M = 2.7  # chosen: oncoming traffic passes this far to the left of the path
 PASS_M = 12.0  # chosen: passing a place means coming this near to it
 VISIT_GAP_S = 5.0
 VIEW_M = 100.0
@@ -72,21 +72,18 @@ def parked_cars(
     free_m = max(100.0 / config.cars - SLOT_M, 0.1)
     station = float(rng.uniform(0, SLOT_M))
     while station < len(frontage.at) - 1:
-        x, y = site.outward(frontage, int(station), CAR_M + rng.normal(scale=0.1))
-        heading = float(frontage.heading_rad[int(station)] + rng.normal(scale=0.03) + np.pi * rng.integers(2))
-        if site.claim(x, y, 5.6, 1.6, heading, clearance_m=CAR_M - 1.3):
-            z = float(site.ground.height_at(np.array([x]), np.array([y]))[0])
-            for start, end in _stays(route, x, y, config, rng):
+        spot = site.outward(frontage, int(station), CAR_M + rng.normal(scale=0.1))
+        if site.claim(spot, 5.6, 1.6, clearance_m=2.0):
+            turn = float(rng.normal(scale=0.03) + np.pi * rng.integers(2))
+            for start, end in _stays(route, spot, config, rng):
                 made = vehicles.car(rng) if rng.uniform() < 0.95 else vehicles.truck(rng)
-                yield ParkedCar(placed(made, x, y, z, yaw_rad=heading), (x, y), start, end)
+                yield ParkedCar(site.stand(made, spot, turn_rad=turn), (spot.x, spot.y), start, end)
         station += SLOT_M + rng.exponential(free_m)
 
 
-def _stays(
-    route: Route, x: float, y: float, config: WorldConfig, rng: np.random.Generator
-) -> list[tuple[float, float]]:
+def _stays(route: Route, spot: Spot, config: WorldConfig, rng: np.random.Generator) -> list[tuple[float, float]]:
     """Who stands at one place, when: one car throughout, or a change between two visits."""
-    change = route.change_time(x, y, rng) if rng.uniform() < config.parked_cars_gone else np.inf
+    change = route.change_time(spot.x, spot.y, rng) if rng.uniform() < config.parked_cars_gone else np.inf
     if not np.isfinite(change):
         return [(-np.inf, np.inf)]
     left, came = (-np.inf, change), (change, np.inf)

@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    ValidationError,
+    model_validator,
+)
 
 from segslam.types import Label, SegslamError
 
@@ -24,6 +33,15 @@ def _label_from_name(value: object) -> object:
 
 LabelName = Annotated[Label, BeforeValidator(_label_from_name), PlainSerializer(lambda label: label.name.lower())]
 """A class by its name in files, such as `traffic_sign`."""
+
+
+def _check_static(label: Label) -> Label:
+    if label == Label.UNLABELLED or label >= Label.MOVING_CAR:
+        raise ValueError("only labelled things that stay where they are help to recognise a place")
+    return label
+
+
+StaticLabel = Annotated[LabelName, AfterValidator(_check_static)]
 
 
 class Section(BaseModel):
@@ -66,35 +84,43 @@ class GeometricLabelsConfig(Section):
     ground_cell_m: float = Field(1.0, gt=0, description="edge of the cells of the ground's surface (m)")
     max_slope: float = Field(0.2, gt=0, description="steepest that the ground rises between cells")
     ground_height_m: float = Field(0.15, gt=0, description="points lower than this are ground (m)")
-    band_m: tuple[float, float] = Field((0.4, 2.4), description="where poles and small solids are looked for (m)")
-    pole_core_m: float = Field(0.3, gt=0, description="a pole lies within this radius (m)")
-    pole_clear_m: float = Field(0.7, gt=0, description="and nothing else within this one (m)")
+    band_m: tuple[float, float] = Field((0.4, 2.6), description="where poles and small solids are looked for (m)")
+    pole_core_m: float = Field(0.4, gt=0, description="a pole lies within this radius (m)")
+    pole_clear_m: float = Field(0.8, gt=0, description="and nothing else within this one (m)")
     pole_min_m: float = Field(1.2, gt=0, description="least height of a pole within the band (m)")
     pole_min_share: float = Field(0.7, gt=0, le=1, description="share of its occupied heights that stand clear")
     trunk_max_m: float = Field(2.0, gt=0, description="longest small solid: young trees, bushes, signs (m)")
-    trunk_min_m: float = Field(1.2, gt=0, description="lowest top of a small solid (m)")
+    trunk_min_m: float = Field(1.6, gt=0, description="lowest top of a small solid (m)")
     car_top_m: tuple[float, float] = Field((1.0, 2.1), description="lowest and highest top of a car (m)")
     car_length_m: tuple[float, float] = Field((1.5, 6.0), description="shortest and longest side seen of a car (m)")
     car_max_width_m: float = Field(2.6, gt=0, description="widest car (m)")
-    wall_thickness_m: float = Field(0.08, gt=0, description="standard deviation of a wall's points across it (m)")
+    wall_thickness_m: float = Field(0.16, gt=0, description="standard deviation of a wall's points across it (m)")
+    wall_min_top_m: float = Field(1.8, gt=0, description="lowest top of a wall: hedges are lower (m)")
 
 
 class SegregatorConfig(Section):
     """Global registration from semantic clusters and point features."""
 
-    cluster_min_points: dict[LabelName, int] = Field(
-        {Label.CAR: 30, Label.TRUNK: 15},
-        description="class -> fewest points of a cluster; these classes give clusters (P: L_SC; A: 30 and 15)",
+    cluster_min_points: dict[StaticLabel, Annotated[int, Field(ge=1)]] = Field(
+        {
+            Label.CAR: 6,
+            Label.TRUCK: 6,
+            Label.OTHER_VEHICLE: 6,
+            Label.TRUNK: 4,
+            Label.POLE: 4,
+            Label.TRAFFIC_SIGN: 3,
+        },
+        description="class -> fewest points of a cluster; these classes give clusters (P: L_SC; A: car 30, trunk 15)",
     )
-    dcvc_start_radius_m: float = Field(0.35, gt=0, description="first radial bin of DCVC (A) (m)")
+    dcvc_start_radius_m: float = Field(0.35, ge=0.01, description="first radial bin of DCVC (A) (m)")
     dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (A) (m)")
-    dcvc_angle_deg: float = Field(1.2, gt=0, description="pitch and azimuth bin of DCVC (A) (degrees)")
+    dcvc_angle_deg: float = Field(1.2, ge=0.1, le=90, description="pitch and azimuth bin of DCVC (A) (degrees)")
     min_range_m: float = Field(0.5, ge=0, description="nearest point clustered (A) (m)")
-    max_range_m: float = Field(120.0, gt=0, description="farthest point clustered (A) (m)")
-    feature_classes: tuple[LabelName, ...] = Field(
+    max_range_m: float = Field(120.0, gt=0, le=1000, description="farthest point clustered (A) (m)")
+    feature_classes: tuple[StaticLabel, ...] = Field(
         (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points (P: L_F)"
     )
-    feature_voxel_m: float = Field(0.5, gt=0, description="voxel of the class clouds (A) (m)")
+    feature_voxel_m: float = Field(0.5, ge=0.01, description="voxel of the class clouds (A) (m)")
     normal_radius_m: float = Field(1.0, gt=0, description="neighbourhood of normals (A) (m)")
     feature_radius_m: float = Field(2.5, gt=0, description="neighbourhood of FPFH (A) (m)")
     patch_radius_m: float = Field(1.0, gt=0, description="neighbourhood of a key point's Gaussian (A) (m)")
@@ -124,6 +150,15 @@ class SegregatorConfig(Section):
     gnc_factor: float = Field(1.4, gt=1, description="growth of GNC's control parameter (A)")
     gnc_max_iterations: int = Field(100, ge=1, description="(A)")
     gnc_cost_tolerance: float = Field(1e-6, gt=0, description="stop at this change of cost (A)")
+
+    @model_validator(mode="after")
+    def _radial_bins_reach_the_range(self) -> "SegregatorConfig":
+        reach_m = self.dcvc_start_radius_m**2 / max(2.0 * self.dcvc_radius_step_m, 1e-12)  # where a bin is 0 deep
+        if reach_m < self.max_range_m:
+            raise ValueError(
+                f"DCVC's radial bins shrink to nothing at {reach_m:.0f} m: lower dcvc_radius_step_m or max_range_m"
+            )
+        return self
 
 
 class RefineConfig(Section):
@@ -184,14 +219,12 @@ class Config(Section):
     log: LogConfig = LogConfig()
 
 
-def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
-    """The defaults, changed by a YAML file and then by `section.key=value` texts.
+def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
+    """The defaults, or `base`, changed by a YAML file and then by `section.key=value` texts.
 
     Raises SegslamError that names the file and key for unreadable YAML, unknown keys and values out of range.
     """
-    values: dict[str, Any] = {}
-    if path is not None:
-        values = _read_yaml(path)
+    values = _changed(base.model_dump(mode="json") if base else {}, _read_yaml(path) if path else {})
     for text in overrides:
         key, separator, value = text.partition("=")
         section, dot, name = key.strip().partition(".")
@@ -216,6 +249,16 @@ def config_to_yaml(config: Config) -> str:
 def config_from_yaml(text: str, source: str) -> Config:
     """The Config that a text holds; `source` names it in the SegslamError raised if it holds none."""
     return _validate(_parse_yaml(text, source), source)
+
+
+def _changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """The values of all sections, with those keys replaced that the changes name."""
+    keywise = {
+        name: values[name] | section
+        for name, section in changes.items()
+        if isinstance(section, dict) and isinstance(values.get(name), dict)
+    }
+    return values | changes | keywise
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -27,7 +27,7 @@ def _world():
     post = np.vstack([_sheet([6, 4, z], [0.1, 0, 0], [0, 0, 2.5]), _sheet([6, 4, z], [0, 0.1, 0], [0, 0, 2.5])])
     box = np.vstack([_sheet([-8, 3, z], [4, 0, 0], [0, 0, 1.5]), _sheet([-4, 3, z], [0, 1.7, 0], [0, 0, 1.5])])
     wall = _sheet([-15, -12, z], [25, 0, 0], [0, 0, 5])
-    return {Label.ROAD: ground, Label.TRUNK: post, Label.CAR: box, Label.BUILDING: wall}
+    return {Label.ROAD: ground, Label.POLE: post, Label.CAR: box, Label.BUILDING: wall}
 
 
 def _shares(labels, truth):
@@ -40,7 +40,7 @@ def test_a_post_a_box_and_a_wall_on_a_plain_are_told_apart():
     points = np.vstack(list(world.values()))
     truth = np.repeat([int(label) for label in world], [len(part) for part in world.values()])
     high = (points[:, 2] > 0.5 - SENSOR_HEIGHT_M) | (truth == Label.ROAD)  # feet of things may count as ground
-    band = high & ((truth != Label.TRUNK) | (points[:, 2] < 2.3 - SENSOR_HEIGHT_M))
+    band = high & ((truth != Label.POLE) | (points[:, 2] < 2.3 - SENSOR_HEIGHT_M))
     shares = _shares(geometric_labels(points, config=CONFIG)[band], truth[band])
     assert min(shares.values()) > 0.95, shares
 

@@ -1,4 +1,4 @@
-"""Labels from shape alone: ground, upright thin things, boxes, walls, and the rough rest.
+"""Labels from shape alone: ground, poles, small solids, cars, walls, and the rough rest.
 
 They serve to find the same things again from elsewhere, so that they are repeatable matters more than what they mean.
 """
@@ -6,33 +6,33 @@ They serve to find the same things again from elsewhere, so that they are repeat
 import numpy as np
 
 from segslam.config import GeometricLabelsConfig
-from segslam.semantics.ground import heights_above_ground, upright
-from segslam.semantics.solids import NO_PIECE, pieces, tightest_rectangles, wall_voxels
-from segslam.semantics.uprights import NUM_SLICES, SLICE_M, columns, thin_uprights
-from segslam.types import Label, Labels, Points, Vector
+from segslam.points import within_range
+from segslam.semantics.ground import heights_above_ground, turned, upright
+from segslam.semantics.solids import NO_PIECE, pieces, tightest_rectangles
+from segslam.semantics.uprights import NUM_SLICES, on_thin_uprights
+from segslam.semantics.walls import on_walls
+from segslam.types import Label, Labels, Mask, Points, Vector
 
 COLUMN_M = 0.1
-BOX_CELL_M = 0.25
-WALL_CELL_M = 0.6
-WALL_LAYER_M = 1.2
-NUM_WALL_LAYERS = 8
-MAX_UP_M = 30.0
+"""Chosen: posts are some cells wide, and points on one are rarely farther apart within 40 m."""
+PIECE_CELL_M = 0.25
+"""Chosen: solids closer than this are one."""
+BORDER_CELLS = 10
 
 
 def geometric_labels(points: Points, *, config: GeometricLabelsConfig) -> Labels:
-    """A class for each point of a scan in the LiDAR frame, from shape alone; it does not depend on the points' order.
+    """A class for each point of a scan in the LiDAR frame, from shape alone. It does not depend on the points' order.
 
-    ROAD for the ground, TRUNK for upright thin things, CAR for boxes of that size, BUILDING for walls, VEGETATION for
-    what else stands above the ground. UNLABELLED where points are not finite or out of range. The sensor may lean.
+    ROAD for the ground, POLE for thin upright things, TRUNK for small solids (young trees, bushes, signs), both only
+    within a band of heights so that their centres keep still; CAR for boxes of that size, BUILDING for walls,
+    VEGETATION for what else stands above the ground. UNLABELLED where points are not finite or out of range. The
+    sensor may lean.
     """
     labels = np.full(len(points), Label.UNLABELLED, np.uint8)
-    usable = np.flatnonzero(np.all(np.abs(points) < config.max_range_m, axis=1))
-    level = points[usable].astype(np.float64)
-    level = level @ upright(level).T
-    inside = np.all(np.abs(level) < config.max_range_m, axis=1)
-    usable, level = usable[inside], level[inside]
-    if len(usable):
-        labels[usable] = _labels_of_level(level, config)
+    usable = within_range(points, 0.0, config.max_range_m)
+    if usable.any():
+        near = points[usable].astype(np.float64)
+        labels[usable] = _labels_of_level(turned(near, upright(near)), config)
     return labels
 
 
@@ -40,65 +40,67 @@ def _labels_of_level(level: Points, config: GeometricLabelsConfig) -> Labels:
     heights = heights_above_ground(
         level, cell_m=config.ground_cell_m, max_range_m=config.max_range_m, max_slope=config.max_slope
     )
-    labels = np.full(len(level), Label.VEGETATION, np.uint8)
-    labels[heights < config.ground_height_m] = Label.ROAD
-    standing = np.flatnonzero(labels != Label.ROAD)
-    for label, rule in ((Label.TRUNK, _is_upright), (Label.CAR, _is_box), (Label.BUILDING, _is_wall)):
-        chosen = rule(level[standing], heights[standing], config)
-        labels[standing[chosen]] = label
-        standing = standing[~chosen]
+    labels = np.where(heights < config.ground_height_m, np.uint8(Label.ROAD), np.uint8(Label.VEGETATION))
+    for rule in (_poles, _solids, _walls):
+        rest = np.flatnonzero(labels == Label.VEGETATION)
+        labels[rest] = rule(level[rest], heights[rest], config)
     return labels
 
 
-def _is_upright(points: Points, heights: Vector, config: GeometricLabelsConfig) -> np.ndarray:
+def _poles(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
+    """POLE for the points of thin upright things, VEGETATION for the rest."""
+    low, high = config.band_m
+    slice_m = (high - low) / NUM_SLICES
     cells, side = _cells(points, COLUMN_M, config.max_range_m)
-    slices = np.floor(heights / SLICE_M).astype(np.int64)
-    low, high = (round(height_m / SLICE_M) for height_m in (config.upright_low_m, config.upright_high_m))
-    marked = thin_uprights(
-        columns(cells, slices, side),
-        round(config.upright_core_m / COLUMN_M),
-        round(config.upright_clear_m / COLUMN_M),
-        np.uint32(sum(1 << s for s in range(low, high))),
-        round(config.upright_min_m / SLICE_M),
-        config.upright_min_share,
+    thin = on_thin_uprights(
+        cells,
+        np.floor((heights - low) / slice_m).astype(np.int64),
+        side,
+        round(config.pole_core_m / COLUMN_M),
+        round(config.pole_clear_m / COLUMN_M),
+        round(config.pole_min_m / slice_m),
+        config.pole_min_share,
     )
-    bits = marked[cells[:, 0], cells[:, 1]] >> np.clip(slices, 0, NUM_SLICES - 1).astype(np.uint32)
-    return (bits & 1).astype(bool) & (slices < NUM_SLICES)
+    return _chosen(thin, Label.POLE)
 
 
-def _is_box(points: Points, heights: Vector, config: GeometricLabelsConfig) -> np.ndarray:
-    cells, side = _cells(points, BOX_CELL_M, config.max_range_m)
-    low, high = config.box_top_m
+def _solids(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
+    """TRUNK and CAR for the points of pieces of that size, VEGETATION for the rest."""
+    low, high = config.band_m
+    cells, side = _cells(points, PIECE_CELL_M, config.max_range_m)
+    in_band = _within(heights, config.band_m)
     occupied = np.zeros((side, side), bool)
-    body = heights < high
-    occupied[tuple(cells[body].T)] = True
-    piece = pieces(occupied)
-    num_pieces = int(piece.max()) + 1
-    if num_pieces == 0:
-        return np.zeros(len(points), bool)
-    length, width = (tightest_rectangles(piece, num_pieces) * BOX_CELL_M).T
-    of_point = np.where(body, piece[tuple(cells.T)], NO_PIECE)
+    occupied[cells[in_band, 0], cells[in_band, 1]] = True
+    grid = pieces(occupied)
+    body = np.flatnonzero((heights < high) & (grid[cells[:, 0], cells[:, 1]] != NO_PIECE))
+    piece = grid[cells[body, 0], cells[body, 1]]
+    num_pieces = int(grid.max()) + 1
     top = np.zeros(num_pieces)
-    np.maximum.at(top, of_point[body], heights[body])
-    shortest, longest = config.box_length_m
-    is_car = (
-        (top > low) & (top < high - 0.1) & (length > shortest) & (length < longest) & (width < config.box_max_width_m)
-    )
-    return np.where(of_point == NO_PIECE, False, is_car[of_point])
+    np.maximum.at(top, piece, heights[body])
+    length, width = tightest_rectangles(grid, num_pieces).T * PIECE_CELL_M
+    is_trunk = (top >= config.trunk_min_m) & (length <= config.trunk_max_m)
+    is_car = _within(top, config.car_top_m) & _within(length, config.car_length_m) & (width < config.car_max_width_m)
+    labels = np.full(len(points), Label.VEGETATION, np.uint8)
+    labels[body[is_car[piece]]] = Label.CAR
+    labels[body[is_trunk[piece] & (heights[body] >= low)]] = Label.TRUNK
+    return labels
 
 
-def _is_wall(points: Points, heights: Vector, config: GeometricLabelsConfig) -> np.ndarray:
-    cells, side = _cells(points, WALL_CELL_M, config.max_range_m)
-    layers = np.clip(heights / WALL_LAYER_M, 0, NUM_WALL_LAYERS - 1).astype(np.int64)
-    offsets_mm = np.round((points[:, :2] + config.max_range_m) * 1000).astype(np.int64)
-    walls = wall_voxels(
-        cells, layers, offsets_mm, (NUM_WALL_LAYERS, side, side), config.wall_thickness_m * 1000, 300.0, 8
-    )
-    return walls[layers, cells[:, 0], cells[:, 1]]
+def _walls(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
+    """BUILDING for points on vertical faces, VEGETATION for the rest."""
+    walls = on_walls(points, heights, thickness_m=config.wall_thickness_m, min_top_m=config.wall_min_top_m)
+    return _chosen(walls, Label.BUILDING)
+
+
+def _chosen(mask: Mask, label: Label) -> Labels:
+    return np.where(mask, np.uint8(label), np.uint8(Label.VEGETATION))
+
+
+def _within(values: Vector, bounds: tuple[float, float]) -> Mask:
+    return (values >= bounds[0]) & (values <= bounds[1])
 
 
 def _cells(points: Points, cell_m: float, max_range_m: float) -> tuple[np.ndarray, int]:
-    """The grid cell of each point, and the grid's side; the border is wide enough for neighbourhoods."""
-    border = 10
-    half = int(np.ceil(max_range_m / cell_m)) + border
+    """The grid cell of each point, and the grid's side; its border is wide enough for neighbourhoods."""
+    half = int(np.ceil(max_range_m / cell_m)) + BORDER_CELLS
     return np.floor(points[:, :2] / cell_m).astype(np.int64) + half, 2 * half

@@ -11,34 +11,54 @@ from numba import njit
 from segslam.types import Points, Rotation, Vector
 
 MAX_TILT_DEG = 40.0
-"""Chosen: a sensor in the hand leans up to 33 degrees in the recordings at hand."""
+"""Chosen: the sensor in the hand of the courtyard recording leans up to 33 degrees."""
 LEVEL_RADIUS_M = 15.0
 """Chosen: the ground this near decides which way is up."""
+LEVEL_BIN_M = 0.2
+"""Chosen: ground within such a layer votes for the same plane."""
+MIN_LEVEL_CELLS = 10
+SURFACE_M = 0.15
+"""Chosen: the lowest points of a cell, this deep, make its height."""
 
 
 def upright(points: Points) -> Rotation:
-    """R_level_lidar: the turn that makes the widest nearly horizontal surface below the sensor level.
+    """R_level_lidar: the smallest turn that makes the widest nearly horizontal surface below the sensor level.
 
-    Searches tilts up to 40 degrees. The identity where fewer than 10 square metres are seen below the sensor.
+    Points are finite. Searches tilts up to 40 degrees; the identity where fewer than 10 square metres are seen there.
     """
-    lowest = _lowest_of_cells(points.astype(np.float64), LEVEL_RADIUS_M)
-    if len(lowest) < 10:
+    lowest = _lowest_of_cells(points, LEVEL_RADIUS_M)
+    if len(lowest) < MIN_LEVEL_CELLS:
         return np.eye(3)
-    normals = _upward_normals()
-    heights = lowest @ normals.T
-    bins = np.floor(heights / 0.2).astype(np.int64)
-    bins[bins >= 0] = -1  # the bin that touches the sensor also takes what cannot be ground
-    bins = np.clip(bins, -64, -1) + 64
-    votes = np.apply_along_axis(np.bincount, 0, bins, minlength=64)
-    votes[63] = 0
-    best = int(np.argmax(votes.max(axis=0)))
-    normal, offset = normals[best], (int(np.argmax(votes[:, best])) - 63.5) * 0.2
+    normal, height = _most_voted_plane(lowest)
     for bound_m in (0.4, 0.2, 0.15):
-        near = lowest[np.abs(lowest @ normal - offset) < bound_m]
-        if len(near) < 10:
+        near = lowest[np.abs(_along(lowest, normal) - height) < bound_m]
+        if len(near) < MIN_LEVEL_CELLS:
             return np.eye(3)
-        normal, offset = _plane(near)
+        normal, height = _plane(near)
     return _turn_to_z(normal) if normal[2] > np.cos(np.radians(MAX_TILT_DEG)) else np.eye(3)
+
+
+def turned(points: Points, R_a_b: Rotation) -> Points:
+    """Points of b in a, float64. Unlike a product of matrices, each row comes out the same wherever it stands."""
+    return np.column_stack([_along(points, row) for row in R_a_b])
+
+
+def heights_above_ground(points: Points, *, cell_m: float, max_range_m: float, max_slope: float) -> Vector:
+    """Height of each point above the ground below it (m), for points in a level frame, the sensor at the origin.
+
+    Points farther than `max_range_m` in x or y are measured from the nearest cell of the border. Where no ground was
+    seen it goes on as high as it was on the way there from the sensor.
+    """
+    half = int(np.ceil(max_range_m / cell_m))
+    cells = np.clip(np.floor(points[:, :2] / cell_m).astype(np.int64) + half, 0, 2 * half - 1)
+    order, starts = _grouped(cells[:, 0] * 2 * half + cells[:, 1], 4 * half * half)
+    surface = _follow(points[order, 2], starts, _outward(half), half, cell_m, max_slope)
+    return points[:, 2] - _interpolate(points, surface, half, cell_m)
+
+
+def _along(points: Points, direction: np.ndarray) -> Vector:
+    x, y, z = direction
+    return points[:, 0] * x + points[:, 1] * y + points[:, 2] * z
 
 
 @njit(cache=True, nogil=True)
@@ -57,11 +77,33 @@ def _lowest_of_cells(points, radius_m):
     return lowest[np.isfinite(lowest[:, 2])]
 
 
+def _most_voted_plane(points: Points) -> tuple[np.ndarray, float]:
+    """Normal and height along it of the plane below the sensor near which most points lie."""
+    normals = _upward_normals()
+    votes = _votes(points, normals, LEVEL_BIN_M, int(LEVEL_RADIUS_M / LEVEL_BIN_M))
+    best, depth = np.unravel_index(int(np.argmax(votes)), votes.shape)
+    return normals[best], -(depth + 0.5) * LEVEL_BIN_M
+
+
+@njit(cache=True, nogil=True)
+def _votes(points, normals, bin_m, num_bins):
+    """How many points lie in each bin of depth below the sensor, along each normal; none in the bin it touches."""
+    votes = np.zeros((len(normals), num_bins), np.int64)
+    for n in range(len(normals)):
+        x, y, z = normals[n]
+        for k in range(len(points)):
+            depth = -(points[k, 0] * x + points[k, 1] * y + points[k, 2] * z) / bin_m
+            if 1.0 <= depth < num_bins:
+                votes[n, int(depth)] += 1
+    return votes
+
+
 def _upward_normals() -> Points:
     """Unit vectors within MAX_TILT_DEG of z, some 4 degrees apart, the least tilted first."""
+    step = np.radians(4.0)
     normals = [(0.0, 0.0, 1.0)]
-    for tilt in np.radians(np.arange(4.0, MAX_TILT_DEG, 4.0)):
-        around = np.arange(0.0, 2 * np.pi, np.radians(4.0) / np.sin(tilt))
+    for tilt in np.arange(step, np.radians(MAX_TILT_DEG) + step / 2, step):
+        around = np.arange(0.0, 2 * np.pi, step / np.sin(tilt))
         normals += [(np.sin(tilt) * np.cos(a), np.sin(tilt) * np.sin(a), np.cos(tilt)) for a in around]
     return np.array(normals)
 
@@ -70,35 +112,36 @@ def _plane(points: Points) -> tuple[np.ndarray, float]:
     """Upward unit normal and height along it of the plane through points, by least squares."""
     mean = points.mean(axis=0)
     normal = np.linalg.eigh(np.cov(points.T))[1][:, 0]
-    normal *= np.sign(normal[2]) or 1.0
+    normal = normal if normal[2] > 0 else -normal
     return normal, float(mean @ normal)
 
 
 def _turn_to_z(normal: np.ndarray) -> Rotation:
-    """The smallest rotation that takes a unit vector to z."""
+    """The smallest rotation that takes a unit vector of the upper half to z."""
     x, y, z = normal
     k = 1.0 / (1.0 + z)
     return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
 
 
-def heights_above_ground(points: Points, *, cell_m: float, max_range_m: float, max_slope: float) -> Vector:
-    """Height of each point above the ground below it (m), for points in a level frame, the sensor at the origin.
-
-    Points farther than `max_range_m` (in x or y) are measured from the nearest cell of the border.
-    """
-    half = int(np.ceil(max_range_m / cell_m))
-    cells = np.clip(np.floor(points[:, :2] / cell_m).astype(np.int64) + half, 0, 2 * half - 1)
-    flat = cells[:, 0] * (2 * half) + cells[:, 1]
-    order = np.argsort(flat, kind="stable")
-    starts = np.searchsorted(flat[order], np.arange(4 * half * half + 1))
-    surface = _follow(points[order, 2].astype(np.float64), starts, _outward(half), half, cell_m, max_slope)
-    return points[:, 2] - _interpolate(points.astype(np.float64), surface, half, cell_m)
+@njit(cache=True, nogil=True)
+def _grouped(group, num_groups):
+    """Rows sorted by group, by counting, and where each group starts (num_groups + 1 values)."""
+    starts = np.zeros(num_groups + 1, np.int64)
+    for k in range(len(group)):
+        starts[group[k] + 1] += 1
+    starts = np.cumsum(starts)
+    free = starts.copy()
+    order = np.empty(len(group), np.int64)
+    for k in range(len(group)):
+        order[free[group[k]]] = k
+        free[group[k]] += 1
+    return order, starts
 
 
 def _outward(half: int) -> np.ndarray:
     """Cells of the grid by distance from the sensor, nearest first."""
-    centre = np.arange(2 * half) - half + 0.5
-    return np.argsort((centre[:, None] ** 2 + centre**2).ravel(), kind="stable")
+    squared = (2 * np.arange(-half, half) + 1) ** 2
+    return np.argsort((squared[:, None] + squared).ravel(), kind="stable")
 
 
 @njit(cache=True, nogil=True)
@@ -107,23 +150,12 @@ def _follow(z, starts, outward, half, cell_m, max_slope):
     side = 2 * half
     height = np.full((side, side), np.nan)
     gap = np.zeros((side, side))  # cells since ground was last seen on the way here
-    z0 = _start_height(z, starts, half, cell_m)
+    height_below_sensor = _start_height(z, starts, half, cell_m)
     for flat in outward:
         i, j = flat // side, flat % side
-        radius = (i - half + 0.5) ** 2 + (j - half + 0.5) ** 2
-        total = 0.0
-        weight = 0.0
-        nearest_gap = 1e9
-        for a in range(max(i - 1, 0), min(i + 2, side)):
-            for b in range(max(j - 1, 0), min(j + 2, side)):
-                if np.isnan(height[a, b]) or (a - half + 0.5) ** 2 + (b - half + 0.5) ** 2 >= radius:
-                    continue
-                w = 1.0 / (1.0 + gap[a, b]) ** 2
-                total += w * height[a, b]
-                weight += w
-                nearest_gap = min(nearest_gap, gap[a, b])
-        expected = total / weight if weight > 0 else z0
-        reach = nearest_gap if weight > 0 else 2.0
+        expected, reach = _expected(height, gap, i, j, half)
+        if np.isnan(expected):
+            expected = height_below_sensor
         tolerance = min(0.1 + max_slope * cell_m * (1.0 + reach), 1.0)
         found = _lowest_surface(z[starts[flat] : starts[flat + 1]], expected - tolerance - 0.1, expected + tolerance)
         if np.isnan(found):
@@ -135,8 +167,26 @@ def _follow(z, starts, outward, half, cell_m, max_slope):
 
 
 @njit(cache=True, nogil=True)
+def _expected(height, gap, i, j, half):
+    """Mean height of the neighbours nearer to the sensor, those that saw ground first, and the least of their gaps."""
+    side = 2 * half
+    distance = (2 * (i - half) + 1) ** 2 + (2 * (j - half) + 1) ** 2
+    total, weight, least_gap = 0.0, 0.0, np.inf
+    for a in range(max(i - 1, 0), min(i + 2, side)):
+        for b in range(max(j - 1, 0), min(j + 2, side)):
+            if (2 * (a - half) + 1) ** 2 + (2 * (b - half) + 1) ** 2 < distance:
+                w = 1.0 / (1.0 + gap[a, b]) ** 2
+                total += w * height[a, b]
+                weight += w
+                least_gap = min(least_gap, gap[a, b])
+    if weight == 0.0:
+        return np.nan, 2.0
+    return total / weight, least_gap
+
+
+@njit(cache=True, nogil=True)
 def _start_height(z, starts, half, cell_m):
-    """Height of the ground at the sensor: the 10th percentile of what lies below it within 8 m."""
+    """Height of the ground at the sensor: the 10th percentile of what lies below it within 8 m; -1.7 m if nothing."""
     reach = min(int(8.0 / cell_m), half)
     below = np.empty(len(z))
     count = 0
@@ -151,18 +201,17 @@ def _start_height(z, starts, half, cell_m):
 
 @njit(cache=True, nogil=True)
 def _lowest_surface(z, low, high):
-    """Mean height of the lowest 0.15 m that are occupied between two bounds; NaN where nothing is."""
+    """Mean height of the lowest SURFACE_M that are occupied between two bounds; NaN where nothing is."""
     lowest = np.inf
     for value in z:
         if low < value < high:
             lowest = min(lowest, value)
-    total = 0.0
-    count = 0
+    total_um, count = 0, 0  # whole micrometres: such sums do not depend on the points' order
     for value in z:
-        if lowest <= value < min(lowest + 0.15, high):
-            total += value
+        if lowest <= value < min(lowest + SURFACE_M, high):
+            total_um += int(np.round(value * 1e6))
             count += 1
-    return total / count if count > 0 else np.nan
+    return total_um / count / 1e6 if count > 0 else np.nan
 
 
 @njit(cache=True, nogil=True)

@@ -1,9 +1,11 @@
-"""Boxes and walls: what stands on the ground as a piece of a car's size, and what is flat and vertical."""
+"""Pieces of what stands on the ground, seen from above, and how large each is."""
 
 import numpy as np
 from numba import njit
 
 NO_PIECE = -1
+RECTANGLE_STEP_DEG = 3.0
+"""Chosen: a 5 m side is measured to within 1 cm."""
 
 
 @njit(cache=True, nogil=True)
@@ -35,68 +37,22 @@ def pieces(occupied):
 
 @njit(cache=True, nogil=True)
 def tightest_rectangles(piece, num_pieces):
-    """(num_pieces, 2) length and width, in cells, of the rectangle of least area around each piece; 3-degree steps."""
-    angles = np.arange(0.0, 90.0, 3.0) * np.pi / 180.0
+    """(num_pieces, 2) longer and shorter side, in cells, of the rectangle of least area around each piece."""
+    angles = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
+    cosines, sines = np.cos(angles), np.sin(angles)
     low = np.full((num_pieces, len(angles), 2), np.inf)
     high = np.full((num_pieces, len(angles), 2), -np.inf)
     for i in range(piece.shape[0]):
         for j in range(piece.shape[1]):
             k = piece[i, j]
-            if k == NO_PIECE:
-                continue
-            for n in range(len(angles)):
-                c, s = np.cos(angles[n]), np.sin(angles[n])
-                u, v = c * i + s * j, c * j - s * i
-                low[k, n, 0], high[k, n, 0] = min(low[k, n, 0], u), max(high[k, n, 0], u)
-                low[k, n, 1], high[k, n, 1] = min(low[k, n, 1], v), max(high[k, n, 1], v)
-    sizes = np.empty((num_pieces, 2))
+            if k != NO_PIECE:
+                for n in range(len(angles)):
+                    u, v = cosines[n] * i + sines[n] * j, cosines[n] * j - sines[n] * i
+                    low[k, n, 0], high[k, n, 0] = min(low[k, n, 0], u), max(high[k, n, 0], u)
+                    low[k, n, 1], high[k, n, 1] = min(low[k, n, 1], v), max(high[k, n, 1], v)
+    sides = np.empty((num_pieces, 2))
     for k in range(num_pieces):
-        best = np.inf
-        for n in range(len(angles)):
-            a, b = high[k, n, 0] - low[k, n, 0] + 1.0, high[k, n, 1] - low[k, n, 1] + 1.0
-            if a * b < best:
-                best = a * b
-                sizes[k] = max(a, b), min(a, b)
-    return sizes
-
-
-@njit(cache=True, nogil=True)
-def wall_voxels(cells, layers, offsets_mm, shape, thickness_mm, min_length_mm, min_points):
-    """(layers, side, side) bool: voxels whose points, with those of the 8 around, lie along one line seen from above.
-
-    `offsets_mm` (n, 2) are whole millimetres from the grid's corner, so that sums do not depend on the points' order.
-    """
-    num_layers, side, _ = shape
-    moments = np.zeros((num_layers, side, side, 6), np.int64)
-    for k in range(len(cells)):
-        x, y = offsets_mm[k, 0], offsets_mm[k, 1]
-        m = moments[layers[k], cells[k, 0], cells[k, 1]]
-        m[0] += 1
-        m[1] += x
-        m[2] += y
-        m[3] += x * x
-        m[4] += x * y
-        m[5] += y * y
-    flat = np.zeros((num_layers, side, side), np.bool_)
-    for layer in range(num_layers):
-        for i in range(1, side - 1):
-            for j in range(1, side - 1):
-                if moments[layer, i, j, 0] > 0:
-                    flat[layer, i, j] = _is_line(
-                        moments[layer, i - 1 : i + 2, j - 1 : j + 2], thickness_mm, min_length_mm, min_points
-                    )
-    return flat
-
-
-@njit(cache=True, nogil=True)
-def _is_line(moments, thickness_mm, min_length_mm, min_points):
-    n, x, y, xx, xy, yy = 0, 0, 0, 0, 0, 0
-    for i in range(moments.shape[0]):
-        for j in range(moments.shape[1]):
-            m = moments[i, j]
-            n, x, y, xx, xy, yy = n + m[0], x + m[1], y + m[2], xx + m[3], xy + m[4], yy + m[5]
-    if n < min_points:
-        return False
-    a, b, c = xx / n - (x / n) ** 2, xy / n - (x / n) * (y / n), yy / n - (y / n) ** 2
-    middle, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
-    return middle - spread < thickness_mm**2 and middle + spread > min_length_mm**2
+        extents = high[k] - low[k] + 1.0  # a cell has a width
+        best = np.argmin(extents[:, 0] * extents[:, 1])
+        sides[k] = max(extents[best, 0], extents[best, 1]), min(extents[best, 0], extents[best, 1])
+    return sides

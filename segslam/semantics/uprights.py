@@ -1,50 +1,65 @@
-"""Upright thin things, boxes, walls and the rest, told apart by what a grid of vertical columns holds.
+"""Thin upright things, found in a grid of vertical columns.
 
 A column is a square cell seen from above; what it holds at each height is one bit of a mask, so that whole
-neighbourhoods are joined by `or` (as occupancy-grid pole extractors do: Schaefer et al., ECMR 2019).
+neighbourhoods are joined by `or`. That a pole is what has free space all around is the idea of occupancy-grid
+extractors (Schaefer, Büscher, Vertens, Luft, Burgard, "Long-term urban vehicle localization using pole landmarks
+extracted from 3-D lidar scans", ECMR 2019).
 """
 
 import numpy as np
 from numba import njit
 
-SLICE_M = 0.2
-"""Chosen: height of one bit of a column, twice the vertical spacing of 64 beams at 10 m."""
-NUM_SLICES = 32
+NUM_SLICES = 16
 
 
 @njit(cache=True, nogil=True)
-def columns(cells, slices, side):
-    """(side, side) uint32: bit s of a column is set where a point lies in slice s; what lies outside sets none."""
-    masks = np.zeros((side, side), np.uint32)
-    for k in range(len(cells)):
-        i, j, s = cells[k, 0], cells[k, 1], slices[k]
-        if 0 <= i < side and 0 <= j < side and 0 <= s < NUM_SLICES:
-            masks[i, j] |= np.uint32(1) << np.uint32(s)
-    return masks
+def on_thin_uprights(cells, slices, side, core, ring, min_slices, min_share):
+    """(n,) bool: which points belong to something thin, tall and free-standing.
 
-
-@njit(cache=True, nogil=True)
-def thin_uprights(masks, core, ring, band, min_slices, min_share):
-    """(side, side) uint32: the bits of columns that belong to something thin, tall and free-standing.
-
-    Around each occupied column the bits within `core` cells are joined, and those between `core` and `ring` cells
-    away are taken off. What is left within `band` must span `min_slices` and be `min_share` of what was there.
+    A point lies in column `cells[k]` of a grid of `side` x `side`, at height `slices[k]`. Around each occupied column
+    the slices occupied within `core` cells are joined, and those occupied between `core` and `ring` cells away are
+    taken off. What is left must span `min_slices` and be `min_share` of what was there. Points outside the grid, or of
+    a slice below 0 or from NUM_SLICES on, take no part. Columns nearer than `ring` cells to the border are passed by.
     """
+    masks = np.zeros((side, side), np.uint16)
+    for k in range(len(cells)):
+        if _takes_part(cells[k], slices[k], side):
+            masks[cells[k, 0], cells[k, 1]] |= np.uint16(1 << slices[k])
+    found = _thin_columns(masks, core, ring, min_slices, min_share)
+    masks[:] = 0
+    inner = _disc(core, -1)
+    for i, j, clear in found:
+        for n in range(len(inner)):
+            masks[i + inner[n, 0], j + inner[n, 1]] |= np.uint16(clear)
+    chosen = np.zeros(len(cells), np.bool_)
+    for k in range(len(cells)):
+        if _takes_part(cells[k], slices[k], side):
+            chosen[k] = masks[cells[k, 0], cells[k, 1]] >> slices[k] & 1
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def _takes_part(cell, slice_index, side):
+    return 0 <= cell[0] < side and 0 <= cell[1] < side and 0 <= slice_index < NUM_SLICES
+
+
+@njit(cache=True, nogil=True)
+def _thin_columns(masks, core, ring, min_slices, min_share):
+    """Rows of (i, j, mask): columns in the middle of something thin, and its slices."""
     side = masks.shape[0]
-    marked = np.zeros_like(masks)
     inner, outer = _disc(core, -1), _disc(ring, core)
+    found = []
     for i in range(ring, side - ring):
         for j in range(ring, side - ring):
-            if masks[i, j] & band == 0:
+            if masks[i, j] == 0:
                 continue
-            held = _join(masks, inner, i, j) & band
+            held = _joined(masks, inner, i, j)
             if _span(held) < min_slices:
                 continue
-            clear = held & ~_join(masks, outer, i, j)
-            if _span(clear) >= min_slices and _count(clear) >= min_share * _count(held):
-                for n in range(len(inner)):
-                    marked[i + inner[n, 0], j + inner[n, 1]] |= clear
-    return marked
+            clear = _left_clear(masks, outer, i, j, held, min_share * _count(held))
+            if _span(clear) >= min_slices:
+                found.append((i, j, clear))
+    return found
 
 
 @njit(cache=True, nogil=True)
@@ -62,18 +77,31 @@ def _disc(radius, inner_radius):
 
 
 @njit(cache=True, nogil=True)
-def _join(masks, offsets, i, j):
-    joined = np.uint32(0)
+def _joined(masks, offsets, i, j):
+    joined = 0
     for n in range(len(offsets)):
         joined |= masks[i + offsets[n, 0], j + offsets[n, 1]]
     return joined
 
 
 @njit(cache=True, nogil=True)
+def _left_clear(masks, offsets, i, j, held, min_count):
+    """The bits of `held` that no column around has; none if they are fewer than `min_count`."""
+    clear = held
+    for n in range(len(offsets)):
+        taken = clear & masks[i + offsets[n, 0], j + offsets[n, 1]]
+        if taken:
+            clear ^= taken
+            if _count(clear) < min_count:
+                return 0
+    return clear
+
+
+@njit(cache=True, nogil=True)
 def _count(mask):
     count = 0
     while mask:
-        mask &= mask - np.uint32(1)
+        mask &= mask - 1
         count += 1
     return count
 
@@ -81,12 +109,8 @@ def _count(mask):
 @njit(cache=True, nogil=True)
 def _span(mask):
     """From the lowest to the highest bit set, both included."""
-    if mask == 0:
-        return 0
-    low = 0
-    while not (mask >> np.uint32(low)) & np.uint32(1):
-        low += 1
-    high = 31
-    while not (mask >> np.uint32(high)) & np.uint32(1):
-        high -= 1
-    return high - low + 1
+    first, last = NUM_SLICES, -1
+    for bit in range(NUM_SLICES):
+        if mask >> bit & 1:
+            first, last = min(first, bit), bit
+    return max(last - first + 1, 0)

@@ -1,0 +1,95 @@
+"""Vertical faces: where points lie along one line seen from above, high enough."""
+
+import numpy as np
+from numba import njit
+
+from segslam.types import Mask, Points, Vector
+
+CELL_M = 0.6
+"""Chosen, as what follows, by the IoU of buildings on the real KITTI scans 0-2 (`tools/bench_labels.py`)."""
+LAYER_M = 2.0
+NUM_LAYERS = 5
+MIN_LENGTH_M = 0.3
+"""Least standard deviation along the line."""
+MIN_POINTS = 8
+
+
+def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: float) -> Mask:
+    """Which points lie on a vertical face, in a level frame.
+
+    A face is judged in voxels, each with the 8 around it: the standard deviation of the points across their line is
+    below `thickness_m`, and something there stands higher than `min_top_m` above the ground.
+    """
+    if not len(points):
+        return np.zeros(0, bool)
+    corner = np.floor(points[:, :2].min(axis=0) / CELL_M) - 1
+    cells = (np.floor(points[:, :2] / CELL_M) - corner).astype(np.int64)
+    layers = np.clip(heights / LAYER_M, 0, NUM_LAYERS - 1).astype(np.int64)
+    offsets_mm = np.round((points[:, :2] - corner * CELL_M) * 1000).astype(np.int64)
+    shape = (NUM_LAYERS, int(cells[:, 0].max()) + 2, int(cells[:, 1].max()) + 2)
+    voxel, moments = _moments(layers, cells, offsets_mm, shape)
+    top = _tops(cells, heights, shape[1:])
+    walls = _walls(voxel, moments, top, thickness_m * 1000, MIN_LENGTH_M * 1000, min_top_m)
+    return walls[voxel[layers, cells[:, 0], cells[:, 1]]]
+
+
+@njit(cache=True, nogil=True)
+def _moments(layers, cells, offsets_mm, shape):
+    """The number of each occupied voxel, -1 elsewhere, and for each the sums of 1, x, y, xx, xy, yy over its points.
+
+    Sums of whole millimetres do not depend on the points' order.
+    """
+    voxel = np.full(shape, -1, np.int32)
+    moments = np.zeros((len(layers), 6), np.int64)
+    num_voxels = 0
+    for k in range(len(layers)):
+        layer, i, j = layers[k], cells[k, 0], cells[k, 1]
+        if voxel[layer, i, j] < 0:
+            voxel[layer, i, j] = num_voxels
+            num_voxels += 1
+        x, y = offsets_mm[k, 0], offsets_mm[k, 1]
+        m = moments[voxel[layer, i, j]]
+        m[0] += 1
+        m[1] += x
+        m[2] += y
+        m[3] += x * x
+        m[4] += x * y
+        m[5] += y * y
+    return voxel, moments[:num_voxels]
+
+
+@njit(cache=True, nogil=True)
+def _tops(cells, heights, shape):
+    top = np.full(shape, -np.inf)
+    for k in range(len(cells)):
+        i, j = cells[k, 0], cells[k, 1]
+        top[i, j] = max(top[i, j], heights[k])
+    return top
+
+
+@njit(cache=True, nogil=True)
+def _walls(voxel, moments, top, thickness_mm, min_length_mm, min_top_m):
+    """Whether each voxel is part of a face. Its surroundings never leave the grid, whose border is empty."""
+    walls = np.zeros(len(moments), np.bool_)
+    for layer in range(voxel.shape[0]):
+        for i in range(1, voxel.shape[1] - 1):
+            for j in range(1, voxel.shape[2] - 1):
+                if voxel[layer, i, j] < 0 or top[i - 1 : i + 2, j - 1 : j + 2].max() < min_top_m:
+                    continue
+                total = np.zeros(6, np.int64)
+                for a in range(i - 1, i + 2):
+                    for b in range(j - 1, j + 2):
+                        if voxel[layer, a, b] >= 0:
+                            total += moments[voxel[layer, a, b]]
+                walls[voxel[layer, i, j]] = _is_line(total, thickness_mm, min_length_mm)
+    return walls
+
+
+@njit(cache=True, nogil=True)
+def _is_line(moments, thickness_mm, min_length_mm):
+    n, x, y, xx, xy, yy = moments
+    if n < MIN_POINTS:
+        return False
+    a, b, c = xx / n - (x / n) ** 2, xy / n - (x / n) * (y / n), yy / n - (y / n) ** 2
+    middle, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
+    return middle - spread < thickness_mm**2 and middle + spread > min_length_mm**2

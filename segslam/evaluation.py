@@ -49,8 +49,8 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
     ate_m, are_deg, height_m: root mean squares after alignment; the last along `up` of the reference's frame.
     rpe_m, rpe_deg: root mean squares of the motion from each row to the next. kitti_translation_percent,
     kitti_rotation_deg_per_100m: means over KITTI's segments, left out if the drive is shorter than 100 m.
-    Nothing at all for fewer than 3 rows; no are_deg and height_m for positions that leave one line by no more than their
-    error does, for the turn about it is then anyone's.
+    Nothing at all for fewer than 3 rows; no are_deg and height_m for positions that leave one line by no more than the
+    error is, for the turn about it is then anyone's.
     """
     if len(reference) < MIN_POSES:
         return {}

@@ -21,14 +21,14 @@ def _segslam() -> None:
     """Map, evaluate, replay and register LiDAR scans."""
 
 
-def main() -> None:
-    """Run a command. Exit status: 0 done, 1 the work failed, 2 bad usage or bad input, 130 interrupted."""
+def main(arguments: list[str] | None = None) -> None:
+    """Run a command, that of the command line unless given, and exit. Exit status: 0 done, 1 the work failed, 2 bad usage or bad input, 130 interrupted."""
     from segslam.cli import commands
 
     logging.basicConfig(level=logging.WARNING, format="segslam: %(levelname)s: %(message)s", stream=sys.stderr)
     commands.add_all(app)
     try:
-        app()
+        app(arguments)
     except SegslamError as error:
         print(f"segslam: {error}", file=sys.stderr)
         sys.exit(2)

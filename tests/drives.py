@@ -1,0 +1,39 @@
+"""A short simulated drive, and an odometry of it that drifts: small enough for tests of the whole pipeline."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from segslam import geometry
+from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, simulate_drive
+from segslam.types import Scan, Trajectory
+
+NUM_SCANS = 72
+STEP_M = 2.2
+RADIUS_M = 18.0  # 158 m of driving: a round of 113 m, and 45 m of it again
+
+
+@cache
+def round_drive() -> tuple[tuple[Scan, ...], Trajectory]:
+    """Scans of a drive around a block, a round and a half, with labels, and their true poses."""
+    along = STEP_M * np.arange(NUM_SCANS) / RADIUS_M
+    poses = np.stack(
+        [geometry.transform(geometry.yaw(a), [RADIUS_M * np.sin(a), -RADIUS_M * np.cos(a), 1.73]) for a in along]
+    )
+    time_s = 0.3 * np.arange(NUM_SCANS)
+    config = SimulationConfig(
+        world=WorldConfig(moving_cars=0.0), sensor=SensorConfig(name="os1-64", sweep_rotation_sigma_deg=0.0)
+    )
+    scans = tuple(simulate_drive(poses, time_s, seed=3, config=config))
+    stamps = np.array([scan.stamp_ns for scan in scans])
+    return scans, Trajectory(np.arange(NUM_SCANS), stamps, poses)
+
+
+def drifting(truth: Trajectory, *, turn_deg: float = 0.15, climb_m: float = 0.01) -> Trajectory:
+    """The same motion with a constant error in each step: some metres after a round."""
+    error = geometry.exp(geometry.tangent(rotation_rad=[0, 0, np.radians(turn_deg)], translation_m=[0.01, 0, climb_m]))
+    poses = [np.eye(4)]
+    for before, after in zip(truth.T_world_lidar[:-1], truth.T_world_lidar[1:], strict=True):
+        poses.append(poses[-1] @ geometry.inverse(before) @ after @ error)
+    return replace(truth, T_world_lidar=np.stack(poses))

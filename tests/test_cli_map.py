@@ -1,0 +1,131 @@
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives import round_drive
+
+from segslam import cli
+from segslam.log import read_log
+from segslam.simulation import made_up_drive
+from segslam.simulation.files import uncorrected
+from segslam.trajectory import camera_from_lidar, read_poses, write_kitti
+from segslam.types import Rejected
+
+RUN_FILES = {
+    "config.yaml",
+    "graph.g2o",
+    "log.mcap",
+    "loops.csv",
+    "metrics.json",
+    "odometry_kitti.txt",
+    "odometry_tum.txt",
+    "poses_kitti.txt",
+    "poses_tum.txt",
+}
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten scans in KITTI's format, the fifth truncated."""
+    root = tmp_path_factory.mktemp("kitti")
+    folder = root / "sequences" / "00"
+    (folder / "velodyne").mkdir(parents=True)
+    (root / "poses").mkdir()
+    scans, truth = round_drive()
+    for scan in scans[:10]:
+        rows = np.column_stack([uncorrected(scan.points), np.zeros(len(scan.points))])
+        rows.astype("<f4").tofile(folder / "velodyne" / f"{scan.index:06d}.bin")
+    broken = folder / "velodyne" / "000004.bin"
+    broken.write_bytes(broken.read_bytes()[:-5])
+    (folder / "calib.txt").write_text(made_up_drive(1).calib)
+    (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans))
+    write_kitti(root / "poses" / "00.txt", camera_from_lidar(truth.T_world_lidar, np.eye(4)))
+    return root
+
+
+def run(*arguments: object) -> int:
+    """Exit status of a command line."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+def test_map_writes_a_whole_run_and_skips_the_bad_scan(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert run("map", kitti, "--out", out, "--json", "--quiet") == 0
+    printed = capsys.readouterr()
+    metrics = json.loads(printed.out)
+    assert metrics == json.loads((out / "metrics.json").read_text())
+    assert {file.name for file in out.iterdir()} >= RUN_FILES
+    assert (metrics["num_scans"], metrics["num_scans_skipped"]) == (9, 1)
+    assert len(read_poses(out / "poses_kitti.txt")) == 9
+    assert len(list(read_log(out / "log.mcap").steps())) == 9
+    assert {"ate_m", "odometry_ate_m", "rpe_m", "num_loops_false", "stage_ms", "peak_rss_mb"} <= set(metrics)
+
+
+def test_a_run_folder_is_never_written_over(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis.txt").write_text("results")
+    assert run("map", kitti, "--out", tmp_path) == 2
+    assert "not empty" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--set", "keyframes.distance=1"], "keyframes.distance"),
+        (["--sequence", "07"], "07"),
+        (["--frames", "50:60"], "--frames 50:60"),
+        (["--labels", "nowhere"], "nowhere"),
+        (["--odometry", "missing.txt"], "missing.txt"),
+        (["--config", "missing.yaml"], "missing.yaml"),
+        (["--dataset", "kitty"], "kitty"),
+    ],
+)
+def test_bad_usage_says_what_is_wrong_in_one_line_and_writes_nothing(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    out = tmp_path / "run"
+    assert run("map", kitti, "--out", out, *options) == 2
+    message = capsys.readouterr().err.strip()
+    assert said in message
+    assert len(message.splitlines()) == 1
+    assert not out.exists()
+
+
+def test_an_odometry_is_taken_as_given(kitti: Path, tmp_path: Path) -> None:
+    given = tmp_path / "given.txt"
+    write_kitti(given, round_drive()[1].T_world_lidar)
+    assert run("map", kitti, "--out", tmp_path / "run", "--odometry", given, "--quiet") == 0
+    poses = read_poses(tmp_path / "run" / "odometry_tum.txt").T_a_b
+    truth = round_drive()[1].T_world_lidar
+    expected = np.linalg.inv(truth[0]) @ truth[[0, 1, 2, 3, 5, 6, 7, 8, 9]]
+    np.testing.assert_allclose(poses, expected, atol=1e-6)
+
+
+def test_loops_csv_has_a_row_for_every_attempt(tmp_path: Path) -> None:
+    from test_slam import CONFIG, _slam
+
+    from segslam.runs import POSE_COLUMNS, write_loops
+
+    slam = _slam()
+    attempts = [attempt for scan in round_drive()[0] for attempt in slam.process(scan).attempts]
+    weights = slam.finish().estimate.closure_weights
+    write_loops(tmp_path / "loops.csv", tuple(attempts), weights)
+    with (tmp_path / "loops.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == len(attempts) > 0
+    assert CONFIG.proximity.max_candidates >= 1
+    for row, attempt in zip(rows, attempts, strict=True):
+        assert int(row["source"]) == attempt.candidate.source_id
+        if isinstance(attempt.outcome, Rejected):
+            assert row["outcome"] == attempt.outcome.reason
+            assert row["T00"] == ""
+        else:
+            matrix = np.array([float(row[column]) for column in POSE_COLUMNS]).reshape(4, 4)
+            np.testing.assert_array_equal(matrix, attempt.outcome.T_target_source)
+            assert 0 <= float(row["weight"]) <= 1

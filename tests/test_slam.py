@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+from drives import drifting, round_drive
+
+from segslam.config import load_config
+from segslam.evaluation import trajectory_metrics
+from segslam.odometry import GivenOdometry
+from segslam.runs import accuracy
+from segslam.slam import Slam, SlamResult
+from segslam.types import BadScan, LoopClosure, Rejected, Scan, Step
+
+CONFIG = load_config(None, ["proximity.min_travel_m=60"])
+
+
+def _slam() -> Slam:
+    return Slam(CONFIG, odometry=GivenOdometry(drifting(round_drive()[1]), CONFIG.odometry))
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[list[Step], SlamResult]:
+    slam = _slam()
+    steps = [slam.process(scan) for scan in round_drive()[0]]
+    return steps, slam.finish()
+
+
+def test_loops_take_the_drift_out(run: tuple[list[Step], SlamResult]) -> None:
+    _, result = run
+    figures = accuracy(result, round_drive()[1])
+    assert figures["num_loops_false"] == 0
+    assert len(result.estimate.closure_weights) >= 3
+    assert figures["odometry_ate_m"] > 0.5, "the drift to be taken out"
+    assert figures["ate_m"] < 0.4 * figures["odometry_ate_m"]
+
+
+def test_every_scan_has_a_pose_and_keyframes_have_the_graph_s(run: tuple[list[Step], SlamResult]) -> None:
+    steps, result = run
+    assert result.trajectory.scan_index.tolist() == [scan.index for scan in round_drive()[0]]
+    for keyframe_id, T_world_keyframe in result.estimate.T_world_keyframe.items():
+        row = result.keyframe_rows[keyframe_id]
+        np.testing.assert_allclose(result.trajectory.T_world_lidar[row], T_world_keyframe, atol=1e-9)
+    assert [step.keyframe.id for step in steps if step.keyframe] == list(range(len(result.keyframe_rows)))
+
+
+def test_a_step_holds_an_estimate_exactly_when_a_loop_was_accepted(run: tuple[list[Step], SlamResult]) -> None:
+    for step in run[0]:
+        accepted = [attempt for attempt in step.attempts if isinstance(attempt.outcome, LoopClosure)]
+        assert (step.estimate is not None) == bool(accepted)
+
+
+def test_repeating_the_steps_gives_the_same_attempts_and_poses(run: tuple[list[Step], SlamResult]) -> None:
+    steps, result = run
+    slam = Slam(CONFIG)
+    again = [slam.repeat(step) for step in steps]
+    repeated = slam.finish()
+    np.testing.assert_allclose(repeated.trajectory.T_world_lidar, result.trajectory.T_world_lidar, atol=1e-9)
+    outcomes = [[_told(attempt.outcome) for attempt in step.attempts] for step in steps]
+    assert [[_told(attempt.outcome) for attempt in step.attempts] for step in again] == outcomes
+
+
+def test_other_gates_on_the_same_steps_reject_what_was_accepted(run: tuple[list[Step], SlamResult]) -> None:
+    slam = Slam(load_config(None, ["proximity.min_travel_m=60", "verify.min_overlap=1"]))
+    for step in run[0]:
+        slam.repeat(step)
+    result = slam.finish()
+    assert result.estimate.closure_weights == {}
+    np.testing.assert_allclose(
+        trajectory_metrics(result.trajectory.T_world_lidar, result.odometry.T_world_lidar)["ate_m"], 0.0, atol=1e-6
+    )
+
+
+def test_a_bad_scan_is_forgotten() -> None:
+    scans, _ = round_drive()
+    slam = _slam()
+    slam.process(scans[0])
+    empty = Scan(1, scans[1].stamp_ns, np.empty((0, 3), np.float32), np.empty(0, np.uint8))
+    with pytest.raises(BadScan):
+        slam.process(empty)
+    slam.process(scans[2])
+    assert slam.finish().trajectory.scan_index.tolist() == [0, 2]
+
+
+def test_there_is_no_end_without_a_beginning() -> None:
+    with pytest.raises(ValueError, match="no scan"):
+        Slam(CONFIG).finish()
+
+
+def _told(outcome: LoopClosure | Rejected) -> str:
+    if isinstance(outcome, Rejected):
+        return f"{outcome.reason} {outcome.detail}"
+    return np.array2string(outcome.T_target_source, precision=10)

@@ -1,11 +1,23 @@
 """Point clouds as arrays: in and out, no state."""
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
-from segslam.types import Indices, Points
+from segslam.types import Covariances, Indices, Points
 
 EMPTY = -1
+MAX_CELLS = 2**62
+
+
+class Neighbours(NamedTuple):
+    """The neighbours of point i, itself among them, are `rows[starts[i] : ends[i]]`."""
+
+    starts: Indices
+    ends: Indices
+    rows: Indices
 
 
 def within_range(points: Points, min_m: float, max_m: float) -> np.ndarray:
@@ -17,36 +29,76 @@ def within_range(points: Points, min_m: float, max_m: float) -> np.ndarray:
 def canonical_order(points: Points) -> Indices:
     """Indices that sort points along a skew direction: the same sequence of points whatever order they come in."""
     x, y, z = points.T.astype(np.float64)
-    return np.argsort(x + np.sqrt(2.0) * y + np.sqrt(3.0) * z)
+    return np.argsort(x + math.sqrt(2.0) * y + math.sqrt(3.0) * z)
 
 
 def voxel_first(points: Points, voxel_m: float) -> Indices:
-    """Indices, ascending, of the first point in each occupied voxel. Raises ValueError if voxel_m <= 0."""
-    keys = voxel_keys(points, voxel_m)
-    return np.flatnonzero(hash_keys(keys)[1] == np.arange(len(keys)))
+    """Indices, ascending, of the first point in each occupied voxel; points that are not finite are in none.
+
+    Raises ValueError if voxel_m <= 0, or if the points spread over more voxels than there are numbers for.
+    """
+    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+    keys, _ = _cell_keys(points[rows], voxel_m)
+    return rows[hash_keys(keys)[1] == np.arange(len(keys))]
 
 
 def voxel_means(points: Points, voxel_m: float) -> Points:
-    """The mean of the points of each occupied voxel, float64, in the order of the voxels x, y, z.
+    """The mean of the finite points of each occupied voxel, float64, voxels in the order of x, y, z.
 
-    Raises ValueError if voxel_m <= 0.
+    For float32 points it does not depend on their order: such sums are exact. Raises ValueError as `voxel_first` does.
     """
-    _, voxel, counts = np.unique(voxel_keys(points, voxel_m), return_inverse=True, return_counts=True)
-    sums = [np.bincount(voxel, weights=column, minlength=len(counts)) for column in points.T]
-    return np.column_stack(sums) / counts[:, None]
+    points = points[np.isfinite(points).all(axis=1)]
+    keys, _ = _cell_keys(points, voxel_m)
+    _, first = hash_keys(keys)
+    occupied = np.flatnonzero(first == np.arange(len(keys)))
+    occupied = occupied[np.argsort(keys[occupied])]
+    voxel_of_first = np.empty(len(keys), np.int64)
+    voxel_of_first[occupied] = np.arange(len(occupied))
+    return group_means(points, voxel_of_first[first], len(occupied))
 
 
-def voxel_keys(points: Points, voxel_m: float) -> Indices:
-    """One number a point, equal for two points exactly if they share a voxel; the voxel of a point is floor(p / voxel_m).
+def group_means(rows: np.ndarray, group: Indices, num_groups: int) -> np.ndarray:
+    """Mean row of each group, float64; every group has a row at least."""
+    sums = [np.bincount(group, weights=column, minlength=num_groups) for column in rows.T]
+    return np.column_stack(sums) / np.bincount(group, minlength=num_groups)[:, None]
 
-    Numbers grow with x, then y, then z. Raises ValueError if voxel_m <= 0.
+
+def radius_neighbours(points: Points, radius_m: float) -> Neighbours:
+    """All neighbours within a radius, the limit included. The points are finite. Raises as `voxel_first` does."""
+    keys, strides = _cell_keys(points, radius_m)
+    order = np.argsort(keys, kind="stable")
+    return Neighbours(*_neighbours(points.astype(np.float64)[order], keys[order], *strides, order, radius_m**2))
+
+
+def patch_covariances(points: Points, neighbours: Neighbours, radius_m: float) -> tuple[Covariances, Indices]:
+    """Covariance (normalised by n) and number of the neighbours within `radius_m` of each point, itself among them."""
+    return _patch_covariances(points.astype(np.float64), *neighbours, radius_m**2)
+
+
+def normals(points: Points, covariances: Covariances) -> Points:
+    """The direction in which the surroundings of each point vary least, turned towards the sensor at the origin."""
+    directions = np.linalg.eigh(covariances)[1][:, :, 0]
+    away = np.einsum("ij,ij->i", directions, points) > 0
+    return np.where(away[:, None], -directions, directions)
+
+
+def _cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]:
+    """A number for each point's cell, and how far it grows from a cell to the next in x and in y; in z it is 1.
+
+    The cell of a point is floor(p / cell_m). Numbers grow with x, then y, then z, and leave room around the points, so
+    that neighbouring cells have numbers of their own.
     """
-    if voxel_m <= 0:
-        raise ValueError(f"voxel_m must be above 0, got {voxel_m}")
-    cells = np.floor(points / voxel_m).astype(np.int64)
-    cells -= cells.min(axis=0, initial=np.iinfo(np.int64).max)
-    _, extent_y, extent_z = cells.max(axis=0, initial=0) + 1
-    return (cells[:, 0] * extent_y + cells[:, 1]) * extent_z + cells[:, 2]
+    if cell_m <= 0:
+        raise ValueError(f"voxel_m or radius_m must be above 0, got {cell_m}")
+    if not len(points):
+        return np.empty(0, np.int64), (1, 1)
+    cells = np.floor(points / cell_m)
+    low = cells.min(axis=0) - 1
+    extent = [int(count) for count in cells.max(axis=0) - low + 2]
+    if math.prod(extent) > MAX_CELLS:
+        raise ValueError(f"points spread over {extent} cells of {cell_m} m; drop far points or enlarge the cells")
+    x, y, z = (cells - low).astype(np.int64).T
+    return (x * extent[1] + y) * extent[2] + z, (extent[1] * extent[2], extent[2])
 
 
 @njit("int64(int64, int64)", cache=True, nogil=True, inline="always")
@@ -82,3 +134,70 @@ def find_key(table, keys, key):
     while table[slot] != EMPTY and keys[table[slot]] != key:
         slot = (slot + 1) & (len(table) - 1)
     return table[slot]
+
+
+@njit("int64[:, :](int64[:], int64, int64, int64)", cache=True, nogil=True)
+def _nearby_columns(keys, key, stride_x, stride_y):
+    """(9, 2) first and last + 1 row, in sorted keys, of the cells around a cell; three of them lie above each other."""
+    bounds = np.empty((9, 2), np.int64)
+    for column in range(9):
+        middle = key + (column // 3 - 1) * stride_x + (column % 3 - 1) * stride_y
+        bounds[column, 0] = np.searchsorted(keys, middle - 1)
+        bounds[column, 1] = np.searchsorted(keys, middle + 2)
+    return bounds
+
+
+@njit(
+    "Tuple((int64[:], int64[:], int64[:]))(float64[:, :], int64[:], int64, int64, int64[:], float64)",
+    cache=True,
+    nogil=True,
+)
+def _neighbours(points, keys, stride_x, stride_y, row_of, squared_radius):
+    """Points and keys are sorted by key; `row_of` gives the row that each had before."""
+    starts, ends = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    rows = np.empty(64 * len(points) + 1, np.int64)
+    bounds = np.empty((9, 2), np.int64)
+    count = 0
+    for at in range(len(points)):
+        if at == 0 or keys[at] != keys[at - 1]:
+            bounds = _nearby_columns(keys, keys[at], stride_x, stride_y)
+        starts[row_of[at]] = count
+        for column in range(9):
+            while count + bounds[column, 1] - bounds[column, 0] >= len(rows):
+                rows = np.concatenate((rows, np.empty_like(rows)))
+            for other in range(bounds[column, 0], bounds[column, 1]):
+                x = points[other, 0] - points[at, 0]
+                y = points[other, 1] - points[at, 1]
+                z = points[other, 2] - points[at, 2]
+                rows[count] = row_of[other]
+                count += x * x + y * y + z * z <= squared_radius
+        ends[row_of[at]] = count
+    return starts, ends, rows[:count].copy()
+
+
+@njit(
+    "Tuple((float64[:, :, :], int64[:]))(float64[:, :], int64[:], int64[:], int64[:], float64)", cache=True, nogil=True
+)
+def _patch_covariances(points, starts, ends, rows, squared_radius):
+    covariances = np.empty((len(points), 3, 3))
+    counts = np.zeros(len(points), np.int64)
+    for row in range(len(points)):
+        sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+        for at in range(starts[row], ends[row]):
+            x = points[rows[at], 0] - points[row, 0]
+            y = points[rows[at], 1] - points[row, 1]
+            z = points[rows[at], 2] - points[row, 2]
+            if x * x + y * y + z * z <= squared_radius:
+                counts[row] += 1
+                sx, sy, sz = sx + x, sy + y, sz + z
+                xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+                yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+        n = counts[row]
+        mx, my, mz = sx / n, sy / n, sz / n
+        covariances[row, 0, 0] = xx / n - mx * mx
+        covariances[row, 1, 1] = yy / n - my * my
+        covariances[row, 2, 2] = zz / n - mz * mz
+        covariances[row, 0, 1] = covariances[row, 1, 0] = xy / n - mx * my
+        covariances[row, 0, 2] = covariances[row, 2, 0] = xz / n - mx * mz
+        covariances[row, 1, 2] = covariances[row, 2, 1] = yz / n - my * mz
+    return covariances, counts

@@ -1,12 +1,13 @@
 """Semantic clusters: labelled points -> Gaussians.
 
-Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator: Global Point Cloud Registration with Semantic and Geometric Cues", ICRA 2023,
-section III-A. The segmentation is the dynamic curved-voxel clustering (DCVC) of Zhou, Guo, Gan, Yang, "T-LOAM: Truncated
-Least Squares LiDAR-Only Odometry and Mapping in Real Time", TGRS 2021: points fall in voxels of range, pitch and
-azimuth around the sensor, and occupied voxels that touch (26 neighbours) form one cluster.
+Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator: Global Point Cloud Registration with Semantic and Geometric Cues", ICRA
+2023, section III. The segmentation is dynamic curved-voxel clustering (DCVC) of Zhou, Guo, Gan, Yang, "T-LOAM:
+Truncated Least Squares LiDAR-Only Odometry and Mapping in Real Time", TGRS 2021: points fall in voxels of range, pitch
+and azimuth around the sensor, and occupied voxels that touch (26 neighbours) form one cluster.
 
-Differs from T-LOAM and the Segregator authors' program: azimuth wraps, and clusters are the connected components
-proper. Theirs let only points that have no cluster yet join clusters, so what is split depends on the points' order.
+Differs from T-LOAM and from the Segregator authors' program: azimuth wraps, and clusters are connected components
+proper. Theirs joins clusters only where a point without a cluster meets them, so how a row of cars splits depends on
+the order of the points.
 """
 
 import math
@@ -16,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from segslam.config import SegregatorConfig
-from segslam.points import EMPTY, canonical_order, find_key, hash_keys, within_range
+from segslam.points import EMPTY, canonical_order, find_key, group_means, hash_keys, within_range
 from segslam.types import Covariances, Indices, Label, Labels, Points, Vector
 
 FIRST_RADIUS_M = 5.0
@@ -55,34 +56,27 @@ def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfi
 def curved_voxel_clusters(points: Points, *, start_m: float, step_m: float, angle_deg: float) -> Indices:
     """(n,) the cluster of each point by DCVC, numbered from 0. The points are finite and none is at the origin.
 
-    Radial bin k, from 1, is `start_m - k * step_m` deep; the first starts at the nearest point, 5 m away at most. Bins of
-    pitch and azimuth are `angle_deg` wide (azimuth: the nearest width that divides the circle).
+    Radial bin k, from 1, is `start_m - k * step_m` deep; the first starts at the nearest point, 5 m away at most. Bins
+    of pitch and azimuth are `angle_deg` wide (azimuth: the nearest width that divides the circle).
     """
     if not len(points):
         return np.empty(0, np.int64)
     polar = _polar(points)
     num_azimuth = max(1, round(360.0 / angle_deg))
-    cells = np.empty((len(points), 3), np.int64)
-    cells[:, 0] = _radial_bins(polar[:, 0], start_m, step_m)
-    cells[:, 1] = np.floor((polar[:, 1] - min(0.0, polar[:, 1].min())) / math.radians(angle_deg) + 0.5)
-    cells[:, 2] = np.floor(polar[:, 2] / (2.0 * math.pi / num_azimuth) + 0.5).astype(np.int64) % num_azimuth
-    num_radial = (
-        cells[:, 0].max() + 2
-    )  # one more than occupied: the neighbours of the outermost bins have keys of their own
-    keys, voxel_of_point = np.unique(
-        (cells[:, 1] * num_radial + cells[:, 0]) * num_azimuth + cells[:, 2], return_inverse=True
-    )
-    return _components(keys, num_radial, num_azimuth)[voxel_of_point]
+    radial = _radial_bins(polar[:, 0], start_m, step_m)
+    pitch = _nearest_bin(polar[:, 1] - min(0.0, polar[:, 1].min()), math.radians(angle_deg))
+    azimuth = _nearest_bin(polar[:, 2], math.tau / num_azimuth) % num_azimuth
+    num_radial = int(radial.max()) + 2  # one more than occupied: neighbours of the outermost bin have keys of their own
+    keys, voxel = np.unique((pitch * num_radial + radial) * num_azimuth + azimuth, return_inverse=True)
+    return _components(keys, num_radial, num_azimuth)[voxel]
 
 
-def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, Covariances, Indices]:
-    """Mean, covariance (normalised by n) and number of the points of each group. A group has a point at least."""
-    sizes = np.bincount(group, minlength=num_groups)
-    means = _group_sums(points, group, num_groups) / sizes[:, None]
+def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, Covariances]:
+    """Mean and covariance (normalised by n) of the points of each group. A group has a point at least."""
+    means = group_means(points, group, num_groups)
     centred = points - means[group]
     products = (centred[:, :, None] * centred[:, None, :]).reshape(-1, 9)
-    covariances = _group_sums(products, group, num_groups) / sizes[:, None]
-    return means, covariances.reshape(-1, 3, 3), sizes
+    return means, group_means(products, group, num_groups).reshape(-1, 3, 3)
 
 
 def _class_clusters(points: Points, label: Label, min_points: int, config: SegregatorConfig) -> Clusters:
@@ -92,19 +86,24 @@ def _class_clusters(points: Points, label: Label, min_points: int, config: Segre
         step_m=config.dcvc_radius_step_m,
         angle_deg=config.dcvc_angle_deg,
     )
-    large = np.bincount(cluster) >= min_points
-    kept = large[cluster]
+    sizes = np.bincount(cluster)
+    large = sizes >= min_points
     renumbered = np.cumsum(large) - 1
-    means, covariances, sizes = gaussians(points[kept], renumbered[cluster[kept]], int(large.sum()))
-    order = np.lexsort((*means.T, -sizes))
-    return Clusters(means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[order])
+    kept = large[cluster]
+    means, covariances = gaussians(points[kept], renumbered[cluster[kept]], int(large.sum()))
+    order = np.lexsort((*means.T, -sizes[large]))
+    return Clusters(means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[large][order])
 
 
 def _polar(points: Points) -> Points:
     """Range (m), pitch and azimuth (rad) of each point, a row each."""
-    distance = np.sqrt((points**2).sum(axis=1))
-    pitch = np.arcsin(points[:, 2] / distance)
-    return np.column_stack((distance, pitch, np.arctan2(points[:, 1], points[:, 0])))
+    x, y, z = points.T
+    level = np.hypot(x, y)
+    return np.column_stack((np.hypot(level, z), np.arctan2(z, level), np.arctan2(y, x)))
+
+
+def _nearest_bin(values: Vector, width: float) -> Indices:
+    return np.floor(values / width + 0.5).astype(np.int64)
 
 
 def _radial_bins(distance: Vector, start_m: float, step_m: float) -> Indices:
@@ -114,10 +113,6 @@ def _radial_bins(distance: Vector, start_m: float, step_m: float) -> Indices:
     while bounds[-1] <= distance.max():
         bounds.append(bounds[-1] + start_m - len(bounds) * step_m)
     return np.searchsorted(bounds[1:], distance, side="right")
-
-
-def _group_sums(rows: np.ndarray, group: Indices, num_groups: int) -> np.ndarray:
-    return np.column_stack([np.bincount(group, weights=column, minlength=num_groups) for column in rows.T])
 
 
 @njit("int64(int64[:], int64)", cache=True, nogil=True)

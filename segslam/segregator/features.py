@@ -1,23 +1,31 @@
 """Point features of background classes: FPFH key points, each with the Gaussian of the patch around it.
 
-Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator", ICRA 2023, section III-B. FPFH: Rusu, Blodow, Beetz, "Fast Point Feature
-Histograms (FPFH) for 3D registration", ICRA 2009.
+Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator: Global Point Cloud Registration with Semantic and Geometric Cues", ICRA
+2023, section III: FPFH on the voxelised cloud of each class.
+
+Differs from the paper: only the points with most neighbours are key points, and a descriptor is the square root of its
+FPFH, scaled to unit length, so that Euclidean distances are Hellinger distances of histograms (Arandjelovic, Zisserman,
+"Three things everyone should know to improve object retrieval", CVPR 2012).
 """
 
 from typing import NamedTuple
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from segslam.config import SegregatorConfig
-from segslam.points import voxel_means, within_range
+from segslam.points import normals, patch_covariances, radius_neighbours, voxel_means, within_range
+from segslam.segregator.fpfh import fpfh
 from segslam.types import Covariances, Labels, Points
+
+MIN_PATCH_POINTS = 4
+"""Chosen: any three points lie on a plane, so that a normal means nothing for fewer than four."""
+MAX_CLOUD_POINTS = 20_000
+"""Chosen: of a class after voxelising, some four times what real scans hold; of more, the nearest are used."""
 
 
 class Features(NamedTuple):
-    """Key points, a row each: position (m), covariance of the patch (m^2), class, FPFH descriptor. float32."""
+    """Key points, a row each, float32: position (m), covariance of the patch (m^2), class, descriptor of length 1."""
 
     points: Points
     covariances: Covariances
@@ -31,30 +39,39 @@ NO_FEATURES = Features(
 
 
 def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) -> Features:
-    """The key points of each class in `config.feature_classes`, in the frame of `points`, whose origin is the sensor."""
+    """The key points of each class in `config.feature_classes`, in the frame of `points`; the sensor is at its origin.
+
+    Points that are NaN or out of range take no part. The result does not depend on the order of the points.
+    """
     parts = []
     for label in config.feature_classes:
-        cloud = points[labels == label]
+        cloud = points[labels == label].astype(np.float32)
         cloud = cloud[within_range(cloud, config.min_range_m, config.max_range_m)]
-        parts.append(_class_features(voxel_means(cloud, config.feature_voxel_m), int(label), config))
+        parts.append(_class_features(_voxelised(cloud, config.feature_voxel_m), int(label), config))
     return Features(*(np.concatenate(columns) for columns in zip(NO_FEATURES, *parts, strict=True)))
 
 
+def _voxelised(cloud: Points, voxel_m: float) -> Points:
+    means = voxel_means(cloud, voxel_m)
+    if len(means) <= MAX_CLOUD_POINTS:
+        return means
+    nearest = np.argsort(np.linalg.norm(means, axis=1), kind="stable")[:MAX_CLOUD_POINTS]
+    return means[np.sort(nearest)]
+
+
 def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Features:
-    if not len(cloud):
-        return NO_FEATURES
-    pcd = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud))
-    pcd.estimate_normals(o3d.geometry.KDTreeSearchParamRadius(config.normal_radius_m))
-    pcd.orient_normals_towards_camera_location()
-    fpfh = o3d.pipelines.registration.compute_fpfh_feature(
-        pcd, o3d.geometry.KDTreeSearchParamRadius(config.feature_radius_m)
-    )
-    kept = np.arange(0, len(cloud), max(1, len(cloud) // 500))
-    neighbours = cKDTree(cloud).query_ball_point(cloud[kept], config.patch_radius_m)
-    covariances = np.array([np.cov(cloud[rows].T, bias=True) for rows in neighbours])
+    """The key points of one class from its voxelised cloud; none where no point has neighbours enough."""
+    close = radius_neighbours(cloud, config.normal_radius_m)
+    covariances, counts = patch_covariances(cloud, close, config.normal_radius_m)
+    kept = counts >= MIN_PATCH_POINTS
+    cloud, covariances = cloud[kept], covariances[kept]
+    around = radius_neighbours(cloud, config.feature_radius_m)
+    chosen = np.sort(np.argsort(around.starts - around.ends, kind="stable")[: config.max_features_per_class])
+    histograms = fpfh(cloud, normals(cloud, covariances), around, chosen)
+    patches, _ = patch_covariances(cloud, around, config.patch_radius_m)
     return Features(
-        cloud[kept].astype(np.float32),
-        covariances.astype(np.float32),
-        np.full(len(kept), label, np.uint8),
-        fpfh.data.T[kept].astype(np.float32),
+        points=cloud[chosen].astype(np.float32),
+        covariances=patches[chosen].astype(np.float32),
+        classes=np.full(len(chosen), label, np.uint8),
+        descriptors=np.sqrt(histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1.0)).astype(np.float32),
     )

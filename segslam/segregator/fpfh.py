@@ -1,0 +1,120 @@
+"""Fast point feature histograms.
+
+Rusu, Blodow, Beetz, "Fast Point Feature Histograms (FPFH) for 3D registration", ICRA 2009, sections II and III.
+
+Of two points with normals, the one whose normal makes the smaller angle with the line between them is the source s, the
+other the target t. With d the unit vector from s to t, u = n_s, v = d x u (normalised) and w = u x v, they have three
+angles:
+
+    alpha = v . n_t        phi = u . d        theta = atan2(w . n_t, u . n_t)
+
+The simple histogram (SPFH) of a point counts each over its neighbours in 11 bins. Its FPFH is its own SPFH and, with
+equal weight, the mean of its neighbours', the near ones counting more. The 33 columns are those of the Point Cloud
+Library, theta, alpha, phi; so is the weight of a neighbour, the inverse of its squared distance. The library leaves out
+the point's own SPFH.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+from numba import njit
+
+from segslam.points import Neighbours
+from segslam.types import Indices, Points
+
+BINS = 11
+CENTRE = BINS // 2
+COLUMNS = 3 * BINS
+TINY = 1e-300
+"""Keeps a sum of nothing from dividing by zero."""
+
+
+@njit("int64(float64)", cache=True, nogil=True, inline="always")
+def _bin(fraction):
+    """The bin of a value that lies `fraction` of the way along its range."""
+    return min(max(int(BINS * fraction), 0), BINS - 1)
+
+
+@njit("UniTuple(int64, 3)(float64[:, :], float64[:, :], int64, int64)", cache=True, nogil=True, inline="always")
+def _pair_columns(points, normals, source, target):
+    """The columns of theta, alpha and phi of two points, the same whichever is named first."""
+    dx = points[target, 0] - points[source, 0]
+    dy = points[target, 1] - points[source, 1]
+    dz = points[target, 2] - points[source, 2]
+    scale = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx * scale, dy * scale, dz * scale
+    phi = normals[source, 0] * dx + normals[source, 1] * dy + normals[source, 2] * dz
+    other_phi = normals[target, 0] * dx + normals[target, 1] * dy + normals[target, 2] * dz
+    if abs(phi) < abs(other_phi):
+        source, target = target, source
+        dx, dy, dz, phi = -dx, -dy, -dz, -other_phi
+    ux, uy, uz = normals[source, 0], normals[source, 1], normals[source, 2]
+    tx, ty, tz = normals[target, 0], normals[target, 1], normals[target, 2]
+    vx, vy, vz = dy * uz - dz * uy, dz * ux - dx * uz, dx * uy - dy * ux
+    sine = math.sqrt(vx * vx + vy * vy + vz * vz)
+    if sine == 0.0:  # the line between them is the normal: v has no direction
+        return CENTRE, BINS + CENTRE, 2 * BINS + CENTRE
+    wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx  # times sine, as v is
+    alpha = (vx * tx + vy * ty + vz * tz) / sine
+    theta = math.atan2((wx * tx + wy * ty + wz * tz) / sine, ux * tx + uy * ty + uz * tz)
+    return _bin(theta / (2.0 * math.pi) + 0.5), BINS + _bin(0.5 * alpha + 0.5), 2 * BINS + _bin(0.5 * phi + 0.5)
+
+
+@njit("boolean[:](int64, int64[:], int64[:], int64[:], int64[:])", cache=True, nogil=True)
+def _neighbours_of(num_points, starts, ends, rows, chosen):
+    """(n,) whether a point is a neighbour of some chosen one."""
+    found = np.zeros(num_points, np.bool_)
+    for row in chosen:
+        for at in range(starts[row], ends[row]):
+            found[rows[at]] = True
+    return found
+
+
+@njit("float64[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int64[:], boolean[:])", cache=True, nogil=True)
+def simple_histograms(points, normals, starts, ends, rows, wanted):
+    """(n, 33) SPFH over its neighbours of each wanted point; zeros for others and for points without neighbours.
+
+    Points are distinct, and neighbours of each other where one is the other's.
+    """
+    histograms = np.zeros((len(points), COLUMNS))
+    for row in range(len(points)):
+        for at in range(starts[row], ends[row]):
+            other = rows[at]
+            if other > row and (wanted[row] or wanted[other]):  # once for both
+                for column in _pair_columns(points, normals, row, other):
+                    histograms[row, column] += 1.0
+                    histograms[other, column] += 1.0
+    for row in range(len(points)):
+        histograms[row] *= 100.0 * wanted[row] / max(ends[row] - starts[row] - 1, 1)
+    return histograms
+
+
+@njit("float64[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int64[:], int64[:])", cache=True, nogil=True)
+def neighbour_histograms(points, histograms, starts, ends, rows, chosen):
+    """(k, 33) weighted sum of the neighbours' histograms for each chosen row; zeros for a point without neighbours."""
+    sums = np.zeros((len(chosen), COLUMNS))
+    for index in range(len(chosen)):
+        row = chosen[index]
+        for at in range(starts[row], ends[row]):
+            if rows[at] != row:
+                x = points[rows[at], 0] - points[row, 0]
+                y = points[rows[at], 1] - points[row, 1]
+                z = points[rows[at], 2] - points[row, 2]
+                weight = 1.0 / (x * x + y * y + z * z)
+                for column in range(COLUMNS):
+                    sums[index, column] += weight * histograms[rows[at], column]
+        for angle in range(3):
+            part = sums[index, BINS * angle : BINS * (angle + 1)]
+            part *= 100.0 / max(part.sum(), TINY)
+    return sums
+
+
+def fpfh(points: Points, normals: Points, neighbours: Neighbours, chosen: Indices) -> Float[np.ndarray, "_ 33"]:
+    """FPFH of the chosen rows, each row of 11 summing to 200; zeros for a point without neighbours.
+
+    Neighbours are those within a radius. The points are distinct.
+    """
+    wanted = _neighbours_of(len(points), *neighbours, chosen)
+    simple = simple_histograms(points, normals, *neighbours, wanted)
+    return simple[chosen] + neighbour_histograms(points, simple, *neighbours, chosen)

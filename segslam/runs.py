@@ -127,13 +127,17 @@ class Run:
 
 def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
     """The figures of `metrics.json` that the true poses give; those of the odometry begin with `odometry_`."""
-    rows = rows_of_same_scan(result.trajectory.scan_index, reference.scan_index)
-    truth = reference.T_world_lidar[rows[:, 1]]
-    corrected = trajectory_metrics(result.trajectory.T_world_lidar[rows[:, 0]], truth)
-    odometry = trajectory_metrics(result.odometry.T_world_lidar[rows[:, 0]], truth)
+    corrected = trajectory_accuracy(result.trajectory, reference)
+    odometry = trajectory_accuracy(result.odometry, reference)
     return (
         corrected | {f"odometry_{name}": value for name, value in odometry.items()} | _loop_accuracy(result, reference)
     )
+
+
+def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[str, float]:
+    """`trajectory_metrics` of the scans that have a true pose."""
+    rows = rows_of_same_scan(trajectory.scan_index, reference.scan_index)
+    return trajectory_metrics(trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]])
 
 
 def _loop_accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:

@@ -1,7 +1,9 @@
 """`segslam map`."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -73,13 +75,21 @@ def map_command(
         raise typer.Exit(130)
 
 
-def finish(run: "Run", reference: "Trajectory | None", *, json: bool, quiet: bool) -> dict[str, Any]:
-    """End a run: write its results, and show its figures, which are returned."""
+def finish(
+    run: "Run",
+    reference: "Trajectory | None",
+    *,
+    json: bool,
+    quiet: bool,
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """End a run: write its results, and show its figures, `more` among them, which are returned."""
     from segslam.runs import accuracy, write_metrics
 
     result, metrics = run.finish()
     if reference is not None:
         metrics |= accuracy(result, reference)
+    metrics |= more
     write_metrics(run.folder, metrics)
     if json:
         print_json(metrics)
@@ -102,6 +112,9 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
             f"error after alignment: {metrics['ate_m']:.3f} m, odometry alone {metrics['odometry_ate_m']:.3f} m; "
             f"false loops: {metrics['num_loops_false']}"
         )
+    if "num_loops_won" in metrics:
+        before = f", error {metrics['recorded_ate_m']:.3f} m before" if "recorded_ate_m" in metrics else ""
+        lines.append(f"replayed: {metrics['num_loops_won']} loops won, {metrics['num_loops_lost']} lost{before}")
     return "\n".join([*lines, f"results in {folder}"])
 
 

@@ -2,11 +2,14 @@
 
 import typer
 
-from segslam.cli import map, register, simulate
+from segslam.cli import evaluate, map, optimize, register, replay, simulate
 
 
 def add_all(app: typer.Typer) -> None:
     """Add every command to the application."""
+    app.command("eval")(evaluate.evaluate)
     app.command("map")(map.map_command)
+    app.command("optimize")(optimize.optimize)
     app.command("register", cls=register.LabelsCommand)(register.register)
+    app.command("replay")(replay.replay)
     app.command("simulate")(simulate.simulate)

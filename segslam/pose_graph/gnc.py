@@ -15,13 +15,14 @@ each mu takes one Gauss-Newton step from the last values, all that a small chang
 Marquardt comes at the end.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from segslam.pose_graph.closures import Closure, squared_errors
-from segslam.pose_graph.solver import optimum
+from segslam.pose_graph.edges import Edge, factor_graph, squared_errors
+from segslam.pose_graph.solver import Search, search
 from segslam.types import Vector
 
 CONTROL_FACTOR = 1.4  # growth of mu in the paper
@@ -31,56 +32,78 @@ NEGLIGIBLE_WEIGHT = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TruncatedProblem:
-    """Factors that are never doubted, and closures that cost at most half of `inlier_bound`."""
+class Solution:
+    """Poses, and which closures to believe."""
 
-    trusted: gtsam.NonlinearFactorGraph
-    closures: list[Closure]
-    inlier_bound: float
-    """Of the squared whitened error (chi-square, not half of it)."""
+    search: Search
+    """Its error is of all that is believed."""
+    weights: Vector
+    """(k,) 1 believed, 0 switched off."""
+    truncated_cost: float
+    """Error of all that is believed, and half the bound for each closure that is not."""
+
+
+class TruncatedProblem:
+    """Factors that are never doubted, and closures that cost at most half of `inlier_bound`.
+
+    The bound is of the squared whitened error (chi-square, not half of it).
+    """
+
+    def __init__(self, trusted: gtsam.NonlinearFactorGraph, closures: Sequence[Edge], inlier_bound: float) -> None:
+        self.inlier_bound = inlier_bound
+        self._trusted = trusted
+        self._closures = closures
+        self._factors = factor_graph(closures)
+
+    def squared_errors(self, values: gtsam.Values) -> Vector:
+        """(k,) chi-square of each closure."""
+        return squared_errors(self._factors, values)
 
     def inliers(self, values: gtsam.Values) -> Vector:
         """(k,) 1 for each closure within the bound, else 0."""
-        return (squared_errors(self.closures, values) <= self.inlier_bound).astype(float)
-
-    def cost(self, values: gtsam.Values) -> float:
-        """The truncated error, half a chi-square as GTSAM's."""
-        truncated = np.minimum(squared_errors(self.closures, values), self.inlier_bound)
-        return float(self.trusted.error(values) + truncated.sum() / 2.0)
+        return (self.squared_errors(values) <= self.inlier_bound).astype(float)
 
     def weighted(self, weights: Vector) -> gtsam.NonlinearFactorGraph:
         """The least-squares problem in which closure i has its information times `weights[i]`."""
-        graph = gtsam.NonlinearFactorGraph(self.trusted)
-        for closure, weight in zip(self.closures, weights, strict=True):
-            if weight > NEGLIGIBLE_WEIGHT:
-                graph.add(closure.factor(weight=weight))
+        graph = gtsam.NonlinearFactorGraph(self._trusted)
+        for i, (closure, weight) in enumerate(zip(self._closures, weights, strict=True)):
+            if weight == 1.0:
+                graph.add(self._factors.at(i))
+            elif weight > NEGLIGIBLE_WEIGHT:
+                graph.add(closure.factor(weight=float(weight)))
         return graph
 
 
-def solve(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Values, Vector]:
-    """The poses, and for each closure whether to believe it (1) or not (0).
+def solve(problem: TruncatedProblem, start: gtsam.Values) -> Solution:
+    """The poses, and for each closure whether to believe it.
 
-    Graduated non-convexity promises no global optimum, so what it finds competes with the optimum next to `start`.
+    Graduated non-convexity promises no global optimum, so unless it believes all, what it finds competes with the
+    optimum next to `start`.
     """
-    found = (_settle(problem, _graduate(problem, start)), _settle(problem, start))
-    return min(found, key=lambda result: problem.cost(result[0]))
+    values, iterations = _graduate(problem, start)
+    graduated = _settle(problem, values, iterations)
+    if graduated.weights.all():
+        return graduated
+    near_start = _settle(problem, start)
+    return min((graduated, near_start), key=lambda solution: solution.truncated_cost)
 
 
-def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> gtsam.Values:
-    """Algorithm 1: from the optimum that believes all to where each closure is believed or not."""
-    values = optimum(problem.weighted(np.ones(len(problem.closures))), start)
-    worst = squared_errors(problem.closures, values).max(initial=0.0)
+def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Values, int]:
+    """Algorithm 1: from the optimum that believes all to where each closure is believed or not; and the iterations."""
+    values, _, iterations = search(problem.weighted(np.ones(len(problem.squared_errors(start)))), start)
+    worst = problem.squared_errors(values).max(initial=0.0)
     if worst <= problem.inlier_bound:
-        return values
+        return values, iterations
     control = problem.inlier_bound / (2.0 * worst - problem.inlier_bound)
     for _ in range(MAX_STEPS):
-        weights = tls_weights(squared_errors(problem.closures, values), control, problem.inlier_bound)
+        weights = tls_weights(problem.squared_errors(values), control, problem.inlier_bound)
         if np.minimum(weights, 1.0 - weights).max() < NEGLIGIBLE_WEIGHT:
             break
         graph = problem.weighted(weights)
         values = values.retract(graph.linearize(values).optimize())
+        iterations += 1
         control *= CONTROL_FACTOR
-    return values
+    return values, iterations
 
 
 def tls_weights(squared: Vector, control: float, inlier_bound: float) -> Vector:
@@ -90,16 +113,18 @@ def tls_weights(squared: Vector, control: float, inlier_bound: float) -> Vector:
     return np.clip(weights, 0.0, 1.0)
 
 
-def _settle(problem: TruncatedProblem, values: gtsam.Values) -> tuple[gtsam.Values, Vector]:
+def _settle(problem: TruncatedProblem, values: gtsam.Values, iterations: int = 0) -> Solution:
     """The optimum of the truncated cost next to `values`: believe what is within the bound, optimise, look again.
 
     Neither half raises the cost, so this ends; MAX_STEPS guards against rounding at the bound.
     """
-    weights = problem.inliers(values)
+    within = problem.inliers(values)
     for _ in range(MAX_STEPS):
-        values = optimum(problem.weighted(weights), values)
+        weights = within
+        found = search(problem.weighted(weights), values)
+        values, iterations = found.values, iterations + found.iterations
         within = problem.inliers(values)
         if (within == weights).all():
             break
-        weights = within
-    return values, weights
+    truncated_cost = found.error + 0.5 * problem.inlier_bound * float((weights == 0.0).sum())
+    return Solution(found._replace(iterations=iterations), weights, truncated_cost)

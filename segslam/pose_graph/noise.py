@@ -4,11 +4,11 @@ import math
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from segslam import geometry
 from segslam.config import GraphConfig
-from segslam.pose_graph.closures import Kernel
+from segslam.pose_graph.edges import Kernel
 from segslam.types import Information, Transform
 
 DEGREES_OF_FREEDOM = 6
@@ -21,7 +21,7 @@ def first_pose() -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Isotropic.Sigma(DEGREES_OF_FREEDOM, FIRST_POSE_SIGMA)
 
 
-def odometry(travel_m: float, T_a_b: Transform, config: GraphConfig) -> gtsam.noiseModel.Base:
+def odometry_information(travel_m: float, T_a_b: Transform, config: GraphConfig) -> Information:
     """Of the motion between two keyframes: variances grow with the way travelled, and a turn counts as a way.
 
     One radian counts as much as `config.turn_m` metres.
@@ -31,7 +31,7 @@ def odometry(travel_m: float, T_a_b: Transform, config: GraphConfig) -> gtsam.no
     sigmas = geometry.tangent(
         rotation_rad=math.radians(config.odometry_sigma_deg) * growth, translation_m=config.odometry_sigma_m * growth
     )
-    return gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    return np.diag(sigmas**-2.0)
 
 
 def closure_information(information: Information, config: GraphConfig) -> Information:
@@ -58,16 +58,16 @@ def is_positive_semidefinite(matrix: Information) -> bool:
     return bool(np.abs(matrix - matrix.T).max() <= tolerance and np.linalg.eigvalsh(matrix).min() >= -tolerance)
 
 
-def inlier_bound(config: GraphConfig) -> float:
-    """The squared whitened error (chi-square, not half of it) up to which a closure counts as an inlier."""
-    return float(chi2.ppf(config.inlier_probability, DEGREES_OF_FREEDOM))
+def inlier_bound(probability: float) -> float:
+    """The squared whitened error (chi-square, not half of it) below which a true edge lies with this probability."""
+    return float(chdtri(DEGREES_OF_FREEDOM, 1.0 - probability))
 
 
-def kernel(config: GraphConfig) -> Kernel | None:
-    """The robust kernel of closures, as wide as the bound of inliers; None for least squares."""
+def kernel(name: str, inlier_bound: float) -> Kernel | None:
+    """A robust kernel as wide as the bound of inliers; None for least squares (`none`)."""
     estimators = gtsam.noiseModel.mEstimator
-    width = math.sqrt(inlier_bound(config))
-    match config.robust:
+    width = math.sqrt(inlier_bound)
+    match name:
         case "none":
             return None
         case "huber":
@@ -76,3 +76,4 @@ def kernel(config: GraphConfig) -> Kernel | None:
             return estimators.Cauchy.Create(width)
         case "geman-mcclure":
             return estimators.GemanMcClure.Create(width)
+    raise ValueError(f"no kernel {name}")

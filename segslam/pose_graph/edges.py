@@ -1,0 +1,54 @@
+"""An edge of the graph as numbers, and as the factor that GTSAM wants."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from jaxtyping import Float
+
+from segslam.types import Information, Transform, Vector
+
+Kernel = Any
+"""One of gtsam.noiseModel.mEstimator; their common base is not in GTSAM's stubs."""
+Transforms = Float[np.ndarray, "_ 4 4"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """The measured pose of vertex b in vertex a."""
+
+    a: int
+    b: int
+    T_a_b: Transform
+    information: Information
+
+    def factor(self, *, weight: float = 1.0, kernel: Kernel | None = None) -> gtsam.BetweenFactorPose3:
+        """The between-factor with its information times `weight`, under `kernel` if there is one."""
+        model: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(weight * self.information)
+        if kernel is not None:
+            model = gtsam.noiseModel.Robust.Create(kernel, model)
+        return gtsam.BetweenFactorPose3(self.a, self.b, gtsam.Pose3(self.T_a_b), model)
+
+
+def factor_graph(edges: Iterable[Edge], *, kernel: Kernel | None = None) -> gtsam.NonlinearFactorGraph:
+    """The between-factors of some edges."""
+    graph = gtsam.NonlinearFactorGraph()
+    for edge in edges:
+        graph.add(edge.factor(kernel=kernel))
+    return graph
+
+
+def squared_errors(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Vector:
+    """Squared whitened error (chi-square, twice GTSAM's error) of each factor; none may have a robust kernel."""
+    return np.array([2.0 * graph.at(i).error(values) for i in range(graph.size())])
+
+
+def poses_by_id(values: gtsam.Values) -> Transforms:
+    """All poses, ascending in their key."""
+    rows = np.asarray(gtsam.utilities.extractPose3(values)).reshape(-1, 12)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+    poses[:, :3, 3] = rows[:, 9:]
+    return poses

@@ -85,9 +85,10 @@ class GeometricLabelsConfig(Section):
     max_slope: float = Field(0.2, gt=0, description="steepest that the ground rises between cells")
     ground_height_m: float = Field(0.15, gt=0, description="points lower than this are ground (m)")
     band_m: tuple[float, float] = Field((0.4, 2.6), description="where poles and small solids are looked for (m)")
+    min_points: int = Field(10, ge=1, description="fewest points of a pole, small solid or car within the band")
     pole_core_m: float = Field(0.4, gt=0, description="a pole lies within this radius (m)")
     pole_clear_m: float = Field(0.8, gt=0, description="and nothing else within this one (m)")
-    pole_min_m: float = Field(1.2, gt=0, description="least height of a pole within the band (m)")
+    pole_min_m: float = Field(1.0, gt=0, description="least height of a pole within the band (m)")
     pole_min_share: float = Field(0.7, gt=0, le=1, description="share of its occupied heights that stand clear")
     trunk_max_m: float = Field(2.0, gt=0, description="longest small solid: young trees, bushes, signs (m)")
     trunk_min_m: float = Field(1.6, gt=0, description="lowest top of a small solid (m)")
@@ -175,7 +176,8 @@ class RefineConfig(Section):
 class VerifyConfig(Section):
     """When an alignment is believed."""
 
-    min_inliers: int = Field(5, ge=0, description="clique members that agree with the coarse pose")
+    max_hypotheses: int = Field(3, ge=1, description="coarse poses tried, the best first")
+    min_inliers: int = Field(5, ge=0, description="clique members that agree with a coarse pose worth refining")
     min_overlap: float = Field(0.3, ge=0, le=1, description="share of points that meet the other surface")
     inlier_m: float = Field(0.5, gt=0, description="a point this near the other surface meets it (m)")
     max_range_m: float = Field(50.0, gt=0, description="points farther from the other sensor are out of its reach (m)")

@@ -8,16 +8,13 @@ import numpy as np
 from segslam.config import GeometricLabelsConfig
 from segslam.points import within_range
 from segslam.semantics.ground import heights_above_ground, turned, upright
-from segslam.semantics.solids import NO_PIECE, pieces, tightest_rectangles
+from segslam.semantics.solids import Pieces, pieces
 from segslam.semantics.uprights import NUM_SLICES, on_thin_uprights
 from segslam.semantics.walls import on_walls
 from segslam.types import Label, Labels, Mask, Points, Vector
 
 COLUMN_M = 0.1
-"""Chosen: posts are some cells wide, and points on one are rarely farther apart within 40 m."""
-PIECE_CELL_M = 0.25
-"""Chosen: solids closer than this are one."""
-BORDER_CELLS = 10
+"""Chosen: a post is some cells wide, and neighbouring points on it are rarely farther apart within 40 m."""
 
 
 def geometric_labels(points: Points, *, config: GeometricLabelsConfig) -> Labels:
@@ -51,56 +48,44 @@ def _poles(points: Points, heights: Vector, config: GeometricLabelsConfig) -> La
     """POLE for the points of thin upright things, VEGETATION for the rest."""
     low, high = config.band_m
     slice_m = (high - low) / NUM_SLICES
-    cells, side = _cells(points, COLUMN_M, config.max_range_m)
+    half = int(np.ceil(config.max_range_m / COLUMN_M)) + 10  # a border: things at the edge have surroundings too
     thin = on_thin_uprights(
-        cells,
+        np.floor(points[:, :2] / COLUMN_M).astype(np.int64) + half,
         np.floor((heights - low) / slice_m).astype(np.int64),
-        side,
+        2 * half,
         round(config.pole_core_m / COLUMN_M),
         round(config.pole_clear_m / COLUMN_M),
         round(config.pole_min_m / slice_m),
         config.pole_min_share,
     )
-    return _chosen(thin, Label.POLE)
+    found = pieces(points, heights, thin)
+    return _labelled(found, found.num_points >= config.min_points, thin, Label.POLE)
 
 
 def _solids(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
     """TRUNK and CAR for the points of pieces of that size, VEGETATION for the rest."""
-    low, high = config.band_m
-    cells, side = _cells(points, PIECE_CELL_M, config.max_range_m)
     in_band = _within(heights, config.band_m)
-    occupied = np.zeros((side, side), bool)
-    occupied[cells[in_band, 0], cells[in_band, 1]] = True
-    grid = pieces(occupied)
-    body = np.flatnonzero((heights < high) & (grid[cells[:, 0], cells[:, 1]] != NO_PIECE))
-    piece = grid[cells[body, 0], cells[body, 1]]
-    num_pieces = int(grid.max()) + 1
-    top = np.zeros(num_pieces)
-    np.maximum.at(top, piece, heights[body])
-    length, width = tightest_rectangles(grid, num_pieces).T * PIECE_CELL_M
-    is_trunk = (top >= config.trunk_min_m) & (length <= config.trunk_max_m)
-    is_car = _within(top, config.car_top_m) & _within(length, config.car_length_m) & (width < config.car_max_width_m)
-    labels = np.full(len(points), Label.VEGETATION, np.uint8)
-    labels[body[is_car[piece]]] = Label.CAR
-    labels[body[is_trunk[piece] & (heights[body] >= low)]] = Label.TRUNK
-    return labels
+    found = pieces(points, heights, in_band)
+    large = found.num_points >= config.min_points
+    is_trunk = large & (found.top_m >= config.trunk_min_m) & (found.length_m <= config.trunk_max_m)
+    is_car = large & _within(found.top_m, config.car_top_m) & _within(found.length_m, config.car_length_m)
+    is_car &= found.width_m <= config.car_max_width_m
+    trunks = _labelled(found, is_trunk, in_band, Label.TRUNK)
+    cars = _labelled(found, is_car & ~is_trunk, heights < config.band_m[1], Label.CAR)
+    return np.where(trunks == Label.TRUNK, trunks, cars)
 
 
 def _walls(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
     """BUILDING for points on vertical faces, VEGETATION for the rest."""
     walls = on_walls(points, heights, thickness_m=config.wall_thickness_m, min_top_m=config.wall_min_top_m)
-    return _chosen(walls, Label.BUILDING)
+    return np.where(walls, np.uint8(Label.BUILDING), np.uint8(Label.VEGETATION))
 
 
-def _chosen(mask: Mask, label: Label) -> Labels:
-    return np.where(mask, np.uint8(label), np.uint8(Label.VEGETATION))
+def _labelled(found: Pieces, chosen: Mask, eligible: Mask, label: Label) -> Labels:
+    """`label` for the eligible points that stand in a chosen piece, VEGETATION for the rest."""
+    in_chosen = np.append(chosen, False)[found.of_point]  # points in no piece have the number -1
+    return np.where(in_chosen & eligible, np.uint8(label), np.uint8(Label.VEGETATION))
 
 
 def _within(values: Vector, bounds: tuple[float, float]) -> Mask:
     return (values >= bounds[0]) & (values <= bounds[1])
-
-
-def _cells(points: Points, cell_m: float, max_range_m: float) -> tuple[np.ndarray, int]:
-    """The grid cell of each point, and the grid's side; its border is wide enough for neighbourhoods."""
-    half = int(np.ceil(max_range_m / cell_m)) + BORDER_CELLS
-    return np.floor(points[:, :2] / cell_m).astype(np.int64) + half, 2 * half

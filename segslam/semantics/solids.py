@@ -1,50 +1,97 @@
 """Pieces of what stands on the ground, seen from above, and how large each is."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 
+from segslam.types import Indices, Mask, Points, Vector
+
+CELL_M = 0.25
+"""Chosen: things nearer to each other than this are one piece."""
 NO_PIECE = -1
 RECTANGLE_STEP_DEG = 3.0
-"""Chosen: a 5 m side is measured to within 1 cm."""
+"""Chosen: a side of 5 m is measured to within a centimetre."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pieces:
+    """Connected cells seen from above. All but `of_point` have a row a piece and regard only the points that make it."""
+
+    of_point: Indices
+    """The piece that a point stands in, NO_PIECE if in none; also of points that did not help to make it."""
+    num_points: Indices
+    top_m: Vector
+    """Height above the ground of the highest point."""
+    length_m: Vector
+    """Longer side of the rectangle of least area around the piece, whole cells."""
+    width_m: Vector
+
+
+def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
+    """The pieces that the chosen points of a level cloud make."""
+    corner = np.floor(points[:, :2].min(axis=0, initial=0.0) / CELL_M)
+    cells = (np.floor(points[:, :2] / CELL_M) - corner).astype(np.int64)
+    grid, num_pieces = _connected(cells, chosen)
+    of_point = grid[cells[:, 0], cells[:, 1]]
+    num_points, top_m = _counts_and_tops(of_point, heights, chosen, num_pieces)
+    sides_m = tightest_rectangles(grid, num_pieces) * CELL_M
+    return Pieces(of_point, num_points, top_m, sides_m[:, 0], sides_m[:, 1])
 
 
 @njit(cache=True, nogil=True)
-def pieces(occupied):
-    """(side, side) int64: which connected piece (8 neighbours) a cell belongs to, NO_PIECE where it is empty."""
-    side = occupied.shape[0]
-    piece = np.full((side, side), NO_PIECE, np.int64)
-    stack = np.empty((side * side, 2), np.int64)
+def _connected(cells, chosen):
+    """The piece (8 neighbours) of each cell of a grid, NO_PIECE where no chosen point lies, and how many there are."""
+    shape = (cells[:, 0].max() + 1, cells[:, 1].max() + 1) if len(cells) else (1, 1)
+    unseen = np.zeros(shape, np.bool_)
+    for k in range(len(cells)):
+        if chosen[k]:
+            unseen[cells[k, 0], cells[k, 1]] = True
+    grid = np.full(shape, NO_PIECE, np.int32)
     num_pieces = 0
-    for i in range(side):
-        for j in range(side):
-            if not occupied[i, j] or piece[i, j] != NO_PIECE:
-                continue
-            piece[i, j] = num_pieces
-            stack[0] = i, j
-            top = 1
-            while top > 0:
-                top -= 1
-                a, b = stack[top, 0], stack[top, 1]
-                for u in range(max(a - 1, 0), min(a + 2, side)):
-                    for v in range(max(b - 1, 0), min(b + 2, side)):
-                        if occupied[u, v] and piece[u, v] == NO_PIECE:
-                            piece[u, v] = num_pieces
-                            stack[top] = u, v
-                            top += 1
-            num_pieces += 1
-    return piece
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            if unseen[i, j]:
+                _fill(grid, unseen, i, j, num_pieces)
+                num_pieces += 1
+    return grid, num_pieces
 
 
 @njit(cache=True, nogil=True)
-def tightest_rectangles(piece, num_pieces):
+def _fill(grid, unseen, i, j, number):
+    unseen[i, j] = False
+    stack = [(i, j)]
+    while stack:
+        i, j = stack.pop()
+        grid[i, j] = number
+        for a in range(max(i - 1, 0), min(i + 2, grid.shape[0])):
+            for b in range(max(j - 1, 0), min(j + 2, grid.shape[1])):
+                if unseen[a, b]:
+                    unseen[a, b] = False
+                    stack.append((a, b))
+
+
+@njit(cache=True, nogil=True)
+def _counts_and_tops(piece, heights, chosen, num_pieces):
+    counts = np.zeros(num_pieces, np.int64)
+    tops = np.full(num_pieces, -np.inf)
+    for k in range(len(piece)):
+        if chosen[k]:
+            counts[piece[k]] += 1
+            tops[piece[k]] = max(tops[piece[k]], heights[k])
+    return counts, tops
+
+
+@njit(cache=True, nogil=True)
+def tightest_rectangles(grid, num_pieces):
     """(num_pieces, 2) longer and shorter side, in cells, of the rectangle of least area around each piece."""
     angles = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
     cosines, sines = np.cos(angles), np.sin(angles)
     low = np.full((num_pieces, len(angles), 2), np.inf)
     high = np.full((num_pieces, len(angles), 2), -np.inf)
-    for i in range(piece.shape[0]):
-        for j in range(piece.shape[1]):
-            k = piece[i, j]
+    for i in range(grid.shape[0]):
+        for j in range(grid.shape[1]):
+            k = grid[i, j]
             if k != NO_PIECE:
                 for n in range(len(angles)):
                     u, v = cosines[n] * i + sines[n] * j, cosines[n] * j - sines[n] * i

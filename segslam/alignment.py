@@ -84,15 +84,29 @@ def align(
 ) -> Alignment | Rejected:
     """The pose of the source in the target, found with no initial guess, refined and verified; or why there is none.
 
-    `gate` may turn down a coarse pose before it is refined.
+    The best few hypotheses are tried in their order, and the first that stands is kept. `gate` may turn down a coarse
+    pose before it is refined. Where none stands, the rejection is that of the best.
     """
     watch = watch or Stopwatch()
     with watch("match"):
-        coarse = segregator.match(source.description, target.description, config=config.segregator)
-    if isinstance(coarse, Rejected):
-        return coarse
-    if turned_down := gate(coarse):
-        return turned_down
+        ranked = segregator.hypotheses(source.description, target.description, config=config.segregator)
+    if isinstance(ranked, Rejected):
+        return ranked
+    rejections = []
+    for coarse in ranked[: config.verify.max_hypotheses]:
+        outcome = gate(coarse) or _sharpened(source, target, coarse, config=config, watch=watch)
+        if isinstance(outcome, Alignment):
+            return outcome
+        rejections.append(outcome)
+    return rejections[0]
+
+
+def _sharpened(
+    source: PreparedScan, target: PreparedScan, coarse: Registration, *, config: Config, watch: Stopwatch
+) -> Alignment | Rejected:
+    """One hypothesis, refined and verified."""
+    if coarse.num_inliers < config.verify.min_inliers:
+        return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {config.verify.min_inliers}")
     with watch("refine"):
         fine = refine.refine(source.surface, target.surface, coarse.T_target_source, config=config.refine)
     if isinstance(fine, Rejected):
@@ -111,7 +125,7 @@ def _verified(
     found = verify.agreement(
         (source.surface, source.view), (target.surface, target.view), fine.T_target_source, config=config
     )
-    return verify.rejection(coarse, found, config=config) or Alignment(
+    return verify.rejection(found, config=config) or Alignment(
         coarse=coarse,
         fine=fine,
         overlap=found.overlap,

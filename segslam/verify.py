@@ -14,7 +14,7 @@ from numba import njit
 from segslam import geometry
 from segslam.config import VerifyConfig
 from segslam.points import within_range
-from segslam.types import Points, Registration, Rejected, RejectReason, Transform
+from segslam.types import Points, Rejected, RejectReason, Transform
 
 NUM_COLUMNS = 360
 NUM_ROWS = 60
@@ -92,10 +92,8 @@ def free_space_violation(points: Points, seen: View, T_view_points: Transform, *
     return num_violations / num_seen if num_seen else 0.0
 
 
-def rejection(registration: Registration, found: Agreement, *, config: VerifyConfig) -> Rejected | None:
+def rejection(found: Agreement, *, config: VerifyConfig) -> Rejected | None:
     """The first test that an alignment fails, in the order of the pipeline; None if it stands."""
-    if registration.num_inliers < config.min_inliers:
-        return Rejected(RejectReason.TOO_FEW_INLIERS, f"{registration.num_inliers} < {config.min_inliers}")
     if found.overlap < config.min_overlap:
         return Rejected(RejectReason.LOW_OVERLAP, f"{found.overlap:.3f} < {config.min_overlap}")
     if found.rms_m > config.max_rms_m:

@@ -76,8 +76,11 @@ def patch_covariances(points: Points, neighbours: Neighbours, radius_m: float) -
 
 
 def normals(points: Points, covariances: Covariances) -> Points:
-    """The direction in which the surroundings of each point vary least, turned towards the sensor at the origin."""
-    directions = np.linalg.eigh(covariances)[1][:, :, 0]
+    """The direction in which the surroundings of each point vary least, turned towards the sensor at the origin.
+
+    Zero where no single direction is least: duplicates, points on a line along an axis.
+    """
+    directions = _least_directions(covariances)
     away = np.einsum("ij,ij->i", directions, points) > 0
     return np.where(away[:, None], -directions, directions)
 
@@ -92,12 +95,12 @@ def _cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]
         raise ValueError(f"voxel_m or radius_m must be above 0, got {cell_m}")
     if not len(points):
         return np.empty(0, np.int64), (1, 1)
-    cells = np.floor(points / cell_m)
-    low = cells.min(axis=0) - 1
-    extent = [int(count) for count in cells.max(axis=0) - low + 2]
+    columns = [np.floor(column / cell_m) for column in np.ascontiguousarray(points.T)]
+    lows = [column.min() - 1 for column in columns]
+    extent = [int(column.max() - low) + 2 for column, low in zip(columns, lows, strict=True)]
     if math.prod(extent) > MAX_CELLS:
         raise ValueError(f"points spread over {extent} cells of {cell_m} m; drop far points or enlarge the cells")
-    x, y, z = (cells - low).astype(np.int64).T
+    x, y, z = ((column - low).astype(np.int64) for column, low in zip(columns, lows, strict=True))
     return (x * extent[1] + y) * extent[2] + z, (extent[1] * extent[2], extent[2])
 
 
@@ -201,3 +204,47 @@ def _patch_covariances(points, starts, ends, rows, squared_radius):
         covariances[row, 0, 2] = covariances[row, 2, 0] = xz / n - mx * mz
         covariances[row, 1, 2] = covariances[row, 2, 1] = yz / n - my * mz
     return covariances, counts
+
+
+@njit("float64(float64[:, :])", cache=True, nogil=True)
+def _least_eigenvalue(a):
+    """Of a symmetric matrix, in closed form (Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961)."""
+    mean = (a[0, 0] + a[1, 1] + a[2, 2]) / 3.0
+    squared = 2.0 * (a[0, 1] ** 2 + a[0, 2] ** 2 + a[1, 2] ** 2)
+    for i in range(3):
+        squared += (a[i, i] - mean) ** 2
+    scale = math.sqrt(squared / 6.0)
+    if scale == 0.0:
+        return mean
+    x, y, z = a[0, 0] - mean, a[1, 1] - mean, a[2, 2] - mean
+    determinant = (
+        x * (y * z - a[1, 2] ** 2)
+        - a[0, 1] * (a[0, 1] * z - a[1, 2] * a[0, 2])
+        + a[0, 2] * (a[0, 1] * a[1, 2] - y * a[0, 2])
+    )
+    cosine = min(max(determinant / (2.0 * scale**3), -1.0), 1.0)
+    return mean + 2.0 * scale * math.cos((math.acos(cosine) + math.tau) / 3.0)
+
+
+@njit("float64[:, :](float64[:, :, :])", cache=True, nogil=True)
+def _least_directions(matrices):
+    """Unit eigenvector of the least eigenvalue of each symmetric matrix, the sign as it comes; zero if it is not one.
+
+    It is normal to the rows of A - lambda I, of which two at least differ: their longest cross product.
+    """
+    directions = np.zeros((len(matrices), 3))
+    for index in range(len(matrices)):
+        a = matrices[index]
+        least = _least_eigenvalue(a)
+        longest = 0.0
+        for i in range(3):
+            j = (i + 1) % 3
+            p, q = a[i].copy(), a[j].copy()
+            p[i] -= least
+            q[j] -= least
+            x, y, z = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+            length = math.sqrt(x * x + y * y + z * z)
+            if length > longest:
+                longest = length
+                directions[index, 0], directions[index, 1], directions[index, 2] = x / length, y / length, z / length
+    return directions

@@ -124,6 +124,24 @@ def test_normals_of_walls_face_the_sensor() -> None:
         np.testing.assert_allclose(normals(wall, covariances), np.tile(-direction, (len(wall), 1)), atol=1e-9)
 
 
+def test_normals_are_the_eigenvectors_of_least_variance() -> None:
+    rng = np.random.default_rng(0)
+    patches = rng.normal(size=(500, 12, 3)) @ (
+        np.diag([0.3, 0.2, 0.02]) @ np.linalg.qr(rng.normal(size=(500, 3, 3)))[0]
+    )
+    covariances = np.einsum("nki,nkj->nij", patches, patches)
+    expected = np.linalg.eigh(covariances)[1][:, :, 0]
+    found = normals(np.tile([20.0, 3, 1], (500, 1)), covariances)
+    np.testing.assert_allclose(np.abs(np.sum(found * expected, axis=1)), 1.0, atol=1e-9)
+    assert (found @ [20.0, 3, 1] <= 0).all()
+
+
+@pytest.mark.parametrize("spread", [[0, 0, 0], [1, 1, 1], [1, 0, 0]], ids=["point", "ball", "line"])
+def test_normals_of_what_has_none_are_zero_or_of_unit_length(spread: list[float]) -> None:
+    length = np.linalg.norm(normals(np.array([[5.0, 0, 0]]), np.diag(spread).astype(float)[None]))
+    assert length == pytest.approx(0.0) or length == pytest.approx(1.0)
+
+
 def test_hashed_keys_are_found_again_and_others_are_not() -> None:
     keys = np.random.default_rng(0).integers(-50, 50, 200) * 2**40
     table, first = hash_keys(keys)

@@ -108,9 +108,9 @@ def _nearest_bin(values: Vector, width: float) -> Indices:
 
 def _radial_bins(distance: Vector, start_m: float, step_m: float) -> Indices:
     """The radial bin of each distance. The bins start at the nearest, but no farther than `FIRST_RADIUS_M`."""
-    first = min(FIRST_RADIUS_M, distance.min())
-    bounds = [first]
-    while bounds[-1] <= distance.max():
+    farthest = distance.max()
+    bounds = [min(FIRST_RADIUS_M, distance.min())]
+    while bounds[-1] <= farthest:
         bounds.append(bounds[-1] + start_m - len(bounds) * step_m)
     return np.searchsorted(bounds[1:], distance, side="right")
 

@@ -113,6 +113,11 @@ class SegregatorConfig(Section):
         },
         description="class -> fewest points of a cluster; these classes give clusters (P: L_SC; A: car 30, trunk 15)",
     )
+    foot_classes: tuple[StaticLabel, ...] = Field(
+        (Label.TRUNK, Label.POLE, Label.TRAFFIC_SIGN),
+        description="upright things: their clusters are placed on the ground beneath, not at their centre",
+    )
+    foot_max_distance_m: float = Field(10.0, gt=0, description="the ground is looked for as far as this (m)")
     dcvc_start_radius_m: float = Field(0.35, ge=0.01, description="first radial bin of DCVC (A) (m)")
     dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (A) (m)")
     dcvc_angle_deg: float = Field(1.2, ge=0.1, le=90, description="pitch and azimuth bin of DCVC (A) (degrees)")
@@ -205,7 +210,7 @@ class GraphConfig(Section):
 
 
 class LogConfig(Section):
-    view_every: int = Field(6, ge=1, description="every n-th point of a keyframe is drawn; all are kept for replay")
+    view_every: int = Field(8, ge=1, description="every n-th point of a keyframe is drawn; all are kept for replay")
     compression: Literal["none", "lz4", "zstd"] = Field("zstd", description="of the chunks of the log")
 
 

@@ -2,7 +2,9 @@
 
 import json
 import resource
+import signal
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -24,6 +26,7 @@ from segslam.config import Config
 from segslam.log import LogWriter, read_log, schema
 from segslam.log.cloud import keyframe_points, points_and_labels
 from segslam.log.drawing import REJECTED_COLORS, weight_color
+from segslam.log.output import Output
 from segslam.log.records import BULK, codec
 from segslam.types import (
     Alignment,
@@ -95,7 +98,7 @@ def _result(steps: list[Step]) -> tuple[GraphEstimate, Trajectory]:
 
 
 def _write(path: Path, steps: list[Step], config: Config = CONFIG) -> Path:
-    with LogWriter(path, config=config, dataset="kitti", sequence="00") as log:
+    with LogWriter(path, config=config, dataset="kitti/00") as log:
         for step in steps:
             log.write(step)
     return path
@@ -190,7 +193,7 @@ def test_settings_and_versions_are_in_the_metadata(steps: list[Step], tmp_path: 
     config = Config.model_validate({"verify": {"min_overlap": 0.37}})
     log = read_log(_write(tmp_path / "log.mcap", steps[:1], config))
     assert log.config == config
-    assert (log.run["dataset"], log.run["sequence"]) == ("kitti", "00")
+    assert log.run["dataset"] == "kitti/00"
     assert log.packages["numpy"] == np.__version__
 
 
@@ -406,16 +409,39 @@ def _end_of_data(path: Path) -> int:
     return offset
 
 
-def test_an_interrupted_step_is_left_out(steps: list[Step], tmp_path: Path) -> None:
-    class Interrupting(dict):
-        def items(self) -> Any:
-            raise KeyboardInterrupt
-
+def test_ctrl_c_in_mid_record_waits_until_the_step_is_complete(
+    steps: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
         log.write(steps[0])
+        write = Output.write
+
+        def interrupted_write(output: Output, data: bytes) -> int:
+            signal.raise_signal(signal.SIGINT)
+            return write(output, data)
+
+        monkeypatch.setattr(Output, "write", interrupted_write)
         with pytest.raises(KeyboardInterrupt):
-            log.write(replace(steps[1], stage_seconds=Interrupting(odometry=1.0)))
-    assert len(list(read_log(tmp_path / "log.mcap").steps())) == 1
+            log.write(steps[1])
+        monkeypatch.undo()
+        log.write(steps[2])
+    _assert_same(tuple(steps[:3]), tuple(read_log(tmp_path / "log.mcap").steps()))
+
+
+def test_a_step_that_cannot_be_encoded_leaves_no_half_of_itself(steps: list[Step], tmp_path: Path) -> None:
+    broken = next(step for step in steps if step.estimate is not None)
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
+        log.write(steps[0])
+        with pytest.raises(ValueError, match="JSON"):
+            log.write(replace(broken, stage_seconds={"odometry": float("nan")}))
+        log.write(steps[1])
+    _assert_same(tuple(steps[:2]), tuple(read_log(tmp_path / "log.mcap").steps()))
+
+
+def test_a_log_can_be_written_from_another_thread(steps: list[Step], tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as thread:
+        path = thread.submit(_write, tmp_path / "log.mcap", steps[:5]).result()
+    assert len(list(read_log(path).steps())) == 5
 
 
 def test_a_log_that_cannot_be_written_names_the_path(tmp_path: Path) -> None:

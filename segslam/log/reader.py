@@ -36,7 +36,7 @@ class RunLog:
     config: Config
     """The effective settings of the run."""
     run: Mapping[str, str]
-    """schema_version, dataset, sequence, python, platform, T_camera_lidar (JSON) where there is one."""
+    """schema_version, dataset, python, platform, T_camera_lidar (JSON) where there is one."""
     packages: Mapping[str, str]
     """Package -> version."""
 

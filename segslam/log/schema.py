@@ -39,7 +39,7 @@ WORLD, ODOM, LIDAR = "world", "odom", "lidar"
 """Frames."""
 
 RUN_METADATA = "segslam"
-"""Metadata record: schema_version, dataset, sequence, python, platform, and T_camera_lidar (JSON) for KITTI."""
+"""Metadata record: schema_version, dataset, python, platform, and T_camera_lidar (JSON) for KITTI."""
 CONFIG_METADATA = "segslam.config"
 """Metadata record: the effective settings under the key `yaml`."""
 PACKAGES_METADATA = "segslam.packages"

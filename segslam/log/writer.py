@@ -2,7 +2,7 @@
 
 import json
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,9 +19,10 @@ from mcap_protobuf.schema import register_schema
 from segslam.config import Config, config_to_yaml
 from segslam.log import schema
 from segslam.log.cloud import KeyframePoints, keyframe_points
-from segslam.log.drawing import Drawing, ground_truth
+from segslam.log.drawing import Drawing, Topical, ground_truth
+from segslam.log.output import Output
 from segslam.log.records import codec
-from segslam.types import GraphEstimate, Keyframe, SegslamError, Step, Trajectory, Transform
+from segslam.types import GraphEstimate, SegslamError, Step, Trajectory, Transform
 
 PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
 """Whose versions a log records: those that its figures depend on."""
@@ -39,12 +40,15 @@ PROTOBUF_TOPICS = {
 CHUNK_BYTES = 4 * 2**20
 """Above the largest step by far: a chunk ends with its step, which makes a step complete or absent."""
 
+Encoded = tuple[str, bytes]
+"""Topic and data of a message."""
+
 
 class LogWriter:
     """Writes the steps of a run as they come; a context manager.
 
-    Each step is handed to the operating system as one compressed chunk with a checksum. A failure of the disk raises
-    SegslamError and leaves a file that ends with the last complete step.
+    Each step is handed to the operating system as one compressed chunk with a checksum. A full or failing disk raises
+    SegslamError and leaves a file that ends with the last complete step. Ctrl-C waits until a step is complete.
     """
 
     def __init__(
@@ -53,7 +57,6 @@ class LogWriter:
         *,
         config: Config,
         dataset: str = "",
-        sequence: str = "",
         T_camera_lidar: Transform | None = None,
         reference: Trajectory | None = None,
     ) -> None:
@@ -63,48 +66,35 @@ class LogWriter:
         self._resolution_m = config.keyframes.resolution_m
         self._stamp_ns = 0
         try:
-            self._file = _WholeWrites(path)
+            self._output = Output(path)
         except OSError as error:
             raise SegslamError(f"{path}: cannot write the log ({error.strerror}); name a folder to write to") from error
-        self._mcap = Writer(
-            cast(IO[bytes], self._file),  # writes, tells and flushes: all that MCAP's writer asks of a stream
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType[config.log.compression.upper()],
-        )
-        with self._guarded():
+        compression = CompressionType[config.log.compression.upper()]
+        self._mcap = Writer(cast(IO[bytes], self._output), chunk_size=CHUNK_BYTES, compression=compression)
+        with self._whole():
             self._mcap.start(library=f"segslam {version('segslam')}")
-            for name, data in _metadata(config, dataset, sequence, T_camera_lidar).items():
+            for name, data in _metadata(config, dataset, T_camera_lidar).items():
                 self._mcap.add_metadata(name, data)
             self._channels = _register_channels(self._mcap)
-            if reference is not None and len(reference):
-                self._add_reference(reference)
+        if reference is not None and len(reference):
+            self._write(_reference_messages(reference), stamp_ns=int(reference.stamp_ns[0]))
 
     def write(self, step: Step) -> None:
-        """Add a step. Raises SegslamError if the disk is full or fails; what was complete before stays readable."""
-        self._stamp_ns = step.stamp_ns
-        with self._guarded():
-            for topic, message in self._drawing.draw(step):
-                self._add(topic, message.SerializeToString())
-            if step.keyframe is not None:
-                self._add_points(step.keyframe)
-            if step.estimate is not None:
-                self._add_estimate(step.estimate)
-            self._add(schema.STEP, _json(codec(Step).encode(step)))
+        """Add a step."""
+        self._write(self._step_messages(step), stamp_ns=step.stamp_ns)
 
     def write_result(self, estimate: GraphEstimate, trajectory: Trajectory) -> None:
         """Add what the last optimisation gave, and the pose of every scan that follows from it."""
-        with self._guarded():
-            for topic, message in self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns):
-                self._add(topic, message.SerializeToString())
-            self._add_estimate(estimate)
-            self._add(schema.RESULT, _json(codec(Trajectory).encode(trajectory)))
+        drawn = self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns)
+        messages = [*_serialised(drawn), _estimate_message(estimate), (schema.RESULT, _json(Trajectory, trajectory))]
+        self._write(messages, stamp_ns=self._stamp_ns)
 
     def close(self) -> None:
         """Write the index. Without it the log can be read as well, only not searched."""
-        if not self._file.closed:
-            with self._guarded():
+        if not self._output.closed:
+            with self._whole():
                 self._mcap.finish()
-            self._file.close()
+            self._output.close()
 
     def __enter__(self) -> "LogWriter":
         return self
@@ -114,71 +104,37 @@ class LogWriter:
     ) -> None:
         self.close()
 
-    def _add(self, topic: str, data: bytes) -> None:
-        self._mcap.add_message(self._channels[topic], self._stamp_ns, data, self._stamp_ns)
+    def _step_messages(self, step: Step) -> Iterator[Encoded]:
+        """Last comes the step itself, which says that the others are complete."""
+        yield from _serialised(self._drawing.draw(step))
+        if step.keyframe is not None:
+            points, labels = step.keyframe.points, step.keyframe.labels
+            yield schema.KEYFRAME, keyframe_points(points, labels, resolution_m=self._resolution_m).SerializeToString()
+        if step.estimate is not None:
+            yield _estimate_message(step.estimate)
+        yield schema.STEP, _json(Step, step)
 
-    def _add_reference(self, reference: Trajectory) -> None:
-        self._stamp_ns = int(reference.stamp_ns[0])
-        topic, path = ground_truth(reference, stamp_ns=self._stamp_ns)
-        self._add(topic, path.SerializeToString())
-        self._add(schema.REFERENCE, _json(codec(Trajectory).encode(reference)))
-
-    def _add_points(self, keyframe: Keyframe) -> None:
-        message = keyframe_points(keyframe.points, keyframe.labels, resolution_m=self._resolution_m)
-        self._add(schema.KEYFRAME, message.SerializeToString())
-
-    def _add_estimate(self, estimate: GraphEstimate) -> None:
-        keyframe_ids = {"keyframe_ids": list(estimate.T_world_keyframe)}
-        self._add(schema.ESTIMATE, _json(codec(GraphEstimate).encode(estimate) | keyframe_ids))
+    def _write(self, messages: Iterable[Encoded], *, stamp_ns: int) -> None:
+        encoded = list(messages)  # before anything is written: what cannot be encoded leaves no half of a step
+        self._stamp_ns = stamp_ns
+        with self._whole():
+            for topic, data in encoded:
+                self._mcap.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
+            self._mcap.flush()
 
     @contextmanager
-    def _guarded(self) -> Iterator[None]:
-        """Hands all that is written within to the operating system, or cuts the file back to what was before."""
-        if self._file.closed:
+    def _whole(self) -> Iterator[None]:
+        """As `Output.whole`, with the failure of the disk put into words."""
+        if self._output.closed:
             raise SegslamError(f"{self._path}: the log is closed; open another to write more")
-        complete = self._file.tell()
         try:
-            yield
-            self._mcap.flush()
-        except BaseException as error:  # Ctrl-C in mid-record as well
-            self._file.cut(complete)
-            if not isinstance(error, OSError):
-                raise
+            with self._output.whole():
+                yield
+        except OSError as error:
             raise SegslamError(
                 f"{self._path}: cannot go on writing the log ({error.strerror}); make room on the disk; "
                 "the log ends with the last complete step"
             ) from error
-
-
-class _WholeWrites:
-    """The stream under MCAP's writer: unbuffered, so that a failure leaves nothing to be written later."""
-
-    def __init__(self, path: Path) -> None:
-        self._raw = path.open("wb", buffering=0)
-
-    @property
-    def closed(self) -> bool:
-        return self._raw.closed
-
-    def write(self, data: bytes) -> int:
-        rest = memoryview(data)
-        while rest:
-            rest = rest[self._raw.write(rest) :]
-        return len(data)
-
-    def tell(self) -> int:
-        return self._raw.tell()
-
-    def flush(self) -> None:
-        self._raw.flush()
-
-    def cut(self, size: int) -> None:
-        """Forget all after `size` bytes, and close."""
-        self._raw.truncate(size)
-        self._raw.close()
-
-    def close(self) -> None:
-        self._raw.close()
 
 
 def _register_channels(mcap: Writer) -> dict[str, int]:
@@ -197,15 +153,12 @@ def _register_channels(mcap: Writer) -> dict[str, int]:
     return protobuf | own
 
 
-def _metadata(
-    config: Config, dataset: str, sequence: str, T_camera_lidar: Transform | None
-) -> dict[str, dict[str, str]]:
+def _metadata(config: Config, dataset: str, T_camera_lidar: Transform | None) -> dict[str, dict[str, str]]:
     calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
     return {
         schema.RUN_METADATA: {
             "schema_version": str(schema.VERSION),
             "dataset": dataset,
-            "sequence": sequence,
             "python": platform.python_version(),
             "platform": platform.platform(),
             **calibration,
@@ -222,5 +175,19 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def _json(values: dict[str, Any]) -> bytes:
-    return json.dumps(values, allow_nan=False).encode()
+def _serialised(drawn: Iterable[Topical]) -> Iterator[Encoded]:
+    for topic, message in drawn:
+        yield topic, message.SerializeToString()
+
+
+def _estimate_message(estimate: GraphEstimate) -> Encoded:
+    return schema.ESTIMATE, _json(GraphEstimate, estimate, keyframe_ids=list(estimate.T_world_keyframe))
+
+
+def _reference_messages(reference: Trajectory) -> Iterator[Encoded]:
+    yield from _serialised([ground_truth(reference, stamp_ns=int(reference.stamp_ns[0]))])
+    yield schema.REFERENCE, _json(Trajectory, reference)
+
+
+def _json(record: type, value: Any, **more: Any) -> bytes:
+    return json.dumps(codec(record).encode(value) | more, allow_nan=False).encode()

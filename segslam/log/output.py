@@ -1,0 +1,68 @@
+"""A file under MCAP's writer that holds whole parts only, whatever happens while one is written."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class Output:
+    """Writes, tells and flushes, which is all that MCAP's writer asks of a stream; unbuffered.
+
+    After a failure nothing is left to be written later.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._raw = path.open("wb", buffering=0)
+
+    @property
+    def closed(self) -> bool:
+        return self._raw.closed
+
+    def write(self, data: bytes) -> int:
+        """Write all of the data: a raw file may take less."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._raw.write(rest) :]
+        return len(data)
+
+    def tell(self) -> int:
+        return self._raw.tell()
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def close(self) -> None:
+        self._raw.close()
+
+    @contextmanager
+    def whole(self) -> Iterator[None]:
+        """What is written within comes to the file whole, or not at all. Ctrl-C waits for its end.
+
+        If the disk is full or fails, the file is cut back to what was before, closed, and the OSError goes on.
+        """
+        size = self.tell()
+        with _interrupts_wait():
+            try:
+                yield
+            except OSError:
+                self._raw.truncate(size)
+                self._raw.close()
+                raise
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Ctrl-C takes effect at the end. Only the main thread can be interrupted by it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    interrupts: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    if interrupts:
+        signal.raise_signal(signal.SIGINT)

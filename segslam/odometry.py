@@ -1,7 +1,7 @@
 """The pose of each scan in the frame of the first: by KISS-ICP (Vizzo et al., RA-L 2023), or as given."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
@@ -27,6 +27,7 @@ class OdometryResult:
     """A row for each point."""
 
 
+@runtime_checkable
 class Odometry(Protocol):
     def register(self, scan: Scan) -> OdometryResult:
         """The pose and the kept points of the next scan, in order of time. Raises BadScan for an unusable scan."""

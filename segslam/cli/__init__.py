@@ -22,7 +22,10 @@ def _segslam() -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command, that of the command line unless given, and exit. Exit status: 0 done, 1 the work failed, 2 bad usage or bad input, 130 interrupted."""
+    """Run a command, that of the command line unless given, and exit.
+
+    Exit status: 0 done, 1 the work failed, 2 bad usage or bad input, 130 interrupted.
+    """
     from segslam.cli import commands
 
     logging.basicConfig(level=logging.WARNING, format="segslam: %(levelname)s: %(message)s", stream=sys.stderr)

@@ -25,7 +25,7 @@ from segslam.cli.console import (
 
 if TYPE_CHECKING:
     from segslam.alignment import Labeller
-    from segslam.config import OdometryConfig
+    from segslam.config import Config, OdometryConfig
     from segslam.datasets import Dataset
     from segslam.odometry import Odometry
     from segslam.runs import Run
@@ -54,13 +54,21 @@ def map_command(
     """
     from segslam.config import load_config
     from segslam.datasets import open_dataset
-    from segslam.runs import Run, new_folder
-    from segslam.slam import Slam
 
     settings_now = load_config(config, settings or ())
     scans = open_dataset(data, sequence=sequence, dataset=dataset, labels=labels, encoding=encoding, frames=frames)
     given = _given_odometry(odometry, scans, settings_now.odometry) if odometry else None
-    slam = Slam(settings_now, odometry=given, labeller=_labeller(scans))
+    map_scans(scans, out, settings=settings_now, odometry=given, json=json, quiet=quiet)
+
+
+def map_scans(
+    scans: "Dataset", out: Path, *, settings: "Config", odometry: "Odometry | None" = None, json: bool, quiet: bool
+) -> None:
+    """Map a data set into a new folder, and show the figures. Raises typer.Exit(130) if Ctrl-C ended it early."""
+    from segslam.runs import Run, new_folder
+    from segslam.slam import Slam
+
+    slam = Slam(settings, odometry=odometry, labeller=_labeller(scans))
     run = Run(
         new_folder(out),
         slam,

@@ -120,12 +120,10 @@ def loop_metrics(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> 
     """How many accepted loops are false, and how many revisits have a true one.
 
     `reference` has a row a keyframe, in order of time; `rows` names the (source, target) of each closure in it.
-    A closure is false if off by more than 2 m or 5 degrees. loop_precision is left out without closures; loop_recall,
-    the share of revisiting keyframes with a true closure at most 10 m of travel away, without revisits.
+    loop_precision is left out without closures; loop_recall, the share of revisiting keyframes with a true closure at
+    most 10 m of travel away, without revisits.
     """
-    truth = np.linalg.inv(reference[rows[:, 1]]) @ reference[rows[:, 0]]
-    errors = pose_errors(T_target_source, truth)
-    false = (errors.translation_m > FALSE_LOOP_M) | (errors.rotation_deg > FALSE_LOOP_DEG)
+    false = false_loops(T_target_source, rows, reference)
     metrics: dict[str, float] = {"num_loops_false": int(false.sum())}
     if len(rows):
         metrics["loop_precision"] = float(1 - false.mean())
@@ -136,6 +134,13 @@ def loop_metrics(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> 
         away_m = np.abs(travel_m[revisiting, None] - closed_m[None]).min(axis=1, initial=np.inf)
         metrics["loop_recall"] = float((away_m <= FOUND_WITHIN_M).mean())
     return metrics
+
+
+def false_loops(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> Flags:
+    """Which closures are off by more than 2 m or 5 degrees; `rows` are the (source, target) of each in `reference`."""
+    truth = np.linalg.inv(reference[rows[:, 1]]) @ reference[rows[:, 0]]
+    errors = pose_errors(T_target_source, truth)
+    return (errors.translation_m > FALSE_LOOP_M) | (errors.rotation_deg > FALSE_LOOP_DEG)
 
 
 def revisits(reference: Poses) -> Flags:

@@ -17,6 +17,32 @@ STAMP_TOLERANCE_NS = 10_000_000
 """Farthest that the stamps of a scan and of its true pose may be apart."""
 
 
+FIGURES = {
+    "ate_m": "absolute trajectory error after alignment, rms (m)",
+    "odometry_ate_m": "the same of the odometry alone (m)",
+    "are_deg": "absolute rotation error after alignment, rms (degrees)",
+    "height_m": "height error after alignment, rms (m)",
+    "rpe_m": "error of the motion from pose to pose, rms (m)",
+    "rpe_deg": "rotation error of the motion from pose to pose, rms (degrees)",
+    "kitti_translation_percent": "KITTI's translation error over 100 to 800 m (%)",
+    "kitti_rotation_deg_per_100m": "KITTI's rotation error over 100 to 800 m (degrees per 100 m)",
+    "num_poses": "poses scored",
+    "num_scans": "scans mapped",
+    "num_scans_skipped": "bad scans left out",
+    "num_keyframes": "keyframes",
+    "num_candidates": "loop candidates tried",
+    "num_loops_accepted": "loops accepted",
+    "num_loops_switched_off": "of these switched off by the graph",
+    "num_loops_false": "of these false: off by more than 2 m or 5 degrees",
+    "loop_precision": "share of the accepted loops that are true",
+    "loop_recall": "share of the revisits within 4 m that a true loop closes",
+    "seconds_total": "time (s)",
+    "scans_per_second": "scans per second",
+    "peak_rss_mb": "peak memory (MB)",
+}
+"""What the figures of `metrics.json` say, in the order in which a person wants them."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedRun:
     """What a run's folder holds of it."""

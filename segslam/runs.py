@@ -18,8 +18,8 @@ from segslam.datasets import Dataset
 from segslam.evaluation import loop_metrics, trajectory_metrics
 from segslam.log import LogWriter
 from segslam.slam import Slam, SlamResult
-from segslam.trajectory import camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
-from segslam.types import BadScan, LoopAttempt, LoopClosure, SegslamError, Step, Trajectory, Transform
+from segslam.trajectory import Poses, camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
+from segslam.types import BadScan, IndexPairs, LoopAttempt, LoopClosure, SegslamError, Step, Trajectory, Transform
 
 logger = logging.getLogger(__name__)
 
@@ -140,15 +140,19 @@ def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[s
     return trajectory_metrics(trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]])
 
 
-def _loop_accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
-    """Of the closures whose two keyframes have a true pose."""
+def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[LoopClosure], IndexPairs, Poses]:
+    """The closures whose two keyframes have a true pose, the rows of (source, target), and the true poses, by row."""
     rows = rows_of_same_scan(result.trajectory.scan_index[result.keyframe_rows], reference.scan_index)
     place_of_id = {int(keyframe_id): place for place, keyframe_id in enumerate(rows[:, 0])}
     closures = [attempt.outcome for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
     known = [c for c in closures if c.source_id in place_of_id and c.target_id in place_of_id]
     pairs = np.array([(place_of_id[c.source_id], place_of_id[c.target_id]) for c in known], dtype=int).reshape(-1, 2)
-    measured = np.array([c.T_target_source for c in known]).reshape(-1, 4, 4)
-    return loop_metrics(measured, pairs, reference.T_world_lidar[rows[:, 1]])
+    return known, pairs, reference.T_world_lidar[rows[:, 1]]
+
+
+def _loop_accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
+    closures, pairs, truth = judged_closures(result, reference)
+    return loop_metrics(np.array([c.T_target_source for c in closures]).reshape(-1, 4, 4), pairs, truth)
 
 
 def write_poses(folder: Path, name: str, trajectory: Trajectory, T_camera_lidar: Transform | None) -> None:

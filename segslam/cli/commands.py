@@ -2,7 +2,7 @@
 
 import typer
 
-from segslam.cli import evaluate, map, optimize, register, replay, simulate
+from segslam.cli import evaluate, map, optimize, register, replay, report, simulate
 
 
 def add_all(app: typer.Typer) -> None:
@@ -12,4 +12,5 @@ def add_all(app: typer.Typer) -> None:
     app.command("optimize")(optimize.optimize)
     app.command("register", cls=register.LabelsCommand)(register.register)
     app.command("replay")(replay.replay)
+    app.command("report")(report.report)
     app.command("simulate")(simulate.simulate)

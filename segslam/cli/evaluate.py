@@ -11,20 +11,6 @@ if TYPE_CHECKING:
     from segslam.trajectory import PoseFile
 
 UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
-FIGURES = {
-    "ate_m": "absolute trajectory error after alignment, rms (m)",
-    "are_deg": "absolute rotation error after alignment, rms (degrees)",
-    "height_m": "height error after alignment, rms (m)",
-    "rpe_m": "relative error from pose to pose, rms (m)",
-    "rpe_deg": "relative rotation error from pose to pose, rms (degrees)",
-    "kitti_translation_percent": "KITTI's translation error (%)",
-    "kitti_rotation_deg_per_100m": "KITTI's rotation error (degrees per 100 m)",
-    "odometry_ate_m": "absolute trajectory error of the odometry alone (m)",
-    "num_loops_accepted": "accepted loops",
-    "num_loops_false": "of these false: off by more than 2 m or 5 degrees",
-    "loop_recall": "share of the revisits within 4 m that a loop closes",
-    "num_poses": "poses scored",
-}
 
 
 def evaluate(
@@ -62,6 +48,8 @@ def evaluate(
 
 def table(figures: dict[str, Any]) -> str:
     """The figures with what they mean, a line each."""
+    from segslam.results import FIGURES
+
     return "\n".join(f"{figures[key]:10.4g}  {meaning}" for key, meaning in FIGURES.items() if key in figures)
 
 

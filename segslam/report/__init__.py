@@ -1,0 +1,40 @@
+"""A run as one HTML page that needs no network: plots, figures, settings."""
+
+from pathlib import Path
+
+import matplotlib
+
+from segslam.report import figures
+from segslam.report.page import page
+from segslam.results import FinishedRun, read_run
+from segslam.types import SegslamError
+
+__all__ = ["write_report"]
+
+
+def write_report(folder: Path) -> Path:
+    """Draw the run of a folder from what is in it, and write `report.html` there, which is returned.
+
+    Raises SegslamError if the folder holds no finished run, or cannot be written to.
+    """
+    run = read_run(folder)
+    with matplotlib.rc_context(figures.STYLE):
+        plots = _plots(run)
+    file = folder / "report.html"
+    try:
+        file.write_text(page(run, plots), encoding="utf-8")
+    except OSError as error:
+        raise SegslamError(f"{file}: cannot be written ({error.strerror})") from error
+    return file
+
+
+def _plots(run: FinishedRun) -> dict[str, str]:
+    """By caption, those that the run has the data for."""
+    plots = {"Trajectory from above, and its height": figures.draw_paths(run)}
+    true = figures.compared(run)
+    if true is not None:
+        plots["Error along the drive, after alignment"] = figures.draw_errors(true)
+    plots["Loops by outcome"] = figures.draw_loops(run)
+    if run.metrics.get("stage_ms"):
+        plots["Time of each stage, each time that it ran"] = figures.draw_stages(run.metrics["stage_ms"])
+    return plots

@@ -1,0 +1,174 @@
+"""The plots of a run, each as the text of an SVG."""
+
+import io
+from dataclasses import dataclass
+from itertools import cycle
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from segslam.evaluation import align, false_loops, pose_errors
+from segslam.results import FinishedRun
+from segslam.runs import judged_closures
+from segslam.trajectory import Poses, rows_of_same_scan, travelled_m
+from segslam.types import LoopClosure, Rejected, RejectReason
+
+# Okabe and Ito's colours, told apart with any colour vision
+TRUTH, CORRECTED, ODOMETRY = "#444444", "#0072B2", "#E69F00"
+ACCEPTED, SWITCHED_OFF, FALSE = "#009E73", "#CC79A7", "#D55E00"
+REJECTED = ("#56B4E9", "#8C564B", "#7F7F7F", "#9467BD", "#BCBD22", "#17BECF", "#1F3A93")
+STYLE: Any = {"svg.fonttype": "none", "font.size": 11, "axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
+SWITCHED_OFF_BELOW = 0.5
+"""Weight of a closure under which the graph has let go of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """The scans that have a true pose, a row each."""
+
+    truth: Poses
+    corrected: Poses
+    odometry: Poses
+
+
+def compared(run: FinishedRun) -> Compared | None:
+    """None if no scan has a true pose."""
+    if run.reference is None:
+        return None
+    rows = rows_of_same_scan(run.result.trajectory.scan_index, run.reference.scan_index)
+    if len(rows) == 0:
+        return None
+    return Compared(
+        run.reference.T_world_lidar[rows[:, 1]],
+        run.result.trajectory.T_world_lidar[rows[:, 0]],
+        run.result.odometry.T_world_lidar[rows[:, 0]],
+    )
+
+
+def draw_paths(run: FinishedRun) -> str:
+    """Truth, odometry and corrected trajectory from above, and their heights along the way."""
+    figure = Figure(figsize=(6.4, 7.6), layout="constrained")
+    above, height = figure.subplots(2, 1, height_ratios=(3, 1))
+    for name, poses, color, style in _paths(run):
+        above.plot(*poses[:, :2, 3].T, style, color=color, label=name, linewidth=1.6)
+        above.plot(*poses[0, :2, 3], "o", color=color, markersize=5)
+        height.plot(travelled_m(poses), poses[:, 2, 3], style, color=color, linewidth=1.4)
+    above.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
+    height.set(xlabel="travelled (m)", ylabel="height (m)")
+    _legend_on_top(above)
+    return _svg(figure, "paths")
+
+
+def draw_loops(run: FinishedRun) -> str:
+    """Every attempt to close a loop, on the corrected trajectory: closures join their ends, rejections are dots."""
+    figure = Figure(figsize=(6.4, 6.2), layout="constrained")
+    axes = figure.subplots()
+    positions = run.result.trajectory.T_world_lidar[:, :2, 3]
+    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
+    ends = positions[run.result.keyframe_rows]
+    for (reason, ids), color in zip(_rejected_sources(run).items(), cycle(REJECTED), strict=False):
+        label = f"{reason.replace('_', ' ')} ({len(ids)})"
+        axes.plot(*ends[ids].T, ".", color=color, markersize=7, label=label, zorder=2)
+    for name, color, closures in _closure_kinds(run):
+        for closure in closures:
+            axes.plot(*ends[[closure.source_id, closure.target_id]].T, "o-", color=color, markersize=3, linewidth=1.5)
+        if closures:
+            axes.plot([], [], "o-", color=color, label=f"{name} ({len(closures)})")
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
+    _legend_on_top(axes, num_columns=2)
+    return _svg(figure, "loops")
+
+
+def draw_errors(poses: Compared) -> str:
+    """Distance from the truth along the way, all of it and its height, after the alignment of the ATE."""
+    figure = Figure(figsize=(6.4, 5.4), layout="constrained")
+    whole, height = figure.subplots(2, 1, sharex=True)
+    along_m = travelled_m(poses.truth)
+    for name, estimate, color in (("odometry", poses.odometry, ODOMETRY), ("corrected", poses.corrected, CORRECTED)):
+        aligned = align(estimate[:, :3, 3], poses.truth[:, :3, 3]) @ estimate
+        error_m = pose_errors(aligned, poses.truth).translation_m
+        label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
+        whole.plot(along_m, error_m, color=color, label=label, linewidth=1.4)
+        height.plot(along_m, (aligned - poses.truth)[:, 2, 3], color=color, linewidth=1.4)
+    whole.set(ylabel="error (m)")
+    whole.set_ylim(bottom=0)
+    height.set(xlabel="travelled (m)", ylabel="height error (m)")
+    _legend_on_top(whole)
+    return _svg(figure, "errors")
+
+
+def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
+    """Median and 95th percentile of the time of each stage, each time that it ran; the longest first."""
+    figure = Figure(figsize=(6.4, 0.9 + 0.32 * len(stage_ms)), layout="constrained")
+    axes = figure.subplots()
+    stages = sorted(stage_ms, key=lambda stage: stage_ms[stage]["median"])
+    axes.barh(stages, [stage_ms[stage]["p95"] for stage in stages], color="#CFE3F1", label="95th percentile")
+    axes.barh(stages, [stage_ms[stage]["median"] for stage in stages], color=CORRECTED, height=0.45, label="median")
+    axes.grid(visible=False, axis="y")
+    axes.set(xlabel="time (ms)")
+    _legend_on_top(axes)
+    return _svg(figure, "stages")
+
+
+def _paths(run: FinishedRun) -> list[tuple[str, Poses, str, str]]:
+    """Name, poses, colour and line of each path: where there is truth, in its frame, the corrected one laid on it."""
+    corrected, odometry = run.result.trajectory.T_world_lidar, run.result.odometry.T_world_lidar
+    true = compared(run)
+    truth_paths = []
+    if true is not None:
+        T_truth_world = align(true.corrected[:, :3, 3], true.truth[:, :3, 3])
+        corrected, odometry = T_truth_world @ corrected, T_truth_world @ odometry
+        truth_paths = [("truth", true.truth, TRUTH, "-")]
+    return [*truth_paths, ("odometry", odometry, ODOMETRY, "--"), ("corrected", corrected, CORRECTED, "-")]
+
+
+def _rejected_sources(run: FinishedRun) -> dict[RejectReason, list[int]]:
+    """The new keyframe of each rejected attempt, by reason, in the order of the pipeline."""
+    sources: dict[RejectReason, list[int]] = {}
+    for attempt in run.result.attempts:
+        if isinstance(attempt.outcome, Rejected):
+            sources.setdefault(attempt.outcome.reason, []).append(attempt.candidate.source_id)
+    return {reason: sources[reason] for reason in RejectReason if reason in sources}
+
+
+def _closure_kinds(run: FinishedRun) -> list[tuple[str, str, list[LoopClosure]]]:
+    """Name, colour and closures: believed, switched off by the graph, false by the truth whatever the graph says."""
+    closures = [attempt.outcome for attempt in run.result.attempts if isinstance(attempt.outcome, LoopClosure)]
+    weights = run.result.estimate.closure_weights
+    false = _false_closures(run)
+    off = {pair for pair, weight in weights.items() if weight < SWITCHED_OFF_BELOW} - false
+    pairs = [(closure.source_id, closure.target_id) for closure in closures]
+    kinds = (
+        ("accepted", ACCEPTED, set(pairs) - off - false),
+        ("switched off", SWITCHED_OFF, off),
+        ("false", FALSE, false),
+    )
+    return [
+        (name, color, [closure for pair, closure in zip(pairs, closures, strict=True) if pair in members])
+        for name, color, members in kinds
+    ]
+
+
+def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:
+    """(source, target) of the closures that the true poses contradict."""
+    if run.reference is None:
+        return set()
+    closures, rows, truth = judged_closures(run.result, run.reference)
+    measured = np.array([closure.T_target_source for closure in closures]).reshape(-1, 4, 4)
+    false = false_loops(measured, rows, truth)
+    return {(c.source_id, c.target_id) for c, is_false in zip(closures, false, strict=True) if is_false}
+
+
+def _legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=num_columns, borderaxespad=0.2, fontsize=10)
+
+
+def _svg(figure: Figure, name: str) -> str:
+    """The picture; the same for the same data."""
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": name}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()

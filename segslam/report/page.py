@@ -1,0 +1,133 @@
+"""The page: a few headline figures, the plots, tables; everything inside one HTML file."""
+
+import base64
+from collections import Counter
+from collections.abc import Iterable
+from html import escape
+from typing import Any
+
+from pydantic.fields import FieldInfo
+
+from segslam.config import Config, Section
+from segslam.results import FIGURES, FinishedRun
+from segslam.types import Rejected
+
+ODOMETRY = "odometry_"
+"""What the figures of the odometry alone begin with."""
+STYLE = """
+:root { color-scheme: light; --line: #d8dee4; --soft: #57606a; }
+body { margin: 0 auto; max-width: 76rem; padding: 1rem; font: 16px/1.45 system-ui, sans-serif; color: #1f2328; }
+h1 { font-size: 1.5rem; margin: 0 0 .2rem; } h2 { font-size: 1.1rem; margin: 0 0 .4rem; }
+.soft { color: var(--soft); } .plots { columns: 2 30rem; column-gap: 1rem; margin-bottom: 1rem; }
+.tiles { display: grid; gap: 1rem; margin: 1rem 0; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); }
+section { margin-bottom: 1rem; break-inside: avoid; min-width: 0; overflow-x: auto; }
+.tiles div, section { border: 1px solid var(--line); border-radius: .5rem; padding: .7rem .9rem; background: #fff; }
+.tiles b { display: block; font-size: 1.4rem; } img { width: 100%; height: auto; display: block; }
+table { border-collapse: collapse; width: 100%; font-size: .92rem; }
+td, th { text-align: left; padding: .2rem .6rem .2rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+td.number, th + th { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: anywhere; }
+details { margin: .3rem 0; } summary { cursor: pointer; }
+@media print { body { max-width: none; padding: 0; font-size: 11px; } .tiles div { break-inside: avoid; } }
+"""
+
+
+def page(run: FinishedRun, plots: dict[str, str]) -> str:
+    """The page of a run; `plots` maps a caption to the text of an SVG."""
+    title = (
+        f"{run.dataset or run.folder.resolve().name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
+    )
+    sections = [_plot(caption, svg) for caption, svg in plots.items()]
+    sections += [_section("Figures", _figures(run.metrics)), _section("Loop candidates", _outcomes(run))]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body><h1>{escape(title)}</h1>"
+        f'<div class="soft">segslam run <code>{escape(run.folder.resolve().name)}</code></div>\n'
+        f'<div class="tiles">{_tiles(run.metrics)}</div>\n<div class="plots">{"".join(sections)}</div>\n'
+        f"{_section('Settings', _settings(run.config))}</body></html>\n"
+    )
+
+
+def _tiles(metrics: dict[str, Any]) -> str:
+    tiles = [
+        ("ate_m", " m", "error after alignment"),
+        ("odometry_ate_m", " m", "error of the odometry alone"),
+        ("num_loops_accepted", "", "loops accepted"),
+        ("num_loops_false", "", "of these false"),
+        ("scans_per_second", "", "scans per second"),
+        ("peak_rss_mb", " MB", "memory at most"),
+    ]
+    known = [(key, unit, text) for key, unit, text in tiles if key in metrics]
+    return "".join(f"<div><b>{_number(metrics[key])}{unit}</b>{text}</div>" for key, unit, text in known)
+
+
+def _plot(caption: str, svg: str) -> str:
+    data = base64.b64encode(svg.encode()).decode()
+    return _section(caption, f'<img alt="{escape(caption)}" src="data:image/svg+xml;base64,{data}">')
+
+
+def _figures(metrics: dict[str, Any]) -> str:
+    """Those with a meaning first, in its order, then the others; beside each, that of the odometry alone."""
+    known = [key for key in FIGURES if key in metrics]
+    rest = [key for key, value in metrics.items() if key not in FIGURES and isinstance(value, int | float)]
+    of_run = [key for key in known + rest if not key.startswith(ODOMETRY)]
+    rows = [
+        (f"{FIGURES.get(key, '')} <code>{escape(key)}</code>", metrics[key], metrics.get(ODOMETRY + key))
+        for key in of_run
+    ]
+    return _table(("", "run", "odometry alone"), rows)
+
+
+def _outcomes(run: FinishedRun) -> str:
+    if not run.result.attempts:
+        return "<p>No place was visited twice, as far as the estimate could tell.</p>"
+    outcomes = (attempt.outcome for attempt in run.result.attempts)
+    names = Counter(outcome.reason.value if isinstance(outcome, Rejected) else "accepted" for outcome in outcomes)
+    return _table(("", "attempts"), ((name.replace("_", " "), count) for name, count in names.most_common()))
+
+
+def _settings(config: Config) -> str:
+    """Every setting by section; those that differ from the defaults are marked, and their sections open."""
+    default = Config()
+    return "".join(
+        _setting_section(name, getattr(config, name), getattr(default, name)) for name in Config.model_fields
+    )
+
+
+def _setting_section(name: str, section: Section, default: Section) -> str:
+    values, usual = section.model_dump(mode="json"), default.model_dump(mode="json")
+    rows = "".join(
+        _setting(key, values[key], field, changed=values[key] != usual[key])
+        for key, field in type(section).model_fields.items()
+    )
+    return f"<details{' open' if values != usual else ''}><summary>{name}</summary><table>{rows}</table></details>"
+
+
+def _setting(key: str, value: Any, field: FieldInfo, *, changed: bool) -> str:
+    kind = ' class="changed"' if changed else ""
+    cells = f"<code>{key}</code>", escape(str(value)), escape(field.description or "")
+    return f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>{body}</section>\n"
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, *tuple[float | None, ...]]]) -> str:
+    """Rows of a name and numbers, where a number may be unknown."""
+    titles = "".join(f"<th>{title}</th>" for title in head)
+    return f"<table><tr>{titles}</tr>{''.join(_row(*row) for row in rows)}</table>"
+
+
+def _row(name: str, *values: float | None) -> str:
+    cells = ("" if value is None else _number(value) for value in values)
+    return f"<tr><td>{name}</td>" + "".join(f'<td class="number">{cell}</td>' for cell in cells) + "</tr>"
+
+
+def _number(value: float) -> str:
+    """Some four digits, none of them beyond the third after the point."""
+    if isinstance(value, int):
+        return str(value)
+    digits = 3 if abs(value) < 10 else 2 if abs(value) < 100 else 1 if abs(value) < 1000 else 0
+    return f"{value:.{digits}f}"

@@ -195,8 +195,8 @@ class VerifyConfig(Section):
 
 
 class GraphConfig(Section):
-    odometry_sigma_m: float = Field(0.05, gt=0, description="odometry's translation noise per metre^0.5 travelled")
-    odometry_sigma_deg: float = Field(0.15, gt=0, description="odometry's rotation noise per metre^0.5 travelled")
+    odometry_sigma_m: float = Field(0.04, gt=0, description="odometry's translation noise per metre^0.5 travelled")
+    odometry_sigma_deg: float = Field(0.05, gt=0, description="odometry's rotation noise per metre^0.5 travelled")
     turn_m: float = Field(5.0, ge=0, description="a turn of one radian adds as much noise as this travel (m)")
     closure_sigma_m: float = Field(0.10, gt=0, description="least translation noise of a closure (m)")
     closure_sigma_deg: float = Field(0.20, gt=0, description="least rotation noise of a closure (degrees)")

@@ -123,6 +123,7 @@ class Description:
     """
 
     means: Points
+    """Centres; of upright things, where the ground is seen, the point of the ground beneath."""
     covariances: Covariances
     classes: Labels
     sizes: Indices

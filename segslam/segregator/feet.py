@@ -35,6 +35,7 @@ def ground_heights(places: Points, ground: Points, *, max_distance_m: float) -> 
     """Height (m) of the ground at each place: the median of the nearest points of `ground`; NaN where none is near."""
     if not len(ground):
         return np.full(len(places), np.nan)
-    distances, nearest = cKDTree(ground[:, :2]).query(places[:, :2], k=range(1, min(NUM_CELLS, len(ground)) + 1))
+    columns = range(1, min(NUM_CELLS, len(ground)) + 1)
+    distances, nearest = map(np.asarray, cKDTree(ground[:, :2]).query(places[:, :2], k=columns))
     heights = np.median(ground[nearest, 2], axis=1)
     return np.where(distances[:, 0] <= max_distance_m, heights, np.nan)

@@ -19,6 +19,9 @@ class WorldConfig(Section):
     clutter: float = Field(2.0, ge=0, le=20, description="bins, switch boxes and the like, of no class")
     built: float = Field(0.65, ge=0, le=1, description="share of the lots that hold a building")
     courts: float = Field(0.1, ge=0, le=1, description="share of the lots that are paved courts with parked cars")
+    shrubs: float = Field(
+        1.0, ge=0, le=3, description="bushes and trees on the lots, as a multiple of the usual number"
+    )
     hedged: float = Field(0.6, ge=0, le=1, description="share of the lots that a hedge closes towards the street")
     fenced: float = Field(0.2, ge=0, le=1, description="share of the lots that a fence closes towards the street")
     equal_tree_rows: bool = Field(

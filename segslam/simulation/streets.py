@@ -64,31 +64,35 @@ def _lots(site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.Ge
         middle = min(start + width // 2, len(frontage.at) - 1)
         kind = rng.uniform()
         if kind < config.built:
-            yield from _house(site, frontage, middle, float(width), rng)
+            yield from _house(site, frontage, middle, float(width), config, rng)
         elif kind < config.built + config.courts:
             yield from _court(site, frontage, middle, float(width), rng)
         else:
-            yield from _garden(site, frontage, middle, float(width), rng)
+            yield from _garden(site, frontage, middle, float(width), config, rng)
         yield from _closure(site, frontage, middle, float(width), config, rng)
-        for _ in range(int(rng.integers(2, 6))):
+        for _ in range(rng.poisson(3.5 * config.shrubs)):
             yield from _shrub(site, frontage, middle, float(width), BACKDROP_M, rng)
         start += width
 
 
-def _house(site: Site, frontage: Frontage, middle: int, width: float, rng: np.random.Generator) -> Iterator[Mesh]:
+def _house(
+    site: Site, frontage: Frontage, middle: int, width: float, config: WorldConfig, rng: np.random.Generator
+) -> Iterator[Mesh]:
     """A building, with shrubs before it and a paved way to its door."""
     depth, wide = rng.uniform(8.0, 12.0), width - max(0.0, rng.uniform(-1.5, 3.0))
     spot = site.outward(frontage, middle, rng.uniform(*HOUSE_M))
     if site.claim(moved(spot, out_m=depth / 2 + 0.5), wide, depth, clearance_m=6.5):
         yield site.stand(buildings.building(rng, wide, depth), spot)
         site.pave(moved(spot, along_m=rng.uniform(-0.3, 0.3) * wide, out_m=-3.0), 3.0, 6.0, Label.SIDEWALK)
-    for _ in range(int(rng.integers(0, 4))):
+    for _ in range(rng.poisson(1.5 * config.shrubs)):
         yield from _shrub(site, frontage, middle, width, (8.5, 12.0), rng)
 
 
-def _garden(site: Site, frontage: Frontage, middle: int, width: float, rng: np.random.Generator) -> Iterator[Mesh]:
+def _garden(
+    site: Site, frontage: Frontage, middle: int, width: float, config: WorldConfig, rng: np.random.Generator
+) -> Iterator[Mesh]:
     """Trees and bushes."""
-    for _ in range(int(rng.integers(5, 12))):
+    for _ in range(rng.poisson(8.0 * config.shrubs)):
         yield from _shrub(site, frontage, middle, width, (8.5, 18.0), rng)
 
 

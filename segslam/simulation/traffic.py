@@ -1,5 +1,6 @@
 """Parked cars, some of which come or leave while the drive lasts, and cars that move."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -31,7 +32,7 @@ class ParkedCar:
     @property
     def changes(self) -> bool:
         """Whether it comes or leaves at all."""
-        return np.isfinite(self.start_s) or np.isfinite(self.end_s)
+        return math.isfinite(self.start_s) or math.isfinite(self.end_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

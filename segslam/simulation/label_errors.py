@@ -1,0 +1,91 @@
+"""True labels made as wrong as a segmentation network's: whole regions confused, edges smeared, nothing moves."""
+
+import numpy as np
+from pydantic import Field
+
+from segslam.config import Section
+from segslam.types import Label, Labels, Points
+
+# What networks take each class for, most likely first.
+CONFUSED_WITH: dict[Label, tuple[Label, ...]] = {
+    Label.CAR: (Label.OTHER_VEHICLE, Label.TRUCK, Label.VEGETATION),
+    Label.TRUCK: (Label.OTHER_VEHICLE, Label.BUILDING, Label.CAR),
+    Label.ROAD: (Label.PARKING, Label.SIDEWALK),
+    Label.PARKING: (Label.ROAD, Label.SIDEWALK),
+    Label.SIDEWALK: (Label.ROAD, Label.TERRAIN),
+    Label.TERRAIN: (Label.VEGETATION, Label.SIDEWALK),
+    Label.BUILDING: (Label.FENCE, Label.VEGETATION, Label.UNLABELLED),
+    Label.FENCE: (Label.VEGETATION, Label.BUILDING),
+    Label.VEGETATION: (Label.FENCE, Label.TERRAIN, Label.TRUNK),
+    Label.TRUNK: (Label.POLE, Label.VEGETATION),
+    Label.POLE: (Label.TRUNK, Label.TRAFFIC_SIGN, Label.FENCE),
+    Label.TRAFFIC_SIGN: (Label.POLE, Label.UNLABELLED),
+}
+STANDING = {
+    Label.MOVING_CAR: Label.CAR,
+    Label.MOVING_TRUCK: Label.TRUCK,
+    Label.MOVING_OTHER_VEHICLE: Label.OTHER_VEHICLE,
+    Label.MOVING_PERSON: Label.PERSON,
+    Label.MOVING_BICYCLIST: Label.BICYCLIST,
+    Label.MOVING_MOTORCYCLIST: Label.MOTORCYCLIST,
+}
+IMAGE = (64, 1024)  # rows over the elevations there are, columns over the circle: what networks work on
+
+
+class LabelErrorConfig(Section):
+    """How wrong. All zero leaves the labels as they are, but for the classes that move."""
+
+    regions: int = Field(25, ge=0, description="regions of a scan in which each class is taken for another one")
+    region_radius_m: float = Field(1.5, gt=0, description="mean radius of a region (m)")
+    bleeding: float = Field(0.5, ge=0, le=1, description="share of the points at an edge that take the other label")
+    lost: float = Field(0.01, ge=0, le=1, description="share of all points that lose their label")
+
+
+def network_like(points: Points, labels: Labels, *, config: LabelErrorConfig, rng: np.random.Generator) -> Labels:
+    """The labels that a network might give to points (n, 3) of the LiDAR frame whose true labels are known."""
+    guessed = _standing(labels)
+    for _ in range(config.regions if len(points) else 0):
+        _confuse_region(guessed, points, config.region_radius_m, rng)
+    guessed = _bled(guessed, points, config.bleeding, rng)
+    guessed[rng.random(len(guessed)) < config.lost] = Label.UNLABELLED
+    return guessed
+
+
+def _standing(labels: Labels) -> Labels:
+    """A single scan does not tell what moves."""
+    table = np.arange(len(Label), dtype=np.uint8)
+    table[list(STANDING)] = list(STANDING.values())
+    return table[labels]
+
+
+def _confuse_region(labels: Labels, points: Points, radius_m: float, rng: np.random.Generator) -> None:
+    """In place: around a random point each class becomes one it is often taken for; regions grow with the range."""
+    centre = points[rng.integers(len(points))]
+    radius = radius_m * rng.exponential() * (0.5 + np.linalg.norm(centre) / 30.0)
+    rows = np.flatnonzero(np.linalg.norm(points - centre, axis=1) < radius)
+    before = labels[rows]
+    for label in np.unique(before):
+        others = CONFUSED_WITH.get(Label(label), ())
+        if others and rng.uniform() < 0.7:
+            labels[rows[before == label]] = others[min(int(rng.geometric(0.6)) - 1, len(others) - 1)]
+
+
+def _bled(labels: Labels, points: Points, share: float, rng: np.random.Generator) -> Labels:
+    """Labels smeared over the edges of the range image, to the side and up or down by a pixel or two."""
+    row, column = _pixels(points)
+    image = np.full(IMAGE, Label.UNLABELLED, dtype=np.uint8)
+    image[row, column] = labels
+    beside = (column + rng.integers(-2, 3, size=len(labels))) % IMAGE[1]
+    above = np.clip(row + rng.integers(-1, 2, size=len(labels)), 0, IMAGE[0] - 1)
+    other = image[above, beside]
+    takes = (other != Label.UNLABELLED) & (rng.random(len(labels)) < share)
+    return np.where(takes, other, labels)
+
+
+def _pixels(points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of each point in the range image."""
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    low, high = (elevation.min(), elevation.max()) if len(points) else (0.0, 1.0)
+    row = (elevation - low) / max(high - low, 1e-9) * (IMAGE[0] - 1)
+    column = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * IMAGE[1]
+    return np.rint(row).astype(int), column.astype(int) % IMAGE[1]

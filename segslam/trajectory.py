@@ -5,7 +5,7 @@ A pose file does not name its frames: the reader hands over T_a_b as the lines h
 
 import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam import geometry
-from segslam.types import IndexPairs, Indices, SegslamError, Trajectory, Transform
+from segslam.types import IndexPairs, Indices, SegslamError, Transform
 
 Poses = Float[np.ndarray, "_ 4 4"]
 """Rigid transforms T_a_b, one a row."""
@@ -50,8 +50,7 @@ def read_poses(path: Path, *, format: PoseFormat | None = None) -> PoseFile:
     rows = np.array([_numbers(path, number, fields, chosen) for number, fields in lines])
     poses = _poses_from_matrices(rows) if chosen == "kitti" else _poses_from_quaternions(rows)
     _require_rotations(path, [number for number, _ in lines], rows, poses, chosen)
-    stamps = [_nanoseconds(path, number, fields[0]) for number, fields in lines] if chosen == "tum" else None
-    return PoseFile(poses, None if stamps is None else np.array(stamps, dtype=np.int64))
+    return PoseFile(poses, _stamps(path, lines) if chosen == "tum" else None)
 
 
 def write_kitti(path: Path, T_a_b: Poses) -> None:
@@ -68,6 +67,17 @@ def write_tum(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
         for stamp, row in zip(stamp_ns, rows, strict=True)
     ]
     path.write_text("".join(line + "\n" for line in lines), encoding="ascii")
+
+
+def nanoseconds(seconds: str) -> int:
+    """The stamp of a text, exact: a double of today's seconds has lost them. Raises ValueError if it is no time."""
+    try:
+        stamp_ns = int(Decimal(seconds).scaleb(9).to_integral_value())
+    except (ArithmeticError, ValueError) as error:
+        raise ValueError(f"{seconds} is no time in seconds") from error
+    if abs(stamp_ns) >= 2**63:
+        raise ValueError(f"{seconds} s are more than 292 years")
+    return stamp_ns
 
 
 def camera_from_lidar(T_world_lidar: Poses, T_camera_lidar: Transform) -> Poses:
@@ -96,11 +106,6 @@ def rows_of_same_scan(scan_index_a: Indices, scan_index_b: Indices) -> IndexPair
     """Rows (of a, of b) that hold the same scan, ascending in the scan's number."""
     _, rows_a, rows_b = np.intersect1d(scan_index_a, scan_index_b, return_indices=True)
     return np.column_stack([rows_a, rows_b])
-
-
-def take(trajectory: Trajectory, rows: Indices) -> Trajectory:
-    """The named rows."""
-    return Trajectory(trajectory.scan_index[rows], trajectory.stamp_ns[rows], trajectory.T_world_lidar[rows])
 
 
 def travelled_m(T_a_b: Poses) -> np.ndarray:
@@ -189,12 +194,14 @@ def _numbers(path: Path, number: int, fields: list[str], format: PoseFormat) -> 
     return values
 
 
-def _nanoseconds(path: Path, number: int, seconds: str) -> int:
-    """Exact: a double cannot hold today's seconds to the nanosecond."""
-    try:
-        return int(Decimal(seconds).scaleb(9).to_integral_value())
-    except InvalidOperation as error:
-        raise SegslamError(f"{path}:{number}: {seconds} is no time in seconds") from error
+def _stamps(path: Path, lines: list[tuple[int, list[str]]]) -> Indices:
+    stamps = []
+    for number, fields in lines:
+        try:
+            stamps.append(nanoseconds(fields[0]))
+        except ValueError as error:
+            raise SegslamError(f"{path}:{number}: {error}; mend or remove the line") from error
+    return np.array(stamps, dtype=np.int64)
 
 
 def _poses_from_matrices(rows: np.ndarray) -> Poses:

@@ -9,10 +9,11 @@ from xml.etree import ElementTree
 
 import pytest
 from finished_run import make_run
+from matplotlib.image import imread
 
 from segslam import cli
 from segslam.config import Config, load_config
-from segslam.report import write_report
+from segslam.report import draw_picture, write_report
 from segslam.report.figures import draw_loops
 from segslam.report.page import page
 from segslam.results import FIGURES, read_run
@@ -122,6 +123,20 @@ def test_run_without_loops_is_drawn(tmp_path: Path) -> None:
     html = page(bare, {"Loops": draw_loops(bare)})
     assert "No place was visited twice" in html
     assert "accepted" not in _plots(html)["Loops"]
+
+
+def test_picture_is_a_png_beside_the_run(tmp_path: Path) -> None:
+    file = draw_picture(make_run(tmp_path / "run").folder)
+    assert file == tmp_path / "run" / "picture.png"
+    height, width, _ = imread(file).shape
+    assert (height, width) == (600, 1280)
+
+
+def test_folder_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run").folder
+    (folder / "report.html").mkdir()
+    with pytest.raises(SegslamError, match=r"report\.html: cannot be written"):
+        write_report(folder)
 
 
 def test_unfinished_run_is_refused(tmp_path: Path) -> None:

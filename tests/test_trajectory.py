@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from segslam import geometry, trajectory
-from segslam.types import SegslamError, Trajectory
+from segslam.types import SegslamError
 
 
 def _drive(rng: np.random.Generator, num_poses: int) -> np.ndarray:
@@ -158,13 +158,30 @@ def test_scans_pair_by_number_whatever_the_order() -> None:
     np.testing.assert_array_equal(pairs, [[1, 0], [0, 2]])
 
 
-def test_rows_taken_keep_number_stamp_and_pose_together() -> None:
-    whole = Trajectory(np.array([5, 6, 9]), np.array([50, 60, 90]), _drive(np.random.default_rng(5), 3))
-    part = trajectory.take(whole, np.array([2, 0]))
-    assert len(part) == 2
-    np.testing.assert_array_equal(part.scan_index, [9, 5])
-    np.testing.assert_array_equal(part.stamp_ns, [90, 50])
-    np.testing.assert_array_equal(part.T_world_lidar, whole.T_world_lidar[[2, 0]])
+@pytest.mark.parametrize(
+    ("text", "stamp_ns"),
+    [
+        ("0", 0),
+        ("1.5", 1_500_000_000),
+        ("4.574208e+02", 457_420_800_000),
+        ("1764000000.123456789", 1764000000123456789),
+    ],
+)
+def test_seconds_become_exact_nanoseconds(text: str, stamp_ns: int) -> None:
+    assert trajectory.nanoseconds(text) == stamp_ns
+
+
+@pytest.mark.parametrize("text", ["", "now", "nan", "inf"])
+def test_text_that_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is no time in seconds"):
+        trajectory.nanoseconds(text)
+
+
+def test_stamp_beyond_any_clock_is_named_with_its_line(tmp_path: Path) -> None:
+    file = tmp_path / "poses.txt"
+    file.write_text("0 1 2 3 0 0 0 1\n1e19 1 2 3 0 0 0 1\n")  # nanoseconds taken for seconds
+    with pytest.raises(SegslamError, match=r"poses\.txt:2: 1e19 s are more than 292 years"):
+        trajectory.read_poses(file)
 
 
 def test_correction_changes_nothing_where_the_graph_changed_nothing() -> None:

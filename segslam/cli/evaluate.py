@@ -9,6 +9,7 @@ from segslam.cli.console import JsonOption, QuietOption, print_json, say
 
 if TYPE_CHECKING:
     from segslam.trajectory import PoseFile
+    from segslam.types import IndexPairs
 
 UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
 
@@ -96,7 +97,7 @@ def _score_files(
     return figures | {"num_poses": len(rows)}
 
 
-def _matching_rows(estimate: "PoseFile", reference: "PoseFile", max_difference_ns: int) -> Any:
+def _matching_rows(estimate: "PoseFile", reference: "PoseFile", max_difference_ns: int) -> "IndexPairs":
     """Row by row in KITTI's format, where rows are scans; by stamp in TUM's."""
     import numpy as np
 

@@ -2,13 +2,13 @@
 
 import logging
 from collections.abc import Iterator
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from segslam.semantics.label_files import LabelSource
+from segslam.trajectory import nanoseconds
 from segslam.types import BadScan, Indices, Labels, Points, Scan, SegslamError, Trajectory, Transform, Vector
 
 logger = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ def read_stamps(file: Path) -> Indices:
     stamps = []
     for number, line in enumerate(lines, start=1):
         try:
-            stamps.append(int(Decimal(line).scaleb(9).to_integral_value()))
-        except (InvalidOperation, ValueError, OverflowError) as error:
-            raise SegslamError(f"{file}:{number}: {line} is no time in seconds; mend the line") from error
+            stamps.append(nanoseconds(line))
+        except ValueError as error:
+            raise SegslamError(f"{file}:{number}: {error}; mend the line") from error
     return np.array(stamps, dtype=np.int64)

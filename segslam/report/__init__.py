@@ -9,7 +9,7 @@ from segslam.report.page import page
 from segslam.results import FinishedRun, read_run
 from segslam.types import SegslamError
 
-__all__ = ["write_report"]
+__all__ = ["draw_picture", "write_report"]
 
 
 def write_report(folder: Path) -> Path:
@@ -20,11 +20,21 @@ def write_report(folder: Path) -> Path:
     run = read_run(folder)
     with matplotlib.rc_context(figures.STYLE):
         plots = _plots(run)
-    file = folder / "report.html"
+    return _write(folder / "report.html", page(run, plots).encode())
+
+
+def draw_picture(folder: Path) -> Path:
+    """The trajectory and the loops of a run as `picture.png` in its folder. Raises SegslamError as `write_report`."""
+    run = read_run(folder)
+    with matplotlib.rc_context(figures.STYLE):
+        return _write(folder / "picture.png", figures.draw_picture(run))
+
+
+def _write(file: Path, content: bytes) -> Path:
     try:
-        file.write_text(page(run, plots), encoding="utf-8")
+        file.write_bytes(content)
     except OSError as error:
-        raise SegslamError(f"{file}: cannot be written ({error.strerror})") from error
+        raise SegslamError(f"{file}: cannot be written ({error.strerror}); make room, or check permissions") from error
     return file
 
 

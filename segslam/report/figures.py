@@ -1,9 +1,10 @@
-"""The plots of a run, each as the text of an SVG."""
+"""The plots of a run."""
 
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import cycle
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -17,7 +18,7 @@ from segslam.trajectory import Poses, rows_of_same_scan, travelled_m
 from segslam.types import LoopClosure, Rejected, RejectReason
 
 # Okabe and Ito's colours, told apart with any colour vision
-TRUTH, CORRECTED, ODOMETRY = "#444444", "#0072B2", "#E69F00"
+TRUTH, CORRECTED, ODOMETRY = "#B8B8B8", "#0072B2", "#E69F00"
 ACCEPTED, SWITCHED_OFF, FALSE = "#009E73", "#CC79A7", "#D55E00"
 REJECTED = ("#56B4E9", "#8C564B", "#7F7F7F", "#9467BD", "#BCBD22", "#17BECF", "#1F3A93")
 STYLE: Any = {"svg.fonttype": "none", "font.size": 11, "axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
@@ -32,6 +33,16 @@ class Compared:
     truth: Poses
     corrected: Poses
     odometry: Poses
+
+
+class Line(NamedTuple):
+    """A path and how it is drawn."""
+
+    name: str
+    poses: Poses
+    color: str
+    style: str
+    width: float
 
 
 def compared(run: FinishedRun) -> Compared | None:
@@ -52,34 +63,31 @@ def draw_paths(run: FinishedRun) -> str:
     """Truth, odometry and corrected trajectory from above, and their heights along the way."""
     figure = Figure(figsize=(6.4, 7.6), layout="constrained")
     above, height = figure.subplots(2, 1, height_ratios=(3, 1))
-    for name, poses, color, style in _paths(run):
-        above.plot(*poses[:, :2, 3].T, style, color=color, label=name, linewidth=1.6)
-        above.plot(*poses[0, :2, 3], "o", color=color, markersize=5)
-        height.plot(travelled_m(poses), poses[:, 2, 3], style, color=color, linewidth=1.4)
-    above.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
+    paths = _paths(run)
+    _plot_from_above(above, paths)
+    for line in paths:
+        along_m = travelled_m(line.poses)
+        height.plot(along_m, line.poses[:, 2, 3], line.style, color=line.color, linewidth=line.width)
     height.set(xlabel="travelled (m)", ylabel="height (m)")
-    _legend_on_top(above)
     return _svg(figure, "paths")
 
 
 def draw_loops(run: FinishedRun) -> str:
     """Every attempt to close a loop, on the corrected trajectory: closures join their ends, rejections are dots."""
     figure = Figure(figsize=(6.4, 6.2), layout="constrained")
-    axes = figure.subplots()
-    positions = run.result.trajectory.T_world_lidar[:, :2, 3]
-    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
-    ends = positions[run.result.keyframe_rows]
-    for (reason, ids), color in zip(_rejected_sources(run).items(), cycle(REJECTED), strict=False):
-        label = f"{reason.replace('_', ' ')} ({len(ids)})"
-        axes.plot(*ends[ids].T, ".", color=color, markersize=7, label=label, zorder=2)
-    for name, color, closures in _closure_kinds(run):
-        for closure in closures:
-            axes.plot(*ends[[closure.source_id, closure.target_id]].T, "o-", color=color, markersize=3, linewidth=1.5)
-        if closures:
-            axes.plot([], [], "o-", color=color, label=f"{name} ({len(closures)})")
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
-    _legend_on_top(axes, num_columns=2)
+    _plot_attempts(figure.subplots(), run)
     return _svg(figure, "loops")
+
+
+def draw_picture(run: FinishedRun) -> bytes:
+    """The paths from above and the loops beside each other, as a PNG."""
+    figure = Figure(figsize=(12.8, 6.0), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _plot_from_above(left, _paths(run))
+    _plot_attempts(right, run)
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=100)
+    return image.getvalue()
 
 
 def draw_errors(poses: Compared) -> str:
@@ -113,16 +121,48 @@ def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
     return _svg(figure, "stages")
 
 
-def _paths(run: FinishedRun) -> list[tuple[str, Poses, str, str]]:
-    """Name, poses, colour and line of each path: where there is truth, in its frame, the corrected one laid on it."""
+def _plot_from_above(axes: Axes, paths: Iterable[Line]) -> None:
+    for line in paths:
+        xy = line.poses[:, :2, 3]
+        axes.plot(*xy.T, line.style, color=line.color, label=line.name, linewidth=line.width)
+        axes.plot(*xy[0], "o", color=line.color, markersize=5)
+    _finish_map(axes, num_columns=3)
+
+
+def _plot_attempts(axes: Axes, run: FinishedRun) -> None:
+    positions = run.result.trajectory.T_world_lidar[:, :2, 3]
+    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
+    ends = positions[run.result.keyframe_rows]
+    for (reason, ids), color in zip(_rejected_sources(run).items(), cycle(REJECTED), strict=False):
+        label = f"{reason.replace('_', ' ')} ({len(ids)})"
+        axes.plot(*ends[ids].T, ".", color=color, markersize=7, label=label, zorder=2)
+    for name, color, closures in _closure_kinds(run):
+        for closure in closures:
+            axes.plot(*ends[[closure.source_id, closure.target_id]].T, "o-", color=color, markersize=3, linewidth=1.5)
+        if closures:
+            axes.plot([], [], "o-", color=color, label=f"{name} ({len(closures)})")
+    _finish_map(axes, num_columns=2)
+
+
+def _finish_map(axes: Axes, *, num_columns: int) -> None:
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
+    _legend_on_top(axes, num_columns=num_columns)
+
+
+def _paths(run: FinishedRun) -> list[Line]:
+    """Where there is truth, the paths are in its frame, the corrected one laid on it."""
     corrected, odometry = run.result.trajectory.T_world_lidar, run.result.odometry.T_world_lidar
     true = compared(run)
-    truth_paths = []
+    paths = []
     if true is not None:
         T_truth_world = align(true.corrected[:, :3, 3], true.truth[:, :3, 3])
         corrected, odometry = T_truth_world @ corrected, T_truth_world @ odometry
-        truth_paths = [("truth", true.truth, TRUTH, "-")]
-    return [*truth_paths, ("odometry", odometry, ODOMETRY, "--"), ("corrected", corrected, CORRECTED, "-")]
+        paths.append(Line("truth", true.truth, TRUTH, "-", 4.0))
+    return [
+        *paths,
+        Line("odometry", odometry, ODOMETRY, "--", 1.5),
+        Line("corrected", corrected, CORRECTED, "-", 1.2),
+    ]
 
 
 def _rejected_sources(run: FinishedRun) -> dict[RejectReason, list[int]]:

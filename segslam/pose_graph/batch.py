@@ -9,7 +9,7 @@ import gtsam
 from scipy.special import chdtrc
 
 from segslam.pose_graph import gnc, noise
-from segslam.pose_graph.edges import factor_graph, poses_by_id, squared_errors
+from segslam.pose_graph.edges import factor_graph, joined, poses_by_id, squared_errors
 from segslam.pose_graph.g2o import G2oGraph, parts
 from segslam.pose_graph.solver import Search, search
 from segslam.types import SegslamError
@@ -55,13 +55,13 @@ def optimize_graph(graph: G2oGraph, *, robust: Robust = "none", inlier_probabili
     if robust == "gnc":
         found = gnc.solve(gnc.TruncatedProblem(trusted, closures, bound), start).search
     elif robust == "none":
-        found = _least_squares(_joined(trusted, doubted), start, redundancy=_redundancy(graph))
+        found = _least_squares(joined(trusted, doubted), start, redundancy=_redundancy(graph))
     else:
-        found = search(_joined(trusted, factor_graph(closures, kernel=noise.kernel(robust, bound))), start)
+        found = search(joined(trusted, factor_graph(closures, kernel=noise.kernel(robust, bound))), start)
     seconds = perf_counter() - started
     return Optimized(
         graph=_moved(graph, found.values),
-        initial_error=_joined(trusted, doubted).error(start),
+        initial_error=joined(trusted, doubted).error(start),
         final_error=found.error,
         iterations=found.iterations,
         seconds=seconds,
@@ -101,13 +101,6 @@ def _anchors(graph: G2oGraph, start: gtsam.Values) -> gtsam.NonlinearFactorGraph
     for vertex in graph.fixed or (next(iter(graph.T_world_vertex)),):
         anchors.add(gtsam.PriorFactorPose3(vertex, start.atPose3(vertex), noise.first_pose()))
     return anchors
-
-
-def _joined(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-    joined = gtsam.NonlinearFactorGraph()
-    for graph in graphs:
-        joined.push_back(graph)
-    return joined
 
 
 def _moved(graph: G2oGraph, values: gtsam.Values) -> G2oGraph:

@@ -40,6 +40,14 @@ def factor_graph(edges: Iterable[Edge], *, kernel: Kernel | None = None) -> gtsa
     return graph
 
 
+def joined(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+    """One graph with the factors of all, in this order."""
+    whole = gtsam.NonlinearFactorGraph()
+    for graph in graphs:
+        whole.push_back(graph)
+    return whole
+
+
 def squared_errors(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Vector:
     """Squared whitened error (chi-square, twice GTSAM's error) of each factor; none may have a robust kernel."""
     return np.array([2.0 * graph.at(i).error(values) for i in range(graph.size())])

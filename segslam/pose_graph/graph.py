@@ -13,7 +13,7 @@ import numpy as np
 from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import gnc, noise
-from segslam.pose_graph.edges import Edge, Transforms, factor_graph, poses_by_id, squared_errors
+from segslam.pose_graph.edges import Edge, Transforms, joined, poses_by_id, squared_errors
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
 from segslam.pose_graph.solver import search
 from segslam.types import GraphEstimate, LoopClosure, SegslamError, Transform, Vector
@@ -31,6 +31,12 @@ class PoseGraph:
         self._closures: list[Edge] = []
         self._trusted = gtsam.NonlinearFactorGraph()
         """The prior of the first pose and the factors of odometry: never doubted."""
+        self._doubted = gtsam.NonlinearFactorGraph()
+        """The factors of the closures, without robust kernel."""
+        self._robust = gtsam.NonlinearFactorGraph()
+        """The same under the kernel."""
+        self._inlier_bound = noise.inlier_bound(config.inlier_probability)
+        self._kernel = noise.kernel(config.robust, self._inlier_bound)
         self._values = gtsam.Values()
         self._T_odom_last = np.eye(4)
         self._travel_m: list[float] = []
@@ -83,17 +89,17 @@ class PoseGraph:
         for keyframe_id in (closure.target_id, closure.source_id):
             self.T_world_keyframe(keyframe_id)
         information = noise.closure_information(closure.information, self._config)
-        self._closures.append(Edge(closure.target_id, closure.source_id, _exact(closure.T_target_source), information))
+        edge = Edge(closure.target_id, closure.source_id, _exact(closure.T_target_source), information)
+        self._closures.append(edge)
+        self._doubted.add(edge.factor())
+        self._robust.add(edge.factor(kernel=self._kernel))
 
     def optimize(self) -> GraphEstimate:
         """The optimum under the robust kernel, searched from the last estimate."""
-        kernel = noise.kernel(self._config.robust, noise.inlier_bound(self._config.inlier_probability))
-        graph = gtsam.NonlinearFactorGraph(self._trusted)
-        graph.push_back(factor_graph(self._closures, kernel=kernel))
-        found = search(graph, self._values)
+        found = search(joined(self._trusted, self._robust), self._values)
         self._values = found.values
-        errors = np.sqrt(squared_errors(factor_graph(self._closures), self._values))
-        weights = [1.0 if kernel is None else kernel.weight(float(error)) for error in errors]
+        errors = np.sqrt(squared_errors(self._doubted, self._values))
+        weights = [1.0 if self._kernel is None else self._kernel.weight(float(error)) for error in errors]
         return self._estimate(found.error, weights)
 
     def finish(self) -> GraphEstimate:
@@ -104,8 +110,7 @@ class PoseGraph:
         running = self.optimize()
         if self._config.final == "none":
             return running
-        bound = noise.inlier_bound(self._config.inlier_probability)
-        problem = gnc.TruncatedProblem(self._trusted, self._closures, bound)
+        problem = gnc.TruncatedProblem(self._trusted, self._closures, self._inlier_bound)
         solution = gnc.solve(problem, self._values)
         self._values = solution.search.values
         return self._estimate(solution.search.error, solution.weights)

@@ -36,17 +36,18 @@ def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
 
     Raises SegslamError that names what is there: real data is never removed.
     """
+    if Path(sequence).name != sequence or not sequence:
+        raise SegslamError(f"--sequence {sequence}: must be a plain name such as 00")
     folder, poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
     there = next((path for path in (folder, poses) if path.exists()), None)
     if there is not None and not (folder / SETTINGS_FILE).is_file():
         raise SegslamError(f"{there}: is there and was not simulated here; choose another folder or --sequence")
     if there is not None and not overwrite:
         raise SegslamError(f"{there}: is there already; choose another folder or --sequence, or pass --overwrite")
-    for path in (folder, poses):
-        if path.is_dir():
-            shutil.rmtree(path)
-        path.unlink(missing_ok=True)
     try:
+        if there is not None:
+            shutil.rmtree(folder)
+            poses.unlink(missing_ok=True)
         for part in (folder / "velodyne", folder / "labels", poses.parent):
             part.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -88,7 +89,10 @@ def write_sequence(out: Path, sequence: str, drive: Drive, sweeps: Iterable[Swee
         for index, one in enumerate(sweeps):
             print(f"{drive.time_s[index]:.6e}", file=times, flush=True)
             print(" ".join(f"{value:.9e}" for value in T_first_camera[index, :3].ravel()), file=poses, flush=True)
-            _write_scan(folder, f"{index:06d}", one)
+            try:
+                _write_scan(folder, f"{index:06d}", one)
+            except OSError as error:
+                raise SegslamError(f"{folder}: stopped after {index} scans ({error}); make room there") from error
             yield index + 1
 
 

@@ -45,15 +45,15 @@ class SensorConfig(Section):
     )
     beam_range_sigma_m: float = Field(0.01, ge=0, description="leftover error of each beam's range (m)")
     vertical_angle_error_deg: float = Field(
-        0.0, ge=-1, le=1, description="leftover error of all vertical angles: the points lie too low by it (degrees)"
+        0.03, ge=-1, le=1, description="leftover error of all vertical angles: the points lie too low by it (degrees)"
     )
     sweep_rotation_sigma_deg: float = Field(
-        0.1, ge=0, description="turn within one sweep that nobody compensated (degrees)"
+        1.0, ge=0, description="turn within one sweep that nobody compensated (degrees)"
     )
     sweep_translation_sigma_m: float = Field(
-        0.02, ge=0, description="translation within one sweep that nobody compensated (m)"
+        0.1, ge=0, description="translation within one sweep that nobody compensated (m)"
     )
-    sweep_correlation_s: float = Field(2.0, gt=0, description="time in which that motion changes (s)")
+    sweep_correlation_s: float = Field(0.3, gt=0, description="time in which that motion changes (s)")
 
 
 class SimulationConfig(Section):

@@ -43,18 +43,20 @@ def read_drive(poses_file: Path, *, sequence: str) -> Drive:
     `sequence`; without calib the nominal one is used, without times 10 Hz.
     Raises SegslamError that names the file if one is broken.
     """
-    folders = [poses_file.parent] + [
-        poses_file.parent.parent / "sequences" / name for name in (poses_file.stem, sequence)
-    ]
-    calib_file = next((folder / "calib.txt" for folder in folders if (folder / "calib.txt").is_file()), None)
-    calib = NOMINAL_CALIB if calib_file is None else calib_file.read_text()
-    T_camera_lidar = parse_calib(calib, source=str(calib_file))
     T_world_camera = read_poses(poses_file, format="kitti").T_a_b
+    calib_file, times_file = (_beside(poses_file, name, sequence) for name in ("calib.txt", "times.txt"))
+    calib = NOMINAL_CALIB if calib_file is None else _text(calib_file)
+    T_camera_lidar = parse_calib(calib, source=str(calib_file))
     count = len(T_world_camera)
-    times_file = next((folder / "times.txt" for folder in folders if (folder / "times.txt").is_file()), None)
     time_s = np.arange(count) * PERIOD_S if times_file is None else _times(times_file, count)
-    T_world_lidar = level(upright(lidar_from_camera(T_world_camera, T_camera_lidar)))
-    return Drive(T_world_lidar, time_s, calib)
+    return Drive(level(upright(lidar_from_camera(T_world_camera, T_camera_lidar))), time_s, calib)
+
+
+def _beside(poses_file: Path, name: str, sequence: str) -> Path | None:
+    """The named file of the sequence that a pose file belongs to, if there is one."""
+    sequences = poses_file.parent.parent / "sequences"
+    folders = (poses_file.parent, sequences / poses_file.stem, sequences / sequence)
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
 def parse_calib(text: str, *, source: str) -> Transform:
@@ -62,11 +64,26 @@ def parse_calib(text: str, *, source: str) -> Transform:
     for line in text.splitlines():
         name, _, values = line.partition(":")
         if name.strip() in ("Tr", "Tr_velo_to_cam"):
-            numbers = np.fromstring(values, sep=" ")
-            if numbers.shape == (12,) and np.isfinite(numbers).all():
-                rows = numbers.reshape(3, 4)
+            rows = _numbers(values)
+            if rows.shape == (12,) and np.isfinite(rows).all():
+                rows = rows.reshape(3, 4)
                 return geometry.transform(geometry.nearest_rotation(rows[:, :3]), rows[:, 3])
     raise SegslamError(f"{source}: no line `Tr:` with 12 numbers; take calib.txt from the KITTI odometry data")
+
+
+def _numbers(text: str) -> Vector:
+    """The numbers of a line; empty if one is none."""
+    try:
+        return np.array([float(word) for word in text.split()])
+    except ValueError:
+        return np.empty(0)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{path}: cannot read the calibration ({error}); take it from the KITTI data") from error
 
 
 def _times(path: Path, count: int) -> Vector:

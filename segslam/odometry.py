@@ -1,5 +1,6 @@
 """The pose of each scan in the frame of the first: by KISS-ICP (Vizzo et al., RA-L 2023), or as given."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -12,6 +13,7 @@ from kiss_icp.preprocess import Preprocessor
 from segslam import geometry
 from segslam.config import OdometryConfig
 from segslam.points import within_range
+from segslam.trajectory import Poses
 from segslam.types import BadScan, Labels, Points, Scan, Trajectory, Transform
 
 
@@ -31,6 +33,10 @@ class OdometryResult:
 class Odometry(Protocol):
     def register(self, scan: Scan) -> OdometryResult:
         """The pose and the kept points of the next scan, in order of time. Raises BadScan for an unusable scan."""
+        ...
+
+    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
+        """Go on after the scans that were given these poses, one or more; `scan_of` reads the scan of a row."""
         ...
 
 
@@ -53,6 +59,25 @@ class KissOdometry:
         points, labels = _prepare(scan, self._kiss.last_delta, self._config)
         self._kiss.register_frame(points, np.empty(0))
         return OdometryResult(np.array(self._kiss.last_pose), points.astype(np.float32), labels)
+
+    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
+        """The state, to the bit, that registering the scans of these poses has left. `scan_of` reads the scan of a row.
+
+        Read are those that can have left points in the local map: it forgets what lies farther than its range, so a
+        scan taken at twice the range from the last, and all before it, have nothing in it.
+        """
+        kiss = self._kiss
+        apart_m = np.linalg.norm(T_odom_lidar[:, :3, 3] - T_odom_lidar[-1, :3, 3], axis=1)
+        forgotten = np.flatnonzero(apart_m > 2 * self._config.max_range_m)
+        first = forgotten[-1] + 1 if len(forgotten) else 0
+        for row, T_odom_now in enumerate(T_odom_lidar):
+            if row >= first:
+                points, _ = _prepare(scan_of(row), kiss.last_delta, self._config)
+                kiss.local_map.update(kiss.voxelize(points)[1], T_odom_now)
+            T_odom_predicted = kiss.last_pose @ kiss.last_delta
+            kiss.adaptive_threshold.update_model_deviation(np.linalg.inv(T_odom_predicted) @ T_odom_now)
+            kiss.last_delta = np.linalg.inv(kiss.last_pose) @ T_odom_now  # inverted as by KISS-ICP: same bits
+            kiss.last_pose = T_odom_now
 
 
 class GivenOdometry:
@@ -77,6 +102,11 @@ class GivenOdometry:
         points, labels = _prepare(scan, geometry.inverse(self._T_odom_last) @ T_odom_lidar, self._config)
         self._T_given_first, self._T_odom_last = T_given_first, T_odom_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels)
+
+    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
+        """Go on after the scans that were given these poses; the first of them is read, with `scan_of`."""
+        self._T_given_first = self._trajectory.T_world_lidar[self._row(scan_of(0))]
+        self._T_odom_last = T_odom_lidar[-1]
 
     def _row_of_scan(self, scan: Scan) -> int:
         if scan.index not in self._rows:

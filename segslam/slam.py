@@ -90,9 +90,15 @@ class Slam:
 
     def repeat(self, recorded: Step) -> Step:
         """As `process`, from a Step that was made before: all from the keyframe on is done again."""
+        self._selector.update(recorded.T_odom_lidar)
         return self._advance(
             recorded.scan_index, recorded.stamp_ns, recorded.T_odom_lidar, recorded.keyframe, Stopwatch()
         )
+
+    def go_on(self, scan_of: Callable[[int], Scan]) -> None:
+        """Let `process` follow on `repeat`. `scan_of` reads the scan of a step, counted from 0, where it is needed."""
+        if self._steps:
+            self._odometry.restore(np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]), scan_of)
 
     def finish(self) -> SlamResult:
         """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan."""

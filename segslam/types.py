@@ -34,6 +34,10 @@ class SegslamError(Exception):
     """Bad input or misuse: the message names the file or key and the remedy."""
 
 
+class WorkFailed(SegslamError):
+    """What was asked for was right and could not be done, as with a full disk."""
+
+
 class BadScan(SegslamError):
     """One scan that cannot be used, the others are unaffected: report it, skip it, count it."""
 
@@ -133,6 +137,10 @@ class Description:
     feature_classes: Labels
     feature_descriptors: Float[np.ndarray, "_ 33"]
     """FPFH, float32."""
+    ground_points: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    """Centres of flat patches of the ground, a row each."""
+    ground_normals: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    """Their unit normals, towards the side of the sensor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

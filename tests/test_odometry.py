@@ -155,3 +155,45 @@ def test_ten_real_scans_end_where_the_reference_says(data_dir: Path, real_pairs:
     assert geometry.distance(error) < 0.10, "the bound asked of the map command"
     assert np.degrees(geometry.angle(error)) < 0.3
     assert len(result.points) == len(result.labels) > 100_000
+
+
+def _street(num_scans: int) -> list[Scan]:
+    """Scans among posts along a street, a metre and a half apart, every other one with times."""
+    rng = np.random.default_rng(5)
+    posts = rng.uniform(-1.0, 1.0, (240, 2)) * [50.0, 10.0] + [30.0, 0.0]
+    world = np.column_stack([np.repeat(posts, 60, axis=0), rng.uniform(-1.7, 3.0, 60 * len(posts))])
+    scans = []
+    for index in range(num_scans):
+        seen = rng.permutation(geometry.apply(_forward(-1.5 * index), world))[:8_000]
+        times = np.linspace(0.0, 1.0, len(seen)) if index % 2 else None
+        scans.append(_scan(seen, index=index, times=times))
+    return scans
+
+
+def test_restored_kiss_goes_on_to_the_bit_and_reads_only_scans_in_reach() -> None:
+    config = OdometryConfig(max_range_m=15.4, min_range_m=1.0, max_num_threads=1)
+    scans = _street(34)
+    uninterrupted, resumed, read = KissOdometry(config), KissOdometry(config), []
+
+    def scan_of(row: int) -> Scan:
+        read.append(row)
+        return scans[row]
+
+    resumed.restore(np.stack([uninterrupted.register(scan).T_odom_lidar for scan in scans[:30]]), scan_of)
+    for scan in scans[30:]:
+        expected, found = uninterrupted.register(scan), resumed.register(scan)
+        np.testing.assert_array_equal(found.T_odom_lidar, expected.T_odom_lidar)
+        np.testing.assert_array_equal(found.points, expected.points)
+    assert np.linalg.norm(expected.T_odom_lidar[:3, 3]) > 45.0, "the drive leaves the reach of its first scans"
+    assert read == list(range(9, 30)), "20 steps are 30 m, and 30.8 m the reach"
+
+
+def test_restored_poses_are_given_as_before() -> None:
+    poses = np.array([_forward(7.0 + i) for i in range(5)])
+    scans = [_scan(_room(np.random.default_rng(i)), index=i, times=np.linspace(0, 1, 4000)) for i in range(5)]
+    uninterrupted, resumed = (GivenOdometry(_trajectory(poses), CONFIG) for _ in range(2))
+    resumed.restore(np.stack([uninterrupted.register(scan).T_odom_lidar for scan in scans[:3]]), scans.__getitem__)
+    for scan in scans[3:]:
+        expected, found = uninterrupted.register(scan), resumed.register(scan)
+        np.testing.assert_array_equal(found.T_odom_lidar, expected.T_odom_lidar)
+        np.testing.assert_array_equal(found.points, expected.points)

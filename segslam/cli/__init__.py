@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from segslam.types import SegslamError
+from segslam.types import SegslamError, WorkFailed
 
 app = typer.Typer(
     name="segslam",
@@ -34,4 +34,4 @@ def main(arguments: list[str] | None = None) -> None:
         app(arguments)
     except SegslamError as error:
         print(f"segslam: {error}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(1 if isinstance(error, WorkFailed) else 2)

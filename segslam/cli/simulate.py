@@ -6,9 +6,6 @@ from typing import Annotated
 import typer
 
 from segslam.cli.console import QuietOption, progress, say
-from segslam.types import SegslamError
-
-SENSORS = ("hdl64", "os1-64", "vlp16")
 
 
 def simulate(
@@ -20,7 +17,11 @@ def simulate(
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; all of the drive unless given.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same scans.")] = 0,
-    sensor: Annotated[str, typer.Option(help=f"One of {', '.join(SENSORS)}.")] = "hdl64",
+    sensor: Annotated[str, typer.Option(help="hdl64 (KITTI's), os1-64 or vlp16.")] = "hdl64",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change the world or the sensor, as in world.cars=3."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a sequence that was simulated here.")] = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -28,11 +29,9 @@ def simulate(
 
     Example: segslam simulate streets --sequence 06 --poses kitti/poses/06.txt --frames 300 --seed 1
     """
-    if sensor not in SENSORS:
-        raise SegslamError(f"--sensor {sensor}: no such sensor; known: {', '.join(SENSORS)}")
     from segslam import simulation
 
-    config = simulation.SimulationConfig.model_validate({"sensor": {"name": sensor}})
+    config = simulation.simulation_config(sensor, settings or ())
     drive = simulation.made_up_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
     total = min(frames or len(drive.time_s), len(drive.time_s))
     simulation.prepare_folder(out, sequence, overwrite=overwrite)

@@ -2,16 +2,18 @@
 
 from segslam.simulation.drive import drive_sweeps, leftover_motion, simulate_drive
 from segslam.simulation.files import prepare_folder, write_drive, write_sequence
+from segslam.simulation.label_errors import LabelErrorConfig, network_like
 from segslam.simulation.levelling import level, upright
 from segslam.simulation.routes import made_up_loop
 from segslam.simulation.sensor import Sensor, Sweep, make_sensor, sweep
-from segslam.simulation.settings import SensorConfig, SimulationConfig, WorldConfig
+from segslam.simulation.settings import SensorConfig, SimulationConfig, WorldConfig, simulation_config
 from segslam.simulation.tracks import Drive, made_up_drive, read_drive
 from segslam.simulation.world import Hits, World, build_world
 
 __all__ = [
     "Drive",
     "Hits",
+    "LabelErrorConfig",
     "Sensor",
     "SensorConfig",
     "SimulationConfig",
@@ -25,9 +27,11 @@ __all__ = [
     "made_up_drive",
     "made_up_loop",
     "make_sensor",
+    "network_like",
     "prepare_folder",
     "read_drive",
     "simulate_drive",
+    "simulation_config",
     "sweep",
     "upright",
     "write_drive",

@@ -15,7 +15,7 @@ from segslam.simulation.settings import SimulationConfig
 from segslam.simulation.tracks import Drive, parse_calib
 from segslam.simulation.world import build_world
 from segslam.trajectory import camera_from_lidar
-from segslam.types import Label, SegslamError
+from segslam.types import Label, SegslamError, WorkFailed
 
 SETTINGS_FILE = "simulation.json"
 KITTI_VERTICAL_ANGLE_RAD = np.radians(0.205)  # what readers of KITTI's scans add to each vertical angle
@@ -92,7 +92,7 @@ def write_sequence(out: Path, sequence: str, drive: Drive, sweeps: Iterable[Swee
             try:
                 _write_scan(folder, f"{index:06d}", one)
             except OSError as error:
-                raise SegslamError(f"{folder}: stopped after {index} scans ({error}); make room there") from error
+                raise WorkFailed(f"{folder}: stopped after {index} scans ({error}); make room there") from error
             yield index + 1
 
 

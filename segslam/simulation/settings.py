@@ -1,10 +1,13 @@
 """What can be chosen about the simulated street world and the sensor that drives through it."""
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
-from pydantic import Field
+import yaml
+from pydantic import Field, ValidationError
 
 from segslam.config import Section
+from segslam.types import SegslamError
 
 SensorName = Literal["hdl64", "os1-64", "vlp16"]
 
@@ -59,3 +62,25 @@ class SensorConfig(Section):
 class SimulationConfig(Section):
     world: WorldConfig = WorldConfig()
     sensor: SensorConfig = SensorConfig()
+
+
+def simulation_config(sensor: str, overrides: Sequence[str] = ()) -> SimulationConfig:
+    """The defaults for a sensor, changed by texts `world.key=value` and `sensor.key=value`.
+
+    Raises SegslamError that names the key for what is unknown or out of range.
+    """
+    values: dict[str, dict[str, Any]] = {"world": {}, "sensor": {"name": sensor}}
+    for text in overrides:
+        key, _, value = text.partition("=")
+        section, _, name = key.strip().partition(".")
+        if section not in values or not name or not value:
+            raise SegslamError(f"--set {text}: write it as world.key=value or sensor.key=value, as in world.cars=3")
+        values[section][name] = yaml.safe_load(value)
+    try:
+        return SimulationConfig.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        section, name = (str(part) for part in first["loc"])
+        known = ", ".join((WorldConfig if section == "world" else SensorConfig).model_fields)
+        remedy = f"known there: {known}" if first["type"] == "extra_forbidden" else f"got {first['input']!r}"
+        raise SegslamError(f"{section}.{name}: {first['msg']}; {remedy}") from error

@@ -59,19 +59,19 @@ def _poles(points: Points, heights: Vector, config: GeometricLabelsConfig) -> La
         config.pole_min_share,
     )
     found = pieces(points, heights, thin)
-    return _labelled(found, found.num_points >= config.min_points, thin, Label.POLE)
+    poles = _most_seen(found, np.full(len(found.top_m), True), config)
+    return _labelled(found, poles, thin, Label.POLE)
 
 
 def _solids(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
     """TRUNK and CAR for the points of pieces of that size, VEGETATION for the rest."""
     in_band = _within(heights, config.band_m)
     found = pieces(points, heights, in_band)
-    large = found.num_points >= config.min_points
-    is_trunk = large & (found.top_m >= config.trunk_min_m) & (found.length_m <= config.trunk_max_m)
-    is_car = large & _within(found.top_m, config.car_top_m) & _within(found.length_m, config.car_length_m)
-    is_car &= found.width_m <= config.car_max_width_m
-    trunks = _labelled(found, is_trunk, in_band, Label.TRUNK)
-    cars = _labelled(found, is_car & ~is_trunk, heights < config.band_m[1], Label.CAR)
+    is_trunk = (found.top_m >= config.trunk_min_m) & (found.length_m <= config.trunk_max_m)
+    is_car = _within(found.top_m, config.car_top_m) & _within(found.length_m, config.car_length_m)
+    is_car &= (found.width_m <= config.car_max_width_m) & ~is_trunk
+    trunks = _labelled(found, _most_seen(found, is_trunk, config), in_band, Label.TRUNK)
+    cars = _labelled(found, _most_seen(found, is_car, config), heights < config.band_m[1], Label.CAR)
     return np.where(trunks == Label.TRUNK, trunks, cars)
 
 
@@ -79,6 +79,13 @@ def _walls(points: Points, heights: Vector, config: GeometricLabelsConfig) -> La
     """BUILDING for points on vertical faces, VEGETATION for the rest."""
     walls = on_walls(points, heights, thickness_m=config.wall_thickness_m, min_top_m=config.wall_min_top_m)
     return np.where(walls, np.uint8(Label.BUILDING), np.uint8(Label.VEGETATION))
+
+
+def _most_seen(found: Pieces, suitable: Mask, config: GeometricLabelsConfig) -> Mask:
+    """The suitable pieces with most points, at most `max_things`, or more where the last are equal."""
+    counts = np.sort(found.num_points[suitable])
+    least = max(config.min_points, counts[-config.max_things]) if len(counts) > config.max_things else config.min_points
+    return suitable & (found.num_points >= least)
 
 
 def _labelled(found: Pieces, chosen: Mask, eligible: Mask, label: Label) -> Labels:

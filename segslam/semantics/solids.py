@@ -7,7 +7,7 @@ from numba import njit
 
 from segslam.types import Indices, Mask, Points, Vector
 
-CELL_M = 0.25
+CELL_M = 0.3
 """Chosen: things nearer to each other than this are one piece."""
 NO_PIECE = -1
 RECTANGLE_STEP_DEG = 3.0
@@ -16,7 +16,7 @@ RECTANGLE_STEP_DEG = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pieces:
-    """Connected cells seen from above. All but `of_point` have a row a piece and regard only the points that make it."""
+    """Connected cells seen from above. All but `of_point` have a row a piece and count only points that make it."""
 
     of_point: Indices
     """The piece that a point stands in, NO_PIECE if in none; also of points that did not help to make it."""

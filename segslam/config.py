@@ -144,16 +144,29 @@ class SegregatorConfig(Section):
     gate: Literal["published", "invariant", "lengths"] = Field(
         "invariant", description="G-TRIM as published, with eigenvalues (rotation-invariant), or lengths only (Segator)"
     )
-    noise_bound_m: float = Field(0.2, gt=0, description="bound of one measurement (P, A) (m)")
-    length_bound_m: float = Field(0.4, gt=0, description="l-TRIM: greatest difference of two lengths (A: 2 bounds) (m)")
+    noise_bounds_m: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        (0.2, 0.4),
+        min_length=1,
+        description="bounds of one measurement (P, A: 0.2), the next tried if the pose is uncertain; lengths differ by "
+        "twice as much at most (m)",
+    )
     shape_bound_m2: float = Field(0.3, gt=0, description="G-TRIM: greatest squared Wasserstein shape distance (m^2)")
-    solver: Literal["joint", "decoupled"] = Field(
-        "joint", description="rotation and translation together, or one after the other (A)"
+    min_clique: int = Field(3, ge=3, description="smallest inlier clique accepted")
+    clique_max_nodes: int = Field(200_000, ge=1, description="search nodes after which the best so far is kept")
+    max_cliques: int = Field(8, ge=1, description="maximum cliques tried at each bound until a pose is certain")
+    certain_inliers: int = Field(12, ge=1, description="inliers that make a pose certain: nothing else is tried then")
+    solver: Literal["gaussians", "joint", "decoupled"] = Field(
+        "gaussians",
+        description="joint: rotation and translation together; decoupled: one after the other (A); gaussians: joint, "
+        "then clusters and ground laid on each other with their own covariances",
     )
     rotation: Literal["full", "yaw"] = Field("full", description="degrees of freedom of the rotation (yaw: Quatro)")
-    min_clique: int = Field(5, ge=3, description="smallest inlier clique accepted")
-    clique_max_nodes: int = Field(200_000, ge=1, description="search nodes after which the best so far is kept")
-    max_cliques: int = Field(8, ge=1, description="maximum cliques tried; the pose with most inliers is kept")
+    centroid_noise_m: float = Field(0.07, gt=0, description="a centroid's noise in each direction (m)")
+    centroid_noise_share: float = Field(
+        0.35, ge=0, description="and as a share of its cluster's standard deviation in that direction"
+    )
+    ground_noise_m: float = Field(0.1, gt=0, description="noise of the distance of two patches of the ground (m)")
+    ground_weight: float = Field(0.3, ge=0, description="weight of such a distance: neighbours err alike")
     gnc_factor: float = Field(1.4, gt=1, description="growth of GNC's control parameter (A)")
     gnc_max_iterations: int = Field(100, ge=1, description="(A)")
     gnc_cost_tolerance: float = Field(1e-6, gt=0, description="stop at this change of cost (A)")

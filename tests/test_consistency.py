@@ -9,11 +9,17 @@ import scipy.linalg
 
 from segslam import geometry
 from segslam.config import SegregatorConfig
-from segslam.segregator.consistency import consistency_graph
+from segslam.segregator.consistency import ConsistencyGraph
+from segslam.segregator.consistency import consistency_graph as graph_of_length
 from segslam.segregator.correspondences import Correspondences
 from segslam.types import Transform
 
+LENGTH_BOUND_M = 0.4
 GATES = ["lengths", "invariant", "published"]
+
+
+def consistency_graph(correspondences: Correspondences, *, config: SegregatorConfig) -> ConsistencyGraph:
+    return graph_of_length(correspondences, length_bound_m=LENGTH_BOUND_M, config=config)
 
 
 def random_covariances(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -61,7 +67,7 @@ def plain_edges(c: Correspondences, gate: str, config: SegregatorConfig) -> list
             if (
                 c.source_index[i] != c.source_index[j]
                 and c.target_index[i] != c.target_index[j]
-                and abs(lengths[0] - lengths[1]) <= config.length_bound_m
+                and abs(lengths[0] - lengths[1]) <= LENGTH_BOUND_M
                 and shape(a, b) <= config.shape_bound_m2
             ):
                 found.append([i, j])
@@ -155,6 +161,6 @@ def test_edges_of_real_correspondences_are_those_of_the_authors_program(data_dir
         np.unique(source, axis=0, return_inverse=True)[1].reshape(-1),
         np.unique(target, axis=0, return_inverse=True)[1].reshape(-1),
     )
-    config = SegregatorConfig(gate="published", shape_bound_m2=5.0, length_bound_m=0.4)
+    config = SegregatorConfig(gate="published", shape_bound_m2=5.0)
     theirs = sorted(map(tuple, golden["edges"].tolist()))
     assert list(map(tuple, consistency_graph(correspondences, config=config).edges.tolist())) == theirs

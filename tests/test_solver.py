@@ -20,9 +20,14 @@ from segslam.segregator.solver import (
     weighted_pose,
     yaw_between,
 )
-from segslam.types import RejectReason, Transform
+from segslam.types import Points, Rejected, RejectReason, Transform
 
 SOLVERS = ["joint", "decoupled"]
+BOUND_M = 0.2
+
+
+def solve(source: Points, target: Points, config: SegregatorConfig | None = None) -> PoseFit | Rejected:
+    return solve_pose(source, target, bound_m=BOUND_M, config=config or SegregatorConfig())
 
 
 def random_pose(rng: np.random.Generator, rotation: str = "full") -> Transform:
@@ -44,7 +49,7 @@ def test_exact_matches_give_the_exact_pose(solver: str, rotation: str, seed: int
     rng = np.random.default_rng(seed)
     T_true = random_pose(rng, rotation)
     source, target = matched(T_true, rng, inliers=8, outliers=0, noise_m=0.0)
-    fit = solve_pose(source, target, config=SegregatorConfig(solver=solver, rotation=rotation))
+    fit = solve(source, target, config=SegregatorConfig(solver=solver, rotation=rotation))
     assert np.allclose(fit.T_target_source, T_true, atol=1e-9)
     assert fit.inliers.all()
     assert fit.rms_m < 1e-9
@@ -56,7 +61,7 @@ def test_a_third_of_outliers_does_not_move_the_joint_pose(rotation: str, seed: i
     rng = np.random.default_rng(seed)
     T_true = random_pose(rng, rotation)
     source, target = matched(T_true, rng, inliers=20, outliers=10, noise_m=0.03)
-    fit = solve_pose(source, target, config=SegregatorConfig(rotation=rotation))
+    fit = solve(source, target, config=SegregatorConfig(rotation=rotation))
     error = fit.T_target_source @ geometry.inverse(T_true)
     centre = source[:20].mean(axis=0)
     # 0.03 m / sqrt(20) in each axis at the inliers' centre, and three times that for chance.
@@ -69,7 +74,7 @@ def test_joint_pose_without_outliers_is_the_least_squares_pose() -> None:
     rng = np.random.default_rng(0)
     source, target = matched(random_pose(rng), rng, inliers=15, outliers=0, noise_m=0.02)
     rotation, _ = ScipyRotation.align_vectors(target - target.mean(axis=0), source - source.mean(axis=0))
-    fit = solve_pose(source, target, config=SegregatorConfig())
+    fit = solve(source, target)
     assert np.allclose(fit.T_target_source[:3, :3], rotation.as_matrix(), atol=1e-9)
 
 
@@ -77,11 +82,11 @@ def test_joint_pose_has_no_greater_truncated_cost_than_nearby_poses() -> None:
     rng = np.random.default_rng(1)
     source, target = matched(random_pose(rng), rng, inliers=12, outliers=6, noise_m=0.05)
     config = SegregatorConfig()
-    fit = solve_pose(source, target, config=config)
+    fit = solve(source, target, config=config)
 
     def cost(T_target_source: Transform) -> float:
         squared = np.sum((target - geometry.apply(T_target_source, source)) ** 2, axis=1)
-        return float(np.minimum(squared, config.noise_bound_m**2).sum())
+        return float(np.minimum(squared, BOUND_M**2).sum())
 
     for _ in range(200):
         step = geometry.tangent(
@@ -94,8 +99,8 @@ def test_joint_pose_has_no_greater_truncated_cost_than_nearby_poses() -> None:
 def test_swapping_the_two_sides_inverts_the_joint_pose(seed: int) -> None:
     rng = np.random.default_rng(seed)
     source, target = matched(random_pose(rng), rng, inliers=12, outliers=4, noise_m=0.02)
-    forth = solve_pose(source, target, config=SegregatorConfig())
-    back = solve_pose(target, source, config=SegregatorConfig())
+    forth = solve(source, target)
+    back = solve(target, source)
     assert np.allclose(forth.T_target_source @ back.T_target_source, np.eye(4), atol=1e-6)
 
 
@@ -139,29 +144,29 @@ def test_vote_of_one_value_is_that_value() -> None:
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_fewer_than_three_points_are_degenerate(solver: str, count: int) -> None:
     points = np.random.default_rng(0).normal(scale=10, size=(count, 3))
-    assert solve_pose(points, points, config=SegregatorConfig(solver=solver)).reason is RejectReason.DEGENERATE
+    assert solve(points, points, config=SegregatorConfig(solver=solver)).reason is RejectReason.DEGENERATE
 
 
 def test_two_points_fix_a_yaw_and_one_or_two_above_each_other_do_not() -> None:
     config = SegregatorConfig(rotation="yaw")
     pair = np.array([[0.0, 0, 0], [5.0, 0, 0]])
-    fit = solve_pose(pair, geometry.apply(geometry.transform(geometry.yaw(1.0), [1.0, 2, 3]), pair), config=config)
+    fit = solve(pair, geometry.apply(geometry.transform(geometry.yaw(1.0), [1.0, 2, 3]), pair), config=config)
     assert isinstance(fit, PoseFit)
     above = np.array([[0.0, 0, 0], [0.0, 0, 5]])
-    assert solve_pose(pair[:1], pair[:1], config=config).reason is RejectReason.DEGENERATE
-    assert solve_pose(above, above, config=config).reason is RejectReason.DEGENERATE
+    assert solve(pair[:1], pair[:1], config=config).reason is RejectReason.DEGENERATE
+    assert solve(above, above, config=config).reason is RejectReason.DEGENERATE
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("spread", [[1.0, 0, 0], [0, 0, 1.0], [0, 0, 0]])
 def test_points_on_a_line_or_in_a_spot_are_degenerate(solver: str, spread: list[float]) -> None:
     points = np.random.default_rng(0).normal(scale=20, size=(10, 3)) * spread
-    assert solve_pose(points, points, config=SegregatorConfig(solver=solver)).reason is RejectReason.DEGENERATE
+    assert solve(points, points, config=SegregatorConfig(solver=solver)).reason is RejectReason.DEGENERATE
 
 
 def test_rows_that_agree_on_nothing_are_degenerate() -> None:
     source, target = np.random.default_rng(0).uniform(-50, 50, size=(2, 4, 3))
-    assert solve_pose(source, target, config=SegregatorConfig()).reason is RejectReason.DEGENERATE
+    assert solve(source, target).reason is RejectReason.DEGENERATE
 
 
 @pytest.mark.data
@@ -169,8 +174,8 @@ def test_rows_that_agree_on_nothing_are_degenerate() -> None:
 def test_decoupled_pose_of_a_real_clique_is_that_of_the_authors_program(data_dir: Path, pair: str) -> None:
     golden = np.load(data_dir / "golden" / f"{pair}_fixed_trunkDCVC.npz")
     clique = golden["clique"]
-    config = SegregatorConfig(solver="decoupled", noise_bound_m=0.2)
-    fit = solve_pose(golden["corr_src"][clique], golden["corr_tgt"][clique], config=config)
+    config = SegregatorConfig(solver="decoupled")
+    fit = solve(golden["corr_src"][clique], golden["corr_tgt"][clique], config=config)
     error = fit.T_target_source @ geometry.inverse(golden["T"])
     assert geometry.distance(error) < 0.01
     assert np.degrees(geometry.angle(error)) < 0.05

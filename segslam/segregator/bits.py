@@ -23,6 +23,15 @@ def lowest_bit(word):
     return np.int64(count_bits((word & (~word + np.uint64(1))) - np.uint64(1)))
 
 
+@njit("uint64(uint64[::1])", cache=True, nogil=True, inline="always")
+def pack_flags(eights):
+    """One word from 64 bytes of 0 or 1, eight at a time: the product gathers the lowest bits in its highest byte."""
+    word = np.uint64(0)
+    for k in range(8):
+        word |= ((eights[k] * np.uint64(0x0102040810204080)) >> np.uint64(56)) << np.uint64(8 * k)
+    return word
+
+
 @njit("int64(uint64[::1], int64[::1])", cache=True, nogil=True)
 def members(row, out):
     """Writes the positions of the bits set in `row`, ascending, and returns how many."""

@@ -189,9 +189,9 @@ def _greedy_clique(adjacency, start):
     candidates = adjacency[start].copy()
     num_rows = members(candidates, rows)
     while num_rows:
-        best, most = rows[0], -1
+        best, most = rows[0], np.int64(-1)
         for k in range(num_rows):
-            left = 0
+            left = np.int64(0)
             for w in range(words):
                 left += np.int64(count_bits(candidates[w] & adjacency[rows[k], w]))
             if left > most:

@@ -7,11 +7,12 @@ from segslam.points import within_range
 from segslam.segregator.clusters import Clusters, semantic_clusters
 from segslam.segregator.features import NO_FEATURES, point_features
 from segslam.segregator.feet import stand_on_ground
+from segslam.segregator.ground import ground_patches
 from segslam.types import GROUND_LABELS, Description, Labels, Points
 
 
 def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
-    """The semantic clusters and point features of a scan, in its frame, whose origin is the sensor.
+    """The semantic clusters, point features and ground of a scan, in its frame, whose origin is the sensor.
 
     Points that are NaN or out of range take no part; a scan without usable points has an empty description. The result
     does not depend on the order of the points. Raises ValueError unless there is one label for each point.
@@ -23,6 +24,7 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
         config.features == "when_few_clusters" and len(clusters.sizes) < config.few_clusters
     )
     features = point_features(points, labels, config=config) if wanted else NO_FEATURES
+    ground = ground_patches(points, labels)
     return Description(
         means=clusters.means,
         covariances=clusters.covariances,
@@ -32,6 +34,8 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
         feature_covariances=features.covariances,
         feature_classes=features.classes,
         feature_descriptors=features.descriptors,
+        ground_points=ground.points,
+        ground_normals=ground.normals,
     )
 
 

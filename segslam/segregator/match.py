@@ -1,49 +1,76 @@
 """Two descriptions in, the pose of one scan in the other out.
 
 Yin et al., "Segregator", ICRA 2023, figure 2: correspondences, consistency graph, maximum clique, pose.
+Differs from the paper: where the pose stays uncertain, every maximum clique is tried, and then wider bounds, as in the
+pyramid of graphs of Qiao et al., "G3Reg: Pyramid Graph-Based Global Registration Using Gaussian Ellipsoid Model",
+T-ASE 2024.
 """
+
+from collections.abc import Iterator
 
 import numpy as np
 
+from segslam import geometry
 from segslam.config import SegregatorConfig
 from segslam.segregator.clique import maximum_cliques
-from segslam.segregator.consistency import ConsistencyGraph, consistency_graph
+from segslam.segregator.consistency import consistency_graph
 from segslam.segregator.correspondences import (
     Correspondences,
     cluster_correspondences,
     concatenate,
     feature_correspondences,
 )
-from segslam.segregator.solver import PoseFit, solve_pose
-from segslam.types import Description, Indices, Information, Points, Registration, Rejected, RejectReason
+from segslam.segregator.gaussians import align_gaussians
+from segslam.segregator.solver import Direction, PoseFit, solve_level, solve_pose
+from segslam.types import Description, Indices, Registration, Rejected, RejectReason, Transform
+
+SAME_PLACE_M, SAME_TURN_RAD = 0.5, np.radians(2.0)
+"""Chosen: poses no farther apart are one hypothesis: refinement leads from both to the same one."""
+MIN_GROUND_PATCHES = 5
+"""Chosen: fewer do not tell which way is up."""
 
 
 def match(source: Description, target: Description, *, config: SegregatorConfig) -> Registration | Rejected:
     """The pose of the source in the target that most correspondences agree with, without an initial guess.
 
-    Returns `Rejected` with TOO_FEW_CORRESPONDENCES, SMALL_CLIQUE or DEGENERATE where there is none to be had.
+    Returns `Rejected` with TOO_FEW_CORRESPONDENCES, SMALL_CLIQUE, DEGENERATE or TOO_FEW_INLIERS where there is none.
     """
     ranked = hypotheses(source, target, config=config)
     return ranked if isinstance(ranked, Rejected) else ranked[0]
 
 
 def hypotheses(source: Description, target: Description, *, config: SegregatorConfig) -> list[Registration] | Rejected:
-    """One pose for each maximum clique, the one with most inliers first, and of equals the one with least rms.
+    """Different poses, the one that explains most first; only one if that is certain.
 
-    `Rejected` as `match` returns it.
+    `Rejected` as `match` returns it, for the narrowest bound.
     """
     correspondences = putative(source, target, config=config)
     if len(correspondences) < config.min_clique:
         return Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
-    graph = consistency_graph(correspondences, config=config)
-    search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=config.clique_max_nodes)
-    if len(search.cliques[0]) < config.min_clique:
-        return Rejected(RejectReason.SMALL_CLIQUE, f"{len(search.cliques[0])} correspondences agree")
-    outcomes = [register(correspondences, graph, clique, config=config) for clique in search.cliques]
-    registrations = [outcome for outcome in outcomes if isinstance(outcome, Registration)]
-    if not registrations:
-        return next(outcome for outcome in outcomes if isinstance(outcome, Rejected))
-    return sorted(registrations, key=lambda registration: (-registration.num_inliers, registration.rms_m))
+    fits: list[tuple[PoseFit, int]] = []
+    rejections = []
+    for outcome, num_edges in _attempts(source, target, correspondences, config):
+        if isinstance(outcome, Rejected):
+            rejections.append(outcome)
+        else:
+            fits.append((outcome, num_edges))
+            if outcome.inliers.sum() >= config.certain_inliers:
+                break
+    if not fits:
+        return rejections[0]
+    fits.sort(key=lambda found: -found[0].score)
+    distinct = [found for k, found in enumerate(fits) if not _is_among(found[0].T_target_source, fits[:k])]
+    return [
+        Registration(
+            T_target_source=fit.T_target_source,
+            num_correspondences=len(correspondences),
+            num_inliers=int(fit.inliers.sum()),
+            rms_m=fit.rms_m,
+            information=fit.information,
+            num_edges=num_edges,
+        )
+        for fit, num_edges in distinct
+    ]
 
 
 def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Correspondences:
@@ -61,40 +88,56 @@ def putative(source: Description, target: Description, *, config: SegregatorConf
     return concatenate(clusters, features)
 
 
-def register(
-    correspondences: Correspondences, graph: ConsistencyGraph, clique: Indices, *, config: SegregatorConfig
-) -> Registration | Rejected:
-    """The pose that the members of one clique agree on. Returns `Rejected(DEGENERATE)` where they fix none."""
-    source, target = correspondences.source[clique], correspondences.target[clique]
-    fit = solve_pose(source, target, config=config)
-    if isinstance(fit, Rejected):
-        return fit
-    return Registration(
-        T_target_source=fit.T_target_source,
-        num_correspondences=len(correspondences),
-        num_inliers=int(fit.inliers.sum()),
-        rms_m=fit.rms_m,
-        information=point_information(source[fit.inliers], sigma_m=_axis_sigma(fit, config)),
-        num_edges=len(graph.edges),
+def _attempts(
+    source: Description, target: Description, correspondences: Correspondences, config: SegregatorConfig
+) -> Iterator[tuple[PoseFit | Rejected, int]]:
+    """The outcome of one maximum clique after the other, bound by bound, with the number of edges of its graph."""
+    for bound_m in config.noise_bounds_m:
+        graph = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
+        search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=config.clique_max_nodes)
+        size = len(search.cliques[0])
+        if size < config.min_clique:
+            yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} correspondences agree"), len(graph.edges)
+            continue
+        for clique in search.cliques:
+            yield _solve(source, target, correspondences, clique, bound_m, config), len(graph.edges)
+
+
+def _solve(
+    source: Description,
+    target: Description,
+    correspondences: Correspondences,
+    clique: Indices,
+    bound_m: float,
+    config: SegregatorConfig,
+) -> PoseFit | Rejected:
+    """The pose that the members of one clique agree on, by the solver that the configuration names."""
+    points = correspondences.source[clique], correspondences.target[clique]
+    source_up, target_up = upward(source), upward(target)
+    if config.solver != "gaussians" or source_up is None or target_up is None:
+        fit = solve_pose(*points, bound_m=bound_m, config=config)
+        if isinstance(fit, Rejected) or config.solver != "gaussians":
+            return fit
+        rough = fit.T_target_source
+    else:
+        level = solve_level(*points, source_up, target_up, bound_m=bound_m, config=config)
+        if isinstance(level, Rejected):
+            return level
+        rough = level
+    return align_gaussians(correspondences, source, target, rough, config=config)
+
+
+def upward(description: Description) -> Direction | None:
+    """The mean normal of the ground, None where too little of it is seen."""
+    if len(description.ground_normals) < MIN_GROUND_PATCHES:
+        return None
+    total = description.ground_normals.astype(np.float64).sum(axis=0)
+    return total / np.linalg.norm(total)
+
+
+def _is_among(T_target_source: Transform, fits: list[tuple[PoseFit, int]]) -> bool:
+    differences = [geometry.inverse(fit.T_target_source) @ T_target_source for fit, _ in fits]
+    return any(
+        geometry.distance(difference) <= SAME_PLACE_M and geometry.angle(difference) <= SAME_TURN_RAD
+        for difference in differences
     )
-
-
-def point_information(source: Points, *, sigma_m: float) -> Information:
-    """Inverse covariance of a pose fitted to matched points, each off by independent noise of `sigma_m` in each axis.
-
-    For T exp(xi) the point a moves to R (a + phi x a + rho) + t, whose derivative is R [-[a]x, I]; R drops out.
-    It claims no more than that noise model: what all points share, such as a bias of the labels, is not in it.
-    """
-    cross = np.cross(np.eye(3)[None, :, :], source[:, None, :])  # row k of each: e_k x a, so that -[a]x = its transpose
-    jacobians = np.concatenate([np.swapaxes(cross, 1, 2), np.broadcast_to(np.eye(3), cross.shape)], axis=2)
-    return np.einsum("nki,nkj->ij", jacobians, jacobians) / sigma_m**2
-
-
-def _axis_sigma(fit: PoseFit, config: SegregatorConfig) -> float:
-    """Noise of one coordinate of an inlier, from the residuals that the pose's six degrees of freedom left.
-
-    Not below a third of the noise bound, which few inliers may fall under by luck.
-    """
-    num_inliers = int(fit.inliers.sum())
-    freedom = max(3 * num_inliers - 6, 1)
-    return max(fit.rms_m * (num_inliers / freedom) ** 0.5, config.noise_bound_m / 3)

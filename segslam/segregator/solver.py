@@ -16,12 +16,15 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Float
 
 from segslam import geometry
 from segslam.config import SegregatorConfig
-from segslam.types import Mask, Points, Rejected, RejectReason, Rotation, Transform, Vector
+from segslam.types import Information, Mask, Points, Rejected, RejectReason, Rotation, Transform, Vector
 
 Fitted = TypeVar("Fitted")
+Direction = Float[np.ndarray, "3"]
+"""A unit vector."""
 AlignRotation = Callable[[Points, Points, Vector], Rotation]
 """The rotation R that minimises sum w |b - R a|^2 over rows a, b, w."""
 
@@ -30,40 +33,53 @@ AlignRotation = Callable[[Points, Points, Vector], Rotation]
 class PoseFit:
     T_target_source: Transform
     inliers: Mask
-    """Rows within the bound of the pose."""
+    """The rows that the pose explains."""
     rms_m: float
-    """Of the inliers' distances."""
+    """Of their distances."""
+    score: float
+    """The number of inliers, each counted from 1 where it fits exactly down to 0 at the bound."""
+    information: Information
 
 
-def solve_pose(source: Points, target: Points, *, config: SegregatorConfig) -> PoseFit | Rejected:
+def solve_pose(source: Points, target: Points, *, bound_m: float, config: SegregatorConfig) -> PoseFit | Rejected:
     """The pose under which the most rows of `source`, moved, meet those of `target`; `config` names the solver.
 
     Row i of `source` matches row i of `target`. Returns `Rejected(DEGENERATE)` where the points, or those that the
-    pose agrees with, are fewer than 3 or within the noise bound of a line (for yaw: fewer than 2, or of a vertical).
+    pose agrees with, are fewer than 3 or within the bound of a line (for yaw: fewer than 2, or of a vertical).
     """
     align = rotation_between if config.rotation == "full" else yaw_between
-    if not _fixes_rotation(source, config):
+    if not _fixes_rotation(source, bound_m, config):
         return _degenerate(len(source))
-    solve = solve_joint if config.solver == "joint" else solve_decoupled
-    T_target_source = solve(source, target, align, config=config)
+    solve = solve_decoupled if config.solver == "decoupled" else solve_joint
+    T_target_source = solve(source, target, align, bound_m=bound_m, config=config)
     squared = _squared_distances(source, target, T_target_source)
-    inliers = squared <= config.noise_bound_m**2
-    if not _fixes_rotation(source[inliers], config):
+    inliers = squared <= bound_m**2
+    if not _fixes_rotation(source[inliers], bound_m, config):
         return _degenerate(int(inliers.sum()))
-    return PoseFit(T_target_source, inliers, math.sqrt(squared[inliers].mean()))
+    return PoseFit(
+        T_target_source=T_target_source,
+        inliers=inliers,
+        rms_m=math.sqrt(squared[inliers].mean()),
+        score=float(np.sum(1.0 - squared[inliers] / bound_m**2)),
+        information=point_information(source[inliers], sigma_m=_axis_sigma(squared[inliers], bound_m)),
+    )
 
 
-def solve_joint(source: Points, target: Points, align: AlignRotation, *, config: SegregatorConfig) -> Transform:
+def solve_joint(
+    source: Points, target: Points, align: AlignRotation, *, bound_m: float, config: SegregatorConfig
+) -> Transform:
     """Minimises sum min(|b - R a - t|^2, bound^2) over rotation and translation together."""
 
     def fit(weights: Vector) -> tuple[Transform, Vector]:
         T_target_source = weighted_pose(source, target, weights, align)
         return T_target_source, _squared_distances(source, target, T_target_source)
 
-    return graduated_non_convexity(fit, len(source), bound_m=config.noise_bound_m, config=config)
+    return graduated_non_convexity(fit, len(source), bound_m=bound_m, config=config)
 
 
-def solve_decoupled(source: Points, target: Points, align: AlignRotation, *, config: SegregatorConfig) -> Transform:
+def solve_decoupled(
+    source: Points, target: Points, align: AlignRotation, *, bound_m: float, config: SegregatorConfig
+) -> Transform:
     """Rotation from the differences of rows that follow each other, then the translation, one axis at a time.
 
     The last row is followed by the first. A difference carries two measurements, hence twice the bound.
@@ -74,9 +90,35 @@ def solve_decoupled(source: Points, target: Points, align: AlignRotation, *, con
         R = align(source_steps, target_steps, weights)
         return R, np.sum((target_steps - source_steps @ R.T) ** 2, axis=1)
 
-    R = graduated_non_convexity(fit, len(source), bound_m=2 * config.noise_bound_m, config=config)
+    R = graduated_non_convexity(fit, len(source), bound_m=2 * bound_m, config=config)
     offsets = target - source @ R.T
-    return geometry.transform(R, [vote(axis, bound_m=config.noise_bound_m) for axis in offsets.T])
+    return geometry.transform(R, np.array([vote(axis, bound_m=bound_m) for axis in offsets.T]))
+
+
+def solve_level(
+    source: Points,
+    target: Points,
+    source_up: Direction,
+    target_up: Direction,
+    *,
+    bound_m: float,
+    config: SegregatorConfig,
+) -> Transform | Rejected:
+    """The pose that turns one upward direction into the other and minimises the truncated cost seen from above.
+
+    Heights decide nothing but the height: it is the median of the inliers'. Points on a line or on one level, which
+    leave a full rotation open or mirrored, fix this one. Returns `Rejected(DEGENERATE)` for fewer than two places.
+    """
+    R_level_source, R_level_target = _to_vertical(source_up), _to_vertical(target_up)
+    source_level, target_level = source @ R_level_source.T, target @ R_level_target.T
+    source_plan, target_plan = source_level * [1.0, 1.0, 0.0], target_level * [1.0, 1.0, 0.0]
+    T_plan = solve_joint(source_plan, target_plan, yaw_between, bound_m=bound_m, config=config)
+    inliers = _squared_distances(source_plan, target_plan, T_plan) <= bound_m**2
+    if inliers.sum() < 2 or np.ptp(source_plan[inliers], axis=0).max() <= bound_m:
+        return _degenerate(int(inliers.sum()))
+    height = np.median((target_level - source_level)[inliers, 2])
+    T_level = geometry.transform(T_plan[:3, :3], T_plan[:3, 3] + [0.0, 0.0, height])
+    return geometry.transform(R_level_target.T, 0.0) @ T_level @ geometry.transform(R_level_source, 0.0)
 
 
 def graduated_non_convexity(
@@ -107,8 +149,9 @@ def graduated_non_convexity(
 
 def tls_weights(squared: Vector, control: float, bound_m: float) -> Vector:
     """Weight in [0, 1] of each squared residual (m^2), falling where it nears the bound."""
-    between = bound_m * np.sqrt(control * (control + 1.0) / np.maximum(squared, np.finfo(float).tiny)) - control
-    return np.clip(between, 0.0, 1.0)  # Eq. (14): its outer cases are where the middle one leaves [0, 1]
+    near = control / (control + 1.0) * bound_m**2  # up to here the weight is 1
+    between = bound_m * np.sqrt(control * (control + 1.0) / np.maximum(squared, near)) - control
+    return np.maximum(between, 0.0)  # Eq. (14): its outer cases are where the middle one leaves [0, 1]
 
 
 def weighted_pose(source: Points, target: Points, weights: Vector, align: AlignRotation) -> Transform:
@@ -149,13 +192,37 @@ def _squared_distances(source: Points, target: Points, T_target_source: Transfor
     return np.sum((target - geometry.apply(T_target_source, source)) ** 2, axis=1)
 
 
-def _fixes_rotation(points: Points, config: SegregatorConfig) -> bool:
-    """Whether points lie farther than the noise bound, in the root mean square, from any line (yaw: vertical)."""
+def point_information(source: Points, *, sigma_m: float) -> Information:
+    """Inverse covariance of a pose fitted to matched points, each off by independent noise of `sigma_m` in each axis.
+
+    For T exp(xi) the point a moves to R (a + phi x a + rho) + t, whose derivative is R [-[a]x, I]; R drops out.
+    It claims no more than that noise model: what all points share, such as a bias of the labels, is not in it.
+    """
+    columns = np.cross(np.eye(3), source[:, None, :])  # of each point, row k is e_k x a, a column of -[a]x
+    jacobians = np.concatenate([np.swapaxes(columns, 1, 2), np.broadcast_to(np.eye(3), columns.shape)], axis=2)
+    return np.einsum("nki,nkj->ij", jacobians, jacobians) / sigma_m**2
+
+
+def _axis_sigma(squared: Vector, bound_m: float) -> float:
+    """Noise of one coordinate, from the squared distances that a pose of six degrees of freedom left.
+
+    Not below a third of the bound, which few points may fall under by luck.
+    """
+    return max(math.sqrt(squared.sum() / max(3 * len(squared) - 6, 1)), bound_m / 3.0)
+
+
+def _to_vertical(up: Direction) -> Rotation:
+    """The smallest rotation that turns a unit vector into +z."""
+    return geometry.nearest_rotation(np.eye(3) + np.outer([0.0, 0.0, 1.0], up))
+
+
+def _fixes_rotation(points: Points, bound_m: float, config: SegregatorConfig) -> bool:
+    """Whether points lie farther than the bound, in the root mean square, from any line (yaw: vertical)."""
     if len(points) < (3 if config.rotation == "full" else 2):
         return False
     centred = points - points.mean(axis=0)
     off_line = np.linalg.svd(centred, compute_uv=False)[1:] if config.rotation == "full" else centred[:, :2]
-    return float(np.linalg.norm(off_line)) > config.noise_bound_m * math.sqrt(len(points))
+    return float(np.linalg.norm(off_line)) > bound_m * math.sqrt(len(points))
 
 
 def _degenerate(num_points: int) -> Rejected:

@@ -13,6 +13,7 @@ PERFECT = {
     "dropout": 0.0,
     "beam_angle_sigma_deg": 0.0,
     "beam_range_sigma_m": 0.0,
+    "vertical_angle_error_deg": 0.0,
     "sweep_rotation_sigma_deg": 0.0,
     "sweep_translation_sigma_m": 0.0,
 }

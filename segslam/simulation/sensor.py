@@ -123,7 +123,9 @@ def _returns(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray
 
 def _smeared(points: Points, fraction: Vector, leftover: Tangent) -> Points:
     """Points as they come out when `leftover` over the sweep is not corrected (small: first order)."""
-    return points - fraction[:, None] * (np.cross(leftover[:3], points) + leftover[3:])
+    x, y, z = leftover[:3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return points - fraction[:, None] * (np.einsum("ij,kj->ik", points, cross) + leftover[3:])
 
 
 def _intensity(labels: Labels, rng: np.random.Generator) -> Vector:

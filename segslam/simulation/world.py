@@ -48,16 +48,14 @@ class World:
 
     def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
         """What rays from the sensor's origin meet; `directions` (n, 3) are unit vectors in the LiDAR frame."""
-        turned = directions @ T_world_lidar[:3, :3].T
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = T_world_lidar[:3, 3]
-        rays[:, 3:] = turned
-        hits = _cast(self._scene, self.static, rays)
-        hits = _relabelled(hits, self.ground, rays)
-        changing = merge(list(self._changing(time_s, T_world_lidar[:2, 3])))
-        if len(changing.triangles) == 0:
-            return hits
-        return _nearer(hits, _cast(_scene(changing), changing, rays))
+        R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
+        np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # beats BLAS's threads
+        hits = _relabelled(_cast(self._scene, self.static, rays), self.ground, rays)
+        for thing in self._changing(time_s, T_world_lidar[:2, 3]):
+            _put_nearer(hits, thing, rays)
+        return hits
 
     def _changing(self, time_s: float, near_xy: np.ndarray) -> Iterator[Mesh]:
         for car in self._parked:
@@ -147,7 +145,17 @@ def _relabelled(hits: Hits, ground: Ground, rays: np.ndarray) -> Hits:
     return replace(hits, labels=labels)
 
 
-def _nearer(a: Hits, b: Hits) -> Hits:
-    """Ray by ray the hit that comes first."""
-    first = b.range_m < a.range_m
-    return Hits(*(np.where(first, getattr(b, field.name), getattr(a, field.name)) for field in fields(Hits)))
+def _put_nearer(hits: Hits, thing: Mesh, rays: np.ndarray) -> None:
+    """In place, ray by ray: what of a thing is met before what was met so far. Only rays that pass near it are cast."""
+    low, high = thing.vertices.min(axis=0), thing.vertices.max(axis=0)
+    away = (low + high) / 2 - rays[0, :3]
+    distance, radius = float(np.linalg.norm(away)), float(np.linalg.norm(high - low)) / 2
+    if distance <= radius:
+        rows = np.arange(len(rays))
+    else:
+        toward = (away / distance).astype(np.float32)
+        rows = np.flatnonzero(np.einsum("ij,j->i", rays[:, 3:], toward) > np.sqrt(1.0 - (radius / distance) ** 2))
+    found = _cast(_scene(thing), thing, rays[rows])
+    first = found.range_m < hits.range_m[rows]
+    for field in fields(Hits):
+        getattr(hits, field.name)[rows[first]] = getattr(found, field.name)[first]

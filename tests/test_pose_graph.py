@@ -6,17 +6,24 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from scipy.stats import chi2, kstest
 
 from segslam import geometry
 from segslam.config import GraphConfig
-from segslam.pose_graph import PoseGraph
+from segslam.pose_graph import PoseGraph, read_g2o
 from segslam.pose_graph.edges import Edge, factor_graph, squared_errors
 from segslam.pose_graph.gnc import tls_weights
 from segslam.pose_graph.noise import closure_information, inlier_bound, odometry_information
 from segslam.types import Alignment, GraphEstimate, LoopClosure, Registration, SegslamError
 
 CONFIG = GraphConfig()
-CLOSURE_SIGMAS = geometry.tangent(rotation_rad=np.radians(0.1), translation_m=0.05)
+
+
+def noise_of(metres: float, degrees: float) -> np.ndarray:
+    return geometry.tangent(rotation_rad=np.radians(degrees), translation_m=metres)
+
+
+CLOSURE_SIGMAS = noise_of(0.05, 0.1)
 
 
 def circle(num: int, *, rounds: float = 2.0, radius_m: float = 30.0) -> np.ndarray:
@@ -233,7 +240,7 @@ def test_the_least_noise_is_added_to_a_closures_covariance() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
     covariance = 1e-3 * (root @ root.T + np.eye(6))
-    sigmas = geometry.tangent(rotation_rad=np.radians(CONFIG.closure_sigma_deg), translation_m=CONFIG.closure_sigma_m)
+    sigmas = noise_of(CONFIG.closure_sigma_m, CONFIG.closure_sigma_deg)
     found = closure_information(np.linalg.inv(covariance), CONFIG)
     np.testing.assert_allclose(np.linalg.inv(found), covariance + np.diag(sigmas**2), rtol=1e-4)
 
@@ -281,3 +288,68 @@ def test_graduated_weights_lie_between_least_squares_and_the_cut() -> None:
     nearly_convex = tls_weights(squared, 1e-3, 1.0)
     assert (np.diff(nearly_convex) <= 0.0).all()
     assert nearly_convex[-1] > 0.0, "at first even the worst has a say"
+
+
+def gtsam_graph(graph: PoseGraph, folder: Path) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """The prior, odometry and closures of a graph as GTSAM reads them from its file."""
+    graph.write_g2o(folder / "graph.g2o")
+    read, values = gtsam.readG2o(str(folder / "graph.g2o"), True)
+    factors = gtsam.NonlinearFactorGraph()
+    factors.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
+    factors.push_back(read)
+    return factors, values
+
+
+def test_gnc_agrees_with_gtsams_own(tmp_path: Path) -> None:
+    """An independent solver of the same problem: same closures believed, same poses."""
+    graph = graph_of(DRIFT, TRUE_LOOPS + LIES)
+    factors, values = gtsam_graph(graph, tmp_path)
+    parameters = gtsam.GncLMParams()
+    parameters.setKnownInliers(list(range(120)))
+    optimizer = gtsam.GncLMOptimizer(factors, values, parameters)
+    optimizer.setInlierCostThresholds(0.5 * inlier_bound(CONFIG.inlier_probability))  # GTSAM bounds the error
+    found = optimizer.optimize()
+    weights = graph.finish().closure_weights
+    np.testing.assert_allclose(optimizer.getWeights()[120:], list(weights.values()))
+    np.testing.assert_allclose(graph.T_world_keyframe(119), found.atPose3(119).matrix(), atol=1e-4)
+
+
+def test_the_end_is_the_batch_optimum(tmp_path: Path) -> None:
+    """Closures one by one, under a kernel, then GNC: the same error as one tight search from the truth."""
+    graph = graph_of(DRIFT, [])
+    for loop in TRUE_LOOPS:
+        graph.add_closure(loop)
+        graph.optimize()
+    end = graph.finish()
+    factors, _ = gtsam_graph(graph, tmp_path)
+    start = gtsam.Values()
+    for i, T_world_keyframe in enumerate(TRUTH):
+        start.insert(i, gtsam.Pose3(T_world_keyframe))
+    tight = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    optimum = gtsam.LevenbergMarquardtOptimizer(factors, start, tight).optimize()
+    assert end.error == pytest.approx(factors.error(optimum), rel=1e-6)
+
+
+def test_true_edges_err_as_much_as_they_claim(tmp_path: Path) -> None:
+    """Odometry and closures drawn from their noise: at the truth each has a chi-square of 6 degrees of freedom."""
+    rng = np.random.default_rng(0)
+    T_odom = [TRUTH[0]]
+    least = noise_of(CONFIG.closure_sigma_m, CONFIG.closure_sigma_deg)
+    for T_a, T_b in itertools.pairwise(TRUTH):
+        T_a_b = geometry.inverse(T_a) @ T_b
+        way = geometry.distance(T_a_b) + CONFIG.turn_m * geometry.angle(T_a_b)
+        sigmas = np.sqrt(way) * noise_of(CONFIG.odometry_sigma_m, CONFIG.odometry_sigma_deg)
+        T_odom.append(T_odom[-1] @ T_a_b @ geometry.exp(sigmas * rng.normal(size=6)))
+    sigmas = np.hypot(CLOSURE_SIGMAS, least)
+    loops = [
+        closure(c.source_id, c.target_id, c.T_target_source @ geometry.exp(sigmas * rng.normal(size=6)))
+        for c in (true_closure(TRUTH, source, source - 60) for source in range(62, 120))
+    ]
+    graph_of(np.array(T_odom), loops).write_g2o(tmp_path / "graph.g2o")
+    squared = [
+        error @ edge.information @ error
+        for edge in read_g2o(tmp_path / "graph.g2o").edges
+        for error in [geometry.log(geometry.inverse(edge.T_a_b) @ geometry.inverse(TRUTH[edge.a]) @ TRUTH[edge.b])]
+    ]
+    assert kstest(squared[:119], chi2(6).cdf).pvalue > 0.01, "odometry"
+    assert kstest(squared[119:], chi2(6).cdf).pvalue > 0.01, "closures"

@@ -10,8 +10,8 @@ from segslam.types import Indices, Mask, Points, Vector
 CELL_M = 0.3
 """Chosen: things nearer to each other than this are one piece."""
 NO_PIECE = -1
-RECTANGLE_STEP_DEG = 3.0
-"""Chosen: a side of 5 m is measured to within a centimetre."""
+RECTANGLE_STEP_DEG = 5.0
+"""Chosen: the short side of a car comes out at most 20 cm too long."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,7 +24,7 @@ class Pieces:
     top_m: Vector
     """Height above the ground of the highest point."""
     length_m: Vector
-    """Longer side of the rectangle of least area around the piece, whole cells."""
+    """Longer side of the rectangle of least area around its points, seen from above."""
     width_m: Vector
 
 
@@ -35,7 +35,7 @@ def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
     grid, num_pieces = _connected(cells, chosen)
     of_point = grid[cells[:, 0], cells[:, 1]]
     num_points, top_m = _counts_and_tops(of_point, heights, chosen, num_pieces)
-    sides_m = tightest_rectangles(grid, num_pieces) * CELL_M
+    sides_m = _tightest_rectangles(points, of_point, chosen, num_pieces)
     return Pieces(of_point, num_points, top_m, sides_m[:, 0], sides_m[:, 1])
 
 
@@ -83,23 +83,23 @@ def _counts_and_tops(piece, heights, chosen, num_pieces):
 
 
 @njit(cache=True, nogil=True)
-def tightest_rectangles(grid, num_pieces):
-    """(num_pieces, 2) longer and shorter side, in cells, of the rectangle of least area around each piece."""
+def _tightest_rectangles(points, piece, chosen, num_pieces):
+    """(num_pieces, 2) longer and shorter side (m) of the upright rectangle of least area around each piece's points."""
     angles = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
     cosines, sines = np.cos(angles), np.sin(angles)
     low = np.full((num_pieces, len(angles), 2), np.inf)
     high = np.full((num_pieces, len(angles), 2), -np.inf)
-    for i in range(grid.shape[0]):
-        for j in range(grid.shape[1]):
-            k = grid[i, j]
-            if k != NO_PIECE:
-                for n in range(len(angles)):
-                    u, v = cosines[n] * i + sines[n] * j, cosines[n] * j - sines[n] * i
-                    low[k, n, 0], high[k, n, 0] = min(low[k, n, 0], u), max(high[k, n, 0], u)
-                    low[k, n, 1], high[k, n, 1] = min(low[k, n, 1], v), max(high[k, n, 1], v)
+    for k in range(len(points)):
+        if chosen[k]:
+            lows, highs = low[piece[k]], high[piece[k]]
+            for n in range(len(angles)):
+                u = cosines[n] * points[k, 0] + sines[n] * points[k, 1]
+                v = cosines[n] * points[k, 1] - sines[n] * points[k, 0]
+                lows[n, 0], highs[n, 0] = min(lows[n, 0], u), max(highs[n, 0], u)
+                lows[n, 1], highs[n, 1] = min(lows[n, 1], v), max(highs[n, 1], v)
     sides = np.empty((num_pieces, 2))
     for k in range(num_pieces):
-        extents = high[k] - low[k] + 1.0  # a cell has a width
+        extents = high[k] - low[k]
         best = np.argmin(extents[:, 0] * extents[:, 1])
         sides[k] = max(extents[best, 0], extents[best, 1]), min(extents[best, 0], extents[best, 1])
     return sides

@@ -114,6 +114,9 @@ class SegregatorConfig(Section):
         },
         description="class -> fewest points of a cluster; these classes give clusters (P: L_SC; A: car 30, trunk 15)",
     )
+    max_clusters_per_class: int = Field(
+        24, ge=3, description="of a class, those with the largest surface seen; bounds the time of matching"
+    )
     foot_classes: tuple[StaticLabel, ...] = Field(
         (Label.TRUNK, Label.POLE, Label.TRAFFIC_SIGN),
         description="upright things: their clusters are placed on the ground beneath, not at their centre",

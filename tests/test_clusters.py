@@ -167,16 +167,25 @@ def test_a_car_behind_the_sensor_is_one_cluster() -> None:
     np.testing.assert_allclose(clusters.covariances[0], np.cov(behind.T, bias=True), atol=1e-12)
 
 
-def test_clusters_of_known_places_come_by_class_and_size() -> None:
+def test_clusters_of_known_places_come_by_class_and_seen_surface() -> None:
     rng = np.random.default_rng(1)
     centres = np.array([[10, 0, -1], [0, 20, -1], [0, -15, 0], [-25, 5, 0.0]])
     sizes, classes = [40, 60, 25, 50], [Label.CAR, Label.CAR, Label.TRUNK, Label.CAR]
     points = np.concatenate([c + rng.normal(0, 0.1, (n, 3)) for c, n in zip(centres, sizes, strict=True)])
     labels = np.repeat(np.array(classes, np.uint8), sizes)
     clusters = semantic_clusters(points, labels, config=CONFIG)
-    assert clusters.sizes.tolist() == [60, 50, 40, 25]
+    assert clusters.sizes.tolist() == [50, 60, 40, 25]  # cars: 50 x 650, 60 x 401, 40 x 101
     assert clusters.classes.tolist() == [Label.CAR, Label.CAR, Label.CAR, Label.TRUNK]
-    np.testing.assert_allclose(clusters.means, centres[[1, 3, 0, 2]], atol=0.06)  # 0.1 / sqrt(25) = 0.02; 3 sigma
+    np.testing.assert_allclose(clusters.means, centres[[3, 1, 0, 2]], atol=0.06)  # 0.1 / sqrt(25) = 0.02; 3 sigma
+
+
+def test_of_many_clusters_those_with_the_largest_surface_are_kept() -> None:
+    angles = np.arange(60) * 2 * np.pi / 60
+    counts = np.random.default_rng(2).permutation(np.arange(10, 70))
+    where = 30 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(60)])
+    points = np.repeat(where, counts, axis=0)
+    clusters = semantic_clusters(points, np.full(len(points), Label.TRUNK, np.uint8), config=CONFIG)
+    assert clusters.sizes.tolist() == list(range(69, 69 - CONFIG.max_clusters_per_class, -1))
 
 
 @pytest.mark.data
@@ -253,4 +262,4 @@ def test_degenerate_clouds_have_their_clusters_or_none(points: np.ndarray, sizes
 def test_two_million_points_are_clustered() -> None:
     points = np.random.default_rng(3).uniform(-60, 60, (2_000_000, 3)).astype(np.float32)
     clusters = semantic_clusters(points, np.full(len(points), Label.CAR, np.uint8), config=CONFIG)
-    assert 0 < clusters.sizes.sum() <= len(points)
+    assert len(clusters.sizes) == CONFIG.max_clusters_per_class

@@ -37,8 +37,10 @@ NO_CLUSTERS = Clusters(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.uin
 
 
 def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfig) -> Clusters:
-    """The clusters of each class in `config.cluster_min_points`: by class, then from the largest to the smallest.
+    """The clusters of each class in `config.cluster_min_points`, by class, then by the surface seen, large ones first.
 
+    That surface goes as the number of points times the squared range. Of each class the first
+    `config.max_clusters_per_class` are kept.
     Centres are in the frame of `points`, whose origin is the sensor. Points that are NaN or out of range take no part.
     The result does not depend on the order of the points.
     """
@@ -91,7 +93,8 @@ def _class_clusters(points: Points, label: Label, min_points: int, config: Segre
     renumbered = np.cumsum(large) - 1
     kept = large[cluster]
     means, covariances = gaussians(points[kept], renumbered[cluster[kept]], int(large.sum()))
-    order = np.lexsort((*means.T, -sizes[large]))
+    area = sizes[large] * (means**2).sum(axis=1)
+    order = np.lexsort((*means.T, -area))[: config.max_clusters_per_class]
     return Clusters(means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[large][order])
 
 

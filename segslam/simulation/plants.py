@@ -29,16 +29,13 @@ def bush(rng: np.random.Generator, width_m: float, height_m: float) -> Mesh:
 
 
 def hedge(rng: np.random.Generator, length_m: float, width_m: float, height_m: float) -> Mesh:
-    """A clipped hedge along x, dense enough that few rays pass."""
-    count = int(length_m * (height_m + width_m) * 32)
-    centres = rng.uniform(-0.5, 0.5, size=(count, 3))
-    centres[:, 1] = np.sign(centres[:, 1]) * np.abs(2 * centres[:, 1]) ** 0.3 / 2  # most leaves near the two faces
-    swell = 1.0 + 0.12 * np.sin(centres[:, 0] * length_m * rng.uniform(1.0, 2.0))
+    """A clipped hedge along x, dense enough that few rays pass, its faces swelling and shrinking along it."""
+    count = int(60 * length_m * (height_m + width_m))
+    along, across, up = rng.uniform(-0.5, 0.5, size=(3, count))
+    across = np.sign(across) * np.abs(2 * across) ** 0.3 / 2  # most leaves near the two faces
+    swell = 1.0 + 0.12 * np.sin(along * length_m * rng.uniform(1.0, 2.0))
     return leaves(
-        centres * [length_m, width_m, height_m * 1.0] * np.column_stack([np.ones(count), swell, swell])
-        + [0.0, 0.0, height_m / 2],
-        0.42,
-        rng,
+        np.column_stack([along * length_m, across * swell * width_m, (up * swell + 0.5) * height_m]), 0.42, rng
     )
 
 

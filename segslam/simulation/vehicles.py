@@ -60,8 +60,3 @@ def _wheels(length: float, width: float, label: Label) -> Mesh:
             for sy in (-1, 1)
         ]
     )
-
-
-def moving_car(rng: np.random.Generator) -> Mesh:
-    """A car of the class that moves."""
-    return car(rng, Label.MOVING_CAR)

@@ -17,9 +17,14 @@ class Search(NamedTuple):
     iterations: int
 
 
-def search(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> Search:
-    """The least error near `start`, by Levenberg-Marquardt."""
+def search(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, *, tolerance: float = 1e-5) -> Search:
+    """The least error near `start`, by Levenberg-Marquardt.
+
+    It ends with an iteration that lowers the error by a share below `tolerance`; what is left is far less, for the
+    search converges quadratically.
+    """
     parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(tolerance)
     parameters.setlambdaFactor(LAMBDA_FACTOR)
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
     values = optimizer.optimize()

@@ -1,14 +1,14 @@
 """A run folder: scans go in one by one, and what a person or a script reads afterwards comes out."""
 
-import csv
-import json
 import logging
 import resource
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,30 +16,26 @@ import numpy as np
 from segslam.config import config_to_yaml
 from segslam.datasets import Dataset
 from segslam.evaluation import loop_metrics, trajectory_metrics
-from segslam.log import LogWriter
+from segslam.log import LogWriter, RunLog
+from segslam.run_files import LOG, UNFINISHED, room_for, write_loops, write_poses
 from segslam.slam import Slam, SlamResult
-from segslam.trajectory import Poses, camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
-from segslam.types import BadScan, IndexPairs, LoopAttempt, LoopClosure, SegslamError, Step, Trajectory, Transform
+from segslam.trajectory import Poses, rows_of_same_scan
+from segslam.types import (
+    BadScan,
+    IndexPairs,
+    LoopClosure,
+    Scan,
+    SegslamError,
+    Step,
+    Trajectory,
+    Transform,
+)
 
 logger = logging.getLogger(__name__)
 
-POSE_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
-STAGES = ("prepare", "match", "refine", "verify")
-
-
-def new_folder(folder: Path) -> Path:
-    """An empty folder for a run. Raises SegslamError if there is anything in it, for nothing written is ever lost."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise SegslamError(f"{folder}: not empty; name another folder with --out, or remove it")
-    except OSError as error:
-        raise SegslamError(f"{folder}: cannot be written to ({error.strerror}); name another with --out") from error
-    return folder
-
 
 class Run:
-    """Maps the scans of a data set into a folder."""
+    """Maps the scans of a data set into a folder; a context manager."""
 
     def __init__(
         self,
@@ -49,29 +45,71 @@ class Run:
         dataset: str,
         T_camera_lidar: Transform | None = None,
         reference: Trajectory | None = None,
+        options: Mapping[str, str] = MappingProxyType({}),
+        resumes: bool = False,
     ) -> None:
         """`T_camera_lidar`, for KITTI, turns the KITTI-format poses into the camera frame of its ground truth.
 
-        `reference` goes to the log, for whoever scores or repeats the run from its folder.
+        `reference` goes to the log, for whoever scores or repeats the run from its folder; `options` too, for whoever
+        resumes it. A run that `resumes` has a log in its folder, which stays until `resume` has taken it over.
         """
         self.folder = folder
         self.num_scans_skipped = 0
+        self.num_scans_resumed = 0
+        self._next_row = 0
         self._slam = slam
         self._T_camera_lidar = T_camera_lidar
         self._started = perf_counter()
         self._stage_ms: dict[str, list[float]] = defaultdict(list)
-        (folder / "config.yaml").write_text(config_to_yaml(slam.config), encoding="utf-8")
+        with room_for(folder):
+            (folder / "config.yaml").write_text(config_to_yaml(slam.config), encoding="utf-8")
         self._log = LogWriter(
-            folder / "log.mcap",
+            folder / (LOG + UNFINISHED if resumes else LOG),
             config=slam.config,
             dataset=dataset,
             T_camera_lidar=T_camera_lidar,
             reference=reference,
+            options=options,
         )
 
+    def __enter__(self) -> "Run":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the log, also that of a run that failed; a log not yet moved to its place goes."""
+        self._log.close()
+        (self.folder / (LOG + UNFINISHED)).unlink(missing_ok=True)
+
+    def resume(self, recorded: RunLog, dataset: Dataset) -> Iterator[Step]:
+        """Do again, from the keyframe on, what the folder's log holds; `map` goes on after it.
+
+        The steps go to a new log, which takes the old one's place when it has them all: a kill loses none of them.
+        Raises SegslamError if they are not of this data set.
+        """
+        row_of_scan = {int(index): row for row, index in enumerate(dataset.scan_index)}
+        taken: list[tuple[int, int]] = []
+        for step in recorded.steps():
+            if step.scan_index not in row_of_scan:
+                raise _other_data(recorded.path, f"has scan {step.scan_index}, the data given has not")
+            taken.append((row_of_scan[step.scan_index], step.stamp_ns))
+            yield self._logged(replace(self._slam.repeat(step), stage_seconds=step.stage_seconds))
+
+        def scan_of(number: int) -> Scan:
+            row, stamp_ns = taken[number]
+            scan = dataset[row]
+            if scan.stamp_ns != stamp_ns:
+                raise _other_data(recorded.path, f"has scan {scan.index} at {stamp_ns} ns, the data {scan.stamp_ns} ns")
+            return scan
+
+        self._slam.go_on(scan_of)
+        self._log.move(recorded.path)
+        self.num_scans_resumed = len(taken)
+        self._next_row = taken[-1][0] + 1 if taken else 0
+        self.num_scans_skipped = self._next_row - len(taken)
+
     def map(self, dataset: Dataset) -> Iterator[Step | BadScan]:
-        """Process and log each scan; a bad one is reported, counted and skipped."""
-        for row in range(len(dataset)):
+        """Process and log each scan after those resumed; a bad one is reported, counted and skipped."""
+        for row in range(self._next_row, len(dataset)):
             try:
                 started = perf_counter()
                 scan = dataset[row]
@@ -95,10 +133,11 @@ class Run:
         self._log.write_result(result.estimate, result.trajectory)
         self._log.close()
         seconds = perf_counter() - self._started
-        write_poses(self.folder, "poses", result.trajectory, self._T_camera_lidar)
-        write_poses(self.folder, "odometry", result.odometry, self._T_camera_lidar)
-        self._slam.graph.write_g2o(self.folder / "graph.g2o")
-        write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
+        with room_for(self.folder):
+            write_poses(self.folder, "poses", result.trajectory, self._T_camera_lidar)
+            write_poses(self.folder, "odometry", result.odometry, self._T_camera_lidar)
+            self._slam.graph.write_g2o(self.folder / "graph.g2o")
+            write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
         closures = [attempt for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
         return result, {
             "num_scans": len(result.trajectory),
@@ -108,7 +147,7 @@ class Run:
             "num_loops_accepted": len(closures),
             "num_loops_switched_off": sum(weight < 0.5 for weight in result.estimate.closure_weights.values()),
             "seconds_total": seconds,
-            "scans_per_second": len(result.trajectory) / seconds,
+            "scans_per_second": (len(result.trajectory) - self.num_scans_resumed) / seconds,
             "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
         }
@@ -155,41 +194,8 @@ def _loop_accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float
     return loop_metrics(np.array([c.T_target_source for c in closures]).reshape(-1, 4, 4), pairs, truth)
 
 
-def write_poses(folder: Path, name: str, trajectory: Trajectory, T_camera_lidar: Transform | None) -> None:
-    """`NAME_tum.txt` in the LiDAR frame, and `NAME_kitti.txt`, in the camera frame where there is one."""
-    poses = trajectory.T_world_lidar
-    write_tum(folder / f"{name}_tum.txt", trajectory.stamp_ns, poses)
-    if T_camera_lidar is not None:
-        poses = camera_from_lidar(poses, T_camera_lidar)
-    write_kitti(folder / f"{name}_kitti.txt", poses)
-
-
-def write_loops(file: Path, attempts: tuple[LoopAttempt, ...], weights: dict[tuple[int, int], float]) -> None:
-    """A row for every attempt; cells that do not apply are empty. `weight` is the graph's final trust, 0 to 1."""
-    head = ("source", "target", "outcome", "detail", "distance_m", "correspondences", "inliers", "overlap", "rms_m")
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow((*head, "free_space_violation", "weight", *POSE_COLUMNS, *(f"{stage}_s" for stage in STAGES)))
-        writer.writerows(_loop_row(attempt, weights) for attempt in attempts)
-
-
-def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
-    """`metrics.json`; a figure that is unknown is left out by the caller."""
-    text = json.dumps(metrics, indent=2, allow_nan=False)
-    (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
-
-
-def _loop_row(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> list[object]:
-    candidate, outcome = attempt.candidate, attempt.outcome
-    ids = (candidate.source_id, candidate.target_id)
-    seconds = [f"{attempt.seconds[stage]:.6f}" if stage in attempt.seconds else "" for stage in STAGES]
-    if not isinstance(outcome, LoopClosure):
-        nothing = [""] * (6 + len(POSE_COLUMNS))
-        return [*ids, outcome.reason.value, outcome.detail, candidate.distance_m, *nothing, *seconds]
-    found = outcome.alignment
-    figures = (found.coarse.num_correspondences, found.coarse.num_inliers, found.overlap, found.rms_m)
-    last = (found.free_space_violation, weights[ids], *outcome.T_target_source.ravel())
-    return [*ids, "accepted", "", candidate.distance_m, *figures, *last, *seconds]
+def _other_data(log: Path, difference: str) -> SegslamError:
+    return SegslamError(f"{log}: {difference}; resume with the data that the run began with")
 
 
 def _median_and_p95(times: list[float]) -> dict[str, float]:

@@ -2,11 +2,15 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
 from segslam import geometry
-from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, simulate_drive
+from segslam.datasets.kitti import read_calibration
+from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, made_up_drive, simulate_drive
+from segslam.simulation.files import RAW_IDS, uncorrected
+from segslam.trajectory import camera_from_lidar, write_kitti
 from segslam.types import Scan, Trajectory
 
 NUM_SCANS = 72
@@ -37,3 +41,25 @@ def drifting(truth: Trajectory, *, turn_deg: float = 0.15, climb_m: float = 0.01
     for before, after in zip(truth.T_world_lidar[:-1], truth.T_world_lidar[1:], strict=True):
         poses.append(poses[-1] @ geometry.inverse(before) @ after @ error)
     return replace(truth, T_world_lidar=np.stack(poses))
+
+
+def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
+    """The drive's first scans as sequence 00 of KITTI's format; returns the folder of the scans.
+
+    Their true labels lie in `true_labels`, where only those find them who ask.
+    """
+    folder = root / "sequences" / "00"
+    (folder / "velodyne").mkdir(parents=True)
+    (folder / "true_labels").mkdir()
+    (root / "poses").mkdir()
+    scans, truth = round_drive()
+    for scan in scans[:num_scans]:
+        rows = np.column_stack([uncorrected(scan.points), np.zeros(len(scan.points))])
+        rows.astype("<f4").tofile(folder / "velodyne" / f"{scan.index:06d}.bin")
+        RAW_IDS[scan.labels].astype("<u4").tofile(folder / "true_labels" / f"{scan.index:06d}.label")
+    (folder / "calib.txt").write_text(made_up_drive(1).calib)
+    (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans))
+    write_kitti(
+        root / "poses" / "00.txt", camera_from_lidar(truth.T_world_lidar, read_calibration(folder / "calib.txt"))
+    )
+    return folder / "velodyne"

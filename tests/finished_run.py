@@ -8,7 +8,7 @@ import numpy as np
 from segslam import geometry
 from segslam.config import Config, config_to_yaml
 from segslam.log import LogWriter
-from segslam.runs import write_metrics
+from segslam.run_files import write_metrics
 from segslam.slam import SlamResult
 from segslam.trajectory import corrected_poses
 from segslam.types import (

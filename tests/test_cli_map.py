@@ -4,13 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import round_drive
+from drives import round_drive, write_kitti_sequence
 
 from segslam import cli
 from segslam.log import read_log
-from segslam.simulation import made_up_drive
-from segslam.simulation.files import uncorrected
-from segslam.trajectory import camera_from_lidar, read_poses, write_kitti
+from segslam.trajectory import read_poses, write_kitti
 from segslam.types import Rejected
 
 RUN_FILES = {
@@ -30,18 +28,8 @@ RUN_FILES = {
 def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten scans in KITTI's format, the fifth truncated."""
     root = tmp_path_factory.mktemp("kitti")
-    folder = root / "sequences" / "00"
-    (folder / "velodyne").mkdir(parents=True)
-    (root / "poses").mkdir()
-    scans, truth = round_drive()
-    for scan in scans[:10]:
-        rows = np.column_stack([uncorrected(scan.points), np.zeros(len(scan.points))])
-        rows.astype("<f4").tofile(folder / "velodyne" / f"{scan.index:06d}.bin")
-    broken = folder / "velodyne" / "000004.bin"
+    broken = write_kitti_sequence(root, num_scans=10) / "000004.bin"
     broken.write_bytes(broken.read_bytes()[:-5])
-    (folder / "calib.txt").write_text(made_up_drive(1).calib)
-    (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans))
-    write_kitti(root / "poses" / "00.txt", camera_from_lidar(truth.T_world_lidar, np.eye(4)))
     return root
 
 
@@ -110,7 +98,7 @@ def test_an_odometry_is_taken_as_given(kitti: Path, tmp_path: Path) -> None:
 def test_loops_csv_has_a_row_for_every_attempt(tmp_path: Path) -> None:
     from test_slam import CONFIG, _slam
 
-    from segslam.runs import POSE_COLUMNS, write_loops
+    from segslam.run_files import POSE_COLUMNS, write_loops
 
     slam = _slam()
     attempts = [attempt for scan in round_drive()[0] for attempt in slam.process(scan).attempts]

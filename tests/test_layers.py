@@ -10,7 +10,7 @@ LAYERS = (  # top first; a room is a module or a folder
     {"cli"},
     {"experiments", "report"},
     {"runs", "results"},
-    {"slam", "log", "map", "evaluation"},
+    {"slam", "log", "run_files", "map", "evaluation"},
     {"alignment"},
     {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "simulation"},
     {"semantics"},  # below datasets, whose scans come with labels

@@ -17,7 +17,8 @@ from segslam.report import draw_picture, write_report
 from segslam.report.figures import draw_loops
 from segslam.report.page import page
 from segslam.results import FIGURES, read_run
-from segslam.runs import accuracy, write_metrics
+from segslam.run_files import write_metrics
+from segslam.runs import accuracy
 from segslam.types import SegslamError
 
 VOID = {"meta", "img"}

@@ -24,7 +24,7 @@ def demo(
     from segslam.config import Config
     from segslam.datasets import open_dataset
     from segslam.report import draw_picture, write_report
-    from segslam.runs import new_folder
+    from segslam.run_files import new_folder
 
     data = new_folder(out) / "data"
     drive = simulation.made_up_drive()

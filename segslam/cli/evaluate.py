@@ -56,7 +56,8 @@ def table(figures: dict[str, Any]) -> str:
 
 def _score_run(folder: Path, reference_file: Path | None) -> dict[str, Any]:
     from segslam.results import read_run, true_poses
-    from segslam.runs import accuracy, write_metrics
+    from segslam.run_files import write_metrics
+    from segslam.runs import accuracy
     from segslam.types import SegslamError
 
     run = read_run(folder)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from segslam.cli.checks import check_same, is_finished, log_to_resume
 from segslam.cli.console import (
     ConfigOption,
     DatasetOption,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from segslam.alignment import Labeller
     from segslam.config import Config, OdometryConfig
     from segslam.datasets import Dataset
+    from segslam.log import RunLog
     from segslam.odometry import Odometry
     from segslam.runs import Run
     from segslam.types import Trajectory
@@ -34,10 +36,11 @@ if TYPE_CHECKING:
 
 def map_command(
     data: Annotated[Path, typer.Argument(help="KITTI's folder (with sequences/), a folder of scans, or a recording.")],
-    out: Annotated[Path, typer.Option(help="New folder for the run.")],
+    out: Annotated[Path, typer.Option(help="New folder for the run; that of the run for --resume.")],
     dataset: DatasetOption = None,
     sequence: SequenceOption = "00",
     frames: FramesOption = None,
+    topic: Annotated[str, typer.Option(help="Of the points, in a recording that has several (rosbag, mcap).")] = "",
     labels: LabelsOption = "auto",
     encoding: EncodingOption = None,
     odometry: Annotated[
@@ -45,6 +48,7 @@ def map_command(
     ] = None,
     config: ConfigOption = None,
     settings: SetOption = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, killed or stopped.")] = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -55,29 +59,63 @@ def map_command(
     from segslam.config import load_config
     from segslam.datasets import open_dataset
 
-    settings_now = load_config(config, settings or ())
-    scans = open_dataset(data, sequence=sequence, dataset=dataset, labels=labels, encoding=encoding, frames=frames)
+    recorded = log_to_resume(out) if resume else None
+    settings_now = load_config(config, settings or (), base=recorded.config if recorded else None)
+    scans = open_dataset(
+        data, sequence=sequence, dataset=dataset, labels=labels, encoding=encoding, frames=frames, topic=topic
+    )
+    options = {
+        "frames": frames or "",
+        "topic": topic,
+        "labels": labels,
+        "encoding": encoding or "",
+        "odometry": str(odometry or ""),
+    }
     given = _given_odometry(odometry, scans, settings_now.odometry) if odometry else None
-    map_scans(scans, out, settings=settings_now, odometry=given, json=json, quiet=quiet)
+    if recorded is not None:
+        check_same(recorded, settings_now, dataset=scans.name, options=options)
+        if is_finished(recorded, scans):
+            say(f"{out}: finished already, all {len(scans)} scans; nothing is left to resume", quiet=quiet)
+            raise typer.Exit(0)
+    map_scans(
+        scans, out, settings=settings_now, odometry=given, options=options, recorded=recorded, json=json, quiet=quiet
+    )
 
 
 def map_scans(
-    scans: "Dataset", out: Path, *, settings: "Config", odometry: "Odometry | None" = None, json: bool, quiet: bool
+    scans: "Dataset",
+    out: Path,
+    *,
+    settings: "Config",
+    odometry: "Odometry | None" = None,
+    options: Mapping[str, str] = MappingProxyType({}),
+    recorded: "RunLog | None" = None,
+    json: bool,
+    quiet: bool,
 ) -> None:
-    """Map a data set into a new folder, and show the figures. Raises typer.Exit(130) if Ctrl-C ended it early."""
-    from segslam.runs import Run, new_folder
+    """Map a data set into a new folder, or go on with the run `recorded` there, and show the figures.
+
+    Raises typer.Exit(130) if Ctrl-C ended it early.
+    """
+    from segslam.run_files import new_folder
+    from segslam.runs import Run
     from segslam.slam import Slam
 
     slam = Slam(settings, odometry=odometry, labeller=_labeller(scans))
-    run = Run(
-        new_folder(out),
+    with Run(
+        out if recorded else new_folder(out),
         slam,
         dataset=scans.name,
         T_camera_lidar=scans.T_camera_lidar,
         reference=scans.reference,
-    )
-    interrupted = _process(run, scans, quiet=quiet)
-    metrics = finish(run, scans.reference, json=json, quiet=quiet)
+        options=options,
+        resumes=recorded is not None,
+    ) as run:
+        if recorded is not None:
+            _take_over(run, recorded, scans, quiet=quiet)
+        resumed = {} if recorded is None else {"num_scans_resumed": run.num_scans_resumed}
+        interrupted = _process(run, scans, quiet=quiet)
+        metrics = finish(run, scans.reference, json=json, quiet=quiet, more=resumed)
     if interrupted:
         say(f"stopped: {metrics['num_scans']} of {len(scans)} scans are mapped", quiet=quiet)
         raise typer.Exit(130)
@@ -92,7 +130,8 @@ def finish(
     more: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """End a run: write its results, and show its figures, `more` among them, which are returned."""
-    from segslam.runs import accuracy, write_metrics
+    from segslam.run_files import write_metrics
+    from segslam.runs import accuracy
 
     result, metrics = run.finish()
     if reference is not None:
@@ -120,16 +159,28 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
             f"error after alignment: {metrics['ate_m']:.3f} m, odometry alone {metrics['odometry_ate_m']:.3f} m; "
             f"false loops: {metrics['num_loops_false']}"
         )
+    if "num_scans_resumed" in metrics:
+        lines.append(f"of these scans, {metrics['num_scans_resumed']} are from the log")
     if "num_loops_won" in metrics:
         before = f", error {metrics['recorded_ate_m']:.3f} m before" if "recorded_ate_m" in metrics else ""
         lines.append(f"replayed: {metrics['num_loops_won']} loops won, {metrics['num_loops_lost']} lost{before}")
     return "\n".join([*lines, f"results in {folder}"])
 
 
+def _take_over(run: "Run", recorded: "RunLog", scans: "Dataset", *, quiet: bool) -> None:
+    """Do again what the log holds. Raises typer.Exit(130) for Ctrl-C, which leaves the log as it was."""
+    try:
+        for _ in progress(run.resume(recorded, scans), total=recorded.num_steps(), title="resume", quiet=quiet):
+            pass
+    except KeyboardInterrupt as interrupt:
+        raise typer.Exit(130) from interrupt
+
+
 def _process(run: "Run", scans: "Dataset", *, quiet: bool) -> bool:
     """Map every scan. Whether Ctrl-C ended it before the last one."""
     with suppress(KeyboardInterrupt):
-        for _ in progress(run.map(scans), total=len(scans), title="map", quiet=quiet):
+        left = len(scans) - run.num_scans_resumed - run.num_scans_skipped
+        for _ in progress(run.map(scans), total=left, title="map", quiet=quiet):
             pass
         return False
     return True

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from segslam.cli.checks import changed_settings
 from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, progress
 from segslam.cli.map import finish
 
@@ -34,22 +35,23 @@ def replay(
     """
     from segslam.config import load_config
     from segslam.log import read_log
-    from segslam.runs import Run, new_folder
+    from segslam.run_files import new_folder
+    from segslam.runs import Run
     from segslam.slam import Slam
 
     recorded = read_log(log)
     settings_now = load_config(config, settings or (), base=recorded.config)
     _check_settings(settings_now, recorded)
     reference = recorded.reference()
-    run = Run(
+    with Run(
         new_folder(out),
         Slam(settings_now),
         dataset=recorded.run["dataset"],
         T_camera_lidar=recorded.T_camera_lidar,
         reference=reference,
-    )
-    changes, interrupted = _repeat(run, recorded, quiet=quiet)
-    finish(run, reference, json=json, quiet=quiet, more=changes | _recorded_accuracy(recorded, reference))
+    ) as run:
+        changes, interrupted = _repeat(run, recorded, quiet=quiet)
+        finish(run, reference, json=json, quiet=quiet, more=changes | _recorded_accuracy(recorded, reference))
     if interrupted:
         raise typer.Exit(130)
 
@@ -58,14 +60,12 @@ def _check_settings(settings_now: "Config", recorded: "RunLog") -> None:
     """Raises SegslamError for a change that would have no effect."""
     from segslam.types import SegslamError
 
-    for name in BEFORE_THE_KEYFRAMES:
-        before, now = getattr(recorded.config, name), getattr(settings_now, name)
-        for key in type(now).model_fields:
-            if getattr(before, key) != getattr(now, key):
-                raise SegslamError(
-                    f"{name}.{key}: a replay takes the keyframes as {recorded.path} has them, made with "
-                    f"{getattr(before, key)}; leave it so, or map the data again"
-                )
+    for key, before, _ in changed_settings(recorded.config, settings_now):
+        if key.partition(".")[0] in BEFORE_THE_KEYFRAMES:
+            raise SegslamError(
+                f"{key}: a replay takes the keyframes as {recorded.path} has them, made with {before}; "
+                "leave it so, or map the data again"
+            )
 
 
 def _repeat(run: "Run", recorded: "RunLog", *, quiet: bool) -> tuple[dict[str, Any], bool]:

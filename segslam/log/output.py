@@ -1,5 +1,7 @@
 """A file under MCAP's writer that holds whole parts only, whatever happens while one is written."""
 
+import fcntl
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -10,11 +12,15 @@ from pathlib import Path
 class Output:
     """Writes, tells and flushes, which is all that MCAP's writer asks of a stream; unbuffered.
 
-    After a failure nothing is left to be written later.
+    After a failure nothing is left to be written later. While it is open nobody else can write the file.
     """
 
     def __init__(self, path: Path) -> None:
-        self._raw = path.open("wb", buffering=0)
+        """Raises OSError if the file cannot be written, or another process does."""
+        self._raw = path.open("ab", buffering=0)
+        fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._raw.truncate(0)
+        self._raw.seek(0)
 
     @property
     def closed(self) -> bool:
@@ -36,6 +42,10 @@ class Output:
     def close(self) -> None:
         self._raw.close()
 
+    def sync(self) -> None:
+        """Wait until all is on the disk, where a power failure leaves it."""
+        os.fsync(self._raw.fileno())
+
     @contextmanager
     def whole(self) -> Iterator[None]:
         """What is written within comes to the file whole, or not at all. Ctrl-C waits for its end.
@@ -50,6 +60,16 @@ class Output:
                 self._raw.truncate(size)
                 self._raw.close()
                 raise
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether an `Output` is open on the file, in any process."""
+    with path.open("rb") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        return False
 
 
 @contextmanager

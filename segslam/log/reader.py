@@ -39,6 +39,8 @@ class RunLog:
     """schema_version, dataset, python, platform, T_camera_lidar (JSON) where there is one."""
     packages: Mapping[str, str]
     """Package -> version."""
+    options: Mapping[str, str]
+    """What was chosen beside the settings, such as where labels come from."""
 
     @property
     def T_camera_lidar(self) -> Transform | None:  # noqa: N802  (a transform)
@@ -126,7 +128,8 @@ def read_log(path: Path) -> RunLog:
             f"use segslam {packages.get('segslam', 'of its time')}, which wrote it"
         )
     config = config_from_yaml(metadata[schema.CONFIG_METADATA]["yaml"], f"{path} (settings)")
-    return RunLog(path=path, config=config, run=run, packages=packages)
+    options = metadata.get(schema.OPTIONS_METADATA, {})
+    return RunLog(path=path, config=config, run=run, packages=packages, options=options)
 
 
 def _step(parts: Parts) -> Step:

@@ -42,6 +42,8 @@ RUN_METADATA = "segslam"
 """Metadata record: schema_version, dataset, python, platform, and T_camera_lidar (JSON) for KITTI."""
 CONFIG_METADATA = "segslam.config"
 """Metadata record: the effective settings under the key `yaml`."""
+OPTIONS_METADATA = "segslam.options"
+"""Metadata record: what was chosen beside the settings, such as where labels come from; empty for a replay."""
 PACKAGES_METADATA = "segslam.packages"
 """Metadata record: package -> version."""
 

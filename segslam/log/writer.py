@@ -2,11 +2,11 @@
 
 import json
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import IO, Any, cast
 
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -22,7 +22,7 @@ from segslam.log.cloud import KeyframePoints, keyframe_points
 from segslam.log.drawing import Drawing, Topical, ground_truth
 from segslam.log.output import Output
 from segslam.log.records import codec
-from segslam.types import GraphEstimate, SegslamError, Step, Trajectory, Transform
+from segslam.types import GraphEstimate, SegslamError, Step, Trajectory, Transform, WorkFailed
 
 PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
 """Whose versions a log records: those that its figures depend on."""
@@ -47,8 +47,9 @@ Encoded = tuple[str, bytes]
 class LogWriter:
     """Writes the steps of a run as they come; a context manager.
 
-    Each step is handed to the operating system as one compressed chunk with a checksum. A full or failing disk raises
-    SegslamError and leaves a file that ends with the last complete step. Ctrl-C waits until a step is complete.
+    Each step is handed to the operating system as one compressed chunk with a checksum, before `write` returns: a slow
+    disk slows the run and nothing gathers in memory. A full or failing disk raises WorkFailed and leaves a file that
+    ends with the last complete step. Ctrl-C waits until a step is complete.
     """
 
     def __init__(
@@ -59,8 +60,12 @@ class LogWriter:
         dataset: str = "",
         T_camera_lidar: Transform | None = None,
         reference: Trajectory | None = None,
+        options: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """`reference` holds true poses and `T_camera_lidar` the calibration, for KITTI: a replay has nothing else."""
+        """`reference` holds true poses and `T_camera_lidar` the calibration, for KITTI: a replay has nothing else.
+
+        `options` are what was chosen beside the settings, and must be chosen again when the run is resumed.
+        """
         self._path = path
         self._drawing = Drawing(config.log)
         self._resolution_m = config.keyframes.resolution_m
@@ -73,7 +78,7 @@ class LogWriter:
         self._mcap = Writer(cast(IO[bytes], self._output), chunk_size=CHUNK_BYTES, compression=compression)
         with self._whole():
             self._mcap.start(library=f"segslam {version('segslam')}")
-            for name, data in _metadata(config, dataset, T_camera_lidar).items():
+            for name, data in _metadata(config, dataset, T_camera_lidar, options).items():
                 self._mcap.add_metadata(name, data)
             self._channels = _register_channels(self._mcap)
         if reference is not None and len(reference):
@@ -88,6 +93,15 @@ class LogWriter:
         drawn = self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns)
         messages = [*_serialised(drawn), _estimate_message(estimate), (schema.RESULT, _json(Trajectory, trajectory))]
         self._write(messages, stamp_ns=self._stamp_ns)
+
+    def move(self, path: Path) -> None:
+        """Take the place of the file `path`, which is there until all that was written here is safely on the disk."""
+        try:
+            self._output.sync()
+            self._path.replace(path)
+        except OSError as error:
+            raise WorkFailed(f"{path}: cannot be replaced by {self._path} ({error.strerror})") from error
+        self._path = path
 
     def close(self) -> None:
         """Write the index. Without it the log can be read as well, only not searched."""
@@ -131,7 +145,7 @@ class LogWriter:
             with self._output.whole():
                 yield
         except OSError as error:
-            raise SegslamError(
+            raise WorkFailed(
                 f"{self._path}: cannot go on writing the log ({error.strerror}); make room on the disk; "
                 "the log ends with the last complete step"
             ) from error
@@ -153,7 +167,9 @@ def _register_channels(mcap: Writer) -> dict[str, int]:
     return protobuf | own
 
 
-def _metadata(config: Config, dataset: str, T_camera_lidar: Transform | None) -> dict[str, dict[str, str]]:
+def _metadata(
+    config: Config, dataset: str, T_camera_lidar: Transform | None, options: Mapping[str, str]
+) -> dict[str, dict[str, str]]:
     calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
     return {
         schema.RUN_METADATA: {
@@ -164,6 +180,7 @@ def _metadata(config: Config, dataset: str, T_camera_lidar: Transform | None) ->
             **calibration,
         },
         schema.CONFIG_METADATA: {"yaml": config_to_yaml(config)},
+        schema.OPTIONS_METADATA: dict(options),
         schema.PACKAGES_METADATA: {name: _version(name) for name in PACKAGES},
     }
 

@@ -1,0 +1,58 @@
+"""What a run that was begun allows: how it can be resumed or replayed."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from segslam.config import Config
+    from segslam.datasets import Dataset
+    from segslam.log import RunLog
+
+
+def log_to_resume(folder: Path) -> "RunLog":
+    """The log of the run in a folder. Raises SegslamError if there is none, or the run is still going on."""
+    from segslam.log import is_being_written, read_log
+    from segslam.run_files import LOG
+    from segslam.types import SegslamError
+
+    log = folder / LOG
+    if not log.is_file():
+        raise SegslamError(f"{folder}: no {LOG} there, so no run to resume; map without --resume into a new folder")
+    if is_being_written(log):
+        raise SegslamError(f"{log}: the run is still going on; end it before it is resumed")
+    return read_log(log)
+
+
+def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options: Mapping[str, str]) -> None:
+    """Raises SegslamError where a run would be resumed otherwise than it began."""
+    from segslam.types import SegslamError
+
+    for key, before, now in changed_settings(recorded.config, settings):
+        raise SegslamError(
+            f"{key}: {now} now, but {recorded.path} began with {before}; a resumed run keeps its settings"
+        )
+    began = {"data set": recorded.run["dataset"]} | {f"--{name}": value for name, value in recorded.options.items()}
+    given = {"data set": dataset} | {f"--{name}": value for name, value in options.items()}
+    for name in given:
+        if began.get(name) != given[name]:
+            raise SegslamError(
+                f"{name}: {given[name] or 'none'} now, but {recorded.path} began with {began.get(name) or 'none'}; "
+                "give the same to resume it"
+            )
+
+
+def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
+    """Whether the run has all its results, of all scans of the data set."""
+    result = recorded.result()
+    has_results = (recorded.path.parent / "metrics.json").is_file()
+    return has_results and result is not None and bool(result[1].scan_index[-1] == scans.scan_index[-1])
+
+
+def changed_settings(before: "Config", now: "Config") -> "Iterator[tuple[str, object, object]]":
+    """`section.key` and its two values, for each setting that differs."""
+    for section in type(now).model_fields:
+        old, new = getattr(before, section), getattr(now, section)
+        for key in type(new).model_fields:
+            if getattr(old, key) != getattr(new, key):
+                yield f"{section}.{key}", getattr(old, key), getattr(new, key)

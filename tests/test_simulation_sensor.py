@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from segslam import geometry
-from segslam.simulation import SensorConfig, WorldConfig, build_world, leftover_motion, make_sensor, sweep
+from segslam.simulation import SensorConfig, WorldConfig, build_world, make_sensor, sweep
+from segslam.simulation.drift import NO_ERROR, SweepError
 from segslam.simulation.sensor import PATTERNS
 from segslam.types import GROUND_LABELS, Label
 
@@ -14,8 +14,6 @@ PERFECT = {
     "beam_angle_sigma_deg": 0.0,
     "beam_range_sigma_m": 0.0,
     "vertical_angle_error_deg": 0.0,
-    "sweep_rotation_sigma_deg": 0.0,
-    "sweep_translation_sigma_m": 0.0,
 }
 EMPTY = WorldConfig(
     cars=0, trees=0, lamps=0, signs=0, clutter=0, built=0, courts=0, hedged=0, fenced=0, shrubs=0, moving_cars=0
@@ -43,10 +41,10 @@ def street():
     return build_world(*straight_drive(), config=WorldConfig(moving_cars=0), seed=0)
 
 
-def scan_of(world, config: SensorConfig, *, at: int = 15, seed: int = 0, leftover=None):
+def scan_of(world, config: SensorConfig, *, at: int = 15, seed: int = 0, error: SweepError = NO_ERROR):
     T_world_lidar = straight_drive()[0][at]
     sensor = make_sensor(config, seed=seed)
-    return sweep(world, sensor, T_world_lidar, rng=np.random.default_rng(seed), leftover=leftover)
+    return sweep(world, sensor, T_world_lidar, rng=np.random.default_rng(seed), error=error)
 
 
 def elevations_deg(points: np.ndarray) -> np.ndarray:
@@ -101,17 +99,6 @@ def test_beam_errors_last_from_sweep_to_sweep_and_change_with_the_seed(bare_worl
     assert not np.array_equal(*errors)
 
 
-def test_leftover_motion_smears_each_point_by_its_time_in_the_sweep(bare_world):
-    """Against the exact rigid motion; the sensor's is of first order, so second-order terms are the tolerance."""
-    leftover = geometry.tangent(rotation_rad=[0.002, -0.001, 0.003], translation_m=[0.05, -0.02, 0.01])
-    truth, smeared = (scan_of(bare_world, perfect(), leftover=one).points for one in (None, leftover))
-    fraction = np.arctan2(truth[:, 1], truth[:, 0]) / (2 * np.pi)  # 0 ahead, -0.5 to 0.5 behind
-    ahead, left = np.abs(fraction) < 1e-3, np.abs(fraction - 0.25) < 1e-3
-    np.testing.assert_allclose(smeared[ahead], truth[ahead], atol=1e-3)
-    expected = geometry.apply(geometry.exp(-0.25 * leftover), truth[left])
-    np.testing.assert_allclose(smeared[left], expected, atol=2e-3)
-
-
 def test_dropout_loses_the_asked_share(street):
     kept = len(scan_of(street, perfect(dropout=0.3)).points) / len(scan_of(street, perfect()).points)
     assert abs(kept - 0.7) < 0.01  # some 120,000 draws
@@ -136,15 +123,6 @@ def test_rows_of_a_sweep_belong_together(street):
     assert cars.any()
     assert (one.instances[cars] > 0).all()
     assert (one.instances[np.isin(one.labels, GROUND_LABELS)] == 0).all()
-
-
-def test_leftover_motion_has_the_asked_spread_and_memory():
-    config = SensorConfig(sweep_rotation_sigma_deg=0.5, sweep_translation_sigma_m=0.1, sweep_correlation_s=1.0)
-    motion = leftover_motion(0.1 * np.arange(20_000), config=config, rng=np.random.default_rng(0))
-    np.testing.assert_allclose(np.degrees(motion[:, :3].std(axis=0)), 0.5, rtol=0.1)  # some 1,000 independent spells
-    np.testing.assert_allclose(motion[:, 3:].std(axis=0), 0.1, rtol=0.1)
-    lagged = np.corrcoef(motion[:-10, 0], motion[10:, 0])[0, 1]
-    assert lagged == pytest.approx(np.exp(-1.0), abs=0.06)
 
 
 def test_a_scan_of_the_sweep_carries_its_points_and_labels(bare_world):

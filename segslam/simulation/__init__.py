@@ -1,6 +1,7 @@
 """Labelled street worlds, the LiDARs that drive through them, and KITTI-format sequences with exact truth."""
 
-from segslam.simulation.drive import drive_sweeps, leftover_motion, simulate_drive
+from segslam.simulation.drift import SweepError, sweep_errors
+from segslam.simulation.drive import drive_sweeps, simulate_drive
 from segslam.simulation.files import prepare_folder, write_drive, write_sequence
 from segslam.simulation.label_errors import LabelErrorConfig, network_like
 from segslam.simulation.levelling import level, upright
@@ -18,11 +19,11 @@ __all__ = [
     "SensorConfig",
     "SimulationConfig",
     "Sweep",
+    "SweepError",
     "World",
     "WorldConfig",
     "build_world",
     "drive_sweeps",
-    "leftover_motion",
     "level",
     "made_up_drive",
     "made_up_loop",
@@ -33,6 +34,7 @@ __all__ = [
     "simulate_drive",
     "simulation_config",
     "sweep",
+    "sweep_errors",
     "upright",
     "write_drive",
     "write_sequence",

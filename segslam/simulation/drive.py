@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float
 
+from segslam.simulation.drift import sweep_errors
 from segslam.simulation.sensor import Sweep, make_sensor, sweep
 from segslam.simulation.settings import SensorConfig, SimulationConfig
 from segslam.simulation.world import World, build_world
@@ -27,17 +27,7 @@ def drive_sweeps(
 ) -> Iterator[Sweep]:
     """The sweeps of a drive through a world."""
     sensor = make_sensor(config, seed=seed)
-    leftovers = leftover_motion(time_s, config=config, rng=np.random.default_rng([seed, 3]))
-    for index, (T_world_now, now, leftover) in enumerate(zip(T_world_lidar, time_s, leftovers, strict=True)):
+    errors = sweep_errors(time_s, config=config, rng=np.random.default_rng([seed, 3]))
+    for index, (T_world_now, now, error) in enumerate(zip(T_world_lidar, time_s, errors, strict=True)):
         rng = np.random.default_rng([seed, 4, index])
-        yield sweep(world, sensor, T_world_now, rng=rng, time_s=float(now), leftover=leftover)
-
-
-def leftover_motion(time_s: Vector, *, config: SensorConfig, rng: np.random.Generator) -> Float[np.ndarray, "_ 6"]:
-    """Uncompensated motion of each sweep, [rotation rad; translation m]: an Ornstein-Uhlenbeck process."""
-    sigma = np.repeat([np.radians(config.sweep_rotation_sigma_deg), config.sweep_translation_sigma_m], 3)
-    kept = np.exp(-np.diff(time_s, prepend=time_s[0]) / config.sweep_correlation_s)
-    motion = rng.normal(size=(len(time_s), 6))
-    for row in range(1, len(motion)):
-        motion[row] = kept[row] * motion[row - 1] + np.sqrt(1.0 - kept[row] ** 2) * motion[row]
-    return motion * sigma
+        yield sweep(world, sensor, T_world_now, rng=rng, time_s=float(now), error=error)

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from segslam.simulation.drift import NO_ERROR, SweepError, distorted
 from segslam.simulation.mesh import Instances
 from segslam.simulation.settings import SensorConfig, SensorName
 from segslam.simulation.world import Hits, World
-from segslam.types import Label, Labels, Points, Scan, Tangent, Transform, Vector
+from segslam.types import Label, Labels, Points, Scan, Transform, Vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,17 +99,16 @@ def sweep(
     *,
     rng: np.random.Generator,
     time_s: float = 0.0,
-    leftover: Tangent | None = None,
+    error: SweepError = NO_ERROR,
 ) -> Sweep:
-    """One sweep from one pose. `leftover` is the motion over it that nobody compensated."""
+    """One sweep from one pose, with the sensor's lasting errors and one of this sweep."""
     hits = world.cast(T_world_lidar, sensor.directions, time_s=time_s)
     rows = np.flatnonzero(_returns(hits, sensor, rng))
     labels = hits.labels[rows]
     noise = rng.normal(scale=sensor.config.range_sigma_m, size=len(rows)) if sensor.config.range_sigma_m else 0.0
     reported = sensor.reported[rows] * (hits.range_m[rows] + sensor.range_error_m[rows] + noise)[:, None]
-    if leftover is not None:
-        reported = _smeared(reported, sensor.sweep_fraction[rows], leftover)
-    return Sweep(reported, _intensity(labels, rng), labels, hits.instances[rows])
+    points = distorted(reported, sensor.sweep_fraction[rows], error)
+    return Sweep(points, _intensity(labels, rng), labels, hits.instances[rows])
 
 
 def _returns(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
@@ -119,13 +119,6 @@ def _returns(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray
         light = SIGNAL * MEAN_INTENSITY[hits.labels] * hits.cos_incidence * (pattern.max_range_m / hits.range_m) ** 2
     share = (1.0 - np.exp(-light)) * (1.0 - sensor.config.dropout) * np.where(hits.glass, 1.0 - GLASS_PASSES, 1.0)
     return seen & (rng.random(len(share), dtype=np.float32) < share)
-
-
-def _smeared(points: Points, fraction: Vector, leftover: Tangent) -> Points:
-    """Points as they come out when `leftover` over the sweep is not corrected (small: first order)."""
-    x, y, z = leftover[:3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return points - fraction[:, None] * (np.einsum("ij,kj->ik", points, cross) + leftover[3:])
 
 
 def _intensity(labels: Labels, rng: np.random.Generator) -> Vector:

@@ -33,6 +33,10 @@ class Correspondences:
     def __len__(self) -> int:
         return len(self.source)
 
+    def take(self, rows: Indices) -> "Correspondences":
+        """Some of the rows."""
+        return Correspondences(*(getattr(self, name)[rows] for name in self.__slots__))
+
 
 def all_to_all(source_classes: Labels, target_classes: Labels) -> IndexPairs:
     """Every pair of rows whose class is the same, ordered by source row, then by target row."""

@@ -1,5 +1,8 @@
 """Matching two descriptions: known answers, symmetries, failures, real scans."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,10 +11,17 @@ from segslam.config import SegregatorConfig
 from segslam.segregator.match import hypotheses, match
 from segslam.types import Description, Label, Registration, Rejected, RejectReason, Transform
 
+NO_ROWS = np.empty((0, 3))
 T_TRUE = geometry.transform(geometry.yaw(2.2), [7.0, -12.0, 0.4])
 
 
-def description(means: np.ndarray, covariances: np.ndarray, classes: np.ndarray) -> Description:
+def description(
+    means: np.ndarray,
+    covariances: np.ndarray,
+    classes: np.ndarray,
+    ground_points: np.ndarray = NO_ROWS,
+    ground_normals: np.ndarray = NO_ROWS,
+) -> Description:
     return Description(
         means=means,
         covariances=covariances,
@@ -21,6 +31,8 @@ def description(means: np.ndarray, covariances: np.ndarray, classes: np.ndarray)
         feature_covariances=np.empty((0, 3, 3)),
         feature_classes=np.empty(0, np.uint8),
         feature_descriptors=np.empty((0, 33)),
+        ground_points=ground_points,
+        ground_normals=ground_normals,
     )
 
 
@@ -33,11 +45,35 @@ def street(seed: int, count: int = 16) -> Description:
 
 def moved(T_a_b: Transform, scan: Description) -> Description:
     R = T_a_b[:3, :3]
-    return description(geometry.apply(T_a_b, scan.means), R @ scan.covariances @ R.T, scan.classes)
+    return description(
+        geometry.apply(T_a_b, scan.means),
+        R @ scan.covariances @ R.T,
+        scan.classes,
+        geometry.apply(T_a_b, scan.ground_points),
+        scan.ground_normals @ R.T,
+    )
+
+
+def grounded(scan: Description, slope: float = 0.02) -> Description:
+    """The same on gently sloping ground, in patches of 4 m."""
+    x, y = np.meshgrid(np.arange(-30.0, 30.0, 4.0), np.arange(-30.0, 30.0, 4.0))
+    points = np.column_stack([x.ravel(), y.ravel(), slope * x.ravel() - 1.7])
+    normal = np.array([-slope, 0.0, 1.0]) / np.hypot(1.0, slope)
+    return replace(scan, ground_points=points, ground_normals=np.tile(normal, (len(points), 1)))
+
+
+def on_no_ground(scan: Description) -> Description:
+    return scan
+
+
+Lay = Callable[[Description], Description]
+LAYS = [on_no_ground, grounded]
 
 
 def permuted(scan: Description, order: np.ndarray) -> Description:
-    return description(scan.means[order], scan.covariances[order], scan.classes[order])
+    return description(
+        scan.means[order], scan.covariances[order], scan.classes[order], scan.ground_points, scan.ground_normals
+    )
 
 
 def seen_again(scan: Description, seed: int, noise_m: float = 0.05, lost: int = 5, new: int = 6) -> Description:
@@ -49,6 +85,8 @@ def seen_again(scan: Description, seed: int, noise_m: float = 0.05, lost: int = 
         np.concatenate([old.means + rng.normal(scale=noise_m, size=old.means.shape), strange.means]),
         np.concatenate([old.covariances, strange.covariances]),
         np.concatenate([old.classes, strange.classes]),
+        old.ground_points,
+        old.ground_normals,
     )
 
 
@@ -87,8 +125,9 @@ def test_noise_and_strangers_leave_the_pose_within_the_noise(gate: str, seed: in
     assert degrees < 0.3
 
 
-def test_swapping_the_scans_inverts_the_pose() -> None:
-    source = street(3)
+@pytest.mark.parametrize("lay", LAYS)
+def test_swapping_the_scans_inverts_the_pose(lay: Lay) -> None:
+    source = lay(street(3))
     target = seen_again(source, 3)
     forth = match(source, target, config=SegregatorConfig())
     back = match(target, source, config=SegregatorConfig())
@@ -96,8 +135,9 @@ def test_swapping_the_scans_inverts_the_pose() -> None:
     assert forth.num_inliers == back.num_inliers
 
 
-def test_moving_the_target_multiplies_the_pose_on_the_left() -> None:
-    source = street(4)
+@pytest.mark.parametrize("lay", LAYS)
+def test_moving_the_target_multiplies_the_pose_on_the_left(lay: Lay) -> None:
+    source = lay(street(4))
     target = seen_again(source, 4)
     T_new_old = geometry.exp(geometry.tangent(rotation_rad=[0.3, -0.2, 1.0], translation_m=[5.0, 6.0, 7.0]))
     before = match(source, target, config=SegregatorConfig())
@@ -105,8 +145,9 @@ def test_moving_the_target_multiplies_the_pose_on_the_left() -> None:
     assert np.allclose(after.T_target_source, T_new_old @ before.T_target_source, atol=1e-6)
 
 
-def test_order_of_clusters_changes_nothing() -> None:
-    source = street(5)
+@pytest.mark.parametrize("lay", LAYS)
+def test_order_of_clusters_changes_nothing(lay: Lay) -> None:
+    source = lay(street(5))
     target = seen_again(source, 5)
     rng = np.random.default_rng(0)
     before = match(source, target, config=SegregatorConfig())
@@ -167,7 +208,41 @@ def test_scans_of_different_places_have_a_small_clique() -> None:
     assert outcome.reason is RejectReason.SMALL_CLIQUE
 
 
-def test_clusters_on_a_line_are_degenerate() -> None:
+def test_clusters_on_a_line_are_degenerate_but_for_the_ground() -> None:
     scan = street(12)
     row = description(scan.means * [1.0, 0.0, 0.0], scan.covariances, scan.classes)
     assert match(row, row, config=SegregatorConfig()).reason is RejectReason.DEGENERATE
+    on_ground = grounded(row)
+    registration = match(on_ground, moved(T_TRUE, on_ground), config=SegregatorConfig())
+    assert np.allclose(registration.T_target_source, T_TRUE, atol=1e-6)
+
+
+def test_ground_keeps_a_level_scene_from_being_turned_over() -> None:
+    """Clusters on one level fit their mirror image upside down as well as themselves."""
+    scan = street(13)
+    level = grounded(description(scan.means * [1.0, 1.0, 0.0], scan.covariances, scan.classes), slope=0.0)
+    for registration in hypotheses(level, moved(T_TRUE, level), config=SegregatorConfig(certain_inliers=1000)):
+        assert (registration.T_target_source @ geometry.inverse(T_TRUE))[2, 2] > 0.9
+
+
+def test_repeated_structure_gives_several_different_hypotheses_with_the_truth_first() -> None:
+    """A row of like trees fits itself when moved on by one tree; one more thing tells which is right."""
+    trees = np.array(
+        [[8.0 * k, 0.0, 0.0] for k in range(6)] + [[8.0 * k, 9.0, 0.0] for k in range(6)] + [[3.0, 4.0, 0.0]]
+    )
+    scan = grounded(description(trees, np.tile(0.01 * np.eye(3), (13, 1, 1)), np.full(13, Label.TRUNK)), slope=0.0)
+    ranked = hypotheses(scan, moved(T_TRUE, scan), config=SegregatorConfig(certain_inliers=1000))
+    assert np.allclose(ranked[0].T_target_source, T_TRUE, atol=1e-6)
+    for k, one in enumerate(ranked):
+        for other in ranked[:k]:
+            assert error(one, other.T_target_source) > (0.5, 2.0) or error(one, other.T_target_source)[1] > 2.0
+
+
+@pytest.mark.parametrize("solver", ["gaussians", "joint", "decoupled"])
+@pytest.mark.parametrize("rotation", ["full", "yaw"])
+def test_every_solver_finds_the_pose(solver: str, rotation: str) -> None:
+    source = street(14)
+    config = SegregatorConfig(solver=solver, rotation=rotation)
+    metres, degrees = error(match(source, seen_again(source, 14), config=config), T_TRUE)
+    assert metres < 0.15
+    assert degrees < 0.6

@@ -13,7 +13,9 @@ from segslam import geometry
 from segslam.config import SegregatorConfig
 from segslam.segregator.solver import (
     PoseFit,
+    point_information,
     rotation_between,
+    solve_level,
     solve_pose,
     tls_weights,
     vote,
@@ -138,6 +140,54 @@ def test_vote_is_the_mean_of_the_larger_group() -> None:
 
 def test_vote_of_one_value_is_that_value() -> None:
     assert vote(np.array([3.5]), bound_m=0.2) == pytest.approx(3.5)
+
+
+def test_level_pose_turns_up_into_up_and_needs_no_more_than_places_seen_from_above() -> None:
+    rng = np.random.default_rng(5)
+    T_true = random_pose(rng)
+    source = rng.uniform(-30, 30, size=(8, 3)) * [1.0, 0.0, 0.0]
+    up = np.array([0.0, 0.0, 1.0])
+    T_found = solve_level(source, geometry.apply(T_true, source), up, T_true[:3, 2], bound_m=BOUND_M,
+                          config=SegregatorConfig())  # fmt: skip
+    assert np.allclose(T_found, T_true, atol=1e-9)
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1.0], [0, 0, -1.0], [0.6, 0, 0.8], [0, -1.0, 0]])
+def test_level_pose_takes_any_direction_for_up(up: list[float]) -> None:
+    points = np.random.default_rng(8).uniform(-30, 30, size=(8, 3))
+    T_found = solve_level(points, points, np.array(up), np.array(up), bound_m=BOUND_M, config=SegregatorConfig())
+    assert np.allclose(T_found, np.eye(4), atol=1e-9)
+
+
+def test_level_pose_takes_its_height_from_the_inliers_in_the_middle() -> None:
+    source = np.random.default_rng(6).uniform(-30, 30, size=(9, 3))
+    target = source + np.array([0.0, 0.0, 2.0])
+    target[:3, 2] += [5.0, -4.0, 0.7]
+    up = np.array([0.0, 0.0, 1.0])
+    T_found = solve_level(source, target, up, up, bound_m=BOUND_M, config=SegregatorConfig())
+    assert np.allclose(T_found, geometry.transform(np.eye(3), [0.0, 0.0, 2.0]), atol=1e-9)
+
+
+def test_level_pose_of_one_place_is_degenerate() -> None:
+    tower = np.array([[1.0, 2.0, z] for z in (0.0, 3.0, 7.0)])
+    up = np.array([0.0, 0.0, 1.0])
+    outcome = solve_level(tower, tower, up, up, bound_m=BOUND_M, config=SegregatorConfig())
+    assert outcome.reason is RejectReason.DEGENERATE
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1.0], [0.6, 0, 0.8], [0, -1.0, 0]])
+def test_information_of_points_is_that_of_their_jacobians(up: list[float]) -> None:
+    """By numerical differentiation of T exp(xi) a."""
+    rng = np.random.default_rng(7)
+    source, T_any, step = rng.normal(size=(4, 3)) + up, random_pose(rng), 1e-6
+    columns = []
+    for axis in range(6):
+        xi = np.zeros(6)
+        xi[axis] = step
+        shift = geometry.apply(T_any @ geometry.exp(xi), source) - geometry.apply(T_any @ geometry.exp(-xi), source)
+        columns.append(shift.ravel() / (2 * step))
+    J = np.stack(columns, axis=1)
+    assert np.allclose(point_information(source, sigma_m=0.5), J.T @ J / 0.25, atol=1e-5)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)

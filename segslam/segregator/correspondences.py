@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
-from segslam.types import Covariances, Description, IndexPairs, Indices, Label, Labels, Points, Vector
+from segslam.types import Covariances, Description, IndexPairs, Indices, Label, Labels, Points
 
 Descriptors = Float[np.ndarray, "_ 33"]
-BLOCK_ROWS = 1024
-"""Chosen: of a distance matrix made at a time, so that 5,000 descriptors take 40 MB and not 200."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +49,9 @@ def mutual_nearest(source: Descriptors, target: Descriptors) -> IndexPairs:
     """
     if len(source) == 0 or len(target) == 0:
         return np.empty((0, 2), np.int64)
-    nearest_target, squared = _nearest(source, target)
-    nearest_source, _ = _nearest(target, source)
+    nearest_target, squared, nearest_source = _nearest_both_ways(
+        source.astype(np.float64), np.ascontiguousarray(target.T, np.float64)
+    )
     rows = np.arange(len(source))
     mutual = nearest_source[nearest_target] == rows
     pairs = np.column_stack([rows, nearest_target])[mutual]
@@ -70,31 +70,9 @@ def tuple_test(
     if num_pairs < 3:
         return np.empty(0, np.int64)
     triples = rng.integers(num_pairs, size=(trials_per_pair * num_pairs, 3))
-    source_edges, target_edges = _triangle_edges(source[triples]), _triangle_edges(target[triples])
-    shorter, longer = np.minimum(source_edges, target_edges), np.maximum(source_edges, target_edges)
-    return np.unique(triples[np.all(shorter > similarity * longer, axis=1)])
-
-
-def _nearest(queries: Descriptors, descriptors: Descriptors) -> tuple[Indices, Vector]:
-    """Row of the nearest descriptor to each query, and the squared distance to it.
-
-    By matrix products, a block of queries at a time: at 33 dimensions a search tree visits nearly every leaf.
-    """
-    transposed = descriptors.astype(np.float64).T
-    squared_norms = np.sum(transposed**2, axis=0)
-    nearest, squared = np.empty(len(queries), np.int64), np.empty(len(queries))
-    for start in range(0, len(queries), BLOCK_ROWS):
-        block = queries[start : start + BLOCK_ROWS].astype(np.float64)
-        partial = squared_norms - 2.0 * (block @ transposed)
-        best = np.argmin(partial, axis=1)
-        nearest[start : start + BLOCK_ROWS] = best
-        squared[start : start + BLOCK_ROWS] = partial[np.arange(len(block)), best] + np.sum(block**2, axis=1)
-    return nearest, squared
-
-
-def _triangle_edges(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Lengths of the three edges; a corner drawn twice gives a zero, which never passes."""
-    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    return np.flatnonzero(
+        _in_similar_triangles(source.astype(np.float64), target.astype(np.float64), triples, similarity)
+    )
 
 
 def cluster_correspondences(source: Description, target: Description) -> Correspondences:
@@ -150,3 +128,44 @@ def _gaussians(description: Description) -> tuple[Points, Covariances]:
     means = np.concatenate([description.means, description.feature_points])
     covariances = np.concatenate([description.covariances, description.feature_covariances])
     return means.astype(np.float64), covariances.astype(np.float64)
+
+
+@njit("boolean[::1](float64[:, ::1], float64[:, ::1], int64[:, ::1], float64)", cache=True, nogil=True)
+def _in_similar_triangles(source, target, triples, similarity):
+    """Which rows belong to a triple that passes. A row drawn twice makes an edge of length 0, which never passes."""
+    passed = np.zeros(len(source), np.bool_)
+    for row in range(len(triples)):
+        similar = True
+        for corner in range(3):
+            i, j = triples[row, corner], triples[row, (corner + 1) % 3]
+            a = np.sqrt(np.sum((source[i] - source[j]) ** 2))
+            b = np.sqrt(np.sum((target[i] - target[j]) ** 2))
+            similar &= min(a, b) > similarity * max(a, b)
+        if similar:
+            passed[triples[row]] = True
+    return passed
+
+
+@njit("Tuple((int64[::1], float64[::1], int64[::1]))(float64[:, ::1], float64[:, ::1])", cache=True, nogil=True)
+def _nearest_both_ways(source, target_columns):
+    """Column of the nearest target to each source, the squared distance to it, and the nearest source to each target.
+
+    Brute force, a row at a time: at 33 dimensions a search tree visits nearly every leaf, and products of small
+    matrices lose more to the threads of the linear algebra library than they gain.
+    """
+    count, width = len(source), target_columns.shape[1]
+    nearest_target, squared = np.empty(count, np.int64), np.empty(count)
+    nearest_source, least = np.zeros(width, np.int64), np.full(width, np.inf)
+    row = np.empty(width)
+    for i in range(count):
+        row[:] = 0.0
+        for k in range(source.shape[1]):
+            value, column = source[i, k], target_columns[k]
+            for j in range(width):
+                row[j] += (column[j] - value) ** 2
+        nearest_target[i] = np.argmin(row)
+        squared[i] = row[nearest_target[i]]
+        for j in range(width):
+            if row[j] < least[j]:
+                nearest_source[j], least[j] = i, row[j]
+    return nearest_target, squared, nearest_source

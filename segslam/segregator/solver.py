@@ -212,8 +212,12 @@ def _axis_sigma(squared: Vector, bound_m: float) -> float:
 
 
 def _to_vertical(up: Direction) -> Rotation:
-    """The smallest rotation that turns a unit vector into +z."""
-    return geometry.nearest_rotation(np.eye(3) + np.outer([0.0, 0.0, 1.0], up))
+    """The smallest rotation that turns a unit vector into +z; about x where that is a half turn."""
+    axis = np.array([up[1], -up[0], 0.0])  # up x z
+    sine = float(np.linalg.norm(axis))
+    axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+    turn = geometry.tangent(rotation_rad=axis * math.atan2(sine, up[2]), translation_m=0.0)
+    return geometry.exp(turn)[:3, :3]
 
 
 def _fixes_rotation(points: Points, bound_m: float, config: SegregatorConfig) -> bool:

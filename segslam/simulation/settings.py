@@ -51,16 +51,16 @@ class SensorConfig(Section):
         0.03, ge=-1, le=1, description="leftover error of all vertical angles: the points lie too low by it (degrees)"
     )
     axis_wander_sigma_deg: float = Field(
-        0.12,
+        0.08,
         ge=0,
         description="slowly changing error of all vertical angles, and of azimuth ahead and behind (degrees)",
     )
     axis_wander_s: float = Field(15.0, gt=0, description="time in which that error changes (s)")
     sweep_rotation_sigma_deg: float = Field(
-        0.3, ge=0, description="turn within one sweep that nobody compensated (degrees)"
+        0.2, ge=0, description="turn within one sweep that nobody compensated (degrees)"
     )
     sweep_translation_sigma_m: float = Field(
-        0.05, ge=0, description="translation within one sweep that nobody compensated (m)"
+        0.03, ge=0, description="translation within one sweep that nobody compensated (m)"
     )
     sweep_correlation_s: float = Field(0.5, gt=0, description="time in which that motion changes (s)")
 

@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.exceptions import McapError
 
+from segslam.datasets.mcap_clouds import McapClouds
+from segslam.datasets.point_cloud2 import CloudReader
 from segslam.datasets.scans import ASSUMED_PERIOD_NS, make_scan, read_stamps, selected_rows, usable_scans
 from segslam.semantics.encodings import Encoding
 from segslam.semantics.label_files import LabelSource, open_labels
@@ -20,13 +23,14 @@ from segslam.types import BadScan, Indices, Scan, SegslamError, Trajectory, Vect
 
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
 READ_IN_ORDER = ("mcap", "rosbag")
-"""Recordings that kiss_icp reads message by message: it gives the next scan, whichever is asked for."""
+"""Recordings that are read message by message: the reader gives the next scan, whichever is asked for."""
 LOADER_ERRORS = (
     ArithmeticError,
     AssertionError,
     AttributeError,
     ImportError,
     LookupError,
+    McapError,
     OSError,
     RuntimeError,
     StopIteration,
@@ -34,7 +38,7 @@ LOADER_ERRORS = (
     TypeError,
     ValueError,
 )
-"""What kiss_icp's readers end in when data are missing or broken."""
+"""What readers end in when data are missing or broken."""
 
 
 class Recording:
@@ -57,6 +61,9 @@ class Recording:
         self._source = source
         self._loader = loader
         self._in_order = kind in READ_IN_ORDER
+        self._clouds = CloudReader()
+        if self._in_order:
+            loader.read_point_cloud = self._clouds
         self._next = 0
         self._stamps = _whole_stamps(beside / "times.txt", len(loader)) if kind == "generic" else None
         self.scan_index = selected_rows(np.arange(len(loader)), frames, source)
@@ -105,6 +112,8 @@ class Recording:
         """Of the scan, which has been read: some readers know it only then."""
         if self._stamps is not None:
             return int(self._stamps[index])
+        if self._clouds.stamp_ns:
+            return self._clouds.stamp_ns
         if not hasattr(self._loader, "get_frames_timestamps"):
             return index * ASSUMED_PERIOD_NS
         seconds = self._loader.get_frames_timestamps()[-1 if self._in_order else index]
@@ -151,7 +160,8 @@ def open_recording(
     try:
         with contextlib.redirect_stdout(said), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of kiss_icp's sources, which it parses to find its readers
-            loader = dataset_factory(kind, source, sequence=sequence, topic=topic)
+            own = kind == "mcap"
+            loader = McapClouds(source, topic) if own else dataset_factory(kind, source, sequence=sequence, topic=topic)
             num_scans = len(loader)
     except LOADER_ERRORS as error:
         complaint = " ".join(said.getvalue().split()) or _reason(error)

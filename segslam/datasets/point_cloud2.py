@@ -1,0 +1,47 @@
+"""ROS's PointCloud2 messages as points and times, in step with each other."""
+
+from typing import Any
+
+import numpy as np
+
+from segslam.types import Points, Vector
+
+TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time")
+"""What drivers (Ouster, Velodyne, Hesai, Robosense, Livox) call the time of a point, in whatever unit."""
+KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""sensor_msgs/PointField's numbers."""
+
+
+class CloudReader:
+    """Takes the place of kiss_icp's function, which puts times out of step where a cloud has a NaN among its points."""
+
+    def __init__(self) -> None:
+        self.stamp_ns = 0
+        """Of the last message's header; 0 if it had none."""
+
+    def __call__(self, message: Any) -> tuple[Points, Vector]:
+        """Points and times of a message, a row for each point, NaN where nothing returned; no times if it has none.
+
+        Raises KeyError, TypeError or ValueError for a message that contradicts itself or has no x, y, z.
+        """
+        stamp = message.header.stamp
+        self.stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        rows = _rows(message)
+        points = np.column_stack([rows[axis].ravel() for axis in "xyz"]).astype(np.float64)
+        time_field = next((field.name for field in message.fields if field.name in TIME_FIELDS), None)
+        return points, rows[time_field].ravel().astype(np.float64) if time_field else np.empty(0)
+
+
+def _rows(message: Any) -> np.ndarray:
+    """(height, width) points with the fields of the message."""
+    order = ">" if message.is_bigendian else "<"
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in message.fields],
+            "formats": [order + KINDS[field.datatype] for field in message.fields],
+            "offsets": [field.offset for field in message.fields],
+            "itemsize": message.point_step,
+        }
+    )
+    shape, strides = (message.height, message.width), (message.row_step, message.point_step)
+    return np.ndarray(shape, dtype, buffer=message.data, strides=strides)

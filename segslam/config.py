@@ -124,18 +124,20 @@ class SegregatorConfig(Section):
     foot_max_distance_m: float = Field(10.0, gt=0, description="the ground is looked for as far as this (m)")
     dcvc_start_radius_m: float = Field(0.35, ge=0.01, description="first radial bin of DCVC (A) (m)")
     dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (A) (m)")
-    dcvc_angle_deg: float = Field(1.2, ge=0.1, le=90, description="pitch and azimuth bin of DCVC (A) (degrees)")
+    dcvc_angle_deg: float = Field(
+        1.2, ge=0.1, le=90, description="pitch and azimuth bin of DCVC (A); no narrower than beams are apart (degrees)"
+    )
     min_range_m: float = Field(0.5, ge=0, description="nearest point clustered (A) (m)")
     max_range_m: float = Field(120.0, gt=0, le=1000, description="farthest point clustered (A) (m)")
     feature_classes: tuple[StaticLabel, ...] = Field(
         (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points (P: L_F)"
     )
-    feature_voxel_m: float = Field(0.5, ge=0.01, description="voxel of the class clouds (A) (m)")
-    normal_radius_m: float = Field(1.0, gt=0, description="neighbourhood of normals (A) (m)")
-    feature_radius_m: float = Field(2.5, gt=0, description="neighbourhood of FPFH (A) (m)")
-    patch_radius_m: float = Field(1.0, gt=0, description="neighbourhood of a key point's Gaussian (A) (m)")
+    feature_voxel_m: float = Field(0.35, ge=0.01, description="voxel of the class clouds (A: 0.5) (m)")
+    normal_radius_m: float = Field(0.7, gt=0, description="neighbourhood of normals (A: 1.0) (m)")
+    feature_radius_m: float = Field(2.0, gt=0, description="neighbourhood of FPFH (A: 2.5) (m)")
+    patch_radius_m: float = Field(0.7, gt=0, description="neighbourhood of a key point's Gaussian (A: 1.0) (m)")
     max_features_per_class: int = Field(
-        500, ge=1, description="key points of a class: those with most neighbours; 1,000 in all take 180 kB"
+        750, ge=1, description="key points of a class: those with most neighbours; 1,500 in all take 175 kB"
     )
     tuple_similarity: float = Field(0.95, gt=0, lt=1, description="edge ratio of the tuple test (A)")
     tuple_trials_per_pair: int = Field(100, ge=1, description="random triples drawn for each mutual pair (A)")
@@ -143,7 +145,7 @@ class SegregatorConfig(Section):
     features: Literal["always", "when_few_clusters", "never"] = Field(
         "when_few_clusters", description="when a scan is given FPFH key points"
     )
-    few_clusters: int = Field(12, ge=0, description="fewer clusters than this are few")
+    few_clusters: int = Field(24, ge=0, description="fewer clusters than this are few")
     gate: Literal["published", "invariant", "lengths"] = Field(
         "invariant", description="G-TRIM as published, with eigenvalues (rotation-invariant), or lengths only (Segator)"
     )
@@ -167,6 +169,9 @@ class SegregatorConfig(Section):
     centroid_noise_m: float = Field(0.07, gt=0, description="a centroid's noise in each direction (m)")
     centroid_noise_share: float = Field(
         0.35, ge=0, description="and as a share of its cluster's standard deviation in that direction"
+    )
+    shared_noise_m: float = Field(
+        0.025, ge=0, description="noise that all share, being seen from one side; in the information alone (m)"
     )
     ground_noise_m: float = Field(0.1, gt=0, description="noise of the distance of two patches of the ground (m)")
     ground_weight: float = Field(0.3, ge=0, description="weight of such a distance: neighbours err alike")
@@ -203,8 +208,8 @@ class VerifyConfig(Section):
     min_overlap: float = Field(0.3, ge=0, le=1, description="share of points that meet the other surface")
     inlier_m: float = Field(0.5, gt=0, description="a point this near the other surface meets it (m)")
     max_range_m: float = Field(50.0, gt=0, description="points farther from the other sensor are out of its reach (m)")
-    max_rms_m: float = Field(0.135, gt=0, description="of the points that meet, to the other surface's planes (m)")
-    max_free_space_violation: float = Field(0.02, ge=0, le=1, description="share of points in space seen empty")
+    max_rms_m: float = Field(0.17, gt=0, description="of the points that meet, to the other surface's planes (m)")
+    max_free_space_violation: float = Field(0.025, ge=0, le=1, description="share of points in space seen empty")
     free_space_margin_m: float = Field(1.0, gt=0, description="a point this far before a return violates it (m)")
     free_space_margin_ratio: float = Field(0.02, ge=0, description="and this much more per metre of range")
     max_coarse_fine_m: float = Field(2.0, gt=0, description="farthest that refinement may move (m)")

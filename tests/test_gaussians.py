@@ -113,6 +113,16 @@ def test_ground_levels_what_clusters_of_uncertain_height_tilt() -> None:
     assert errors[1] < 0.3 * errors[0]
 
 
+def test_shared_noise_bounds_what_the_information_claims_of_the_translation() -> None:
+    source = scan(trees(4, count=60), flat_ground())
+    sigma = {}
+    for noise_m in (0.0, 0.5):
+        fit = align(source, source, np.eye(4), SegregatorConfig(shared_noise_m=noise_m))
+        sigma[noise_m] = np.sqrt(np.diagonal(np.linalg.inv(fit.information)))
+    assert np.allclose(sigma[0.5][:3], sigma[0.0][:3], rtol=1e-6)
+    assert np.allclose(sigma[0.5][3:], np.hypot(sigma[0.0][3:], 0.5), rtol=1e-6)
+
+
 def test_far_fewer_pairs_than_a_clique_needs_are_rejected() -> None:
     source = scan(trees(3), flat_ground())
     elsewhere = geometry.transform(np.eye(3), [500.0, 0.0, 0.0])

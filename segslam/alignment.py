@@ -107,24 +107,31 @@ def _sharpened(
     """One hypothesis, refined and verified."""
     if coarse.num_inliers < config.verify.min_inliers:
         return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {config.verify.min_inliers}")
+    scans = (source.surface, source.view), (target.surface, target.view)
+    with watch("verify"):
+        if hopeless := verify.early_rejection(*scans, coarse.T_target_source, config=config.verify):
+            return hopeless
     with watch("refine"):
         fine = refine.refine(source.surface, target.surface, coarse.T_target_source, config=config.refine)
     if isinstance(fine, Rejected):
         return fine
     with watch("verify"):
-        return _verified(source, target, coarse, fine, config=config.verify)
+        return _verified(*scans, coarse, fine, config=config.verify)
 
 
 def _verified(
-    source: PreparedScan, target: PreparedScan, coarse: Registration, fine: Registration, *, config: VerifyConfig
+    source: tuple[refine.Surface, verify.View],
+    target: tuple[refine.Surface, verify.View],
+    coarse: Registration,
+    fine: Registration,
+    *,
+    config: VerifyConfig,
 ) -> Alignment | Rejected:
     moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ fine.T_target_source)
     if moved_m > config.max_coarse_fine_m:
         detail = f"moved {moved_m:.2f} m > {config.max_coarse_fine_m} m"
         return Rejected(RejectReason.REFINEMENT_DIVERGED, detail)
-    found = verify.agreement(
-        (source.surface, source.view), (target.surface, target.view), fine.T_target_source, config=config
-    )
+    found = verify.agreement(source, target, fine.T_target_source, config=config)
     return verify.rejection(found, config=config) or Alignment(
         coarse=coarse,
         fine=fine,

@@ -133,9 +133,8 @@ class SegregatorConfig(Section):
         (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points (P: L_F)"
     )
     feature_voxel_m: float = Field(0.35, ge=0.01, description="voxel of the class clouds (A: 0.5) (m)")
-    normal_radius_m: float = Field(0.7, gt=0, description="neighbourhood of normals (A: 1.0) (m)")
+    normal_radius_m: float = Field(0.7, gt=0, description="of the patch that gives a point's normal and Gaussian (A: 1.0) (m)")
     feature_radius_m: float = Field(2.0, gt=0, description="neighbourhood of FPFH (A: 2.5) (m)")
-    patch_radius_m: float = Field(0.7, gt=0, description="neighbourhood of a key point's Gaussian (A: 1.0) (m)")
     max_features_per_class: int = Field(
         750, ge=1, description="key points of a class: those with most neighbours; 1,500 in all take 175 kB"
     )

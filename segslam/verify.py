@@ -92,6 +92,18 @@ def free_space_violation(points: Points, seen: View, T_view_points: Transform, *
     return num_violations / num_seen if num_seen else 0.0
 
 
+def early_rejection(
+    source: tuple[Surface, View], target: tuple[Surface, View], T_target_source: Transform, *, config: VerifyConfig
+) -> Rejected | None:
+    """Rejects a coarse pose that violates twice the free space allowed: no refinement mends that. Takes 1 ms."""
+    forth = free_space_violation(source[0].points, target[1], T_target_source, config=config)
+    back = free_space_violation(target[0].points, source[1], geometry.inverse(T_target_source), config=config)
+    allowed = 2 * config.max_free_space_violation
+    if max(forth, back) > allowed:
+        return Rejected(RejectReason.FREE_SPACE_VIOLATED, f"{max(forth, back):.4f} > {allowed} before refinement")
+    return None
+
+
 def rejection(found: Agreement, *, config: VerifyConfig) -> Rejected | None:
     """The first test that an alignment fails, in the order of the pipeline; None if it stands."""
     if found.overlap < config.min_overlap:

@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "segslam"
 LAYERS = (  # top first; a room is a module or a folder
     {"cli"},
     {"experiments", "report"},
-    {"runs", "results"},
+    {"runs", "results", "viewer"},
     {"slam", "log", "run_files", "map", "evaluation"},
     {"alignment"},
     {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "simulation"},
@@ -19,7 +19,7 @@ LAYERS = (  # top first; a room is a module or a folder
     {"types", "config"},
 )  # fmt: skip
 BOTTOM = {"types", "config"}  # config names the classes of types
-FOREIGN = {"gtsam": {"pose_graph"}, "mcap": {"log", "datasets"}, "small_gicp": {"refine", "experiments"}}
+FOREIGN = {"gtsam": {"pose_graph"}, "mcap": {"log", "datasets"}, "small_gicp": {"refine", "experiments"}, "rerun": {"viewer", "cli"}}
 
 
 def _room(parts: tuple[str, ...]) -> str:

@@ -2,15 +2,17 @@
 
 import typer
 
-from segslam.cli import evaluate, map, optimize, register, replay, report, simulate
+from segslam.cli import demo, evaluate, map, optimize, register, replay, report, simulate, view
 
 
 def add_all(app: typer.Typer) -> None:
     """Add every command to the application."""
     app.command("eval")(evaluate.evaluate)
+    app.command("demo")(demo.demo)
     app.command("map")(map.map_command)
     app.command("optimize")(optimize.optimize)
     app.command("register", cls=register.LabelsCommand)(register.register)
     app.command("replay")(replay.replay)
     app.command("report")(report.report)
     app.command("simulate")(simulate.simulate)
+    app.command("view")(view.view)

@@ -12,7 +12,7 @@ MESSAGE = "sensor_msgs/msg/PointCloud2"
 
 
 class McapClouds:
-    """Read in order, like kiss_icp's reader, whose place it takes: that one fails on what mcap-ros2-support 0.6 decodes.
+    """Read in order. Takes the place of kiss_icp's reader, which fails on what mcap-ros2-support 0.6 decodes.
 
     Raises ValueError if the file has no index or no such topic, ImportError if the package that decodes is missing.
     """

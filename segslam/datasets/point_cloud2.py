@@ -13,7 +13,7 @@ KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 class CloudReader:
-    """Takes the place of kiss_icp's function, which puts times out of step where a cloud has a NaN among its points."""
+    """Takes the place of kiss_icp's function, which puts times out of step where a cloud holds a NaN."""
 
     def __init__(self) -> None:
         self.stamp_ns = 0

@@ -1,0 +1,90 @@
+"""The steps of a run in Rerun's viewer: trajectory, clouds, loops coloured by their outcome, times and memory."""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import rerun as rr
+
+from segslam import geometry
+from segslam.log.drawing import ACCEPTED_COLOR, REJECTED_COLORS
+from segslam.types import GraphEstimate, Keyframe, LoopAttempt, Rejected, Step, Transform
+
+WORLD, LIDAR = "world", "world/lidar"
+CORRECTED_COLOR, ODOMETRY_COLOR = "#00a0ff", "#ff9000"
+
+
+def show(steps: Iterable[Step], viewer: rr.RecordingStream, *, view_every: int) -> Iterator[Step]:
+    """Log each step and hand it on; of the points of a keyframe every `view_every`-th."""
+    scene = _Scene(viewer, view_every)
+    for step in steps:
+        scene.add(step)
+        yield step
+    scene.draw_paths()
+
+
+class _Scene:
+    def __init__(self, viewer: rr.RecordingStream, view_every: int) -> None:
+        self._viewer = viewer
+        self._view_every = view_every
+        self._T_odom_keyframe: list[Transform] = []
+        self._T_world_keyframe: list[Transform] = []
+        self._T_world_odom = np.eye(4)
+        viewer.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def add(self, step: Step) -> None:
+        self._viewer.set_time("scan", sequence=step.scan_index)
+        self._viewer.set_time("data", timestamp=np.datetime64(step.stamp_ns, "ns"))
+        if step.keyframe is not None:
+            self._add_keyframe(step.keyframe)
+        if step.estimate is not None:
+            self._correct(step.estimate)
+        self._viewer.log(LIDAR, _pose(self._T_world_odom @ step.T_odom_lidar), rr.TransformAxes3D(3.0))
+        for attempt in step.attempts:
+            self._add_attempt(attempt)
+        for stage, seconds in step.stage_seconds.items():
+            self._viewer.log(f"stage_ms/{stage}", rr.Scalars(1000 * seconds))
+
+    def draw_paths(self) -> None:
+        """Both paths through the keyframes so far."""
+        for name, poses, color in (
+            ("trajectory", self._T_world_keyframe, CORRECTED_COLOR),
+            ("odometry", self._T_odom_keyframe, ODOMETRY_COLOR),
+        ):
+            positions = [T_world_keyframe[:3, 3] for T_world_keyframe in poses]
+            self._viewer.log(f"{WORLD}/{name}", rr.LineStrips3D([positions], colors=[_rgb(color)]))
+
+    def _add_keyframe(self, keyframe: Keyframe) -> None:
+        entity = f"{WORLD}/keyframes/{keyframe.id}"
+        self._T_odom_keyframe.append(keyframe.T_odom_keyframe)
+        self._T_world_keyframe.append(self._T_world_odom @ keyframe.T_odom_keyframe)
+        some = slice(None, None, self._view_every)
+        self._viewer.log(entity, rr.Points3D(keyframe.points[some], class_ids=keyframe.labels[some], radii=0.05))
+        self._viewer.log(entity, _pose(self._T_world_keyframe[-1]))
+
+    def _correct(self, estimate: GraphEstimate) -> None:
+        """Move the clouds to where the graph has their keyframes now."""
+        for keyframe_id, T_world_keyframe in estimate.T_world_keyframe.items():
+            self._T_world_keyframe[keyframe_id] = T_world_keyframe
+            self._viewer.log(f"{WORLD}/keyframes/{keyframe_id}", _pose(T_world_keyframe))
+        self._T_world_odom = self._T_world_keyframe[-1] @ geometry.inverse(self._T_odom_keyframe[-1])
+        self.draw_paths()
+
+    def _add_attempt(self, attempt: LoopAttempt) -> None:
+        candidate, outcome = attempt.candidate, attempt.outcome
+        ids = (candidate.source_id, candidate.target_id)
+        rejected = isinstance(outcome, Rejected)
+        color = REJECTED_COLORS[outcome.reason] if isinstance(outcome, Rejected) else ACCEPTED_COLOR
+        told = f"{outcome.reason}: {outcome.detail}" if isinstance(outcome, Rejected) else "accepted"
+        ends = [self._T_world_keyframe[keyframe_id][:3, 3] for keyframe_id in ids]
+        self._viewer.log(
+            f"{WORLD}/loops/{'rejected' if rejected else 'accepted'}/{ids[0]}-{ids[1]}",
+            rr.LineStrips3D([ends], colors=[_rgb(color)], labels=[told], show_labels=False),
+        )
+
+
+def _pose(T_world_child: Transform) -> rr.Transform3D:
+    return rr.Transform3D(translation=T_world_child[:3, 3], mat3x3=T_world_child[:3, :3])
+
+
+def _rgb(color: str) -> list[int]:
+    return list(bytes.fromhex(color[1:7]))

@@ -1,0 +1,50 @@
+"""What a viewer is given of a run; and that its absence is told."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from made_logs import made_steps, write_log
+
+from segslam import cli
+from segslam.types import Step
+
+pytest.importorskip("rerun")
+
+
+def run(*arguments: object) -> int:
+    """Exit status of a command line."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def steps() -> list[Step]:
+    return list(made_steps(60))
+
+
+def test_a_run_is_saved_for_rerun_with_its_clouds_paths_and_loops(steps: list[Step], tmp_path: Path) -> None:
+    write_log(tmp_path / "log.mcap", steps)
+    assert run("view", tmp_path, "--save", tmp_path / "run.rrd", "--quiet") == 0
+    entities = _entities(tmp_path / "run.rrd")
+    attempts = [attempt for step in steps for attempt in step.attempts]
+    keyframes = {f"/world/keyframes/{step.keyframe.id}" for step in steps if step.keyframe is not None}
+    assert keyframes <= entities
+    assert sum(entity.startswith("/world/loops/") for entity in entities) == len(attempts)
+    assert {"/world/trajectory", "/world/odometry", "/world/lidar", "/stage_ms/odometry"} <= entities
+
+
+def _entities(file: Path) -> set[str]:
+    command = [sys.executable, "-m", "rerun", "rrd", "stats", str(file)]
+    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return {line.partition(":")[0] for line in listed.splitlines() if line.startswith("/")}
+
+
+def test_without_the_viewer_one_line_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert run("view", tmp_path) == 2
+    assert "pip install 'segslam[viewer]'" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """What Foxglove finds in a log, and what the layout makes of it."""
 
 import json
+import resource
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ def test_own_messages_agree_with_the_json_schemas_in_the_file(steps: list[Step],
             if found.encoding == "jsonschema":
                 jsonschema.validate(json.loads(message.data), json.loads(found.data))
                 topics.add(channel.topic)
-    assert topics == {schema.STEP, schema.ESTIMATE, schema.RESULT, schema.REFERENCE}
+    assert topics == {schema.STEP, schema.ESTIMATE, schema.RESULT, schema.REFERENCE, schema.MEMORY}
 
 
 def test_fields_left_out_of_the_json_exist() -> None:
@@ -161,3 +162,12 @@ def test_the_layout_plots_numbers_that_the_log_has() -> None:
             values = values["properties"].get(name) or values["additionalProperties"]
             values = values["items"] if is_array else values
         assert values["type"] in {"number", "integer"}
+
+
+def test_memory_at_each_step_is_what_the_process_holds(steps: list[Step], whole: Path) -> None:
+    with whole.open("rb") as stream:
+        values = [
+            json.loads(message.data)["rss_mb"] for _, _, message in make_reader(stream).iter_messages(["/memory"])
+        ]
+    assert len(values) == len(steps)
+    assert 10 < values[-1] <= resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 + 1

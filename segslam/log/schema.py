@@ -13,6 +13,8 @@ STEP = "/step"
 """segslam.Step (JSON): all of a step but what `records.BULK` names, written after all other messages of the step."""
 ESTIMATE = "/estimate"
 """segslam.Estimate (JSON): what an optimisation gave, and the keyframes whose poses the /trajectory before it holds."""
+MEMORY = "/memory"
+"""segslam.Memory (JSON): `rss_mb`, what the process held at each step, where the system tells it."""
 RESULT = "/result"
 """segslam.Result (JSON): the trajectory of every scan, once, after the last step and the last estimate."""
 REFERENCE = "/reference"
@@ -56,6 +58,7 @@ def json_schemas() -> dict[str, dict[str, Any]]:
     return {
         STEP: codec(Step).schema | {"title": "segslam.Step"},
         ESTIMATE: estimate | {"title": "segslam.Estimate"},
+        MEMORY: {"title": "segslam.Memory", "type": "object", "properties": {"rss_mb": {"type": "number"}}},
         RESULT: codec(Trajectory).schema | {"title": "segslam.Result"},
         REFERENCE: codec(Trajectory).schema | {"title": "segslam.Reference"},
     }

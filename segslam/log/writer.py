@@ -2,6 +2,7 @@
 
 import json
 import platform
+import resource
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -39,6 +40,8 @@ PROTOBUF_TOPICS = {
 }
 CHUNK_BYTES = 4 * 2**20
 """Above the largest step by far: a chunk ends with its step, which makes a step complete or absent."""
+
+_STATM = Path("/proc/self/statm")
 
 Encoded = tuple[str, bytes]
 """Topic and data of a message."""
@@ -121,6 +124,8 @@ class LogWriter:
     def _step_messages(self, step: Step) -> Iterator[Encoded]:
         """Last comes the step itself, which says that the others are complete."""
         yield from _serialised(self._drawing.draw(step))
+        if (rss_mb := _rss_mb()) is not None:
+            yield schema.MEMORY, json.dumps({"rss_mb": rss_mb}).encode()
         if step.keyframe is not None:
             points, labels = step.keyframe.points, step.keyframe.labels
             yield schema.KEYFRAME, keyframe_points(points, labels, resolution_m=self._resolution_m).SerializeToString()
@@ -204,6 +209,15 @@ def _estimate_message(estimate: GraphEstimate) -> Encoded:
 def _reference_messages(reference: Trajectory) -> Iterator[Encoded]:
     yield from _serialised([ground_truth(reference, stamp_ns=int(reference.stamp_ns[0]))])
     yield schema.REFERENCE, _json(Trajectory, reference)
+
+
+def _rss_mb() -> float | None:
+    """What the process has in memory; None where there is no /proc to tell."""
+    try:
+        pages = int(_STATM.read_text().split()[1])
+    except OSError:
+        return None
+    return round(pages * resource.getpagesize() / 2**20, 1)
 
 
 def _json(record: type, value: Any, **more: Any) -> bytes:

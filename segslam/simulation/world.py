@@ -5,19 +5,19 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import open3d as o3d
-from scipy.spatial import cKDTree
 
 from segslam.simulation.ground import Ground, ground_mesh, ground_of
 from segslam.simulation.mesh import Flags, Instances, Mesh, as_instance, merge
+from segslam.simulation.parking import ParkedCar, parked_cars
+from segslam.simulation.path import Route, route_of, street_of
 from segslam.simulation.settings import WorldConfig
 from segslam.simulation.site import Site, frontages
 from segslam.simulation.streets import furnish
-from segslam.simulation.traffic import VIEW_M, MovingCar, ParkedCar, Route, meshes_at, moving_cars, parked_cars
+from segslam.simulation.traffic import MovingCar, meshes_at, moving_cars
 from segslam.trajectory import Poses
 from segslam.types import Label, Labels, Points, Transform, Vector
 
-BEYOND_M = 60.0  # chosen: the street is seen this far past the ends of the drive
-APART_M = 15.0  # chosen: but not where it would come this near to another piece of the drive
+VIEW_M = 100.0  # chosen: what changes is seen this far
 NUMBERED = (Label.CAR, Label.TRUCK, Label.TRUNK, Label.POLE)
 
 
@@ -61,7 +61,7 @@ class World:
         for car in self._parked:
             if car.start_s <= time_s < car.end_s and np.hypot(*(near_xy - car.at)) < VIEW_M:
                 yield car.mesh
-        yield from meshes_at(self._moving, self._route, time_s, near_xy)
+        yield from meshes_at(self._moving, self._route, time_s=time_s, near_xy=near_xy, view_m=VIEW_M)
 
 
 def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> World:
@@ -70,47 +70,22 @@ def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, se
     Every pose of the drive stands `config.sensor_height_m` above its road; no thing stands on any piece of the path.
     """
     rng = np.random.default_rng([seed, 1])
-    route = _route(T_world_lidar, time_s, config.sensor_height_m)
-    path = _street(route, T_world_lidar)
-    ground = ground_of(path, rng)
+    route = route_of(T_world_lidar, time_s, sensor_height_m=config.sensor_height_m)
+    street = street_of(route, T_world_lidar)
+    ground = ground_of(street, rng)
     site = Site(ground)
-    sides = frontages(path)
-    parked = [car for side in sides for car in parked_cars(site, side, route, config, rng)]
+    sides = frontages(street)
+    parked = _numbered_cars([car for side in sides for car in parked_cars(site, side, route, config, rng)])
     things = [thing for side in sides for thing in furnish(site, side, config, rng)]
     standing = [car.mesh for car in parked if not car.changes]
-    static = merge([ground_mesh(ground), *_numbered([*standing, *things])])
+    static = merge([ground_mesh(ground), *standing, *_numbered(things)])
     changing = [car for car in parked if car.changes]
     return World(ground, static, route, changing, moving_cars(route, config, rng))
 
 
-def _route(T_world_lidar: Poses, time_s: Vector, height_m: float) -> Route:
-    """The road right under the sensor, pose by pose."""
-    at = T_world_lidar[:, :3, 3] - [0.0, 0.0, height_m]
-    steps = np.linalg.norm(np.diff(at[:, :2], axis=0), axis=1)
-    return Route(at, np.asarray(time_s, dtype=np.float64), np.concatenate([[0.0], np.cumsum(steps)]))
-
-
-def _street(route: Route, T_world_lidar: Poses) -> np.ndarray:
-    """(n, 3) the route at steps of at most a metre, with the street going on straight before it and after it."""
-    length = route.travel_m[-1]
-    stations = np.linspace(0.0, length, int(np.ceil(length)) + 1)
-    moving = np.concatenate([[True], np.diff(route.travel_m) > 1e-6])
-    driven = np.column_stack([np.interp(stations, route.travel_m[moving], route.at[moving, axis]) for axis in range(3)])
-    before = _straight_on(driven, route.at[0], -T_world_lidar[0, :2, 0])
-    after = _straight_on(driven, route.at[-1], T_world_lidar[-1, :2, 0])
-    return np.concatenate([before[::-1], driven, after])
-
-
-def _straight_on(driven: np.ndarray, end: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    """(n, 3) points a metre apart on from one end at its height, up to where the drive itself passes again."""
-    reach = np.arange(1.0, BEYOND_M + 1.0)[:, None]
-    points = end + np.hstack([reach * heading / np.linalg.norm(heading), np.zeros_like(reach)])
-    elsewhere = driven[np.linalg.norm(driven[:, :2] - end[:2], axis=1) > APART_M]
-    if len(elsewhere) == 0:
-        return points
-    distance, _ = cKDTree(elsewhere[:, :2]).query(points[:, :2])
-    met = np.flatnonzero(distance < APART_M)
-    return points[: met[0]] if len(met) else points
+def _numbered_cars(cars: list[ParkedCar]) -> list[ParkedCar]:
+    meshes = _numbered([car.mesh for car in cars])
+    return [replace(car, mesh=mesh) for car, mesh in zip(cars, meshes, strict=True)]
 
 
 def _numbered(things: list[Mesh]) -> list[Mesh]:

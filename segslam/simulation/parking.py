@@ -1,0 +1,88 @@
+"""Parked cars at the kerb and in courts, some of which come or leave while the drive lasts."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from segslam.simulation import vehicles
+from segslam.simulation.mesh import Mesh
+from segslam.simulation.path import Route, time_between_visits
+from segslam.simulation.settings import WorldConfig
+from segslam.simulation.site import Frontage, Site, Spot, moved
+from segslam.types import Label
+
+KERB_M, SLOT_M = 4.4, 6.0  # chosen: from the street's middle to a parked car's; room that one takes along the street
+COURT_M, COURT_DEPTH_M, COURT_SLOT_M = (
+    13.0,
+    12.0,
+    2.7,
+)  # chosen: the same across, in courts with cars nose to the street
+TRUCKS = 0.05  # chosen: share of the vehicles at the kerb
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParkedCar:
+    """A vehicle, in the world, that stands `at` (x, y) while `start_s` <= time < `end_s`."""
+
+    mesh: Mesh
+    at: tuple[float, float]
+    start_s: float
+    end_s: float
+
+    @property
+    def changes(self) -> bool:
+        """Whether it comes or leaves at all."""
+        return math.isfinite(self.start_s) or math.isfinite(self.end_s)
+
+
+def parked_cars(
+    site: Site, frontage: Frontage, route: Route, config: WorldConfig, rng: np.random.Generator
+) -> Iterator[ParkedCar]:
+    """The cars on one side of the streets; at `parked_cars_gone` of the places they differ from visit to visit."""
+    for spot, across in [*_kerb_spots(site, frontage, config, rng), *_court_spots(site, frontage, config, rng)]:
+        turn = (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(scale=0.03)
+        for start, end in _stays(route, spot, config, rng):
+            lorry = not across and rng.uniform() < TRUCKS
+            made = vehicles.truck(rng) if lorry else vehicles.car(rng)
+            yield ParkedCar(site.stand(made, spot, turn_rad=float(turn)), (spot.x, spot.y), start, end)
+
+
+def _kerb_spots(
+    site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.Generator
+) -> Iterator[tuple[Spot, bool]]:
+    """Places along the kerb, not across the street."""
+    if config.cars <= 0:
+        return
+    free_m = max(100.0 / config.cars - SLOT_M, 0.1)
+    station = float(rng.uniform(0, SLOT_M))
+    while station < len(frontage.at) - 1:
+        spot = site.outward(frontage, int(station), KERB_M + rng.normal(scale=0.1))
+        if site.claim(spot, 5.6, 1.6, clearance_m=2.0):
+            yield spot, False
+        station += SLOT_M + rng.exponential(free_m)
+
+
+def _court_spots(
+    site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.Generator
+) -> Iterator[tuple[Spot, bool]]:
+    """Places across the street, in paved courts that open the view between the houses."""
+    for _ in range(rng.poisson(config.courts * len(frontage.at) / 100.0)):
+        width = rng.uniform(9.0, 22.0)
+        middle = site.outward(frontage, int(rng.integers(len(frontage.at))), COURT_M)
+        if site.claim(middle, width, COURT_DEPTH_M, clearance_m=5.5):
+            site.pave(middle, width, COURT_DEPTH_M, Label.PARKING)
+            for along in np.arange(-width / 2 + 1.5, width / 2 - 1.4, COURT_SLOT_M):
+                if rng.uniform() < 0.5:
+                    yield moved(middle, along_m=float(along), out_m=rng.normal(scale=0.3)), True
+
+
+def _stays(route: Route, spot: Spot, config: WorldConfig, rng: np.random.Generator) -> list[tuple[float, float]]:
+    """Who stands at one place, from when to when (s): one car throughout, or a change between two visits."""
+    changes = rng.uniform() < config.parked_cars_gone
+    change = time_between_visits(route, spot.x, spot.y, rng) if changes else None
+    if change is None:
+        return [(-math.inf, math.inf)]
+    left, came = (-math.inf, change), (change, math.inf)
+    return [[left], [came], [left, came]][int(rng.integers(3))]

@@ -70,9 +70,9 @@ def radius_neighbours(points: Points, radius_m: float) -> Neighbours:
     return Neighbours(*_neighbours(points.astype(np.float64)[order], keys[order], *strides, order, radius_m**2))
 
 
-def patch_covariances(points: Points, neighbours: Neighbours, radius_m: float) -> tuple[Covariances, Indices]:
-    """Covariance (normalised by n) and number of the neighbours within `radius_m` of each point, itself among them."""
-    return _patch_covariances(points.astype(np.float64), *neighbours, radius_m**2)
+def patch_covariances(points: Points, neighbours: Neighbours) -> Covariances:
+    """Covariance (normalised by n) of the neighbours of each point, itself among them."""
+    return _patch_covariances(points.astype(np.float64), *neighbours)
 
 
 def normals(points: Points, covariances: Covariances) -> Points:
@@ -151,14 +151,14 @@ def _nearby_columns(keys, key, stride_x, stride_y):
 
 
 @njit(
-    "Tuple((int64[:], int64[:], int64[:]))(float64[:, :], int64[:], int64, int64, int64[:], float64)",
+    "Tuple((int64[:], int64[:], int32[:]))(float64[:, :], int64[:], int64, int64, int64[:], float64)",
     cache=True,
     nogil=True,
 )
 def _neighbours(points, keys, stride_x, stride_y, row_of, squared_radius):
     """Points and keys are sorted by key; `row_of` gives the row that each had before."""
     starts, ends = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
-    rows = np.empty(64 * len(points) + 1, np.int64)
+    rows = np.empty(64 * len(points) + 1, np.int32)
     bounds = np.empty((9, 2), np.int64)
     count = 0
     for at in range(len(points)):
@@ -178,24 +178,19 @@ def _neighbours(points, keys, stride_x, stride_y, row_of, squared_radius):
     return starts, ends, rows[:count].copy()
 
 
-@njit(
-    "Tuple((float64[:, :, :], int64[:]))(float64[:, :], int64[:], int64[:], int64[:], float64)", cache=True, nogil=True
-)
-def _patch_covariances(points, starts, ends, rows, squared_radius):
+@njit("float64[:, :, :](float64[:, :], int64[:], int64[:], int32[:])", cache=True, nogil=True)
+def _patch_covariances(points, starts, ends, rows):
     covariances = np.empty((len(points), 3, 3))
-    counts = np.zeros(len(points), np.int64)
     for row in range(len(points)):
         sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
         for at in range(starts[row], ends[row]):
             x = points[rows[at], 0] - points[row, 0]
             y = points[rows[at], 1] - points[row, 1]
             z = points[rows[at], 2] - points[row, 2]
-            if x * x + y * y + z * z <= squared_radius:
-                counts[row] += 1
-                sx, sy, sz = sx + x, sy + y, sz + z
-                xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
-                yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
-        n = counts[row]
+            sx, sy, sz = sx + x, sy + y, sz + z
+            xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+            yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+        n = ends[row] - starts[row]
         mx, my, mz = sx / n, sy / n, sz / n
         covariances[row, 0, 0] = xx / n - mx * mx
         covariances[row, 1, 1] = yy / n - my * my
@@ -203,7 +198,7 @@ def _patch_covariances(points, starts, ends, rows, squared_radius):
         covariances[row, 0, 1] = covariances[row, 1, 0] = xy / n - mx * my
         covariances[row, 0, 2] = covariances[row, 2, 0] = xz / n - mx * mz
         covariances[row, 1, 2] = covariances[row, 2, 1] = yz / n - my * mz
-    return covariances, counts
+    return covariances
 
 
 @njit("float64(float64[:, :])", cache=True, nogil=True)

@@ -136,7 +136,7 @@ class Description:
     feature_covariances: Covariances
     feature_classes: Labels
     feature_descriptors: Float[np.ndarray, "_ 33"]
-    """FPFH, float32."""
+    """Square roots of FPFH at unit length, float16."""
     ground_points: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
     """Centres of flat patches of the ground, a row each."""
     ground_normals: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))

@@ -25,7 +25,10 @@ MAX_CLOUD_POINTS = 20_000
 
 
 class Features(NamedTuple):
-    """Key points, a row each, float32: position (m), covariance of the patch (m^2), class, descriptor of length 1."""
+    """Key points, a row each: position (m), covariance of the patch (m^2), class, descriptor of unit length.
+
+    float32, the descriptors float16.
+    """
 
     points: Points
     covariances: Covariances
@@ -34,7 +37,7 @@ class Features(NamedTuple):
 
 
 NO_FEATURES = Features(
-    np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty(0, np.uint8), np.empty((0, 33), np.float32)
+    np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty(0, np.uint8), np.empty((0, 33), np.float16)
 )
 
 
@@ -61,17 +64,16 @@ def _voxelised(cloud: Points, voxel_m: float) -> Points:
 
 def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Features:
     """The key points of one class from its voxelised cloud; none where no point has neighbours enough."""
-    close = radius_neighbours(cloud, config.normal_radius_m)
-    covariances, counts = patch_covariances(cloud, close, config.normal_radius_m)
-    kept = counts >= MIN_PATCH_POINTS
-    cloud, covariances = cloud[kept], covariances[kept]
+    patches = radius_neighbours(cloud, config.normal_radius_m)
+    kept = patches.ends - patches.starts >= MIN_PATCH_POINTS
+    covariances = patch_covariances(cloud, patches)[kept]
+    cloud = cloud[kept]
     around = radius_neighbours(cloud, config.feature_radius_m)
     chosen = np.sort(np.argsort(around.starts - around.ends, kind="stable")[: config.max_features_per_class])
     histograms = fpfh(cloud, normals(cloud, covariances), around, chosen)
-    patches, _ = patch_covariances(cloud, around, config.patch_radius_m)
     return Features(
         points=cloud[chosen].astype(np.float32),
-        covariances=patches[chosen].astype(np.float32),
+        covariances=covariances[chosen].astype(np.float32),
         classes=np.full(len(chosen), label, np.uint8),
-        descriptors=np.sqrt(histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1.0)).astype(np.float32),
+        descriptors=np.sqrt(histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1.0)).astype(np.float16),
     )

@@ -61,7 +61,7 @@ def _pair_columns(points, normals, source, target):
     return _bin(theta / (2.0 * math.pi) + 0.5), BINS + _bin(0.5 * alpha + 0.5), 2 * BINS + _bin(0.5 * phi + 0.5)
 
 
-@njit("boolean[:](int64, int64[:], int64[:], int64[:], int64[:])", cache=True, nogil=True)
+@njit("boolean[:](int64, int64[:], int64[:], int32[:], int64[:])", cache=True, nogil=True)
 def _neighbours_of(num_points, starts, ends, rows, chosen):
     """(n,) whether a point is a neighbour of some chosen one."""
     found = np.zeros(num_points, np.bool_)
@@ -71,7 +71,7 @@ def _neighbours_of(num_points, starts, ends, rows, chosen):
     return found
 
 
-@njit("float64[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int64[:], boolean[:])", cache=True, nogil=True)
+@njit("float64[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int32[:], boolean[:])", cache=True, nogil=True)
 def simple_histograms(points, normals, starts, ends, rows, wanted):
     """(n, 33) SPFH over its neighbours of each wanted point; zeros for others and for points without neighbours.
 
@@ -90,7 +90,7 @@ def simple_histograms(points, normals, starts, ends, rows, wanted):
     return histograms
 
 
-@njit("float64[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int64[:], int64[:])", cache=True, nogil=True)
+@njit("float64[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int32[:], int64[:])", cache=True, nogil=True)
 def neighbour_histograms(points, histograms, starts, ends, rows, chosen):
     """(k, 33) weighted sum of the neighbours' histograms for each chosen row; zeros for a point without neighbours."""
     sums = np.zeros((len(chosen), COLUMNS))

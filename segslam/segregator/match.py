@@ -112,19 +112,24 @@ def _solve(
     config: SegregatorConfig,
 ) -> PoseFit | Rejected:
     """The pose that the members of one clique agree on, by the solver that the configuration names."""
-    points = correspondences.source[clique], correspondences.target[clique]
-    source_up, target_up = upward(source), upward(target)
-    if config.solver != "gaussians" or source_up is None or target_up is None:
-        fit = solve_pose(*points, bound_m=bound_m, config=config)
-        if isinstance(fit, Rejected) or config.solver != "gaussians":
-            return fit
-        rough = fit.T_target_source
-    else:
-        level = solve_level(*points, source_up, target_up, bound_m=bound_m, config=config)
-        if isinstance(level, Rejected):
-            return level
-        rough = level
+    if config.solver != "gaussians":
+        members = correspondences.take(clique)
+        return solve_pose(members.source, members.target, bound_m=bound_m, config=config)
+    rough = _rough_pose(source, target, correspondences.take(clique), bound_m, config)
+    if isinstance(rough, Rejected):
+        return rough
     return align_gaussians(correspondences, source, target, rough, config=config)
+
+
+def _rough_pose(
+    source: Description, target: Description, members: Correspondences, bound_m: float, config: SegregatorConfig
+) -> Transform | Rejected:
+    """As seen from above where both scans know which way that is."""
+    source_up, target_up = upward(source), upward(target)
+    if source_up is None or target_up is None:
+        fit = solve_pose(members.source, members.target, bound_m=bound_m, config=config)
+        return fit if isinstance(fit, Rejected) else fit.T_target_source
+    return solve_level(members.source, members.target, source_up, target_up, bound_m=bound_m, config=config)
 
 
 def upward(description: Description) -> Direction | None:

@@ -114,8 +114,9 @@ def solve_level(
     source_plan, target_plan = source_level * [1.0, 1.0, 0.0], target_level * [1.0, 1.0, 0.0]
     T_plan = solve_joint(source_plan, target_plan, yaw_between, bound_m=bound_m, config=config)
     inliers = _squared_distances(source_plan, target_plan, T_plan) <= bound_m**2
-    if inliers.sum() < 2 or np.ptp(source_plan[inliers], axis=0).max() <= bound_m:
-        return _degenerate(int(inliers.sum()))
+    places = source_plan[inliers]
+    if len(places) < 2 or np.linalg.norm(places - places.mean(axis=0), axis=1).max() <= bound_m:
+        return _degenerate(len(places))
     height = np.median((target_level - source_level)[inliers, 2])
     T_level = geometry.transform(T_plan[:3, :3], T_plan[:3, 3] + [0.0, 0.0, height])
     return geometry.transform(R_level_target.T, 0.0) @ T_level @ geometry.transform(R_level_source, 0.0)

@@ -1,6 +1,8 @@
 """Steps as a run makes them, of random numbers, and what tests of the log do with one."""
 
+import resource
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -120,3 +122,14 @@ def decoded(path: Path, topic: str) -> list[Any]:
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         return [item.decoded_message for item in reader.iter_decoded_messages(topics=[topic], log_time_order=False)]
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """The operating system refuses to let files grow beyond this size: a full disk that a test can have."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

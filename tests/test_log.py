@@ -40,6 +40,14 @@ def test_other_compressions_hold_the_same(steps: list[Step], tmp_path: Path, com
     assert_same(tuple(steps), tuple(read))
 
 
+def test_a_step_is_in_the_file_when_write_returns(steps: list[Step], tmp_path: Path) -> None:
+    """So that a slow disk slows the run: what waited in memory would grow there."""
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
+        for number, step in enumerate(steps[:9], start=1):
+            log.write(step)
+            assert read_log(tmp_path / "log.mcap").num_steps() == number
+
+
 def test_result_read_again_is_that_written(steps: list[Step], tmp_path: Path) -> None:
     estimate, trajectory = made_result(steps)
     with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:

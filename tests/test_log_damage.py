@@ -1,21 +1,18 @@
 """A log that was cut, damaged, or is none of this version's; disks that fail and people that press Ctrl-C."""
 
-import resource
 import signal
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from made_logs import CONFIG, assert_same, boundaries, made_steps, write_log
+from made_logs import CONFIG, assert_same, boundaries, largest_file, made_steps, write_log
 from mcap.writer import Writer
 
 from segslam.log import LogWriter, read_log, schema
 from segslam.log.output import Output
-from segslam.types import SegslamError, Step
+from segslam.types import SegslamError, Step, WorkFailed
 
 
 @pytest.fixture(scope="module")
@@ -60,17 +57,6 @@ def test_a_damaged_log_gives_the_steps_before_the_damage(
         assert "kept the 20 steps before" in caplog.text
 
 
-@contextmanager
-def _largest_file(size: int) -> Iterator[None]:
-    """The operating system refuses to let files grow beyond this size: a full disk that a test can have."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def test_a_full_disk_stops_with_the_file_named_and_the_log_still_opens(steps: list[Step], tmp_path: Path) -> None:
     path, written = tmp_path / "log.mcap", []
 
@@ -79,8 +65,8 @@ def test_a_full_disk_stops_with_the_file_named_and_the_log_still_opens(steps: li
             log.write(step)
             written.append(step)
 
-    with LogWriter(path, config=CONFIG) as log, _largest_file(60_000):
-        with pytest.raises(SegslamError, match=r"log\.mcap: cannot go on writing the log .* make room"):
+    with LogWriter(path, config=CONFIG) as log, largest_file(60_000):
+        with pytest.raises(WorkFailed, match=r"log\.mcap: cannot go on writing the log .* make room"):
             write_all()
         with pytest.raises(SegslamError, match="closed"):
             log.write(steps[0])

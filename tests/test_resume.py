@@ -1,5 +1,6 @@
 """A run that was killed goes on from its last complete step, and ends as if nothing had happened."""
 
+import errno
 import json
 import signal
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drives import write_kitti_sequence
-from made_logs import boundaries
+from made_logs import boundaries, largest_file
 from mcap.reader import make_reader
 
 from segslam import cli
@@ -136,6 +137,30 @@ def test_a_run_that_lost_its_end_is_resumed(kitti: Path, whole: Path, tmp_path: 
     ends = boundaries(whole / "log.mcap")  # of the ground truth, of each step, of the result
     size = {"no step": ends[0], "half a step": ends[30] + 700, "all steps, no result": ends[-2]}.get(part, ends[-1])
     _resumed_as_whole(kitti, whole, _cut(whole, tmp_path / "run", log_bytes=size))
+
+
+def test_a_full_disk_ends_with_status_1_and_the_run_goes_on_when_there_is_room(
+    kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    with largest_file(int(0.7 * _size(whole / "log.mcap"))):
+        assert run("map", kitti, "--out", out, *OPTIONS, *SETTINGS) == 1
+    assert "make room on the disk" in capsys.readouterr().err
+    _resumed_as_whole(kitti, whole, out)
+
+
+def test_results_that_find_no_room_end_with_status_1_and_the_run_goes_on(
+    kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    out = _cut(whole, tmp_path / "run", log_bytes=boundaries(whole / "log.mcap")[-2])
+    with monkeypatch.context() as patched:
+        patched.setattr("segslam.run_files.write_kitti", full)
+        assert run("map", kitti, "--out", out, "--resume", *OPTIONS) == 1
+    assert "cannot write the results (No space left on device)" in capsys.readouterr().err
+    _resumed_as_whole(kitti, whole, out)
 
 
 def test_resuming_a_finished_run_says_so_and_changes_nothing(

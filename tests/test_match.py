@@ -12,6 +12,7 @@ from segslam.segregator.match import hypotheses, match
 from segslam.types import Description, Label, Registration, Rejected, RejectReason, Transform
 
 NO_ROWS = np.empty((0, 3))
+T_IDENTITY = np.eye(4)
 T_TRUE = geometry.transform(geometry.yaw(2.2), [7.0, -12.0, 0.4])
 
 
@@ -236,6 +237,34 @@ def test_repeated_structure_gives_several_different_hypotheses_with_the_truth_fi
     for k, one in enumerate(ranked):
         for other in ranked[:k]:
             assert error(one, other.T_target_source) > (0.5, 2.0) or error(one, other.T_target_source)[1] > 2.0
+
+
+def with_features(scan: Description, T_a_b: Transform = T_IDENTITY) -> Description:
+    """Forty key points around the scan, each unlike the others."""
+    rng = np.random.default_rng(99)
+    return replace(
+        scan,
+        feature_points=geometry.apply(T_a_b, rng.uniform([-30, -30, 0], [30, 30, 6], size=(40, 3))),
+        feature_covariances=np.tile(0.1 * np.eye(3), (40, 1, 1)),
+        feature_classes=np.full(40, Label.BUILDING, np.uint8),
+        feature_descriptors=rng.uniform(size=(40, 33)),
+    )
+
+
+def test_features_help_only_where_clusters_leave_the_pose_uncertain() -> None:
+    for count, members in [(4, 44), (20, 20)]:
+        scan = street(15, count)
+        target = with_features(moved(T_TRUE, scan), T_TRUE)
+        registration = match(with_features(scan), target, config=SegregatorConfig())
+        assert np.allclose(registration.T_target_source, T_TRUE, atol=1e-6)
+        assert registration.num_inliers == members
+
+
+def test_features_wanted_always_join_from_the_start_and_never_not_at_all() -> None:
+    scan = street(16, count=20)
+    source, target = with_features(scan), with_features(moved(T_TRUE, scan), T_TRUE)
+    always, never = (match(source, target, config=SegregatorConfig(features=when)) for when in ("always", "never"))
+    assert always.num_correspondences == never.num_correspondences + 40
 
 
 @pytest.mark.parametrize("solver", ["gaussians", "joint", "decoupled"])

@@ -1,12 +1,13 @@
 """Two descriptions in, the pose of one scan in the other out.
 
 Yin et al., "Segregator", ICRA 2023, figure 2: correspondences, consistency graph, maximum clique, pose.
-Differs from the paper: where the pose stays uncertain, every maximum clique is tried, and then wider bounds, as in the
+Differs from the paper: where the pose stays uncertain, every maximum clique is tried, then wider bounds, as in the
 pyramid of graphs of Qiao et al., "G3Reg: Pyramid Graph-Based Global Registration Using Gaussian Ellipsoid Model",
-T-ASE 2024.
+T-ASE 2024, and only then point features.
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,63 +45,76 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
 
     `Rejected` as `match` returns it, for the narrowest bound.
     """
-    correspondences = putative(source, target, config=config)
-    if len(correspondences) < config.min_clique:
-        return Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
-    fits: list[tuple[PoseFit, int]] = []
-    rejections = []
-    for outcome, num_edges in _attempts(source, target, correspondences, config):
-        if isinstance(outcome, Rejected):
-            rejections.append(outcome)
-        else:
-            fits.append((outcome, num_edges))
-            if outcome.inliers.sum() >= config.certain_inliers:
-                break
-    if not fits:
-        return rejections[0]
-    fits.sort(key=lambda found: -found[0].score)
-    distinct = [found for k, found in enumerate(fits) if not _is_among(found[0].T_target_source, fits[:k])]
-    return [
-        Registration(
-            T_target_source=fit.T_target_source,
-            num_correspondences=len(correspondences),
-            num_inliers=int(fit.inliers.sum()),
-            rms_m=fit.rms_m,
-            information=fit.information,
-            num_edges=num_edges,
-        )
-        for fit, num_edges in distinct
-    ]
-
-
-def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Correspondences:
-    """Correspondences of clusters, and of features where the configuration wants them and both scans hold any."""
-    clusters = cluster_correspondences(source, target)
-    if config.features == "never":
-        return clusters
-    features = feature_correspondences(
-        source,
-        target,
-        similarity=config.tuple_similarity,
-        trials_per_pair=config.tuple_trials_per_pair,
-        seed=config.tuple_seed,
-    )
-    return concatenate(clusters, features)
-
-
-def _attempts(
-    source: Description, target: Description, correspondences: Correspondences, config: SegregatorConfig
-) -> Iterator[tuple[PoseFit | Rejected, int]]:
-    """The outcome of one maximum clique after the other, bound by bound, with the number of edges of its graph."""
-    for bound_m in config.noise_bounds_m:
-        graph = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
-        search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=config.clique_max_nodes)
-        size = len(search.cliques[0])
-        if size < config.min_clique:
-            yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} correspondences agree"), len(graph.edges)
+    found, rejections = [], []
+    for attempt in _attempts(source, target, config):
+        if isinstance(attempt, Rejected):
+            rejections.append(attempt)
             continue
-        for clique in search.cliques:
-            yield _solve(source, target, correspondences, clique, bound_m, config), len(graph.edges)
+        found.append(attempt)
+        if attempt.fit.inliers.sum() >= config.certain_inliers:
+            break
+    if not found:
+        return rejections[0]
+    found.sort(key=lambda attempt: -attempt.fit.score)
+    poses = [attempt.fit.T_target_source for attempt in found]
+    return [attempt.registration() for k, attempt in enumerate(found) if not _is_among(poses[k], poses[:k])]
+
+
+class _Attempt(NamedTuple):
+    """A pose, and how many correspondences and edges it was found among."""
+
+    fit: PoseFit
+    num_correspondences: int
+    num_edges: int
+
+    def registration(self) -> Registration:
+        return Registration(
+            T_target_source=self.fit.T_target_source,
+            num_correspondences=self.num_correspondences,
+            num_inliers=int(self.fit.inliers.sum()),
+            rms_m=self.fit.rms_m,
+            information=self.fit.information,
+            num_edges=self.num_edges,
+        )
+
+
+def _attempts(source: Description, target: Description, config: SegregatorConfig) -> Iterator[_Attempt | Rejected]:
+    """One maximum clique after the other: first of clusters, then of clusters and features, bound by bound."""
+    for correspondences in putative(source, target, config=config):
+        if len(correspondences) < config.min_clique:
+            yield Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
+            continue
+        for bound_m in config.noise_bounds_m:
+            graph = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
+            search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=config.clique_max_nodes)
+            size = len(search.cliques[0])
+            if size < config.min_clique:
+                yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} correspondences agree")
+                continue
+            for clique in search.cliques:
+                fit = _solve(source, target, correspondences, clique, bound_m, config)
+                yield fit if isinstance(fit, Rejected) else _Attempt(fit, len(correspondences), len(graph.edges))
+
+
+def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Iterator[Correspondences]:
+    """Sets of correspondences to try: of clusters; then, where both scans hold features, of these as well.
+
+    If features are wanted always, they are there from the start.
+    """
+    clusters = cluster_correspondences(source, target)
+    if config.features != "always":
+        yield clusters
+    if config.features == "always" or (
+        config.features != "never" and len(source.feature_points) and len(target.feature_points)
+    ):
+        features = feature_correspondences(
+            source,
+            target,
+            similarity=config.tuple_similarity,
+            trials_per_pair=config.tuple_trials_per_pair,
+            seed=config.tuple_seed,
+        )
+        yield concatenate(clusters, features)
 
 
 def _solve(
@@ -140,8 +154,8 @@ def upward(description: Description) -> Direction | None:
     return total / np.linalg.norm(total)
 
 
-def _is_among(T_target_source: Transform, fits: list[tuple[PoseFit, int]]) -> bool:
-    differences = [geometry.inverse(fit.T_target_source) @ T_target_source for fit, _ in fits]
+def _is_among(T_target_source: Transform, poses: list[Transform]) -> bool:
+    differences = [geometry.inverse(T_target_other) @ T_target_source for T_target_other in poses]
     return any(
         geometry.distance(difference) <= SAME_PLACE_M and geometry.angle(difference) <= SAME_TURN_RAD
         for difference in differences

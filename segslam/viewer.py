@@ -1,29 +1,21 @@
 """The steps of a run in Rerun's viewer: trajectory, clouds, loops coloured by their outcome, times and memory."""
 
-from collections.abc import Iterable, Iterator
-
 import numpy as np
 import rerun as rr
 
 from segslam import geometry
 from segslam.log.drawing import ACCEPTED_COLOR, REJECTED_COLORS
-from segslam.types import GraphEstimate, Keyframe, LoopAttempt, Rejected, Step, Transform
+from segslam.types import BadScan, GraphEstimate, Keyframe, LoopAttempt, Rejected, Step, Transform
 
 WORLD, LIDAR = "world", "world/lidar"
 CORRECTED_COLOR, ODOMETRY_COLOR = "#00a0ff", "#ff9000"
 
 
-def show(steps: Iterable[Step], viewer: rr.RecordingStream, *, view_every: int) -> Iterator[Step]:
-    """Log each step and hand it on; of the points of a keyframe every `view_every`-th."""
-    scene = _Scene(viewer, view_every)
-    for step in steps:
-        scene.add(step)
-        yield step
-    scene.draw_paths()
+class Scene:
+    """What the viewer shows of a run so far."""
 
-
-class _Scene:
-    def __init__(self, viewer: rr.RecordingStream, view_every: int) -> None:
+    def __init__(self, viewer: rr.RecordingStream, *, view_every: int) -> None:
+        """Of the points of a keyframe every `view_every`-th is shown."""
         self._viewer = viewer
         self._view_every = view_every
         self._T_odom_keyframe: list[Transform] = []
@@ -31,7 +23,10 @@ class _Scene:
         self._T_world_odom = np.eye(4)
         viewer.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
-    def add(self, step: Step) -> None:
+    def add(self, step: Step | BadScan) -> None:
+        """Show a step; a bad scan has nothing to show."""
+        if isinstance(step, BadScan):
+            return
         self._viewer.set_time("scan", sequence=step.scan_index)
         self._viewer.set_time("data", timestamp=np.datetime64(step.stamp_ns, "ns"))
         if step.keyframe is not None:
@@ -44,7 +39,12 @@ class _Scene:
         for stage, seconds in step.stage_seconds.items():
             self._viewer.log(f"stage_ms/{stage}", rr.Scalars(1000 * seconds))
 
-    def draw_paths(self) -> None:
+    def end(self) -> None:
+        """Draw the last of the paths, and wait until the viewer has all."""
+        self._draw_paths()
+        self._viewer.flush()
+
+    def _draw_paths(self) -> None:
         """Both paths through the keyframes so far."""
         for name, poses, color in (
             ("trajectory", self._T_world_keyframe, CORRECTED_COLOR),
@@ -67,7 +67,7 @@ class _Scene:
             self._T_world_keyframe[keyframe_id] = T_world_keyframe
             self._viewer.log(f"{WORLD}/keyframes/{keyframe_id}", _pose(T_world_keyframe))
         self._T_world_odom = self._T_world_keyframe[-1] @ geometry.inverse(self._T_odom_keyframe[-1])
-        self.draw_paths()
+        self._draw_paths()
 
     def _add_attempt(self, attempt: LoopAttempt) -> None:
         candidate, outcome = attempt.candidate, attempt.outcome

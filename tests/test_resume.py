@@ -169,7 +169,13 @@ def test_resuming_a_finished_run_says_so_and_changes_nothing(
     before = {file.name: file.read_bytes() for file in whole.iterdir()}
     assert run("map", kitti, "--out", whole, "--resume", "--labels", "true_labels") == 0
     assert "finished already" in capsys.readouterr().err
+    assert run("map", kitti, "--out", whole, "--resume", "--json", *OPTIONS) == 0
+    assert capsys.readouterr().out.encode() == _one_line(before["metrics.json"])
     assert {file.name: file.read_bytes() for file in whole.iterdir()} == before
+
+
+def _one_line(metrics: bytes) -> bytes:
+    return json.dumps(json.loads(metrics)).encode() + b"\n"
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from drives import write_kitti_sequence
 from made_logs import made_steps, write_log
 
 from segslam import cli
 from segslam.types import Step
 
-pytest.importorskip("rerun")
+RecordingStream = pytest.importorskip("rerun").RecordingStream
 
 
 def run(*arguments: object) -> int:
@@ -36,6 +37,14 @@ def test_a_run_is_saved_for_rerun_with_its_clouds_paths_and_loops(steps: list[St
     assert {"/world/trajectory", "/world/odometry", "/world/lidar", "/stage_ms/odometry"} <= entities
 
 
+def test_mapping_can_be_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A viewer that opens no window, and writes what it is sent to a file."""
+    monkeypatch.setattr(RecordingStream, "spawn", lambda stream: stream.save(tmp_path / "run.rrd"))
+    write_kitti_sequence(tmp_path, num_scans=4)
+    assert run("map", tmp_path, "--frames", "0:4", "--out", tmp_path / "run", "--view", "--quiet") == 0
+    assert {f"/world/keyframes/{number}" for number in range(4)} <= _entities(tmp_path / "run.rrd")
+
+
 def _entities(file: Path) -> set[str]:
     command = [sys.executable, "-m", "rerun", "rrd", "stats", str(file)]
     listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
@@ -45,6 +54,7 @@ def _entities(file: Path) -> set[str]:
 def test_without_the_viewer_one_line_says_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    write_log(tmp_path / "log.mcap", [])
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert run("view", tmp_path) == 2
     assert "pip install 'segslam[viewer]'" in capsys.readouterr().err

@@ -1,6 +1,6 @@
 """`segslam map`."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -23,6 +23,7 @@ from segslam.cli.console import (
     progress,
     say,
 )
+from segslam.cli.view import open_scene
 
 if TYPE_CHECKING:
     from segslam.alignment import Labeller
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from segslam.log import RunLog
     from segslam.odometry import Odometry
     from segslam.runs import Run
-    from segslam.types import Trajectory
+    from segslam.types import BadScan, Step, Trajectory
 
 
 def map_command(
@@ -48,6 +49,9 @@ def map_command(
     ] = None,
     config: ConfigOption = None,
     settings: SetOption = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Watch it in Rerun's viewer, as `segslam view` shows it.")
+    ] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, killed or stopped.")] = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
@@ -58,6 +62,7 @@ def map_command(
     """
     from segslam.config import load_config
     from segslam.datasets import open_dataset
+    from segslam.results import read_metrics
 
     recorded = log_to_resume(out) if resume else None
     settings_now = load_config(config, settings or (), base=recorded.config if recorded else None)
@@ -76,10 +81,27 @@ def map_command(
         check_same(recorded, settings_now, dataset=scans.name, options=options)
         if is_finished(recorded, scans):
             say(f"{out}: finished already, all {len(scans)} scans; nothing is left to resume", quiet=quiet)
+            if json:
+                print_json(read_metrics(out))
             raise typer.Exit(0)
+    scene = open_scene(None, view_every=settings_now.log.view_every) if view else None
     map_scans(
-        scans, out, settings=settings_now, odometry=given, options=options, recorded=recorded, json=json, quiet=quiet
+        scans,
+        out,
+        settings=settings_now,
+        odometry=given,
+        options=options,
+        recorded=recorded,
+        watch=scene.add if scene else _nobody,
+        json=json,
+        quiet=quiet,
     )
+    if scene:
+        scene.end()
+
+
+def _nobody(_: "Step | BadScan") -> None:
+    """Watches."""
 
 
 def map_scans(
@@ -90,12 +112,13 @@ def map_scans(
     odometry: "Odometry | None" = None,
     options: Mapping[str, str] = MappingProxyType({}),
     recorded: "RunLog | None" = None,
+    watch: "Callable[[Step | BadScan], None]" = _nobody,
     json: bool,
     quiet: bool,
 ) -> None:
     """Map a data set into a new folder, or go on with the run `recorded` there, and show the figures.
 
-    Raises typer.Exit(130) if Ctrl-C ended it early.
+    `watch` is given each step. Raises typer.Exit(130) if Ctrl-C ended it early.
     """
     from segslam.run_files import new_folder
     from segslam.runs import Run
@@ -112,9 +135,9 @@ def map_scans(
         resumes=recorded is not None,
     ) as run:
         if recorded is not None:
-            _take_over(run, recorded, scans, quiet=quiet)
+            _take_over(run, recorded, scans, watch, quiet=quiet)
         resumed = {} if recorded is None else {"num_scans_resumed": run.num_scans_resumed}
-        interrupted = _process(run, scans, quiet=quiet)
+        interrupted = _process(run, scans, watch, quiet=quiet)
         metrics = finish(run, scans.reference, json=json, quiet=quiet, more=resumed)
     if interrupted:
         say(f"stopped: {metrics['num_scans']} of {len(scans)} scans are mapped", quiet=quiet)
@@ -167,21 +190,23 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
     return "\n".join([*lines, f"results in {folder}"])
 
 
-def _take_over(run: "Run", recorded: "RunLog", scans: "Dataset", *, quiet: bool) -> None:
+def _take_over(
+    run: "Run", recorded: "RunLog", scans: "Dataset", watch: "Callable[[Step | BadScan], None]", *, quiet: bool
+) -> None:
     """Do again what the log holds. Raises typer.Exit(130) for Ctrl-C, which leaves the log as it was."""
     try:
-        for _ in progress(run.resume(recorded, scans), total=recorded.num_steps(), title="resume", quiet=quiet):
-            pass
+        for step in progress(run.resume(recorded, scans), total=recorded.num_steps(), title="resume", quiet=quiet):
+            watch(step)
     except KeyboardInterrupt as interrupt:
         raise typer.Exit(130) from interrupt
 
 
-def _process(run: "Run", scans: "Dataset", *, quiet: bool) -> bool:
+def _process(run: "Run", scans: "Dataset", watch: "Callable[[Step | BadScan], None]", *, quiet: bool) -> bool:
     """Map every scan. Whether Ctrl-C ended it before the last one."""
     with suppress(KeyboardInterrupt):
         left = len(scans) - run.num_scans_resumed - run.num_scans_skipped
-        for _ in progress(run.map(scans), total=left, title="map", quiet=quiet):
-            pass
+        for step in progress(run.map(scans), total=left, title="map", quiet=quiet):
+            watch(step)
         return False
     return True
 

@@ -1,11 +1,14 @@
 """`segslam view`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from segslam.cli.console import QuietOption, progress, say
+
+if TYPE_CHECKING:
+    from segslam.viewer import Scene
 
 
 def view(
@@ -19,17 +22,27 @@ def view(
     """
     from segslam.log import read_log
     from segslam.run_files import LOG
+
+    log = read_log(run / LOG)
+    scene = open_scene(save, view_every=log.config.log.view_every)
+    for step in progress(log.steps(), total=log.num_steps(), title="view", quiet=quiet):
+        scene.add(step)
+    scene.end()
+    say(f"written to {save}" if save else "all steps are in the viewer", quiet=quiet)
+
+
+def open_scene(save: Path | None, *, view_every: int) -> "Scene":
+    """An empty scene in a new viewer, or in a file. Raises SegslamError if there is no viewer."""
     from segslam.types import SegslamError
 
     try:
         import rerun
 
-        from segslam.viewer import show
+        from segslam.viewer import Scene
     except ImportError as error:
         raise SegslamError(
             "the viewer is a package of its own: pip install 'segslam[viewer]' (or open log.mcap in Foxglove)"
         ) from error
-    log = read_log(run / LOG)
     viewer = rerun.RecordingStream("segslam")
     try:
         if save is None:
@@ -38,8 +51,4 @@ def view(
             viewer.save(save)
     except (OSError, RuntimeError) as error:
         raise SegslamError(f"{save or 'the viewer'}: cannot be opened ({error}); --save FILE.rrd needs none") from error
-    steps = show(log.steps(), viewer, view_every=log.config.log.view_every)
-    for _ in progress(steps, total=log.num_steps(), title="view", quiet=quiet):
-        pass
-    viewer.flush()
-    say(f"written to {save}" if save else "all steps are in the viewer", quiet=quiet)
+    return Scene(viewer, view_every=view_every)

@@ -74,7 +74,7 @@ class ProximityConfig(Section):
     height_factor: float = Field(2.0, gt=0, description="greatest difference of heights, in search radii")
     max_candidates: int = Field(2, ge=1, description="candidates proposed per keyframe")
     spread_m: float = Field(8.0, ge=0, description="travel between two candidates of one keyframe (m)")
-    min_gap_m: float = Field(4.0, ge=0, description="no new search within this travel of an accepted loop (m)")
+    min_gap_m: float = Field(8.0, ge=0, description="no new search within this travel of an accepted loop (m)")
 
 
 class GeometricLabelsConfig(Section):

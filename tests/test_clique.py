@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from segslam.segregator.clique import maximum_cliques
+from segslam.segregator.clique import degeneracy_order, maximum_cliques
 
 ENOUGH = 10_000_000
 
@@ -56,6 +56,19 @@ def test_size_in_larger_graphs_is_that_of_networkx(count: int, density: float) -
     search = maximum_cliques(packed(flags), max_cliques=1, max_nodes=ENOUGH)
     assert len(search.cliques[0]) == size
     assert search.proved
+
+
+@pytest.mark.parametrize(("count", "density"), [(1, 0.0), (50, 0.0), (100, 0.1), (100, 0.5), (60, 1.0)])
+def test_core_numbers_are_those_of_networkx_and_the_order_takes_the_least_connected_first(
+    count: int, density: float
+) -> None:
+    flags = random_graph(np.random.default_rng(count), count, density)
+    order, core_numbers = degeneracy_order(packed(flags))
+    assert dict(enumerate(core_numbers.tolist())) == nx.core_number(nx.from_numpy_array(flags))
+    left = flags.copy()
+    for v in order:
+        assert left[v].sum() <= core_numbers[v]
+        left[v, :] = left[:, v] = False
 
 
 def test_planted_clique_is_found_among_a_thousand_vertices() -> None:

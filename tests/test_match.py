@@ -209,6 +209,22 @@ def test_scans_of_different_places_have_a_small_clique() -> None:
     assert outcome.reason is RejectReason.SMALL_CLIQUE
 
 
+@pytest.mark.parametrize("lay", LAYS)
+def test_clusters_all_in_one_spot_give_no_pose(lay: Lay) -> None:
+    scan = street(17)
+    spot = lay(description(np.zeros_like(scan.means), scan.covariances, scan.classes))
+    assert isinstance(match(spot, spot, config=SegregatorConfig()), Rejected)
+
+
+@pytest.mark.parametrize("lay", LAYS)
+def test_clusters_whose_place_is_no_number_are_as_if_not_there(lay: Lay) -> None:
+    scan = lay(street(18))
+    broken = replace(scan, means=np.where(np.arange(16)[:, None] < 4, np.nan, scan.means))
+    registration = match(broken, moved(T_TRUE, scan), config=SegregatorConfig())
+    assert np.allclose(registration.T_target_source, T_TRUE, atol=1e-6)
+    assert registration.num_inliers == 12
+
+
 def test_clusters_on_a_line_are_degenerate_but_for_the_ground() -> None:
     scan = street(12)
     row = description(scan.means * [1.0, 0.0, 0.0], scan.covariances, scan.classes)

@@ -35,7 +35,7 @@ def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> Cli
     """
     if len(adjacency) == 0:
         return CliqueSearch((), True)
-    order, core_numbers = _degeneracy_order(adjacency)
+    order, core_numbers = degeneracy_order(adjacency)
     cliques, proved = _search(adjacency, order, core_numbers, 0, 1, max_nodes)
     if proved and max_cliques > 1:
         listed, _ = _search(adjacency, order, core_numbers, cliques.shape[1] - 1, max_cliques, max_nodes)
@@ -44,7 +44,7 @@ def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> Cli
 
 
 @njit("UniTuple(int64[::1], 2)(uint64[:, ::1])", cache=True, nogil=True)
-def _degeneracy_order(adjacency):
+def degeneracy_order(adjacency):
     """Vertices as repeatedly taken with the fewest neighbours left, and the core number of each vertex."""
     count = len(adjacency)
     neighbours = np.empty(count, np.int64)

@@ -20,7 +20,7 @@ class WorldConfig(Section):
     lamps: float = Field(2.5, ge=0, le=20, description="street lamps")
     signs: float = Field(2.5, ge=0, le=20, description="traffic signs")
     clutter: float = Field(2.0, ge=0, le=20, description="bins, switch boxes and the like, of no class")
-    built: float = Field(0.65, ge=0, le=1, description="share of the lots that hold a building")
+    built: float = Field(0.75, ge=0, le=1, description="share of the lots that hold a building")
     courts: float = Field(0.6, ge=0, le=3, description="paved courts with parked cars, between the houses")
     shrubs: float = Field(
         1.0, ge=0, le=3, description="bushes and trees on the lots, as a multiple of the usual number"

@@ -77,14 +77,23 @@ class ProximityConfig(Section):
     min_gap_m: float = Field(8.0, ge=0, description="no new search within this travel of an accepted loop (m)")
 
 
+def _check_rising(bounds: tuple[float, float]) -> tuple[float, float]:
+    if not 0 <= bounds[0] < bounds[1]:
+        raise ValueError("write the lower bound, at least 0, and then the upper one")
+    return bounds
+
+
+Bounds = Annotated[tuple[float, float], AfterValidator(_check_rising)]
+
+
 class GeometricLabelsConfig(Section):
     """Labelling by shape alone. Heights are above the ground."""
 
-    max_range_m: float = Field(70.0, gt=0, description="points farther away in x or y stay unlabelled (m)")
-    ground_cell_m: float = Field(1.0, gt=0, description="edge of the cells of the ground's surface (m)")
+    max_range_m: float = Field(70.0, gt=0, le=200, description="points farther away stay unlabelled (m)")
+    ground_cell_m: float = Field(1.0, ge=0.2, description="edge of the cells of the ground's surface (m)")
     max_slope: float = Field(0.2, gt=0, description="steepest that the ground rises between cells")
     ground_height_m: float = Field(0.15, gt=0, description="points lower than this are ground (m)")
-    band_m: tuple[float, float] = Field((0.4, 2.6), description="where poles and small solids are looked for (m)")
+    band_m: Bounds = Field((0.4, 2.6), description="where poles and small solids are looked for (m)")
     min_points: int = Field(4, ge=1, description="fewest points of a pole, small solid or car within the band")
     max_things: int = Field(30, ge=1, description="of each of these classes, those with most points")
     pole_core_m: float = Field(0.4, gt=0, description="a pole lies within this radius (m)")
@@ -93,8 +102,8 @@ class GeometricLabelsConfig(Section):
     pole_min_share: float = Field(0.7, gt=0, le=1, description="share of its occupied heights that stand clear")
     trunk_max_m: float = Field(1.6, gt=0, description="longest small solid: young trees, bushes, signs (m)")
     trunk_min_m: float = Field(1.6, gt=0, description="lowest top of a small solid (m)")
-    car_top_m: tuple[float, float] = Field((1.0, 2.1), description="lowest and highest top of a car (m)")
-    car_length_m: tuple[float, float] = Field((1.0, 6.0), description="shortest and longest side seen of a car (m)")
+    car_top_m: Bounds = Field((1.0, 2.1), description="lowest and highest top of a car (m)")
+    car_length_m: Bounds = Field((1.0, 6.0), description="shortest and longest side seen of a car (m)")
     car_max_width_m: float = Field(2.4, gt=0, description="widest car (m)")
     wall_thickness_m: float = Field(0.16, gt=0, description="standard deviation of a wall's points across it (m)")
     wall_min_top_m: float = Field(1.8, gt=0, description="lowest top of a wall: hedges are lower (m)")

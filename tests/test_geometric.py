@@ -159,3 +159,9 @@ def test_turning_a_real_scan_changes_few_labels(real_pairs):
     for yaw_deg, share in ((90, 0.001), (30, 0.07)):  # measured 0.0000 and 0.041: grids do not turn with the points
         turned = geometric_labels(points @ yaw(np.radians(yaw_deg)).T, config=CONFIG)
         assert (turned != labels).mean() < share
+
+
+@pytest.mark.parametrize("bounds", [(2.4, 0.4), (-1.0, 2.0), (1.0, 1.0)])
+def test_bounds_that_do_not_rise_are_refused(bounds):
+    with pytest.raises(ValueError, match="band_m"):
+        GeometricLabelsConfig(band_m=bounds)

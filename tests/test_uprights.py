@@ -12,7 +12,13 @@ RULE = {"core": 3, "ring": 6, "min_slices": 6, "min_share": 0.7}
 def _found(cells, slices, **changes):
     rule = RULE | changes
     return on_thin_uprights(
-        np.asarray(cells), np.asarray(slices), SIDE, rule["core"], rule["ring"], rule["min_slices"], rule["min_share"]
+        np.asarray(cells),
+        np.asarray(slices),
+        (SIDE, SIDE),
+        rule["core"],
+        rule["ring"],
+        rule["min_slices"],
+        rule["min_share"],
     )
 
 

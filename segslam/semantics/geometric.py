@@ -7,6 +7,7 @@ import numpy as np
 
 from segslam.config import GeometricLabelsConfig
 from segslam.points import within_range
+from segslam.semantics.cells import cells_above
 from segslam.semantics.ground import heights_above_ground, turned, upright
 from segslam.semantics.solids import Pieces, pieces
 from segslam.semantics.uprights import NUM_SLICES, on_thin_uprights
@@ -48,19 +49,23 @@ def _poles(points: Points, heights: Vector, config: GeometricLabelsConfig) -> La
     """POLE for the points of thin upright things, VEGETATION for the rest."""
     low, high = config.band_m
     slice_m = (high - low) / NUM_SLICES
-    half = int(np.ceil(config.max_range_m / COLUMN_M)) + 10  # a border: things at the edge have surroundings too
+    ring = round(config.pole_clear_m / COLUMN_M)
+    cells, _, shape = cells_above(points, COLUMN_M, border=ring)
     thin = on_thin_uprights(
-        np.floor(points[:, :2] / COLUMN_M).astype(np.int64) + half,
+        cells,
         np.floor((heights - low) / slice_m).astype(np.int64),
-        2 * half,
+        shape,
         round(config.pole_core_m / COLUMN_M),
-        round(config.pole_clear_m / COLUMN_M),
+        ring,
         round(config.pole_min_m / slice_m),
         config.pole_min_share,
     )
-    found = pieces(points, heights, thin)
-    poles = _most_seen(found, np.full(len(found.top_m), True), config)
-    return _labelled(found, poles, thin, Label.POLE)
+    rows = np.flatnonzero(thin)
+    found = pieces(points[rows], heights[rows], np.full(len(rows), True))
+    kept = _most_seen(found, np.full(len(found.top_m), True), config)
+    labels = np.full(len(points), Label.VEGETATION, np.uint8)
+    labels[rows[kept[found.of_point]]] = Label.POLE
+    return labels
 
 
 def _solids(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:

@@ -5,10 +5,12 @@ that its neighbours nearer to the sensor expect, so that other levels, roofs and
 passed by.
 """
 
+from functools import cache
+
 import numpy as np
 from numba import njit
 
-from segslam.types import Points, Rotation, Vector
+from segslam.types import Indices, Points, Rotation, Vector
 
 MAX_TILT_DEG = 40.0
 """Chosen: the sensor in the hand of the courtyard recording leans up to 33 degrees."""
@@ -98,6 +100,7 @@ def _votes(points, normals, bin_m, num_bins):
     return votes
 
 
+@cache
 def _upward_normals() -> Points:
     """Unit vectors within MAX_TILT_DEG of z, some 4 degrees apart, the least tilted first."""
     step = np.radians(4.0)
@@ -138,8 +141,9 @@ def _grouped(group, num_groups):
     return order, starts
 
 
-def _outward(half: int) -> np.ndarray:
-    """Cells of the grid by distance from the sensor, nearest first."""
+@cache
+def _outward(half: int) -> Indices:
+    """Cells of the grid by distance from the sensor, nearest first; the same for every scan."""
     squared = (2 * np.arange(-half, half) + 1) ** 2
     return np.argsort((squared[:, None] + squared).ravel(), kind="stable")
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from segslam.semantics.cells import cells_above
 from segslam.types import Indices, Mask, Points, Vector
 
 CELL_M = 0.3
@@ -30,9 +31,8 @@ class Pieces:
 
 def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
     """The pieces that the chosen points of a level cloud make."""
-    corner = np.floor(points[:, :2].min(axis=0, initial=0.0) / CELL_M)
-    cells = (np.floor(points[:, :2] / CELL_M) - corner).astype(np.int64)
-    grid, num_pieces = _connected(cells, chosen)
+    cells, _, shape = cells_above(points, CELL_M, border=1)
+    grid, num_pieces = _connected(cells, chosen, shape)
     of_point = grid[cells[:, 0], cells[:, 1]]
     num_points, top_m = _counts_and_tops(of_point, heights, chosen, num_pieces)
     sides_m = _tightest_rectangles(points, of_point, chosen, num_pieces)
@@ -40,9 +40,8 @@ def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
 
 
 @njit(cache=True, nogil=True)
-def _connected(cells, chosen):
+def _connected(cells, chosen, shape):
     """The piece (8 neighbours) of each cell of a grid, NO_PIECE where no chosen point lies, and how many there are."""
-    shape = (cells[:, 0].max() + 1, cells[:, 1].max() + 1) if len(cells) else (1, 1)
     unseen = np.zeros(shape, np.bool_)
     for k in range(len(cells)):
         if chosen[k]:
@@ -64,8 +63,8 @@ def _fill(grid, unseen, i, j, number):
     while stack:
         i, j = stack.pop()
         grid[i, j] = number
-        for a in range(max(i - 1, 0), min(i + 2, grid.shape[0])):
-            for b in range(max(j - 1, 0), min(j + 2, grid.shape[1])):
+        for a in range(i - 1, i + 2):  # never outside: the border is empty
+            for b in range(j - 1, j + 2):
                 if unseen[a, b]:
                     unseen[a, b] = False
                     stack.append((a, b))
@@ -84,7 +83,7 @@ def _counts_and_tops(piece, heights, chosen, num_pieces):
 
 @njit(cache=True, nogil=True)
 def _tightest_rectangles(points, piece, chosen, num_pieces):
-    """(num_pieces, 2) longer and shorter side (m) of the upright rectangle of least area around each piece's points."""
+    """(num_pieces, 2) longer and shorter side (m) of the rectangle of least area around each piece, from above."""
     angles = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
     cosines, sines = np.cos(angles), np.sin(angles)
     low = np.full((num_pieces, len(angles), 2), np.inf)

@@ -13,17 +13,17 @@ NUM_SLICES = 16
 
 
 @njit(cache=True, nogil=True)
-def on_thin_uprights(cells, slices, side, core, ring, min_slices, min_share):
+def on_thin_uprights(cells, slices, shape, core, ring, min_slices, min_share):
     """(n,) bool: which points belong to something thin, tall and free-standing.
 
-    A point lies in column `cells[k]` of a grid of `side` x `side`, at height `slices[k]`. Around each occupied column
+    A point lies in column `cells[k]` of a grid of that shape, at height `slices[k]`. Around each occupied column
     the slices occupied within `core` cells are joined, and those occupied between `core` and `ring` cells away are
     taken off. What is left must span `min_slices` and be `min_share` of what was there. Points outside the grid, or of
     a slice below 0 or from NUM_SLICES on, take no part. Columns nearer than `ring` cells to the border are passed by.
     """
-    masks = np.zeros((side, side), np.uint16)
+    masks = np.zeros(shape, np.uint16)
     for k in range(len(cells)):
-        if _takes_part(cells[k], slices[k], side):
+        if _takes_part(cells[k], slices[k], shape):
             masks[cells[k, 0], cells[k, 1]] |= np.uint16(1 << slices[k])
     found = _thin_columns(masks, core, ring, min_slices, min_share)
     masks[:] = 0
@@ -33,24 +33,23 @@ def on_thin_uprights(cells, slices, side, core, ring, min_slices, min_share):
             masks[i + inner[n, 0], j + inner[n, 1]] |= np.uint16(clear)
     chosen = np.zeros(len(cells), np.bool_)
     for k in range(len(cells)):
-        if _takes_part(cells[k], slices[k], side):
+        if _takes_part(cells[k], slices[k], shape):
             chosen[k] = masks[cells[k, 0], cells[k, 1]] >> slices[k] & 1
     return chosen
 
 
 @njit(cache=True, nogil=True)
-def _takes_part(cell, slice_index, side):
-    return 0 <= cell[0] < side and 0 <= cell[1] < side and 0 <= slice_index < NUM_SLICES
+def _takes_part(cell, slice_index, shape):
+    return 0 <= cell[0] < shape[0] and 0 <= cell[1] < shape[1] and 0 <= slice_index < NUM_SLICES
 
 
 @njit(cache=True, nogil=True)
 def _thin_columns(masks, core, ring, min_slices, min_share):
     """Rows of (i, j, mask): columns in the middle of something thin, and its slices."""
-    side = masks.shape[0]
     inner, outer = _disc(core, -1), _disc(ring, core)
     found = []
-    for i in range(ring, side - ring):
-        for j in range(ring, side - ring):
+    for i in range(ring, masks.shape[0] - ring):
+        for j in range(ring, masks.shape[1] - ring):
             if masks[i, j] == 0:
                 continue
             held = _joined(masks, inner, i, j)

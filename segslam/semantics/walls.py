@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from segslam.semantics.cells import cells_above
 from segslam.types import Mask, Points, Vector
 
 CELL_M = 0.6
@@ -20,21 +21,16 @@ def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: 
     A face is judged in voxels, each with the 8 around it: the standard deviation of the points across their line is
     below `thickness_m`, and something there stands higher than `min_top_m` above the ground.
     """
-    if not len(points):
-        return np.zeros(0, bool)
-    corner = np.floor(points[:, :2].min(axis=0) / CELL_M) - 1
-    cells = (np.floor(points[:, :2] / CELL_M) - corner).astype(np.int64)
+    cells, corner, shape = cells_above(points, CELL_M, border=1)
     layers = np.clip(heights / LAYER_M, 0, NUM_LAYERS - 1).astype(np.int64)
-    offsets_mm = np.round((points[:, :2] - corner * CELL_M) * 1000).astype(np.int64)
-    shape = (NUM_LAYERS, int(cells[:, 0].max()) + 2, int(cells[:, 1].max()) + 2)
-    voxel, moments = _moments(layers, cells, offsets_mm, shape)
-    top = _tops(cells, heights, shape[1:])
+    voxel, moments = _moments(points, layers, cells, corner, (NUM_LAYERS, *shape))
+    top = _tops(cells, heights, shape)
     walls = _walls(voxel, moments, top, thickness_m * 1000, MIN_LENGTH_M * 1000, min_top_m)
     return walls[voxel[layers, cells[:, 0], cells[:, 1]]]
 
 
 @njit(cache=True, nogil=True)
-def _moments(layers, cells, offsets_mm, shape):
+def _moments(points, layers, cells, corner, shape):
     """The number of each occupied voxel, -1 elsewhere, and for each the sums of 1, x, y, xx, xy, yy over its points.
 
     Sums of whole millimetres do not depend on the points' order.
@@ -47,7 +43,8 @@ def _moments(layers, cells, offsets_mm, shape):
         if voxel[layer, i, j] < 0:
             voxel[layer, i, j] = num_voxels
             num_voxels += 1
-        x, y = offsets_mm[k, 0], offsets_mm[k, 1]
+        x = int(np.round((points[k, 0] - corner[0]) * 1000))
+        y = int(np.round((points[k, 1] - corner[1]) * 1000))
         m = moments[voxel[layer, i, j]]
         m[0] += 1
         m[1] += x

@@ -1,0 +1,17 @@
+"""Square cells seen from above."""
+
+import numpy as np
+
+from segslam.types import IndexPairs, Points, Vector
+
+
+def cells_above(points: Points, cell_m: float, *, border: int) -> tuple[IndexPairs, Vector, tuple[int, int]]:
+    """The cell of each point, the corner of the grid (m, a whole number of cells), and the grid's shape.
+
+    The grid holds all points and `border` empty cells around them, so that neighbourhoods that wide never leave it.
+    """
+    whole = [np.floor(points[:, axis] / cell_m) for axis in (0, 1)]
+    first = np.array([column.min() if len(points) else 0.0 for column in whole]) - border
+    cells = np.column_stack([column - start for column, start in zip(whole, first, strict=True)]).astype(np.int64)
+    rows, columns = (int(cells[:, axis].max(initial=0)) + border + 1 for axis in (0, 1))
+    return cells, first * cell_m, (rows, columns)

@@ -134,7 +134,7 @@ class SegregatorConfig(Section):
     dcvc_start_radius_m: float = Field(0.35, ge=0.01, description="first radial bin of DCVC (A) (m)")
     dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (A) (m)")
     dcvc_angle_deg: float = Field(
-        1.2, ge=0.1, le=90, description="pitch and azimuth bin of DCVC (A); no narrower than beams are apart (degrees)"
+        2.0, ge=0.1, le=90, description="pitch and azimuth bin of DCVC; no narrower than beams are apart (A: 1.2) (deg)"
     )
     min_range_m: float = Field(0.5, ge=0, description="nearest point clustered (A) (m)")
     max_range_m: float = Field(120.0, gt=0, le=1000, description="farthest point clustered (A) (m)")
@@ -142,7 +142,9 @@ class SegregatorConfig(Section):
         (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points (P: L_F)"
     )
     feature_voxel_m: float = Field(0.35, ge=0.01, description="voxel of the class clouds (A: 0.5) (m)")
-    normal_radius_m: float = Field(0.7, gt=0, description="of the patch that gives a point's normal and Gaussian (A: 1.0) (m)")
+    normal_radius_m: float = Field(
+        0.7, gt=0, description="of the patch that gives a point's normal and Gaussian (A: 1.0) (m)"
+    )
     feature_radius_m: float = Field(2.0, gt=0, description="neighbourhood of FPFH (A: 2.5) (m)")
     max_features_per_class: int = Field(
         750, ge=1, description="key points of a class: those with most neighbours; 1,500 in all take 175 kB"

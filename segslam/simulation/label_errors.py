@@ -35,8 +35,8 @@ IMAGE = (64, 1024)  # rows over the elevations there are, columns over the circl
 class LabelErrorConfig(Section):
     """How wrong. All zero leaves the labels as they are, but for the classes that move.
 
-    The defaults, on simulated HDL-64E scans, leave an IoU of 0.90 for cars, 0.85 for buildings, 0.69 for trunks and 0.61
-    for poles: between what RangeNet++ and SPVNAS are known for on SemanticKITTI.
+    The defaults, on simulated HDL-64E scans, leave an IoU of 0.90 for cars, 0.85 for buildings, 0.69 for trunks and
+    0.61 for poles: between what RangeNet++ and SPVNAS are known for on SemanticKITTI.
     """
 
     regions: int = Field(10, ge=0, description="regions of a scan in which each class is taken for another one")

@@ -19,7 +19,12 @@ LAYERS = (  # top first; a room is a module or a folder
     {"types", "config"},
 )  # fmt: skip
 BOTTOM = {"types", "config"}  # config names the classes of types
-FOREIGN = {"gtsam": {"pose_graph"}, "mcap": {"log", "datasets"}, "small_gicp": {"refine", "experiments"}, "rerun": {"viewer", "cli"}}
+FOREIGN = {
+    "gtsam": {"pose_graph"},
+    "mcap": {"log", "datasets"},
+    "rerun": {"viewer", "cli"},
+    "small_gicp": {"refine", "experiments"},
+}
 
 
 def _room(parts: tuple[str, ...]) -> str:

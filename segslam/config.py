@@ -133,9 +133,10 @@ class SegregatorConfig(Section):
     foot_max_distance_m: float = Field(10.0, gt=0, description="the ground is looked for as far as this (m)")
     dcvc_start_radius_m: float = Field(0.35, ge=0.01, description="first radial bin of DCVC (A) (m)")
     dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (A) (m)")
-    dcvc_angle_deg: float = Field(
-        2.0, ge=0.1, le=90, description="pitch and azimuth bin of DCVC; no narrower than beams are apart (A: 1.2) (deg)"
+    dcvc_pitch_deg: float = Field(
+        2.0, ge=0.1, le=90, description="pitch bin of DCVC, no narrower than beams are apart (A: 1.2) (degrees)"
     )
+    dcvc_azimuth_deg: float = Field(1.2, ge=0.1, le=90, description="azimuth bin of DCVC (A) (degrees)")
     min_range_m: float = Field(0.5, ge=0, description="nearest point clustered (A) (m)")
     max_range_m: float = Field(120.0, gt=0, le=1000, description="farthest point clustered (A) (m)")
     feature_classes: tuple[StaticLabel, ...] = Field(

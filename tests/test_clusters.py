@@ -14,7 +14,7 @@ from segslam.segregator.clusters import Clusters, curved_voxel_clusters, gaussia
 from segslam.types import Label
 
 CONFIG = SegregatorConfig()
-DCVC = {"start_m": 0.35, "step_m": 0.0004, "angle_deg": 1.2}
+DCVC = {"start_m": 0.35, "step_m": 0.0004, "pitch_deg": 1.2, "azimuth_deg": 1.2}
 AUTHORS = load_config(Path(__file__).resolve().parents[1] / "configs" / "authors.yaml").segregator
 GOLDEN = {  # scan -> where its clusters are kept
     0: ("000000_004413_fixed_trunkDCVC.npz", "src"),
@@ -212,12 +212,20 @@ def test_points_out_of_range_of_no_number_or_of_other_classes_change_nothing(dat
         np.testing.assert_array_equal(column, before)
 
 
+@pytest.mark.parametrize("beam_deg", [0.4, 2.0])
+def test_a_trunk_is_one_cluster_however_far_apart_the_beams_are(beam_deg: float) -> None:
+    pitch, azimuth = np.meshgrid(np.radians(np.arange(-15, 15.1, beam_deg)), np.radians(np.arange(-1, 1, 0.2)))
+    trunk = np.column_stack([np.full(pitch.size, 12.0), 12.0 * np.tan(azimuth.ravel()), 12.0 * np.tan(pitch.ravel())])
+    clusters = semantic_clusters(trunk, np.full(len(trunk), Label.TRUNK, np.uint8), config=CONFIG)
+    assert clusters.sizes.tolist() == [len(trunk)]
+
+
 @pytest.mark.data
-@pytest.mark.parametrize("bins", [1, 45, 90, 179])
+@pytest.mark.parametrize("bins", [1, 75, 150, 299])
 def test_turning_the_scan_by_whole_bins_turns_its_clusters(data_dir, bins: int) -> None:
     """By other angles the voxels fall elsewhere and a few clusters differ: DCVC is not invariant to yaw."""
     points, labels = raw_scan(data_dir, 0)
-    R = geometry.yaw(np.radians(CONFIG.dcvc_angle_deg * bins))
+    R = geometry.yaw(np.radians(CONFIG.dcvc_azimuth_deg * bins))
     before = semantic_clusters(points.astype(float), labels, config=CONFIG)
     turned = semantic_clusters(points.astype(float) @ R.T, labels, config=CONFIG)
     assert turned.sizes.tolist() == before.sizes.tolist()

@@ -62,3 +62,28 @@ def test_a_scan_without_points_has_an_empty_description() -> None:
 def test_labels_of_another_length_are_refused() -> None:
     with pytest.raises(ValueError, match="10 points but 9 labels"):
         describe(np.ones((10, 3)), np.zeros(9, np.uint8), config=ALWAYS)
+
+
+@pytest.mark.parametrize("points", [np.ones((4, 2)), np.ones((4, 4)), np.ones(4)])
+def test_points_of_another_shape_are_refused(points: np.ndarray) -> None:
+    with pytest.raises((ValueError, TypeError)):  # a TypeError is that of the shape check while testing
+        describe(points, np.ones(len(points), np.uint8), config=ALWAYS)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_strange_clouds_have_finite_descriptions(seed: int) -> None:
+    """Any number and scale of points; flat, on a grid or repeated; with values that are none or too large."""
+    rng = np.random.default_rng(seed)
+    scale = 10.0 ** rng.uniform(-3, 3)
+    points = rng.normal(size=(rng.choice([1, 2, 5, 100, 1000]), 3)) * scale
+    points *= rng.choice([0.0, 1.0], 3, p=[0.2, 0.8])
+    points = np.round(points / scale) * scale if seed % 3 == 0 else points
+    points = np.repeat(points[: len(points) // 10 + 1], 10, axis=0) if seed % 5 == 0 else points
+    for value in (np.nan, np.inf, -np.inf, 1e30, 1e-300):
+        points[rng.integers(len(points)), rng.integers(3)] = value
+    labels = (
+        rng.integers(0, 26, len(points)).astype(np.uint8) if seed % 2 else np.full(len(points), Label.CAR, np.uint8)
+    )
+    description = describe(points.astype(np.float32 if seed % 4 < 2 else np.float64), labels, config=ALWAYS)
+    for field in dataclasses.fields(description):
+        assert np.isfinite(getattr(description, field.name)).all()

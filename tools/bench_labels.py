@@ -1,6 +1,6 @@
 """How good the labels from shape alone are: per class, and by the registrations they make possible. Writes JSON.
 
-    python tools/bench_labels.py DATA [--drive FOLDER:SEQUENCE ...] [--set segregator.dcvc_angle_deg=2.5] --out FILE
+    python tools/bench_labels.py DATA [--drive FOLDER:SEQUENCE ...] [--set segregator.dcvc_pitch_deg=2.5] --out FILE
 
 DATA is the folder of real data: `kitti/` with ground-truth labels of scans 0-2 and `reference_pairs.json`, and
 `courtyard/`. The numbers of `GeometricLabelsConfig` were chosen on those scans and pairs of KITTI; independent checks

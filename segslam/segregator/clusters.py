@@ -55,18 +55,20 @@ def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfi
     return Clusters(*(np.concatenate(columns) for columns in zip(NO_CLUSTERS, *parts, strict=True)))
 
 
-def curved_voxel_clusters(points: Points, *, start_m: float, step_m: float, angle_deg: float) -> Indices:
+def curved_voxel_clusters(
+    points: Points, *, start_m: float, step_m: float, pitch_deg: float, azimuth_deg: float
+) -> Indices:
     """(n,) the cluster of each point by DCVC, numbered from 0. The points are finite and none is at the origin.
 
-    Radial bin k, from 1, is `start_m - k * step_m` deep; the first starts at the nearest point, 5 m away at most. Bins
-    of pitch and azimuth are `angle_deg` wide (azimuth: the nearest width that divides the circle).
+    Radial bin k, from 1, is `start_m - k * step_m` deep; the first starts at the nearest point, 5 m away at most. The
+    width of azimuth bins is the one nearest to `azimuth_deg` that divides the circle.
     """
     if not len(points):
         return np.empty(0, np.int64)
     polar = _polar(points)
-    num_azimuth = max(1, round(360.0 / angle_deg))
+    num_azimuth = max(1, round(360.0 / azimuth_deg))
     radial = _radial_bins(polar[:, 0], start_m, step_m)
-    pitch = _nearest_bin(polar[:, 1] - min(0.0, polar[:, 1].min()), math.radians(angle_deg))
+    pitch = _nearest_bin(polar[:, 1] - min(0.0, polar[:, 1].min()), math.radians(pitch_deg))
     azimuth = _nearest_bin(polar[:, 2], math.tau / num_azimuth) % num_azimuth
     num_radial = int(radial.max()) + 2  # one more than occupied: neighbours of the outermost bin have keys of their own
     keys, voxel = np.unique((pitch * num_radial + radial) * num_azimuth + azimuth, return_inverse=True)
@@ -86,7 +88,8 @@ def _class_clusters(points: Points, label: Label, min_points: int, config: Segre
         points,
         start_m=config.dcvc_start_radius_m,
         step_m=config.dcvc_radius_step_m,
-        angle_deg=config.dcvc_angle_deg,
+        pitch_deg=config.dcvc_pitch_deg,
+        azimuth_deg=config.dcvc_azimuth_deg,
     )
     sizes = np.bincount(cluster)
     large = sizes >= min_points

@@ -15,8 +15,10 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
     """The semantic clusters, point features and ground of a scan, in its frame, whose origin is the sensor.
 
     Points that are NaN or out of range take no part; a scan without usable points has an empty description. The result
-    does not depend on the order of the points. Raises ValueError unless there is one label for each point.
+    does not depend on the order of the points. Raises ValueError unless points are rows of three and labels as many.
     """
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points of shape {points.shape}; give a row x, y, z for each")
     if len(points) != len(labels):
         raise ValueError(f"{len(points)} points but {len(labels)} labels; give one label for each point")
     clusters = _grounded(semantic_clusters(points, labels, config=config), points, labels, config)
@@ -43,6 +45,6 @@ def _grounded(clusters: Clusters, points: Points, labels: Labels, config: Segreg
     upright = np.isin(clusters.classes, [int(label) for label in config.foot_classes])
     if not upright.any():
         return clusters
-    ground = points[np.isin(labels, [int(label) for label in GROUND_LABELS])].astype(np.float32)
-    ground = ground[within_range(ground, config.min_range_m, config.max_range_m)]
+    ground = points[np.isin(labels, [int(label) for label in GROUND_LABELS])]
+    ground = ground[within_range(ground, config.min_range_m, config.max_range_m)].astype(np.float32)
     return stand_on_ground(clusters, upright, ground, max_distance_m=config.foot_max_distance_m)

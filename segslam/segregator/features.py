@@ -48,8 +48,8 @@ def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) 
     """
     parts = []
     for label in config.feature_classes:
-        cloud = points[labels == label].astype(np.float32)
-        cloud = cloud[within_range(cloud, config.min_range_m, config.max_range_m)]
+        cloud = points[labels == label]
+        cloud = cloud[within_range(cloud, config.min_range_m, config.max_range_m)].astype(np.float32)
         parts.append(_class_features(_voxelised(cloud, config.feature_voxel_m), int(label), config))
     return Features(*(np.concatenate(columns) for columns in zip(NO_FEATURES, *parts, strict=True)))
 

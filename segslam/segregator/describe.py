@@ -3,12 +3,11 @@
 import numpy as np
 
 from segslam.config import SegregatorConfig
-from segslam.points import within_range
 from segslam.segregator.clusters import Clusters, semantic_clusters
 from segslam.segregator.features import NO_FEATURES, point_features
-from segslam.segregator.feet import stand_on_ground
+from segslam.segregator.feet import ground_cells, stand_on_ground
 from segslam.segregator.ground import ground_patches
-from segslam.types import GROUND_LABELS, Description, Labels, Points
+from segslam.types import Description, Labels, Points
 
 
 def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
@@ -45,6 +44,5 @@ def _grounded(clusters: Clusters, points: Points, labels: Labels, config: Segreg
     upright = np.isin(clusters.classes, [int(label) for label in config.foot_classes])
     if not upright.any():
         return clusters
-    ground = points[np.isin(labels, [int(label) for label in GROUND_LABELS])]
-    ground = ground[within_range(ground, config.min_range_m, config.max_range_m)].astype(np.float32)
+    ground = ground_cells(points, labels, reach_m=config.max_range_m)
     return stand_on_ground(clusters, upright, ground, max_distance_m=config.foot_max_distance_m)

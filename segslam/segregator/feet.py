@@ -5,12 +5,14 @@ does not. Of 34 trunks, poles and signs a scan, on 6 pairs of real scans 9 to 35
 0.2 m of a centre in the other scan, and 16 their foot.
 """
 
+import math
+
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
-from segslam.points import voxel_means
 from segslam.segregator.clusters import Clusters
-from segslam.types import Points, Vector
+from segslam.types import GROUND_LABELS, Labels, Points, Vector
 
 CELL_M = 1.0
 """Chosen: the ground is averaged in cells of this edge; 0.5 and 2 m do as well."""
@@ -21,10 +23,10 @@ NUM_CELLS = 5
 def stand_on_ground(clusters: Clusters, upright: np.ndarray, ground: Points, *, max_distance_m: float) -> Clusters:
     """The clusters, the `upright` ones (k, bool) moved along z to the ground around them.
 
-    `ground` holds points of the ground, finite, in the clusters' frame. A cluster with none within `max_distance_m`,
-    measured level, stays. Covariances stay: they are those of the points, about their centre.
+    `ground` is that of `ground_cells` in the clusters' frame. A cluster with none within `max_distance_m`, measured
+    level, stays. Covariances stay: they are those of the points, about their centre.
     """
-    heights = ground_heights(clusters.means, voxel_means(ground, CELL_M), max_distance_m=max_distance_m)
+    heights = ground_heights(clusters.means, ground, max_distance_m=max_distance_m)
     means = clusters.means.copy()
     moved = upright & np.isfinite(heights)
     means[moved, 2] = heights[moved]
@@ -39,3 +41,31 @@ def ground_heights(places: Points, ground: Points, *, max_distance_m: float) -> 
     distances, nearest = map(np.asarray, cKDTree(ground[:, :2]).query(places[:, :2], k=columns))
     heights = np.median(ground[nearest, 2], axis=1)
     return np.where(distances[:, 0] <= max_distance_m, heights, np.nan)
+
+
+def ground_cells(points: Points, labels: Labels, *, reach_m: float) -> Points:
+    """The mean point of the ground in each square cell that has any; nothing beyond `reach_m` in x, y or z.
+
+    Sums in float64 of float32 values are exact, so that the order of points does not matter.
+    """
+    is_ground = np.zeros(256, np.bool_)
+    is_ground[list(GROUND_LABELS)] = True
+    sums = _cell_sums(points[is_ground[labels]].astype(np.float64), reach_m, CELL_M)
+    sums = sums[sums[:, 3] > 0]
+    return sums[:, :3] / sums[:, 3:]
+
+
+@njit("float64[:, ::1](float64[:, ::1], float64, float64)", cache=True, nogil=True)
+def _cell_sums(points, reach, cell):
+    """Sums of x, y, z, each rounded to float32, and the number of points in each cell of a square grid."""
+    side = math.ceil(2.0 * reach / cell)
+    sums = np.zeros((side * side, 4))
+    for row in range(len(points)):
+        x, y, z = np.float32(points[row, 0]), np.float32(points[row, 1]), np.float32(points[row, 2])
+        if abs(x) < reach and abs(y) < reach and abs(z) < reach:  # false for NaN
+            at = int((x + reach) / cell) * side + int((y + reach) / cell)
+            sums[at, 0] += x
+            sums[at, 1] += y
+            sums[at, 2] += z
+            sums[at, 3] += 1.0
+    return sums

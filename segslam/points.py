@@ -9,7 +9,9 @@ from numba import njit
 from segslam.types import Covariances, Indices, Points
 
 EMPTY = -1
+"""Of a slot in a hash table, and the row of a key that is not in it."""
 MAX_CELLS = 2**62
+"""What an int64 can number."""
 
 
 class Neighbours(NamedTuple):
@@ -45,7 +47,8 @@ def voxel_first(points: Points, voxel_m: float) -> Indices:
 def voxel_means(points: Points, voxel_m: float) -> Points:
     """The mean of the finite points of each occupied voxel, float64, voxels in the order of x, y, z.
 
-    For float32 points it does not depend on their order: such sums are exact. Raises ValueError as `voxel_first` does.
+    It does not depend on the order of float32 points: their sums are exact, but for coordinates below 1e-5 m.
+    Raises ValueError as `voxel_first` does.
     """
     points = points[np.isfinite(points).all(axis=1)]
     keys, _ = _cell_keys(points, voxel_m)

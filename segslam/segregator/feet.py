@@ -46,7 +46,7 @@ def ground_heights(places: Points, ground: Points, *, max_distance_m: float) -> 
 def ground_cells(points: Points, labels: Labels, *, reach_m: float) -> Points:
     """The mean point of the ground in each square cell that has any; nothing beyond `reach_m` in x, y or z.
 
-    Sums in float64 of float32 values are exact, so that the order of points does not matter.
+    Sums in float64 of float32 values are exact, but for those below 1e-5 m, so that the order does not matter.
     """
     is_ground = np.zeros(256, np.bool_)
     is_ground[list(GROUND_LABELS)] = True

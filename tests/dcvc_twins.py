@@ -21,9 +21,9 @@ def curved_bins(points: np.ndarray) -> np.ndarray:
     )
 
 
-def touching(a: np.ndarray, b: np.ndarray, *, wrap: bool) -> bool:
+def touching(a: np.ndarray, b: np.ndarray) -> bool:
     turn = abs(a[2] - b[2])
-    return bool(max(abs(a[0] - b[0]), abs(a[1] - b[1]), min(turn, 300 - turn) if wrap else turn) <= 1)
+    return bool(max(abs(a[0] - b[0]), abs(a[1] - b[1]), min(turn, 300 - turn)) <= 1)
 
 
 def plain_dcvc(points: np.ndarray) -> set[frozenset[int]]:
@@ -32,7 +32,7 @@ def plain_dcvc(points: np.ndarray) -> set[frozenset[int]]:
     graph = nx.Graph()
     graph.add_nodes_from(range(len(points)))
     pairs = itertools.combinations(range(len(points)), 2)
-    graph.add_edges_from((i, j) for i, j in pairs if touching(bins[i], bins[j], wrap=True))
+    graph.add_edges_from((i, j) for i, j in pairs if touching(bins[i], bins[j]))
     return {frozenset(component) for component in nx.connected_components(graph)}
 
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from segslam import geometry
 from segslam.datasets.kitti import read_calibration
+from segslam.semantics.encodings import RAW_OF_LABEL
 from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, made_up_drive, simulate_drive
-from segslam.simulation.files import RAW_IDS, uncorrected
+from segslam.simulation.files import uncorrected
 from segslam.trajectory import camera_from_lidar, write_kitti
 from segslam.types import Scan, Trajectory
 
@@ -56,7 +57,7 @@ def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
     for scan in scans[:num_scans]:
         rows = np.column_stack([uncorrected(scan.points), np.zeros(len(scan.points))])
         rows.astype("<f4").tofile(folder / "velodyne" / f"{scan.index:06d}.bin")
-        RAW_IDS[scan.labels].astype("<u4").tofile(folder / "true_labels" / f"{scan.index:06d}.label")
+        RAW_OF_LABEL[scan.labels].astype("<u4").tofile(folder / "true_labels" / f"{scan.index:06d}.label")
     (folder / "calib.txt").write_text(made_up_drive(1).calib)
     (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans))
     write_kitti(

@@ -21,6 +21,7 @@ RUN_FILES = {
     "odometry_tum.txt",
     "poses_kitti.txt",
     "poses_tum.txt",
+    "report.html",
 }
 
 

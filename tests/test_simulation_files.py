@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from segslam.datasets import open_dataset
+from segslam.semantics.encodings import RAW_OF_LABEL
 from segslam.simulation import (
     Drive,
     SensorConfig,
@@ -19,7 +20,7 @@ from segslam.simulation import (
     write_drive,
     write_sequence,
 )
-from segslam.simulation.files import RAW_IDS, uncorrected
+from segslam.simulation.files import uncorrected
 from segslam.simulation.tracks import NOMINAL_CALIB
 from segslam.trajectory import read_poses, write_kitti
 from segslam.types import Label, SegslamError
@@ -75,9 +76,9 @@ def test_poses_are_the_cameras_from_its_first(written):
 def test_labels_are_raw_ids_with_instances_above(written, sweeps):
     raw = np.fromfile(written / "sequences" / "03" / "labels" / "000001.label", dtype="<u4")
     np.testing.assert_array_equal(raw >> 16, sweeps[1].instances)
-    np.testing.assert_array_equal(raw & 0xFFFF, RAW_IDS[sweeps[1].labels])
-    assert RAW_IDS[Label.CAR] == 10
-    assert RAW_IDS[Label.MOVING_CAR] == 252
+    np.testing.assert_array_equal(raw & 0xFFFF, RAW_OF_LABEL[sweeps[1].labels])
+    assert RAW_OF_LABEL[Label.CAR] == 10
+    assert RAW_OF_LABEL[Label.MOVING_CAR] == 252
 
 
 def test_points_are_lowered_by_what_readers_add():

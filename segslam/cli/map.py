@@ -153,6 +153,7 @@ def finish(
     more: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """End a run: write its results, and show its figures, `more` among them, which are returned."""
+    from segslam.report import write_report
     from segslam.run_files import write_metrics
     from segslam.runs import accuracy
 
@@ -161,6 +162,7 @@ def finish(
         metrics |= accuracy(result, reference)
     metrics |= more
     write_metrics(run.folder, metrics)
+    write_report(run.folder)
     if json:
         print_json(metrics)
     else:

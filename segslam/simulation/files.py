@@ -9,26 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from segslam import geometry
+from segslam.semantics.encodings import RAW_OF_LABEL
 from segslam.simulation.drive import drive_sweeps
 from segslam.simulation.sensor import Sweep
 from segslam.simulation.settings import SimulationConfig
 from segslam.simulation.tracks import Drive, parse_calib
 from segslam.simulation.world import build_world
 from segslam.trajectory import camera_from_lidar
-from segslam.types import Label, SegslamError, WorkFailed
+from segslam.types import SegslamError, WorkFailed
 
 SETTINGS_FILE = "simulation.json"
 KITTI_VERTICAL_ANGLE_RAD = np.radians(0.205)  # what readers of KITTI's scans add to each vertical angle
-# SemanticKITTI's raw ids.
-RAW_ID = {
-    Label.UNLABELLED: 0, Label.CAR: 10, Label.BICYCLE: 11, Label.MOTORCYCLE: 15, Label.TRUCK: 18,
-    Label.OTHER_VEHICLE: 20, Label.PERSON: 30, Label.BICYCLIST: 31, Label.MOTORCYCLIST: 32, Label.ROAD: 40,
-    Label.PARKING: 44, Label.SIDEWALK: 48, Label.OTHER_GROUND: 49, Label.BUILDING: 50, Label.FENCE: 51,
-    Label.VEGETATION: 70, Label.TRUNK: 71, Label.TERRAIN: 72, Label.POLE: 80, Label.TRAFFIC_SIGN: 81,
-    Label.MOVING_CAR: 252, Label.MOVING_BICYCLIST: 253, Label.MOVING_PERSON: 254, Label.MOVING_MOTORCYCLIST: 255,
-    Label.MOVING_OTHER_VEHICLE: 259, Label.MOVING_TRUCK: 258,
-}  # fmt: skip
-RAW_IDS = np.array([RAW_ID[label] for label in Label], dtype=np.uint32)
 
 
 def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
@@ -97,7 +88,7 @@ def write_sequence(out: Path, sequence: str, drive: Drive, sweeps: Iterable[Swee
 
 
 def _write_scan(folder: Path, name: str, one: Sweep) -> None:
-    raw = RAW_IDS[one.labels] | one.instances.astype(np.uint32) << 16
+    raw = RAW_OF_LABEL[one.labels] | one.instances.astype(np.uint32) << 16
     raw.astype("<u4").tofile(folder / "labels" / f"{name}.label")
     part = folder / "velodyne" / f"{name}.part"
     np.column_stack([uncorrected(one.points), one.intensity]).astype("<f4").tofile(part)

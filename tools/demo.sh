@@ -3,5 +3,5 @@
 # Options go to `segslam demo`, for example: bash tools/demo.sh --out runs/demo
 set -euo pipefail
 cd "$(dirname "$0")/.."
-. tools/setup.sh
+. tools/setup.sh ''
 exec "$PYTHON" -m segslam demo "$@"

@@ -1,16 +1,16 @@
 # Sourced by the other scripts: makes all that segslam needs on a fresh Debian or Ubuntu machine, and reuses it after.
 # Sets PYTHON to the interpreter of the virtual environment (.venv, or the folder that SEGSLAM_VENV names).
-# Usage: . tools/setup.sh [EXTRA]        EXTRA: an extra of pyproject.toml, such as dev
+# Usage: . tools/setup.sh EXTRA        EXTRA: an extra of pyproject.toml, such as dev, or empty
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 venv=${SEGSLAM_VENV:-$root/.venv}
-extra=${1:-}
+extra=$1
 
 install_packages() {
     local sudo=
     [ "$(id -u)" = 0 ] || sudo=sudo
     echo "installing system packages: $*" >&2
-    $sudo apt-get update -qq >&2
+    $sudo apt-get update -qq >&2 || return
     DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "$@" >&2
 }
 
@@ -23,7 +23,7 @@ system_packages() {
     python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3 python3-venv)
     if [ ${#missing[@]} -gt 0 ]; then
         command -v apt-get >/dev/null || { echo "setup: install by hand: ${missing[*]}" >&2; return 1; }
-        install_packages "${missing[@]}"
+        install_packages "${missing[@]}" || return
     fi
 }
 
@@ -35,9 +35,9 @@ python_packages() {
         echo "setup: segslam runs on Python 3.11 to 3.13, python3 is $(python3 --version)" >&2
         return 1
     }
-    [ -x "$venv/bin/python" ] || python3 -m venv "$venv"
+    [ -x "$venv/bin/python" ] || python3 -m venv "$venv" || return
     echo "installing Python packages into $venv" >&2
-    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$root${extra:+[$extra]}" >&2
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$root${extra:+[$extra]}" >&2 || return
     echo "$wanted" >> "$stamp"
 }
 

@@ -13,12 +13,21 @@ if TYPE_CHECKING:
     from segslam.config import Config
     from segslam.types import Alignment, Labels, Points, Registration, Rejected
 
+FPFH_ONLY = {
+    "gate": "lengths",
+    "features": "always",
+    "cluster_min_points": {},
+    "feature_voxel_m": 0.5,
+    "normal_radius_m": 1.0,
+    "feature_radius_m": 2.5,
+}
+"""Point features alone, as Segregator's authors compute them."""
 METHODS: dict[str, dict[str, Any]] = {
     "segregator": {},
     "segregator-c2f": {},
     "segator": {"gate": "lengths"},
-    "teaser": {"gate": "lengths", "features": "always", "cluster_min_points": {}},
-    "quatro": {"gate": "lengths", "features": "always", "cluster_min_points": {}, "rotation": "yaw"},
+    "teaser": FPFH_ONLY,
+    "quatro": FPFH_ONLY | {"rotation": "yaw"},
 }
 """Settings of section `segregator` that make the methods of the paper's tables."""
 LABEL_WORDS = ("geometric", "none")

@@ -15,9 +15,9 @@ from segslam.segregator.clusters import Clusters
 from segslam.types import GROUND_LABELS, Labels, Points, Vector
 
 CELL_M = 1.0
-"""Chosen: the ground is averaged in cells of this edge; 0.5 and 2 m do as well."""
+"""Chosen: the ground is averaged in cells of this edge."""
 NUM_CELLS = 5
-"""Chosen: the foot is as high as the middle one of the nearest cells; 3 and 9 do as well."""
+"""Chosen: the foot is as high as the middle one of the nearest cells."""
 
 
 def stand_on_ground(clusters: Clusters, upright: np.ndarray, ground: Points, *, max_distance_m: float) -> Clusters:

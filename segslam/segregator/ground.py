@@ -12,7 +12,7 @@ from numba import njit
 from segslam.types import GROUND_LABELS, Labels, Points
 
 CELL_M = 4.0
-"""Chosen: edge of a patch; 3 and 6 m do as well."""
+"""Chosen: edge of a patch."""
 REACH_M = 40.0
 """Chosen: the ground farther away in x or y is seen too flatly to tell its height."""
 MIN_POINTS = 8

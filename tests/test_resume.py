@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -161,6 +162,12 @@ def test_results_that_find_no_room_end_with_status_1_and_the_run_goes_on(
         assert run("map", kitti, "--out", out, "--resume", *OPTIONS) == 1
     assert "cannot write the results (No space left on device)" in capsys.readouterr().err
     _resumed_as_whole(kitti, whole, out)
+
+
+def test_a_run_killed_before_its_report_gets_it_on_resuming(kitti: Path, whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole, tmp_path / "run")
+    (tmp_path / "run" / "report.html").unlink()
+    _resumed_as_whole(kitti, whole, tmp_path / "run")
 
 
 def test_resuming_a_finished_run_says_so_and_changes_nothing(

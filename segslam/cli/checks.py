@@ -45,7 +45,7 @@ def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options:
 def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
     """Whether the run has all its results, of all scans of the data set."""
     result = recorded.result()
-    has_results = (recorded.path.parent / "metrics.json").is_file()
+    has_results = (recorded.path.parent / "report.html").is_file()  # the last that a run writes
     return has_results and result is not None and bool(result[1].scan_index[-1] == scans.scan_index[-1])
 
 

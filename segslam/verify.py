@@ -36,9 +36,10 @@ class Surface(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a sensor saw: for each direction the nearest return there or in the eight cells around it.
+    """What a sensor saw: for each direction with a return, the nearest there or in the eight cells around it.
 
-    (NUM_ROWS, NUM_COLUMNS) float32 in metres; infinite where nothing returned, which says nothing.
+    (NUM_ROWS, NUM_COLUMNS) float32 in metres; infinite where nothing returned. That says nothing, whatever its
+    neighbours saw: where grazing rays on the ground are lost, those above go on to the wall behind.
     """
 
     nearest_m: np.ndarray
@@ -63,7 +64,7 @@ def view(points: Points) -> View:
     padded = np.pad(nearest, ((1, 1), (0, 0)), constant_values=np.inf)
     padded = np.pad(padded, ((0, 0), (1, 1)), mode="wrap")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
-    return View(windows.min(axis=(2, 3)))
+    return View(np.where(np.isfinite(nearest), windows.min(axis=(2, 3)), np.float32(np.inf)))
 
 
 def agreement(

@@ -23,19 +23,26 @@ def _ring(radius_m: float, *, azimuths_deg: tuple[float, float] = (-180.0, 180.0
     return np.column_stack([radius_m * np.cos(azimuth.ravel()), radius_m * np.sin(azimuth.ravel()), height.ravel()])
 
 
-def test_a_view_holds_the_nearest_return_of_a_direction_and_its_neighbours() -> None:
-    points = np.array([[10.0, 0.05, 0.05], [20.0, 0.1, 0.1], [1.0, 0.0, 0.0]])  # the last is the vehicle itself
-    seen = view(points).nearest_m
+def test_a_view_holds_the_nearest_return_around_each_direction_that_has_one() -> None:
+    points = np.array(
+        [[10.0, 0.05, 0.05], [20.0, 0.1, 0.1], [20.0, 0.5, 0.1], [1.0, 0.0, 0.0]]
+    )  # the last: the vehicle
     expected = np.full((NUM_ROWS, NUM_COLUMNS), np.inf)
-    expected[NUM_ROWS // 2 - 1 : NUM_ROWS // 2 + 2, NUM_COLUMNS // 2 - 1 : NUM_COLUMNS // 2 + 2] = 10.0
-    np.testing.assert_allclose(seen, expected, rtol=1e-4)
+    expected[NUM_ROWS // 2, NUM_COLUMNS // 2 : NUM_COLUMNS // 2 + 2] = 10.0
+    np.testing.assert_allclose(view(points).nearest_m, expected, rtol=1e-4)
 
 
 def test_a_view_wraps_behind_the_sensor() -> None:
-    seen = view(np.array([[-10.0, 0.01, 0.05]])).nearest_m
-    row = seen[NUM_ROWS // 2]
-    assert np.isfinite(row[[0, -1, -2]]).all()
-    assert np.isinf(row[1:-2]).all()
+    seen = view(np.array([[-10.0, 0.01, 0.05], [-20.0, -0.01, 0.05]])).nearest_m
+    np.testing.assert_allclose(seen[NUM_ROWS // 2, [0, -1]], 10.0, rtol=1e-4)
+
+
+def test_ground_whose_grazing_rays_were_lost_does_not_stand_in_the_way_to_the_wall_behind() -> None:
+    wall = _ring(20.0)
+    far_ground = np.array([[17.0, 0.0, -1.34]])  # 4.5 degrees down, in the row below the lowest of the wall
+    seen = view(wall[wall[:, 2] > -1.35])  # down to 3.7 degrees
+    assert np.isfinite(seen.nearest_m).any()
+    assert free_space_violation(far_ground, seen, np.eye(4), config=CONFIG) == 0.0
 
 
 def test_points_before_a_wall_that_was_seen_violate_and_points_behind_it_do_not() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from mcap.exceptions import McapError
 
 from segslam.datasets.mcap_clouds import McapClouds
+from segslam.datasets.ouster import OusterFrames
 from segslam.datasets.point_cloud2 import CloudReader
 from segslam.datasets.scans import ASSUMED_PERIOD_NS, make_scan, read_stamps, selected_rows, usable_scans
 from segslam.semantics.encodings import Encoding
@@ -112,8 +113,9 @@ class Recording:
         """Of the scan, which has been read: some readers know it only then."""
         if self._stamps is not None:
             return int(self._stamps[index])
-        if self._clouds.stamp_ns:
-            return self._clouds.stamp_ns
+        stamp_ns = self._clouds.stamp_ns or getattr(self._loader, "stamp_ns", 0)
+        if stamp_ns:
+            return stamp_ns
         if not hasattr(self._loader, "get_frames_timestamps"):
             return index * ASSUMED_PERIOD_NS
         seconds = self._loader.get_frames_timestamps()[-1 if self._in_order else index]
@@ -160,11 +162,15 @@ def open_recording(
     try:
         with contextlib.redirect_stdout(said), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of kiss_icp's sources, which it parses to find its readers
-            own = kind == "mcap"
-            loader = McapClouds(source, topic) if own else dataset_factory(kind, source, sequence=sequence, topic=topic)
+            if kind == "mcap":
+                loader: Any = McapClouds(source, topic)
+            elif kind == "ouster":
+                loader = OusterFrames(source)
+            else:
+                loader = dataset_factory(kind, source, sequence=sequence, topic=topic)
             num_scans = len(loader)
     except LOADER_ERRORS as error:
-        complaint = " ".join(said.getvalue().split()) or _reason(error)
+        complaint = " ".join(said.getvalue().split()) if isinstance(error, SystemExit) else _reason(error)
         raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset") from error
     if num_scans == 0:
         raise SegslamError(f"{data}: holds no scan that the reader for {kind} data finds; see --dataset")

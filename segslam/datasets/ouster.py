@@ -1,0 +1,192 @@
+"""Ouster recordings: a pcap of the sensor's UDP packets, and the JSON metadata of the same session beside it.
+
+kiss_icp's reader needs one certain release of ouster-sdk, which has wheels for Python 3.11 and 3.12 alone and pins
+rosbags, kiss-icp and numpy to versions that cannot be installed beside ours. The packets are documented in Ouster's
+firmware manual, "Lidar Data" and "Coordinate Frames and XYZ Calculation".
+"""
+
+import json
+import mmap
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from segslam.datasets.pcap import udp_payloads
+from segslam.types import Points, Vector
+
+
+class _Channel(NamedTuple):
+    """What a packet holds of each beam, its (first) range ahead of the rest."""
+
+    num_bytes: int
+    range_type: str
+    range_bits: int
+    mm_per_count: int
+
+    @property
+    def dtype(self) -> np.dtype:
+        return np.dtype({"names": ["range"], "formats": [self.range_type], "itemsize": self.num_bytes})
+
+
+CHANNELS = {
+    "LEGACY": _Channel(12, "<u4", 20, 1),
+    "RNG19_RFL8_SIG16_NIR16": _Channel(12, "<u4", 19, 1),
+    "RNG19_RFL8_SIG16_NIR16_DUAL": _Channel(16, "<u4", 19, 1),
+    "RNG15_RFL8_NIR8": _Channel(4, "<u2", 15, 8),
+    "RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8),
+    "FUSA_RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8),
+}
+"""By the name of the packet's profile."""
+HEADER_BYTES = FOOTER_BYTES = 32
+"""Around the columns of a packet, but in the legacy profile."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Sensor:
+    """What the metadata say, whichever of its two layouts they have."""
+
+    profile: str
+    port: int | None
+    columns_per_frame: int
+    columns_per_packet: int
+    altitude_rad: np.ndarray
+    azimuth_rad: np.ndarray
+    beam_origin_mm: float
+    """Of the beams before the axis they turn about."""
+    T_sensor_lidar_mm: np.ndarray
+
+    @property
+    def column_dtype(self) -> np.dtype:
+        channels = ("channels", CHANNELS[self.profile].dtype, len(self.altitude_rad))
+        stamped = [("stamp_ns", "<u8"), ("measurement", "<u2")]
+        if self.profile == "LEGACY":
+            return np.dtype([*stamped, ("frame", "<u2"), ("encoder", "<u4"), channels, ("status", "<u4")])
+        return np.dtype([*stamped, ("status", "<u2"), channels])
+
+    @property
+    def header_bytes(self) -> int:
+        return 0 if self.profile == "LEGACY" else HEADER_BYTES
+
+    @property
+    def packet_bytes(self) -> int:
+        around = 0 if self.profile == "LEGACY" else HEADER_BYTES + FOOTER_BYTES
+        return around + self.columns_per_packet * self.column_dtype.itemsize
+
+
+class OusterFrames:
+    """The frames of a recording: points in the sensor's frame with their times. Takes the place of kiss_icp's reader.
+
+    Raises ValueError if the file is no pcap or the metadata do not describe its packets, FileNotFoundError if there
+    are none.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._sensor = _read_sensor(_metadata_of(file))
+        with file.open("rb") as stream:
+            self._content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self._frames = self._find_frames()
+        self.stamp_ns = 0
+        """Of the first column of the last frame read."""
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> tuple[Points, Vector]:
+        """(n, 3) points (m) of the beams that returned, and n times (s) after the first column."""
+        columns = np.concatenate([self._columns(payload) for payload in self._frames[index]])
+        columns = columns[(columns["status"] & 1).astype(bool)]
+        if len(columns) == 0:
+            raise ValueError("no valid column in this frame")
+        self.stamp_ns = int(columns["stamp_ns"].min())
+        channel = CHANNELS[self._sensor.profile]
+        counts = columns["channels"]["range"] & ((1 << channel.range_bits) - 1)
+        ranges_mm = counts.astype(np.float64) * channel.mm_per_count
+        column, beam = np.nonzero(ranges_mm)
+        rays, origins = self._rays_and_origins
+        measured = columns["measurement"][column].astype(np.intp)
+        points_mm = rays[measured, beam] * ranges_mm[column, beam, None] + origins[measured, beam]
+        times = (columns["stamp_ns"] - np.uint64(self.stamp_ns)) * 1e-9
+        return points_mm * 1e-3, times[column]
+
+    def get_frames_timestamps(self) -> list[float]:
+        """When the last frame read began, in seconds of the sensor's clock."""
+        return [self.stamp_ns * 1e-9]
+
+    def _find_frames(self) -> list[list[list[slice]]]:
+        """Payloads by frame: a new one begins where the number of the column falls back by more than half a turn."""
+        sensor = self._sensor
+        frames: list[list[list[slice]]] = []
+        last = sensor.columns_per_frame
+        payloads = udp_payloads(self._content, num_bytes=sensor.packet_bytes, port=sensor.port)
+        for payload in payloads:
+            number = int(self._columns(payload)["measurement"][0])
+            if not frames or last - number > sensor.columns_per_frame // 2:
+                frames.append([])
+            frames[-1].append(payload)
+            last = number
+        return frames
+
+    def _columns(self, payload: list[slice]) -> np.ndarray:
+        packet = b"".join(self._content[piece] for piece in payload)
+        sensor = self._sensor
+        return np.frombuffer(packet, sensor.column_dtype, sensor.columns_per_packet, offset=sensor.header_bytes)
+
+    @cached_property
+    def _rays_and_origins(self) -> tuple[np.ndarray, np.ndarray]:
+        """(columns, beams, 3): a point (mm) in the sensor's frame is its range (mm) times the ray, plus the origin."""
+        sensor = self._sensor
+        encoder = 2 * np.pi * (1 - np.arange(sensor.columns_per_frame) / sensor.columns_per_frame)[:, None]
+        heading = encoder - sensor.azimuth_rad
+        level = np.cos(sensor.altitude_rad)
+        ray = [
+            np.cos(heading) * level,
+            np.sin(heading) * level,
+            np.broadcast_to(np.sin(sensor.altitude_rad), heading.shape),
+        ]
+        rays = np.stack(ray, axis=-1)
+        turned = np.broadcast_to(encoder, heading.shape)
+        axis = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
+        rotation, shift = sensor.T_sensor_lidar_mm[:3, :3], sensor.T_sensor_lidar_mm[:3, 3]
+        return rays @ rotation.T, (axis - rays) * sensor.beam_origin_mm @ rotation.T + shift
+
+
+def _metadata_of(file: Path) -> Path:
+    """The JSON file beside it whose name begins like the recording's, or the only one there is."""
+    beside = sorted(file.resolve().parent.glob("*.json"))
+    alike = [path for path in beside if path.stem.startswith(file.stem) or file.stem.startswith(path.stem)]
+    found = alike or beside
+    if len(found) != 1 and file.with_suffix(".json") not in found:
+        raise FileNotFoundError(f"the sensor's metadata are missing: put them beside it as {file.stem}.json")
+    return found[0] if len(found) == 1 else file.with_suffix(".json")
+
+
+def _read_sensor(file: Path) -> _Sensor:
+    try:
+        values = _flat(json.loads(file.read_text(encoding="utf-8")))
+        profile = str(values.get("udp_profile_lidar", "LEGACY"))
+        if profile not in CHANNELS:
+            raise ValueError(f"packets of profile {profile}; known: {', '.join(CHANNELS)}")
+        return _Sensor(
+            profile=profile,
+            port=int(values.get("udp_port_lidar") or 0) or None,
+            columns_per_frame=int(values["columns_per_frame"]),
+            columns_per_packet=int(values["columns_per_packet"]),
+            altitude_rad=np.radians(values["beam_altitude_angles"]),
+            azimuth_rad=np.radians(values["beam_azimuth_angles"]),
+            beam_origin_mm=float(values["lidar_origin_to_beam_origin_mm"]),
+            T_sensor_lidar_mm=np.asarray(values["lidar_to_sensor_transform"], dtype=float).reshape(4, 4),
+        )
+    except KeyError as error:
+        raise ValueError(f"{file.name} does not say {error}; it must be the metadata of an Ouster sensor") from error
+
+
+def _flat(values: dict[str, Any]) -> dict[str, Any]:
+    """The keys of all sections: older metadata have none."""
+    inner = [_flat(value) for value in values.values() if isinstance(value, dict)]
+    flat = {key: value for key, value in values.items() if not isinstance(value, dict)}
+    for section in inner:
+        flat.update(section)
+    return flat

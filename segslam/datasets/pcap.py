@@ -1,0 +1,85 @@
+"""UDP datagrams of a pcap file, as tcpdump and Wireshark write it."""
+
+import mmap
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+BYTE_ORDERS = {
+    b"\xd4\xc3\xb2\xa1": "<",
+    b"\x4d\x3c\xb2\xa1": "<",
+    b"\xa1\xb2\xc3\xd4": ">",
+    b"\xa1\xb2\x3c\x4d": ">",
+}
+"""By the file's first bytes, with stamps in micro- or nanoseconds."""
+PCAPNG = b"\x0a\x0d\x0d\x0a"
+LINK_HEADER_BYTES = {0: 4, 1: 14, 101: 0, 113: 16, 276: 20}
+"""Loopback, Ethernet, raw IP, and Linux's two cooked captures."""
+ETHERNET, VLAN_TAG = 1, 0x8100
+IPV4, UDP = 4, 17
+UDP_HEADER_BYTES = 8
+
+Content = bytes | mmap.mmap
+
+
+@dataclass(slots=True)
+class _Fragments:
+    """One datagram that the network split, as places in the file."""
+
+    missing_bytes: int = 0
+    """Counted down from 0 until the first fragment, which knows the length, is seen."""
+    pieces: dict[int, slice] = field(default_factory=dict)
+
+
+def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Iterator[list[slice]]:
+    """Where the payloads of this length, sent to this port (None: any), lie in the file, in order of arrival.
+
+    Each is one slice, or several that follow one another where the network split it. Incomplete ones are left out.
+    Raises ValueError if the file is no pcap, or of a kind of link that is not known.
+    """
+    waiting: dict[bytes, _Fragments] = {}
+    wanted_bytes = num_bytes + UDP_HEADER_BYTES
+    for start, end in _ip_packets(content):
+        header_end = start + 4 * (content[start] & 0xF)
+        flags, protocol = struct.unpack_from(">HxB", content, start + 6)
+        offset, more = 8 * (flags & 0x1FFF), bool(flags & 0x2000)
+        if protocol != UDP or header_end >= end:
+            continue
+        if offset == 0:
+            sent_to, length = struct.unpack_from(">HH", content, header_end + 2)
+            if length != wanted_bytes or port not in (None, sent_to):
+                continue
+            header_end += UDP_HEADER_BYTES
+            if not more:
+                yield [slice(header_end, end)]
+                continue
+        key = content[start + 12 : start + 20] + content[start + 4 : start + 6]  # from, to, number of the datagram
+        fragments = waiting.setdefault(key, _Fragments())
+        fragments.pieces[offset] = slice(header_end, end)
+        fragments.missing_bytes += (num_bytes if offset == 0 else 0) - (end - header_end)
+        if fragments.missing_bytes == 0:
+            yield [fragments.pieces[place] for place in sorted(fragments.pieces)]
+            del waiting[key]
+
+
+def _ip_packets(content: Content) -> Iterator[tuple[int, int]]:
+    """First byte and end of every whole IPv4 packet."""
+    order = BYTE_ORDERS.get(content[:4])
+    if order is None:
+        remedy = "; convert it by `editcap -F pcap IN OUT`" if content[:4] == PCAPNG else ""
+        raise ValueError(f"this is not the classic pcap format{remedy}")
+    (link,) = struct.unpack_from(order + "I", content, 20)
+    if link not in LINK_HEADER_BYTES:
+        raise ValueError(f"captured on a link of kind {link}; known: {', '.join(map(str, LINK_HEADER_BYTES))}")
+    record = 24
+    while record + 16 <= len(content):
+        (captured,) = struct.unpack_from(order + "I", content, record + 8)
+        start = record + 16 + LINK_HEADER_BYTES[link]
+        record += 16 + captured
+        if link == ETHERNET and content[start - 2 : start] == VLAN_TAG.to_bytes(2, "big"):
+            start += 4
+        if start + 20 > min(record, len(content)) or content[start] >> 4 != IPV4:
+            continue
+        end = start + int.from_bytes(content[start + 2 : start + 4], "big")  # a frame may be padded
+        if end <= min(record, len(content)):
+            yield start, end

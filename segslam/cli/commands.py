@@ -2,13 +2,15 @@
 
 import typer
 
-from segslam.cli import demo, evaluate, map, optimize, register, replay, report, simulate, view
+from segslam.cli import bench, demo, evaluate, export, map, optimize, register, replay, report, simulate, view
 
 
 def add_all(app: typer.Typer) -> None:
     """Add every command to the application."""
     app.command("eval")(evaluate.evaluate)
+    app.add_typer(bench.app, name="bench")
     app.command("demo")(demo.demo)
+    app.command("export")(export.export)
     app.command("map")(map.map_command)
     app.command("optimize")(optimize.optimize)
     app.command("register", cls=register.LabelsCommand)(register.register)

@@ -7,29 +7,14 @@ import typer
 from typer.core import TyperCommand
 
 from segslam.cli.console import ConfigOption, EncodingOption, JsonOption, SetOption, print_json, say
+from segslam.experiments.settings import METHOD_NAMES
 
 if TYPE_CHECKING:
-    from segslam.alignment import PreparedScan, Stopwatch
+    from segslam.alignment import Stopwatch
     from segslam.config import Config
-    from segslam.types import Alignment, Labels, Points, Registration, Rejected
+    from segslam.experiments.estimate import Estimate
+    from segslam.types import Labels, Points, Rejected
 
-FPFH_ONLY = {
-    "gate": "lengths",
-    "features": "always",
-    "cluster_min_points": {},
-    "feature_voxel_m": 0.5,
-    "normal_radius_m": 1.0,
-    "feature_radius_m": 2.5,
-}
-"""Point features alone, as Segregator's authors compute them."""
-METHODS: dict[str, dict[str, Any]] = {
-    "segregator": {},
-    "segregator-c2f": {},
-    "segator": {"gate": "lengths"},
-    "teaser": FPFH_ONLY,
-    "quatro": FPFH_ONLY | {"rotation": "yaw"},
-}
-"""Settings of section `segregator` that make the methods of the paper's tables."""
 LABEL_WORDS = ("geometric", "none")
 
 
@@ -40,9 +25,14 @@ class LabelsCommand(TyperCommand):
         """Repeat the option before its second value, which is how click takes two."""
         if "--labels" in args:
             second = args.index("--labels") + 2
-            if args[second - 1 : second] and args[second - 1] not in LABEL_WORDS and second < len(args):
+            if second < len(args) and not _is_word(args[second - 1]):
                 args = [*args[:second], "--labels", *args[second:]]
         return super().parse_args(ctx, args)
+
+
+def _is_word(label_source: str) -> bool:
+    """Whether it labels both scans, as no file does."""
+    return label_source in LABEL_WORDS or label_source.startswith("network:")
 
 
 def register(
@@ -50,11 +40,14 @@ def register(
     target: Annotated[Path, typer.Argument(help="Scan that stays.")],
     dataset: Annotated[str | None, typer.Option(help="kitti: apply KITTI's vertical-angle correction.")] = None,
     labels: Annotated[
-        list[str] | None, typer.Option(help="Two .label files, source's and target's; or geometric (default), or none.")
+        list[str] | None,
+        typer.Option(help="Two .label files, source's and target's; geometric (default); network:MODEL.onnx; none."),
     ] = None,
     encoding: EncodingOption = None,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "segregator-c2f",
-    refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Sharpen the coarse pose by ICP.")] = True,
+    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHOD_NAMES)}.")] = "segregator-c2f",
+    refine: Annotated[
+        bool, typer.Option("--refine/--no-refine", help="Of segregator-c2f: sharpen the coarse pose by ICP.")
+    ] = True,
     config: ConfigOption = None,
     settings: SetOption = None,
     json: JsonOption = False,
@@ -63,32 +56,23 @@ def register(
 
     Example: segslam register 000000.bin 004413.bin --dataset kitti --labels 000000.label 004413.label
     """
-    from segslam import segregator
-    from segslam.alignment import Stopwatch, align, prepare_scan
+    from segslam.alignment import Stopwatch
+    from segslam.config import load_config
+    from segslam.experiments.methods import find_method, prepare
 
-    settings_now = _settings(method, config, settings)
+    if method == "segregator-c2f" and not refine:
+        method = "segregator"
+    chosen = find_method(method)
+    settings_now = load_config(config, settings or ())
     clouds = _read(source, target, dataset, labels, encoding, settings_now)
     watch = Stopwatch()
-    scans: list[PreparedScan] = []
+    scans: list[dict[str, Any]] = []
     for name, (points, classes) in zip(("source", "target"), clouds, strict=True):
         with watch(f"describe_{name}"):
-            scans.append(prepare_scan(points, classes, config=settings_now))
-    if refine and method != "segregator":
-        found: Alignment | Registration | Rejected = align(*scans, config=settings_now, watch=watch)
-    else:
-        with watch("match"):
-            found = segregator.match(*(scan.description for scan in scans), config=settings_now.segregator)
+            parts = prepare(points, classes, methods=[method], config=settings_now)
+        scans.append({part: made.value for part, made in parts.items()})
+    found = chosen.align(scans[0], scans[1], settings_now, watch)
     _show(_figures(found, watch), json=json)
-
-
-def _settings(method: str, config: Path | None, settings: list[str] | None) -> "Config":
-    from segslam.config import load_config
-    from segslam.types import SegslamError
-
-    if method not in METHODS:
-        raise SegslamError(f"--method {method}: no such method; known: {', '.join(METHODS)}")
-    chosen = load_config(config, settings or ())
-    return chosen.model_copy(update={"segregator": chosen.segregator.model_copy(update=METHODS[method])})
 
 
 def _read(
@@ -101,10 +85,10 @@ def _read(
 ) -> list[tuple["Points", "Labels"]]:
     """The two scans with their labels, in step."""
     from segslam.alignment import shape_labels
-    from segslam.datasets.clouds import read_cloud
+    from segslam.datasets.clouds import read_cloud, read_intensities
     from segslam.datasets.kitti import correct_vertical_angle
     from segslam.datasets.scans import make_scan
-    from segslam.semantics.label_files import encoding_of, read_labels, unlabelled
+    from segslam.semantics.label_files import encoding_of, open_labels, read_labels
     from segslam.types import SegslamError
 
     if dataset not in (None, "kitti"):
@@ -115,10 +99,16 @@ def _read(
         files = [Path(word) for word in words]
         numbering = encoding or encoding_of(files)
         classes = [read_labels(file, len(points), numbering) for file, points in zip(files, stored, strict=True)]
-    elif words[0] in LABEL_WORDS:
-        classes = [unlabelled(len(points)) for points in stored]
+    elif _is_word(words[0]):
+        labeller = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None)
+        classes = [
+            labeller.read(file.stem, points, read_intensities(file))
+            for file, points in zip((source, target), stored, strict=True)
+        ]
     else:
-        raise SegslamError(f"--labels {words[0]}: give two .label files, the source's and the target's, or geometric")
+        raise SegslamError(
+            f"--labels {words[0]}: give two .label files, the source's and the target's, or geometric, or network:MODEL"
+        )
     corrected = [correct_vertical_angle(points) if dataset == "kitti" else points for points in stored]
     scans = [
         make_scan(file, 0, 0, points, ids)
@@ -130,31 +120,17 @@ def _read(
     ]
 
 
-def _figures(found: "Alignment | Registration | Rejected", watch: "Stopwatch") -> dict[str, Any]:
-    from segslam.types import Alignment, Rejected
+def _figures(found: "Estimate | Rejected", watch: "Stopwatch") -> dict[str, Any]:
+    from segslam.types import Rejected
 
-    figures: dict[str, Any] = {
-        "accepted": not isinstance(found, Rejected),
-        "reason": None,
-        "detail": None,
-        "T_target_source": None,
-        "num_correspondences": None,
-        "num_edges": None,
-        "num_inliers": None,
-        "overlap": None,
-    }
+    reason, detail, pose = None, None, None
     if isinstance(found, Rejected):
-        figures |= {"reason": found.reason.value, "detail": found.detail}
+        reason, detail = found.reason.value, found.detail
     else:
-        coarse, fine = (found.coarse, found.fine) if isinstance(found, Alignment) else (found, found)
-        figures |= {
-            "T_target_source": fine.T_target_source.ravel().tolist(),
-            "num_correspondences": coarse.num_correspondences,
-            "num_edges": coarse.num_edges,
-            "num_inliers": coarse.num_inliers,
-            "overlap": found.overlap if isinstance(found, Alignment) else None,
-        }
-    return figures | {"seconds": watch.seconds}
+        pose = found.T_target_source.ravel().tolist()
+    told = {key: getattr(found, key, None) for key in ("num_correspondences", "num_edges", "num_inliers", "overlap")}
+    answer = {"accepted": reason is None, "reason": reason, "detail": detail, "T_target_source": pose}
+    return answer | told | {"seconds": watch.seconds}
 
 
 def _show(figures: dict[str, Any], *, json: bool) -> None:
@@ -170,4 +146,5 @@ def _show(figures: dict[str, Any], *, json: bool) -> None:
     print("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
     overlap = "" if figures["overlap"] is None else f", overlap {figures['overlap']:.2f}"
     times = ", ".join(f"{stage} {1000 * seconds:.0f} ms" for stage, seconds in figures["seconds"].items())
-    say(f"{figures['num_inliers']} of {figures['num_correspondences']} correspondences{overlap}; {times}")
+    inliers = "" if figures["num_inliers"] is None else f"{figures['num_inliers']} inliers{overlap}; "
+    say(f"{inliers}{times}")

@@ -1,0 +1,101 @@
+"""A benchmark from its trials to all rows: spread over workers, kept as they come, continued where it was stopped."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from segslam.experiments.job import Job
+from segslam.experiments.rows import Row, read_rows, row_writer
+from segslam.experiments.trials import Trial
+from segslam.experiments.workers import LOST_WORKER, cluster, run_here, run_on
+from segslam.types import SegslamError
+
+ROWS_FILE = "details.csv"
+ASKED_FILE = "asked.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """Who does the work: this process, several of this machine, or the workers of a Dask cluster."""
+
+    workers: int = 1
+    scheduler: str | None = None
+
+
+def run(job: Job, trials: Sequence[Trial], *, pool: Pool = Pool(), folder: Path | None = None) -> Iterator[list[Row]]:
+    """The rows of each trial as it is finished, those that the folder holds from before first.
+
+    With a folder every row is on the disk before the next trial's. The same benchmark in the same folder goes on where
+    it was stopped; raises SegslamError if the folder holds another one.
+    """
+    done = _rows_before(folder, job, trials) if folder else []
+    tried = {row.key[:3] for row in done}
+    if done:
+        yield done
+    left = [trial for trial in trials if trial.key not in tried]
+    with row_writer(folder / ROWS_FILE, done) if folder else nullcontext() as writer:
+        for rows in _work(job, left, pool):
+            if writer is not None:
+                writer.write(rows)
+            yield rows
+
+
+def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row]:
+    """The rows as one process would have made them, whoever was first."""
+    place = {trial.key: number for number, trial in enumerate(trials)}
+    return sorted(rows, key=lambda row: (place[row.key[:3]], job.methods.index(row.method)))
+
+
+def _work(job: Job, trials: Sequence[Trial], pool: Pool) -> Iterator[list[Row]]:
+    if not trials:
+        return
+    if pool.workers == 1 and pool.scheduler is None:
+        yield from run_here(job, trials)
+        return
+    with cluster(workers=pool.workers, scheduler=pool.scheduler) as client:
+        yield from run_on(client, job, trials)
+
+
+def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
+    """The rows of the trials that are finished, after making sure that they are of this benchmark."""
+    asked = _asked(job, trials)
+    file = folder / ASKED_FILE
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        if before is None:
+            file.write_text(json.dumps(asked, indent=1) + "\n", encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise SegslamError(f"{file}: cannot be read or written ({error}); choose another --out") from error
+    if before is None:
+        return []
+    for key in asked:
+        if before.get(key) != asked[key]:
+            raise SegslamError(f"{folder}: holds a benchmark with other {key}; choose another --out, or delete it")
+    rows = read_rows(folder / ROWS_FILE) if (folder / ROWS_FILE).exists() else []
+    return _of_whole_trials([row for row in rows if row.reason != LOST_WORKER], job)
+
+
+def _of_whole_trials(rows: list[Row], job: Job) -> list[Row]:
+    """Those of trials that every method has finished."""
+    methods: dict[Any, set[str]] = {}
+    for row in rows:
+        methods.setdefault(row.key[:3], set()).add(row.method)
+    return [row for row in rows if methods[row.key[:3]] == set(job.methods)]
+
+
+def _asked(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:
+    """What makes two benchmarks the same one, in words that a person can compare."""
+    digest = hashlib.sha256()
+    for trial in trials:
+        digest.update(repr((trial.key, trial.T_target_source.round(6).tolist())).encode())
+    return {
+        "methods": list(job.methods),
+        "settings": job.config.model_dump(mode="json"),
+        "labels": [job.source.labels, job.source.encoding],
+        "pairs": {"number": len(trials), "sha256": digest.hexdigest()},
+    }

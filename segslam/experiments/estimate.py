@@ -1,0 +1,17 @@
+"""What any registration method gives."""
+
+from dataclasses import dataclass
+
+from segslam.types import Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The pose of the source in the target, and what the method tells of how it found it; None is what it has not."""
+
+    T_target_source: Transform
+    num_correspondences: int | None = None
+    num_inliers: int | None = None
+    num_edges: int | None = None
+    """Of the consistency graph."""
+    overlap: float | None = None

@@ -1,0 +1,147 @@
+"""One benchmark's scans, methods and settings, and the two pieces of work it consists of, wherever they are done."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from segslam import geometry
+from segslam.alignment import Stopwatch, shape_labels
+from segslam.config import Config
+from segslam.datasets import Dataset, open_dataset
+from segslam.experiments.estimate import Estimate
+from segslam.experiments.meter import Cost, measured
+from segslam.experiments.methods import METHODS, Part, prepare
+from segslam.experiments.rows import Row
+from segslam.experiments.trials import ScanVariant, Trial
+from segslam.semantics.encodings import Encoding
+from segslam.types import BadScan, Rejected
+
+BAD_SCAN = "bad_scan"
+"""The reason of a row whose scan could not be read."""
+
+
+@dataclass(frozen=True, slots=True)
+class DataSource:
+    """What opens the data set, here or on another machine that sees the same files."""
+
+    data: Path
+    sequence: str = "00"
+    dataset: str | None = None
+    labels: str = "auto"
+    encoding: Encoding | None = None
+
+    def open(self) -> Dataset:
+        """Raises SegslamError as `open_dataset` does."""
+        return open_dataset(
+            self.data, sequence=self.sequence, dataset=self.dataset, labels=self.labels, encoding=self.encoding
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Job:
+    """What all trials of a benchmark have in common. Travels to the workers."""
+
+    source: DataSource
+    methods: tuple[str, ...]
+    config: Config
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedScan:
+    """All that the methods need of one scan, made once; or why it cannot be used."""
+
+    parts: Mapping[str, Part]
+    labelling: Cost | None = None
+    """Labels by shape; None where labels came from files, whose making nobody timed."""
+    problem: str = ""
+
+
+def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
+    """Read, label, turn, rob and prepare a scan."""
+    dataset, row_of_scan = _opened(job.source)
+    try:
+        scan = dataset[row_of_scan[variant.index]]
+    except BadScan as error:
+        return SharedScan({}, problem=str(error))
+    labels, labelling = scan.labels, None
+    if dataset.labels.geometric and not labels.any():
+        with measured() as labelling:
+            labels = shape_labels(scan.points, config=job.config)
+    points, labels = variant.of(scan.points, labels)
+    return SharedScan(prepare(points, labels, methods=job.methods, config=job.config), labelling)
+
+
+def register(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> list[Row]:
+    """The pair registered by every method of the job, from the same scans."""
+    return [_register(method, job.config, trial, source, target) for method in job.methods]
+
+
+@lru_cache(maxsize=4)
+def _opened(source: DataSource) -> tuple[Dataset, dict[int, int]]:
+    """The data set, once a process, and the row of each scan."""
+    dataset = source.open()
+    return dataset, {int(index): row for row, index in enumerate(dataset.scan_index)}
+
+
+def _register(method: str, config: Config, trial: Trial, source: SharedScan, target: SharedScan) -> Row:
+    problem = source.problem or target.problem
+    if problem:
+        return failed_row(method, trial, BAD_SCAN)
+    scans = [{name: shared.parts[name] for name in METHODS[method].parts} for shared in (source, target)]
+    values = [{name: part.value for name, part in parts.items()} for parts in scans]
+    watch = Stopwatch()
+    with measured() as cost:
+        outcome = METHODS[method].align(values[0], values[1], config, watch)
+    costs = [part.cost for parts in scans for part in parts.values()]
+    labelled = [shared.labelling for shared in (source, target) if shared.labelling and _uses_labels(method)]
+    reason = outcome.reason.value if isinstance(outcome, Rejected) else ""
+    return failed_row(method, trial, reason).model_copy(
+        update=_times(cost, costs, labelled, watch) | ({} if isinstance(outcome, Rejected) else _found(outcome, trial))
+    )
+
+
+def _times(aligned: Cost, prepared: list[Cost], labelled: list[Cost], watch: Stopwatch) -> dict[str, float | None]:
+    """The columns of a row that say what it took."""
+    costs = [aligned, *prepared, *labelled]
+    return {
+        "ms": 1000 * sum(cost.seconds for cost in costs),
+        "cpu_ms": 1000 * sum(cost.cpu_seconds for cost in costs),
+        "label_ms": 1000 * sum(cost.seconds for cost in labelled) if labelled else None,
+        "prepare_ms": 1000 * sum(cost.seconds for cost in prepared),
+        "peak_mb": max((cost.peak_mb for cost in costs if cost.peak_mb is not None), default=None),
+    } | {f"{stage}_ms": 1000 * seconds for stage, seconds in watch.seconds.items()}
+
+
+def _found(estimate: Estimate, trial: Trial) -> dict[str, object]:
+    T_error = estimate.T_target_source @ geometry.inverse(trial.T_target_source)
+    return {
+        "accepted": True,
+        "error_m": geometry.distance(T_error),
+        "error_deg": math.degrees(geometry.angle(T_error)),
+        "num_correspondences": estimate.num_correspondences,
+        "num_edges": estimate.num_edges,
+        "num_inliers": estimate.num_inliers,
+        "T_target_source": " ".join(f"{value:.9g}" for value in estimate.T_target_source[:3].ravel()),
+    }
+
+
+def _uses_labels(method: str) -> bool:
+    return any(part.endswith("description") for part in METHODS[method].parts)
+
+
+def failed_row(method: str, trial: Trial, reason: str) -> Row:
+    """The row of a registration that gave no pose."""
+    return Row(
+        pairs=trial.pairs,
+        source=trial.source.index,
+        target=trial.target.index,
+        source_yaw_deg=trial.source.yaw_deg,
+        source_lost=trial.source.lost,
+        target_lost=trial.target.lost,
+        draw=max(trial.source.draw, trial.target.draw),
+        method=method,
+        accepted=False,
+        reason=reason,
+    )

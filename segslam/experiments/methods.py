@@ -1,0 +1,153 @@
+"""Every method on one interface: what it needs of each scan, made once a scan, and how it aligns two so prepared."""
+
+import importlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from segslam import alignment, refine, segregator, verify
+from segslam.alignment import PreparedScan, Stopwatch
+from segslam.config import Config, RefineConfig
+from segslam.experiments import baselines
+from segslam.experiments.estimate import Estimate
+from segslam.experiments.meter import Cost, measured
+from segslam.experiments.settings import check_method, method_config
+from segslam.types import Alignment, Description, Labels, Points, Registration, Rejected, SegslamError
+
+Values = Mapping[str, Any]
+"""The parts of one scan by name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """Something made of one scan, and what that took."""
+
+    value: Any
+    cost: Cost
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """How two scans are aligned, from the parts of each that it names."""
+
+    parts: tuple[str, ...]
+    align: Callable[[Values, Values, Config, Stopwatch], Estimate | Rejected]
+    package: tuple[str, str] | None = None
+    """Module and extra, where it is optional."""
+
+
+class SurfaceScan:
+    """Surface and view of a scan, for refinement and verification. Travels between processes as its points."""
+
+    def __init__(self, thinned: Points, view: verify.View, config: RefineConfig) -> None:
+        self.surface = refine.prepare(thinned, config=config)
+        self.view = view
+        self._config = config
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SurfaceScan, (self.surface.points.astype("float32"), self.view, self._config)
+
+
+def _surface(points: Points, labels: Labels, config: Config) -> SurfaceScan:
+    return SurfaceScan(refine.thin(points, config=config.refine), verify.view(points), config.refine)
+
+
+def _description(points: Points, labels: Labels, config: Config) -> Description:
+    return segregator.describe(points, labels, config=config.segregator)
+
+
+def _fpfh_description(points: Points, labels: Labels, config: Config) -> Description:
+    return segregator.describe(points, labels, config=method_config(config, "teaser").segregator)
+
+
+def _of_points(prepare: Callable[[Points], Any]) -> Callable[[Points, Labels, Config], Any]:
+    """For a part that neither labels nor settings change."""
+    return lambda points, labels, config: prepare(points)
+
+
+PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
+    "description": _description,
+    "fpfh_description": _fpfh_description,
+    "surface": _surface,
+    "gicp": _of_points(baselines.prepare_gicp),
+    "fpfh": _of_points(baselines.prepare_fpfh),
+    "points": _of_points(baselines.prepare_points),
+}
+
+
+def prepare(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> dict[str, Part]:
+    """All parts of a scan that these methods need, each made once."""
+    parts = {}
+    for name in dict.fromkeys(part for method in methods for part in METHODS[method].parts):
+        with measured() as cost:
+            value = PARTS[name](points, labels, config)
+        parts[name] = Part(value, cost)
+    return parts
+
+
+def find_method(name: str) -> Method:
+    """The method of a name. Raises SegslamError if there is none, or if its package is not installed."""
+    check_method(name)
+    method = METHODS[name]
+    if method.package is not None:
+        module, extra = method.package
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise SegslamError(f"--method {name}: needs {module}; pip install 'segslam[{extra}]'") from error
+    return method
+
+
+def _match(source: Values, target: Values, config: Config, watch: Stopwatch, *, part: str) -> Estimate | Rejected:
+    with watch("match"):
+        found = segregator.match(source[part], target[part], config=config.segregator)
+    return found if isinstance(found, Rejected) else _estimate(found, found)
+
+
+def _segregator(name: str, part: str = "description") -> Method:
+    """Segregator's coarse pose under the settings of a name."""
+    return Method(
+        (part,),
+        lambda source, target, config, watch: _match(source, target, method_config(config, name), watch, part=part),
+    )
+
+
+def _align(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:
+    scans = (
+        PreparedScan(values["description"], values["surface"].surface, values["surface"].view)
+        for values in (source, target)
+    )
+    found = alignment.align(*scans, config=config, watch=watch)
+    if isinstance(found, Alignment):
+        return _estimate(found.coarse, found.fine, overlap=found.overlap)
+    return found
+
+
+def _estimate(coarse: Registration, fine: Registration, *, overlap: float | None = None) -> Estimate:
+    return Estimate(
+        fine.T_target_source, coarse.num_correspondences, coarse.num_inliers, coarse.num_edges, overlap=overlap
+    )
+
+
+def _baseline(
+    part: str, align: Callable[[Any, Any], Estimate | Rejected], package: tuple[str, str] | None = None
+) -> Method:
+    def run(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:
+        with watch("match"):
+            return align(source[part], target[part])
+
+    return Method((part,), run, package)
+
+
+METHODS: dict[str, Method] = {
+    "segregator": _segregator("segregator"),
+    "segregator-c2f": Method(("description", "surface"), _align),
+    "segator": _segregator("segator"),
+    "teaser": _segregator("teaser", "fpfh_description"),
+    "quatro": _segregator("quatro", "fpfh_description"),
+    "vgicp": _baseline("gicp", baselines.align_vgicp),
+    "gicp": _baseline("gicp", baselines.align_gicp),
+    "kiss-matcher": _baseline("points", baselines.align_kiss_matcher, ("kiss_matcher", "bench")),
+    "ransac": _baseline("fpfh", baselines.align_ransac),
+    "fgr": _baseline("fpfh", baselines.align_fgr),
+}

@@ -1,0 +1,132 @@
+"""Pairs of scans: lists from files, or cut from true poses as the paper's were; and the pose that is true of each."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from segslam import geometry
+from segslam.experiments.trials import ScanVariant, Trial, trial
+from segslam.trajectory import rows_of_same_scan
+from segslam.types import IndexPairs, SegslamError, Trajectory, Transform
+
+MIN_GAP = 50
+"""Scans between the two of a pair, as the paper's lists were cut."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairList:
+    """Pairs of scans, `pairs` (n, 2) of source and target by number."""
+
+    name: str
+    pairs: IndexPairs
+    num_whole: int
+    """Pairs of the list before it was sampled."""
+    truth: Mapping[tuple[int, int], Transform] | None = None
+    """T_target_source where the list brings it; else it comes from the data set's poses."""
+
+
+def read_pairs(file: Path) -> PairList:
+    """A list `source target` a line; or JSON, a list of {source, target, T_target_source} with its own truth.
+
+    Raises SegslamError that names file and line for another form.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(
+            f"{file}: cannot read the pairs ({error}); name a file with `source target` a line"
+        ) from error
+    return _from_json(file, text) if file.suffix == ".json" else _from_text(file, text)
+
+
+def cut_pairs(reference: Trajectory, *, name: str, min_m: float, max_m: float, min_gap: int = MIN_GAP) -> PairList:
+    """All pairs, older scan first, `min_m` to `max_m` apart and at least `min_gap` scans apart in time."""
+    positions = reference.T_world_lidar[:, :3, 3]
+    found = [np.empty((0, 2), dtype=int)]
+    for row, index in enumerate(reference.scan_index):
+        later = np.flatnonzero(reference.scan_index >= index + min_gap)
+        distance_m = np.linalg.norm(positions[later] - positions[row], axis=1)
+        chosen = later[(distance_m >= min_m) & (distance_m < max_m)]
+        found.append(np.column_stack([np.full(len(chosen), index), reference.scan_index[chosen]]))
+    pairs = np.concatenate(found)
+    return PairList(name, pairs, len(pairs))
+
+
+def sample_pairs(whole: PairList, *, num_pairs: int, seed: int) -> PairList:
+    """So many pairs drawn from a list, in its order; the whole if it has no more."""
+    if num_pairs >= len(whole.pairs):
+        return whole
+    rows = np.random.default_rng(seed).choice(len(whole.pairs), num_pairs, replace=False)
+    return replace(whole, pairs=whole.pairs[np.sort(rows)])
+
+
+def scans_named(lists: Sequence[PairList]) -> set[int]:
+    """The numbers of all scans that the lists name."""
+    return set(chain.from_iterable(one.pairs.ravel().tolist() for one in lists))
+
+
+def pair_trials(pairs: PairList, reference: Trajectory | None) -> list[Trial]:
+    """A trial a pair, the scans as they are. Raises SegslamError for a pair whose true pose is not known."""
+    return [
+        trial(pairs.name, ScanVariant(source), ScanVariant(target), T_target_source)
+        for (source, target), T_target_source in true_poses(pairs, reference).items()
+    ]
+
+
+def true_poses(pairs: PairList, reference: Trajectory | None) -> dict[tuple[int, int], Transform]:
+    """T_target_source of each pair (source, target). Raises SegslamError for a pair whose true pose is not known."""
+    keys = [(int(source), int(target)) for source, target in pairs.pairs]
+    if pairs.truth is not None:
+        return {key: pairs.truth[key] for key in keys}
+    if reference is None:
+        raise SegslamError(
+            f"{pairs.name}: the data has no true poses; put KITTI's poses/NN.txt there, or give a JSON list with poses"
+        )
+    numbers = np.array(sorted(scans_named([pairs])), dtype=int)
+    rows = rows_of_same_scan(numbers, reference.scan_index)
+    if len(rows) < len(numbers):
+        missing = np.setdiff1d(numbers, numbers[rows[:, 0]])
+        raise SegslamError(
+            f"{pairs.name}: scan {missing[0]} has no file or no true pose, nor have {len(missing) - 1} other scans; "
+            "put them there, or --sample pairs of a list whose scans are all there"
+        )
+    T_world = dict(zip(numbers[rows[:, 0]].tolist(), reference.T_world_lidar[rows[:, 1]], strict=True))
+    return {(source, target): geometry.inverse(T_world[target]) @ T_world[source] for source, target in keys}
+
+
+def _from_text(file: Path, text: str) -> PairList:
+    pairs = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) < 2 or not all(word.isdecimal() for word in words[:2]):
+            raise SegslamError(f"{file}:{number}: expected two scan numbers, source and target, found {line.strip()!r}")
+        pairs.append((int(words[0]), int(words[1])))
+    return _checked(file, PairList(file.stem, np.array(pairs, dtype=int).reshape(-1, 2), len(pairs)))
+
+
+def _from_json(file: Path, text: str) -> PairList:
+    try:
+        truth = {(int(row["source"]), int(row["target"])): _rigid(row["T_target_source"]) for row in json.loads(text)}
+    except (ValueError, KeyError, TypeError) as error:
+        raise SegslamError(
+            f"{file}: expected a list of objects with source, target and T_target_source (4x4): {error}"
+        ) from error
+    pairs = np.array(list(truth), dtype=int).reshape(-1, 2)
+    return _checked(file, PairList(file.stem, pairs, len(pairs), truth))
+
+
+def _rigid(rows: object) -> Transform:
+    matrix = np.array(rows, dtype=float).reshape(4, 4)
+    return geometry.transform(geometry.nearest_rotation(matrix[:3, :3]), matrix[:3, 3])
+
+
+def _checked(file: Path, pairs: PairList) -> PairList:
+    if len(pairs.pairs) == 0:
+        raise SegslamError(f"{file}: holds no pair; write `source target` a line")
+    return pairs

@@ -1,0 +1,84 @@
+"""Values of the Segregator paper (Yin et al., ICRA 2023), to stand beside what is measured on the same lists."""
+
+LISTS = {"easy": "3to5", "medium": "8to10", "hard": "10to15"}
+"""How the files of the lists call them, by the metres between the scans."""
+NUM_PAIRS = {
+    "00": (8503, 7527, 21267),
+    "05": (5155, 5243, 11600),
+    "06": (1128, 1113, 2825),
+    "07": (1311, 1169, 2877),
+    "08": (2064, 2750, 9457),
+}
+"""Of the easy, medium and hard list of each sequence."""
+SUCCESS_PERCENT = {
+    "vgicp": {
+        "00": (95.6, 34.1, 14.9),
+        "05": (82.6, 34.6, 25.3),
+        "06": (94.6, 66.7, 35.1),
+        "07": (80.0, 36.5, 0.8),
+        "08": (0.24, 0.0, 4.9),
+    },
+    "teaser": {
+        "00": (97.0, 65.4, 41.1),
+        "05": (96.4, 73.4, 48.0),
+        "06": (99.8, 94.3, 83.2),
+        "07": (91.1, 49.2, 30.7),
+        "08": (96.6, 74.8, 49.5),
+    },
+    "quatro": {
+        "00": (96.9, 66.2, 41.2),
+        "05": (96.3, 73.7, 48.1),
+        "06": (99.8, 93.9, 83.2),
+        "07": (91.3, 51.0, 31.9),
+        "08": (96.8, 75.2, 49.8),
+    },
+    "segator": {
+        "00": (98.6, 88.3, 75.4),
+        "05": (77.8, 72.2, 59.0),
+        "06": (91.0, 74.6, 63.8),
+        "07": (100.0, 95.5, 81.4),
+        "08": (90.3, 84.4, 78.2),
+    },
+    "segregator": {
+        "00": (99.7, 89.3, 80.7),
+        "05": (98.7, 93.2, 81.8),
+        "06": (100.0, 99.6, 98.3),
+        "07": (100.0, 98.1, 88.0),
+        "08": (96.9, 94.1, 88.8),
+    },
+}
+"""Success (below 2 m and 5 degrees) on those lists."""
+TIMING_SEQUENCE = "06"
+TIMING = {
+    "vgicp": {"success_percent": 55.4, "translation_m": 0.07, "rotation_deg": 0.10, "mean_ms": 90.0},
+    "teaser": {
+        "success_percent": 89.0,
+        "translation_m": 0.36,
+        "rotation_deg": 0.67,
+        "mean_ms": 150.0,
+        "mean_edges": 3025.0,
+    },
+    "quatro": {"success_percent": 89.0, "translation_m": 0.36, "rotation_deg": 0.66, "mean_ms": 150.0},
+    "segregator": {
+        "success_percent": 99.0,
+        "translation_m": 0.09,
+        "rotation_deg": 0.27,
+        "mean_ms": 100.0,
+        "mean_edges": 2687.0,
+    },
+    "segregator-c2f": {"success_percent": 99.0, "translation_m": 0.07, "rotation_deg": 0.12, "mean_ms": 150.0},
+}
+"""On all three lists of 06; `mean_edges` is its average inlier count, AIC."""
+DETERIORATION = {10: (0.09, 0.20), 30: (0.04, 0.22), 50: (0.31, 0.21), 70: (0.06, 1.70), 90: (0.27, 1.70)}
+"""Segregator's error in metres and degrees by percent of labels lost, on scans 0 and 10 of 05."""
+
+
+def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
+    """The paper's, on the list of this file name (kittiSS_LOtoHI) if it has the paper's number of pairs."""
+    name, _, band = pairs.removeprefix("kitti").partition("_")
+    if not pairs.startswith("kitti") or name not in NUM_PAIRS or band not in LISTS.values():
+        return None
+    place = list(LISTS.values()).index(band)
+    if NUM_PAIRS[name][place] != num_pairs or method not in SUCCESS_PERCENT:
+        return None
+    return SUCCESS_PERCENT[method][name][place]

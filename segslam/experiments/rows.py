@@ -1,0 +1,131 @@
+"""One row for each registration that was tried: made, written to a CSV file as it comes, read back to go on."""
+
+import csv
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, TextIO
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+
+from segslam.evaluation import FALSE_LOOP_DEG, FALSE_LOOP_M
+from segslam.experiments.trials import ScanVariant
+from segslam.types import SegslamError, Transform
+
+SUCCESS_M, SUCCESS_DEG = FALSE_LOOP_M, FALSE_LOOP_DEG
+"""The paper's: a registration with less error is a success."""
+
+
+def _none_if_empty(value: object) -> object:
+    return None if value == "" else value
+
+
+Number = Annotated[float | None, BeforeValidator(_none_if_empty)]
+Count = Annotated[int | None, BeforeValidator(_none_if_empty)]
+
+
+class Row(BaseModel):
+    """A registration by one method; None for what it has not, as a rejected one has no pose."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    pairs: str
+    source: int
+    target: int
+    source_yaw_deg: float
+    source_lost: float
+    target_lost: float
+    draw: int
+    method: str
+    accepted: bool
+    reason: str
+    """Of the rejection; empty if accepted."""
+    error_m: Number = None
+    error_deg: Number = None
+    """Of T_estimate inv(T_true), as the paper measures."""
+    num_correspondences: Count = None
+    num_edges: Count = None
+    num_inliers: Count = None
+    ms: Number = None
+    """All that this registration took had it been the only one: labels by shape, both scans prepared, aligned."""
+    cpu_ms: Number = None
+    """The same by the process's own clock, which other work on the machine does not slow."""
+    label_ms: Number = None
+    prepare_ms: Number = None
+    match_ms: Number = None
+    refine_ms: Number = None
+    verify_ms: Number = None
+    peak_mb: Number = None
+    """Memory needed at most beyond what was held before; None where the system does not tell."""
+    T_target_source: str = ""
+    """12 numbers by rows, empty if rejected."""
+
+    @property
+    def success(self) -> bool:
+        return self.accepted and _below(self.error_m, SUCCESS_M) and _below(self.error_deg, SUCCESS_DEG)
+
+    @property
+    def key(self) -> tuple[str, ScanVariant, ScanVariant, str]:
+        """What was tried, and by which method."""
+        source = ScanVariant(self.source, self.source_yaw_deg, self.source_lost, self.draw if self.source_lost else 0)
+        target = ScanVariant(self.target, 0.0, self.target_lost, self.draw if self.target_lost else 0)
+        return self.pairs, source, target, self.method
+
+    @property
+    def estimate(self) -> Transform | None:
+        """The pose that was found."""
+        if not self.T_target_source:
+            return None
+        return np.vstack([np.array(self.T_target_source.split(), dtype=float).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+
+
+def _below(value: float | None, bound: float) -> bool:
+    return value is not None and value < bound
+
+
+@contextmanager
+def row_writer(file: Path, rows: list[Row]) -> Iterator["RowWriter"]:
+    """A file that holds these rows and takes more. What was written of them before stays until the new file has all."""
+    part = file.with_suffix(".part")
+    try:
+        with part.open("w", newline="", encoding="utf-8") as stream:
+            writer = RowWriter(stream)
+            writer.write(rows)
+            part.replace(file)
+            yield writer
+    except OSError as error:
+        raise SegslamError(f"{file}: cannot be written ({error.strerror}); make room, or check permissions") from error
+
+
+class RowWriter:
+    """Rows as lines of CSV, all of one call on the disk before it returns."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._csv = csv.DictWriter(stream, [*Row.model_fields, "success"])
+        self._csv.writeheader()
+
+    def write(self, rows: list[Row]) -> None:
+        """Add them to the file, at once."""
+        self._csv.writerows(row.model_dump() | {"success": row.success} for row in rows)
+        self._stream.flush()
+
+
+def read_rows(file: Path) -> list[Row]:
+    """The rows of a file that `row_writer` made. A last line that was cut off is left out.
+
+    Raises SegslamError that names the line for one that is broken.
+    """
+    with file.open(newline="", encoding="utf-8") as stream:
+        text = stream.read()
+    complete = text[: text.rfind("\n") + 1].splitlines()
+    rows = []
+    for number, values in enumerate(csv.DictReader(complete), start=2):
+        values.pop("success", None)
+        try:
+            rows.append(Row.model_validate(values))
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise SegslamError(f"{file}:{number}: {first['loc'][0]}: {first['msg']}; remove the line") from error
+    return rows

@@ -1,0 +1,56 @@
+"""What is to be registered: two scans, each perhaps turned or robbed of labels, and the pose that is true of them."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from segslam import geometry
+from segslam.types import Label, Labels, Points, Transform
+
+
+@dataclass(frozen=True, slots=True)
+class ScanVariant:
+    """A scan by its number, and what is done to it before any method sees it."""
+
+    index: int
+    yaw_deg: float = 0.0
+    """Turned by so much about z."""
+    lost: float = 0.0
+    """Share of the points, 0 to 1, whose labels are taken away."""
+    draw: int = 0
+    """Which of the random choices of those points."""
+
+    @property
+    def T_variant_scan(self) -> Transform:  # noqa: N802  (a transform)
+        return geometry.transform(geometry.yaw(math.radians(self.yaw_deg)), 0.0)
+
+    def of(self, points: Points, labels: Labels) -> tuple[Points, Labels]:
+        """Points and labels of the scan, as this variant has them."""
+        if self.yaw_deg:
+            points = geometry.apply(self.T_variant_scan, points).astype(points.dtype)
+        if self.lost:
+            rng = np.random.default_rng([self.draw, self.index])
+            labels = np.where(rng.random(len(labels)) < self.lost, np.uint8(Label.UNLABELLED), labels)
+        return points, labels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """One pair that each method registers. `T_target_source` is the truth, of the variants."""
+
+    pairs: str
+    """Name of the list that the pair is of."""
+    source: ScanVariant
+    target: ScanVariant
+    T_target_source: Transform
+
+    @property
+    def key(self) -> tuple[str, ScanVariant, ScanVariant]:
+        return self.pairs, self.source, self.target
+
+
+def trial(pairs: str, source: ScanVariant, target: ScanVariant, T_target_source: Transform) -> Trial:
+    """The trial of two variants, given the true pose of the scans as they are."""
+    T_true = target.T_variant_scan @ T_target_source @ geometry.inverse(source.T_variant_scan)
+    return Trial(pairs, source, target, T_true)

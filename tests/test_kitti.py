@@ -9,7 +9,7 @@ from kiss_icp.pybind import kiss_icp_pybind
 
 from segslam import geometry
 from segslam.datasets import Dataset, open_dataset
-from segslam.datasets.kitti import correct_vertical_angle, read_bin, read_calibration
+from segslam.datasets.kitti import correct_vertical_angle, read_calibration, read_returns
 from segslam.trajectory import camera_from_lidar, read_poses
 from segslam.types import BadScan, Label, SegslamError
 
@@ -263,4 +263,4 @@ def test_real_labels_have_a_row_for_each_point(data_dir: Path) -> None:
 @pytest.mark.data
 def test_real_file_reads_as_it_was_written(data_dir: Path) -> None:
     file = data_dir / "kitti" / "sequences" / "00" / "velodyne" / "000000.bin"
-    np.testing.assert_array_equal(read_bin(file), np.fromfile(file, np.float32).reshape(-1, 4)[:, :3])
+    np.testing.assert_array_equal(read_returns(file), np.fromfile(file, np.float32).reshape(-1, 4))

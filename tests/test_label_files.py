@@ -29,14 +29,14 @@ def test_labels_beside_the_scans_are_found_by_themselves(tmp_path: Path) -> None
         _write(tmp_path / "labels", name, [10, 40, 50])
     source = open_labels("auto", beside=tmp_path, scan_names=NAMES, encoding=None)
     assert source.files == LabelFiles(tmp_path / "labels", "raw")
-    np.testing.assert_array_equal(source.read("000001", 3), [Label.CAR, Label.ROAD, Label.BUILDING])
+    np.testing.assert_array_equal(source.read("000001", np.ones((3, 3))), [Label.CAR, Label.ROAD, Label.BUILDING])
 
 
 def test_without_label_files_the_shape_is_asked(tmp_path: Path) -> None:
     source = open_labels("auto", beside=tmp_path, scan_names=NAMES, encoding=None)
     assert source.files is None
     assert source.geometric
-    np.testing.assert_array_equal(source.read("000000", 2), [Label.UNLABELLED] * 2)
+    np.testing.assert_array_equal(source.read("000000", np.ones((2, 3))), [Label.UNLABELLED] * 2)
 
 
 @pytest.mark.parametrize(("name", "geometric"), [("none", False), ("geometric", True)])
@@ -53,7 +53,7 @@ def test_folder_is_named_from_the_sequence_or_the_root(tmp_path: Path, absolute:
     name = str(tmp_path / "mine") if absolute else "mine"
     source = open_labels(name, beside=tmp_path, scan_names=NAMES, encoding="learning-0")
     assert not source.geometric
-    np.testing.assert_array_equal(source.read("000000", 2), [Label.CAR, Label.TRAFFIC_SIGN])
+    np.testing.assert_array_equal(source.read("000000", np.ones((2, 3))), [Label.CAR, Label.TRAFFIC_SIGN])
 
 
 def test_scans_without_a_file_stay_unlabelled_and_are_counted_once(
@@ -63,7 +63,7 @@ def test_scans_without_a_file_stay_unlabelled_and_are_counted_once(
     with caplog.at_level(logging.WARNING):
         source = open_labels("auto", beside=tmp_path, scan_names=NAMES, encoding=None)
     assert "1 of 2 scans have no label file" in caplog.text
-    np.testing.assert_array_equal(source.read("000001", 4), [Label.UNLABELLED] * 4)
+    np.testing.assert_array_equal(source.read("000001", np.ones((4, 3))), [Label.UNLABELLED] * 4)
     assert source.geometric
 
 
@@ -109,8 +109,8 @@ def test_undecided_encoding_names_the_folder_and_the_option(tmp_path: Path) -> N
         open_labels("mine", beside=tmp_path, scan_names=NAMES, encoding=None)
 
 
-def test_network_is_refused_with_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match=r"name a folder of their \.label files"):
+def test_missing_network_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match=r"model\.onnx: no such file"):
         open_labels("network:model.onnx", beside=tmp_path, scan_names=NAMES, encoding=None)
 
 
@@ -126,7 +126,7 @@ def test_each_real_prediction_tells_its_encoding_alone(data_dir: Path, name: str
 def test_real_predictions_agree_with_the_real_truth(data_dir: Path) -> None:
     sequence = data_dir / "kitti" / "sequences" / "00"
     truth, prediction = (
-        open_labels(source, beside=sequence, scan_names=["000000"], encoding=None).read("000000", 124668)
+        open_labels(source, beside=sequence, scan_names=["000000"], encoding=None).read("000000", np.ones((124668, 3)))
         for source in ("labels", "predicted_labels")
     )
     known = truth != Label.UNLABELLED

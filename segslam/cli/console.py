@@ -24,7 +24,9 @@ SequenceOption = Annotated[str, typer.Option("--sequence", help="Which sequence 
 FramesOption = Annotated[str | None, typer.Option("--frames", help="Scans A:B by number, B not included.")]
 LabelsOption = Annotated[
     str,
-    typer.Option("--labels", help="auto (labels/ where there is one, else geometric), none, geometric, or a folder."),
+    typer.Option(
+        "--labels", help="auto (labels/ if there, else geometric), none, geometric, network:MODEL.onnx, or a folder."
+    ),
 ]
 EncodingOption = Annotated[
     Literal["raw", "learning", "learning-0"] | None,

@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
-from segslam.datasets.kitti import read_bin
-from segslam.types import Points, SegslamError
+from segslam.datasets.kitti import read_returns
+from segslam.types import Points, SegslamError, Vector
 
 
 def read_cloud(file: Path) -> Points:
@@ -17,22 +18,32 @@ def read_cloud(file: Path) -> Points:
         raise SegslamError(f"{file}: no such file; name a scan (.bin, .npy, .ply, .pcd)")
     match file.suffix:
         case ".bin":
-            return read_bin(file)
+            return read_returns(file)[:, :3]
         case ".npy":
-            return _read_npy(file)
+            return _read_npy(file)[:, :3]
         case ".ply" | ".pcd":
             return _read_by_open3d(file)
     raise SegslamError(f"{file}: {file.suffix or 'no ending'} is no known format; give .bin, .npy, .ply or .pcd")
 
 
-def _read_npy(file: Path) -> Points:
+def read_intensities(file: Path) -> Vector | None:
+    """The intensity of each point of a file that `read_cloud` reads: the fourth column of .bin and .npy; None else."""
+    if file.suffix == ".bin":
+        return read_returns(file)[:, 3]
+    if file.suffix == ".npy":
+        values = _read_npy(file)
+        return values[:, 3] if values.shape[1] > 3 else None
+    return None
+
+
+def _read_npy(file: Path) -> Float64[np.ndarray, "_ _"]:
     try:
         values = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise SegslamError(f"{file}: cannot be read ({error}); save an array by numpy.save") from error
     if values.ndim != 2 or values.shape[1] < 3 or values.dtype.kind not in "fiu":
         raise SegslamError(f"{file}: holds {values.dtype} of shape {values.shape}; expected (n, 3) numbers, x y z")
-    return values[:, :3].astype(np.float64)
+    return values.astype(np.float64)
 
 
 def _read_by_open3d(file: Path) -> Points:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 
 from segslam import geometry
 from segslam.datasets.scans import make_scan, read_stamps, selected_rows, usable_scans
@@ -42,8 +43,9 @@ class KittiSequence:
     def __getitem__(self, row: int) -> Scan:
         """The scan, its vertical angle corrected. Raises BadScan if the file or its labels cannot be used."""
         file = self.scan_files[row]
-        points = read_bin(file)
-        labels = self.labels.read(file.stem, len(points))
+        returns = read_returns(file)
+        points = returns[:, :3]
+        labels = self.labels.read(file.stem, points, returns[:, 3])
         return make_scan(
             file, int(self.scan_index[row]), int(self.stamp_ns[row]), correct_vertical_angle(points), labels
         )
@@ -81,8 +83,8 @@ def open_kitti(
     )
 
 
-def read_bin(file: Path) -> Points:
-    """x, y, z of a velodyne file (float32 x y z intensity), as stored. Raises BadScan if it is broken."""
+def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
+    """x, y, z, intensity of a velodyne file, as stored. Raises BadScan if it is broken."""
     try:
         content = file.read_bytes()
     except OSError as error:
@@ -92,7 +94,7 @@ def read_bin(file: Path) -> Points:
             f"{file}: {len(content)} bytes are no multiple of 16 (float32 x y z intensity): truncated; "
             "fetch the file again"
         )
-    return np.frombuffer(content, dtype="<f4").reshape(-1, 4)[:, :3]
+    return np.frombuffer(content, dtype="<f4").reshape(-1, 4)
 
 
 def correct_vertical_angle(points: Points) -> Points:

@@ -18,6 +18,8 @@ class CloudReader:
     def __init__(self) -> None:
         self.stamp_ns = 0
         """Of the last message's header; 0 if it had none."""
+        self.intensities: Vector | None = None
+        """Of the last message's points; None if it had none."""
 
     def __call__(self, message: Any) -> tuple[Points, Vector]:
         """Points and times of a message, a row for each point, NaN where nothing returned; no times if it has none.
@@ -28,6 +30,8 @@ class CloudReader:
         self.stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
         rows = _rows(message)
         points = np.column_stack([rows[axis].ravel() for axis in "xyz"]).astype(np.float64)
+        has_intensity = any(field.name == "intensity" for field in message.fields)
+        self.intensities = rows["intensity"].ravel().astype(np.float64) if has_intensity else None
         time_field = next((field.name for field in message.fields if field.name in TIME_FIELDS), None)
         return points, rows[time_field].ravel().astype(np.float64) if time_field else np.empty(0)
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from mcap.exceptions import McapError
 
+from segslam.datasets.clouds import read_intensities
 from segslam.datasets.mcap_clouds import McapClouds
 from segslam.datasets.ouster import OusterFrames
 from segslam.datasets.point_cloud2 import CloudReader
@@ -80,7 +81,7 @@ class Recording:
         index = int(self.scan_index[row])
         file = self._file(index)
         points, times = self._read(index, file)
-        labels = self.labels.read(file.stem, len(points))
+        labels = self.labels.read(file.stem, points, self._intensities(file, len(points)))
         return make_scan(file, index, self._stamp_ns(index), points, labels, _from_0_to_1(times, len(points)))
 
     def __iter__(self) -> Iterator[Scan]:
@@ -95,6 +96,13 @@ class Recording:
             return np.asarray(points, dtype=np.float64).reshape(-1, 3), np.asarray(times, dtype=np.float64).ravel()
         except LOADER_ERRORS as error:
             raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
+
+    def _intensities(self, file: Path, num_points: int) -> Vector | None:
+        """Of the scan read last, where they are wanted and known."""
+        if self.labels.network is None:
+            return None
+        known = self._clouds.intensities if self._in_order else read_intensities(file)
+        return known if known is not None and len(known) == num_points else None
 
     def _go_to(self, index: int) -> None:
         """Read over what lies before, where a recording can only be read in order."""

@@ -3,15 +3,18 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from segslam.semantics.encodings import Encoding, Histogram, Ids, detect_encoding, to_labels
-from segslam.types import BadScan, Label, Labels, SegslamError
+from segslam.semantics.network import Network, open_network
+from segslam.types import BadScan, Label, Labels, Points, SegslamError, Vector
 
 logger = logging.getLogger(__name__)
 
+NETWORK = "network:"
 FILES_LOOKED_AT = 8  # chosen: what the encoding is told from, spread over the drive
 
 
@@ -38,32 +41,40 @@ class LabelSource:
     files: LabelFiles | None
     geometric: bool
     """Scans that no file labels are to be labelled by shape, when they become keyframes."""
+    network: Network | None = None
 
-    def read(self, name: str, num_points: int) -> Labels:
-        """The labels of the scan `name` by file, all UNLABELLED where there is none. Raises BadScan as `LabelFiles`."""
-        return self.files.read(name, num_points) if self.files else unlabelled(num_points)
+    def read(self, name: str, points: Points, intensities: Vector | None = None) -> Labels:
+        """The labels of the scan `name`, points and intensities as its file holds them; all UNLABELLED if none knows.
+
+        A network is given zeros for intensities that are not known. Raises BadScan as `LabelFiles`, SegslamError as
+        `Network.labels`.
+        """
+        if self.network:
+            if intensities is None:
+                _warn_of_zeros()
+                intensities = np.zeros(len(points))
+            return self.network.labels(points, intensities)
+        return self.files.read(name, len(points)) if self.files else unlabelled(len(points))
 
 
 def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelSource:
-    """What `--labels` names: `auto`, `none`, `geometric`, or a folder of `.label` files.
+    """What `--labels` names: `auto`, `none`, `geometric`, `network:MODEL.onnx`, or a folder of `.label` files.
 
     `beside` is the folder that relative ones start from, and where `auto` looks for `labels/`; without it, `auto` is
-    `geometric`. Raises SegslamError for a folder that is missing or labels none of the scans, and for files whose
-    encoding is neither given nor to be told.
+    `geometric`. Raises SegslamError for a folder that is missing or labels none of the scans, for files whose
+    encoding is neither given nor to be told, and for a network that `open_network` refuses.
     """
     if source in ("none", "geometric"):
         return LabelSource(None, geometric=source == "geometric")
-    if source.startswith("network:"):
-        raise SegslamError(
-            f"--labels {source}: networks are not run by this version; name a folder of their .label files"
-        )
+    if source.startswith(NETWORK):
+        return LabelSource(None, geometric=False, network=open_network(Path(source.removeprefix(NETWORK)).expanduser()))
     if source == "auto":
         if not _labelled(beside / "labels", scan_names):
             return LabelSource(None, geometric=True)
         return LabelSource(_open_folder(beside / "labels", scan_names, encoding), geometric=True)
     folder = beside / Path(source).expanduser()
     if not folder.is_dir():
-        raise SegslamError(f"--labels {source}: no folder {folder}; name one, or auto, none, geometric")
+        raise SegslamError(f"--labels {source}: no folder {folder}; name one, or auto, none, geometric, network:MODEL")
     if not _labelled(folder, scan_names):
         raise SegslamError(
             f"{folder}: no .label file for any of the {len(scan_names)} scans; they are named like the scans"
@@ -107,6 +118,12 @@ def encoding_of(files: Sequence[Path]) -> Encoding:
 def unlabelled(num_points: int) -> Labels:
     """No knowledge of any point."""
     return np.full(num_points, Label.UNLABELLED, dtype=np.uint8)
+
+
+@cache
+def _warn_of_zeros() -> None:
+    """Once, not for every scan."""
+    logger.warning("the data hold no intensities that can be read; the network is given zeros for them")
 
 
 def _labelled(folder: Path, scan_names: Sequence[str]) -> list[str]:

@@ -1,0 +1,141 @@
+"""Labels from a network: any range-image model in ONNX format, run by onnxruntime. The only importer of onnxruntime.
+
+A YAML file beside the model, of the same name, says what the input is made of and what the outputs mean.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from segslam.points import within_range
+from segslam.semantics.network_settings import NetworkSettings, read_settings
+from segslam.semantics.range_image import network_input, project
+from segslam.semantics.votes import point_labels
+from segslam.types import Label, Labels, Points, SegslamError, Vector
+
+LabelImage = UInt8[np.ndarray, "_ _"]
+
+
+class Network:
+    """A model that labels scans. Its input and output were tried once when it was opened, so that they fit."""
+
+    def __init__(self, model: Path, settings: NetworkSettings, session: Any) -> None:
+        self.settings = settings
+        self._model = model
+        self._session = session
+        self._input = session.get_inputs()[0].name
+        self._label_of_class = np.array([int(label) for label in settings.classes], np.uint8)
+
+    def labels(self, points: Points, intensities: Vector) -> Labels:
+        """The label of each point (n, 3) of a scan in the LiDAR frame, as its file holds it.
+
+        UNLABELLED where a point is not finite or at the origin. Raises SegslamError for class ids beyond the classes
+        that the settings name, and for outputs that are not numbers.
+        """
+        labels = np.full(len(points), Label.UNLABELLED, np.uint8)
+        usable = within_range(points, 0.0, np.inf)
+        if usable.any():
+            near = points[usable].astype(np.float64)
+            projection = project(near, settings=self.settings)
+            image = network_input(near, intensities[usable], projection, settings=self.settings)
+            labels[usable] = point_labels(self.label_image(image), projection, settings=self.settings.votes)
+        return labels
+
+    def label_image(self, image: np.ndarray) -> LabelImage:
+        """(height, width) labels of an input (1, channels, height, width) float32."""
+        from onnxruntime.capi import onnxruntime_pybind11_state as errors
+
+        try:
+            output = self._session.run(None, {self._input: image})[0]
+        except (errors.Fail, errors.InvalidArgument, errors.RuntimeException) as error:
+            raise SegslamError(f"{self._model}: fails on {_shape(image.shape)} numbers ({_brief(error)})") from error
+        return self._label_of_class[self._class_image(output)]
+
+    def _class_image(self, output: np.ndarray) -> np.ndarray:
+        """(height, width) class ids of the first output: ids as they are, the largest logit else."""
+        size = (self.settings.height, self.settings.width)
+        if output.dtype.kind in "iu":
+            self._check_output(output, "class ids", [(1, *size), (1, 1, *size), size])
+            ids = output.reshape(size)
+            if ids.min() < 0 or ids.max() >= len(self._label_of_class):
+                raise _misfit(
+                    self._model,
+                    f"gave class id {ids.min() if ids.min() < 0 else ids.max()}",
+                    f"names {len(self._label_of_class)} classes, ids 0 to {len(self._label_of_class) - 1}",
+                )
+            return ids
+        self._check_output(output, "logits", [(1, len(self._label_of_class), *size)])
+        if not np.isfinite(output).all():
+            raise SegslamError(f"{self._model}: gave logits that are no numbers; export it again in float32")
+        return output[0].argmax(axis=0)
+
+    def _check_output(self, output: np.ndarray, what: str, allowed: list[tuple[int, ...]]) -> None:
+        if output.shape not in allowed:
+            expected = " or ".join(_shape(shape) for shape in allowed)
+            raise _misfit(self._model, f"gives {what} of {_shape(output.shape)}", f"asks for {expected}")
+
+
+def settings_file(model: Path) -> Path:
+    """The YAML file of a model."""
+    return model.with_suffix(".yaml")
+
+
+def open_network(model: Path) -> Network:
+    """The network of an .onnx file and the YAML file beside it, tried on an empty image.
+
+    Raises SegslamError for a file that is missing or broken, and where the two contradict each other, with both
+    numbers; also if onnxruntime is not installed.
+    """
+    if not model.is_file():
+        raise SegslamError(f"{model}: no such file; give the model as network:MODEL.onnx")
+    settings = read_settings(settings_file(model))
+    session = _session(model)
+    wanted = (1, len(settings.channels), settings.height, settings.width)
+    _check_input(session, model, wanted)
+    network = Network(model, settings, session)
+    network.label_image(np.zeros(wanted, np.float32))
+    return network
+
+
+def _session(model: Path) -> Any:
+    try:
+        import onnxruntime
+        from onnxruntime.capi import onnxruntime_pybind11_state as errors
+    except ImportError as error:
+        raise SegslamError(f"--labels network: needs a package ({error}): pip install 'segslam[network]'") from error
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # errors, which are raised anyway
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave the cores to the other stages
+    broken = (errors.Fail, errors.InvalidGraph, errors.InvalidProtobuf, errors.NotImplemented, errors.RuntimeException)
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=onnxruntime.get_available_providers())
+    except broken as error:
+        raise SegslamError(f"{model}: onnxruntime cannot load it ({_brief(error)}); export it again") from error
+
+
+def _check_input(session: Any, model: Path, wanted: tuple[int, ...]) -> None:
+    """Raises SegslamError unless the model takes one float32 image of that shape; sizes that it leaves open fit all."""
+    inputs = session.get_inputs()
+    if len(inputs) != 1 or inputs[0].type != "tensor(float)":
+        found = ", ".join(f"{each.name}: {each.type}" for each in inputs)
+        raise SegslamError(f"{model}: takes the inputs {found}; expected a single one of float32, tensor(float)")
+    shape = inputs[0].shape
+    fits = len(shape) == len(wanted) and all(
+        not isinstance(size, int) or size == asked for size, asked in zip(shape, wanted, strict=True)
+    )
+    if not fits:
+        raise _misfit(model, f"takes an image of {_shape(shape)}", f"makes one of {_shape(wanted)}")
+
+
+def _misfit(model: Path, found: str, expected: str) -> SegslamError:
+    return SegslamError(f"{model}: {found}, but {settings_file(model).name} {expected}; mend one of them")
+
+
+def _shape(sizes: Any) -> str:
+    return " x ".join(str(size) for size in sizes)
+
+
+def _brief(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]

@@ -60,7 +60,7 @@ class SharedScan:
 
 def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
     """Read, label, turn, rob and prepare a scan."""
-    dataset, row_of_scan = _opened(job.source)
+    dataset, row_of_scan = open_once(job.source)
     try:
         scan = dataset[row_of_scan[variant.index]]
     except BadScan as error:
@@ -79,7 +79,7 @@ def register(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> 
 
 
 @lru_cache(maxsize=4)
-def _opened(source: DataSource) -> tuple[Dataset, dict[int, int]]:
+def open_once(source: DataSource) -> tuple[Dataset, dict[int, int]]:
     """The data set, once a process, and the row of each scan."""
     dataset = source.open()
     return dataset, {int(index): row for row, index in enumerate(dataset.scan_index)}

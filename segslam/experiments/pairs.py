@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from segslam import geometry
-from segslam.experiments.trials import ScanVariant, Trial, trial
 from segslam.trajectory import rows_of_same_scan
 from segslam.types import IndexPairs, SegslamError, Trajectory, Transform
 
@@ -67,14 +66,6 @@ def sample_pairs(whole: PairList, *, num_pairs: int, seed: int) -> PairList:
 def scans_named(lists: Sequence[PairList]) -> set[int]:
     """The numbers of all scans that the lists name."""
     return set(chain.from_iterable(one.pairs.ravel().tolist() for one in lists))
-
-
-def pair_trials(pairs: PairList, reference: Trajectory | None) -> list[Trial]:
-    """A trial a pair, the scans as they are. Raises SegslamError for a pair whose true pose is not known."""
-    return [
-        trial(pairs.name, ScanVariant(source), ScanVariant(target), T_target_source)
-        for (source, target), T_target_source in true_poses(pairs, reference).items()
-    ]
 
 
 def true_poses(pairs: PairList, reference: Trajectory | None) -> dict[tuple[int, int], Transform]:

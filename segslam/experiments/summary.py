@@ -1,6 +1,6 @@
 """Rows to the figures of a table."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
         "rotation_deg": _mean([row.error_deg for row in good]),
         "num_false_accepted": len(accepted) - len(good),
         "num_rejected": len(rows) - len(accepted),
+        "mean_ms": _mean([row.ms for row in rows]),
         "median_ms": _percentile([row.ms for row in rows], 50),
         "p95_ms": _percentile([row.ms for row in rows], 95),
         "median_cpu_ms": _percentile([row.cpu_ms for row in rows], 50),
@@ -36,17 +37,34 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def by_method(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The rows of each method, in the order in which the methods first come."""
-    methods: dict[str, list[Row]] = {}
+def results(rows: Sequence[Row], *, by: str) -> dict[str, dict[str, Any]]:
+    """The figures of each method over all rows, and in `by` for each value of what was varied, one of `VARIED`."""
+    return {
+        method: figures(own) | {"by": [{by: value} | figures(some) for value, some in grouped(own, VARIED[by]).items()]}
+        for method, own in grouped(rows, lambda row: row.method).items()
+    }
+
+
+VARIED: dict[str, Callable[[Row], Any]] = {
+    "list": lambda row: row.pairs,
+    "yaw_deg": lambda row: row.source_yaw_deg,
+    "lost_percent": lambda row: round(100 * row.source_lost, 6),
+}
+"""What an experiment varies, read from a row."""
+
+
+def grouped(rows: Sequence[Row], key: Callable[[Row], Hashable]) -> dict[Any, list[Row]]:
+    """The rows by a key, in the order in which its values first come."""
+    groups: dict[Any, list[Row]] = {}
     for row in rows:
-        methods.setdefault(row.method, []).append(row)
-    return methods
+        groups.setdefault(key(row), []).append(row)
+    return groups
 
 
-def success_percent(rows: Sequence[Row]) -> float:
-    """Of these rows, at least one."""
-    return 100.0 * sum(row.success for row in rows) / len(rows)
+def worst_failures(rows: Sequence[Row], count: int) -> list[Row]:
+    """Accepted poses that are wrong, the farthest first; then what was rejected."""
+    failures = [row for row in rows if not row.success]
+    return sorted(failures, key=lambda row: -(row.error_m or 0.0))[:count]
 
 
 def _known(values: Sequence[float | None]) -> list[float]:

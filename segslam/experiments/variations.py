@@ -1,0 +1,52 @@
+"""The trials of each experiment: pairs as they are, turned through the circle, or with labels taken away."""
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from segslam.experiments.pairs import PairList, true_poses
+from segslam.experiments.trials import ScanVariant, Trial, trial
+from segslam.types import Trajectory
+
+PAPER_PAIR = PairList("0 and 10", np.array([[0, 10]]), 1)
+"""The scans (of 05) on which the paper turns the source and takes labels away."""
+
+
+def pair_trials(pairs: PairList, reference: Trajectory | None) -> list[Trial]:
+    """A trial a pair, the scans as they are. Raises SegslamError for a pair whose true pose is not known."""
+    return [
+        trial(pairs.name, ScanVariant(source), ScanVariant(target), T_target_source)
+        for (source, target), T_target_source in true_poses(pairs, reference).items()
+    ]
+
+
+def turned_trials(pairs: PairList, reference: Trajectory | None, *, step_deg: float) -> list[Trial]:
+    """Each pair with its source turned about z through the circle. Raises SegslamError as `pair_trials`."""
+    return [
+        trial(pairs.name, ScanVariant(source, yaw_deg=float(yaw_deg)), ScanVariant(target), T_target_source)
+        for (source, target), T_target_source in true_poses(pairs, reference).items()
+        for yaw_deg in np.arange(0.0, 360.0, step_deg)
+    ]
+
+
+def robbed_trials(
+    pairs: PairList,
+    reference: Trajectory | None,
+    *,
+    lost_percent: Sequence[float],
+    num_draws: int,
+    seed: int,
+    both: bool,
+) -> list[Trial]:
+    """Each pair with so much of its labels lost, each time drawn anew: of both scans or of the source alone.
+
+    Raises SegslamError as `pair_trials`.
+    """
+    trials = []
+    for ((source, target), T_target_source), percent in product(true_poses(pairs, reference).items(), lost_percent):
+        for draw in range(seed * num_draws, (seed + 1) * num_draws):
+            robbed = [ScanVariant(index, lost=percent / 100, draw=draw) for index in (source, target)]
+            kept = robbed[1] if both else ScanVariant(target)
+            trials.append(trial(pairs.name, robbed[0], kept, T_target_source))
+    return trials

@@ -247,6 +247,22 @@ class LogConfig(Section):
     compression: Literal["none", "lz4", "zstd"] = Field("zstd", description="of the chunks of the log")
 
 
+class MapConfig(Section):
+    """The map that `--map` and `segslam export` make of a run."""
+
+    voxel_m: float = Field(0.2, ge=0.02, le=5, description="edge of the voxels, a point each (m)")
+    max_range_m: float = Field(50.0, gt=0, le=300, description="points farther from their keyframe are left out (m)")
+    color: Literal["class", "height"] = Field("class", description="what the colours of the cloud say")
+    view_range_m: float = Field(30.0, ge=0, description="keyframes nearer than this are asked; 0: none (m)")
+    view_margin_m: float = Field(0.3, gt=0, description="a return this far behind a voxel saw through it (m)")
+    view_margin_ratio: float = Field(0.01, ge=0, description="and this much more per metre of range")
+    min_views: int = Field(3, ge=1, description="fewest keyframes that saw through what is removed")
+    moved_radius_m: float = Field(0.8, ge=0, description="what has mostly removed voxels this near goes with them (m)")
+    cell_m: float = Field(0.2, ge=0.05, le=4, description="edge of the cells of the occupancy grid (m)")
+    obstacle_m: Bounds = Field((0.3, 2.0), description="heights above the ground where a voxel is an obstacle (m)")
+    min_obstacle_voxels: int = Field(2, ge=1, description="fewest of them in an occupied cell")
+
+
 class Config(Section):
     odometry: OdometryConfig = OdometryConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
@@ -257,6 +273,7 @@ class Config(Section):
     verify: VerifyConfig = VerifyConfig()
     graph: GraphConfig = GraphConfig()
     log: LogConfig = LogConfig()
+    map: MapConfig = MapConfig()
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:

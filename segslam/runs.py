@@ -148,7 +148,7 @@ class Run:
             "num_loops_switched_off": sum(weight < 0.5 for weight in result.estimate.closure_weights.values()),
             "seconds_total": seconds,
             "scans_per_second": (len(result.trajectory) - self.num_scans_resumed) / seconds,
-            "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "peak_rss_mb": peak_rss_mb(),
             "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
         }
 
@@ -162,6 +162,11 @@ class Run:
 
     def _note_ms(self, stage: str, seconds: float) -> None:
         self._stage_ms[stage].append(1000 * seconds)
+
+
+def peak_rss_mb() -> float:
+    """Most memory that this process has had so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:

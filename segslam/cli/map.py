@@ -1,10 +1,10 @@
 """`segslam map`."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,6 +23,8 @@ from segslam.cli.console import (
     progress,
     say,
 )
+from segslam.cli.ending import finish
+from segslam.cli.export import WITH_MAP, map_summary, write_maps
 from segslam.cli.view import open_scene
 
 if TYPE_CHECKING:
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
     from segslam.log import RunLog
     from segslam.odometry import Odometry
     from segslam.runs import Run
-    from segslam.types import BadScan, Step, Trajectory
+    from segslam.types import BadScan, Step
 
 
 def map_command(
@@ -49,6 +51,11 @@ def map_command(
     ] = None,
     config: ConfigOption = None,
     settings: SetOption = None,
+    with_map: Annotated[bool, typer.Option("--map", help="Write one clean cloud, map.ply, and map.png too.")] = False,
+    map_file: Annotated[
+        list[Path] | None,
+        typer.Option(help="Write the map as this file of the run: .ply .pcd .las .laz .png .yaml; may be repeated."),
+    ] = None,
     view: Annotated[
         bool, typer.Option("--view", help="Watch it in Rerun's viewer, as `segslam view` shows it.")
     ] = False,
@@ -62,8 +69,11 @@ def map_command(
     """
     from segslam.config import load_config
     from segslam.datasets import open_dataset
+    from segslam.map import check_names
     from segslam.results import read_metrics
 
+    map_files = [out / name for name in (*(WITH_MAP if with_map else ()), *(map_file or ()))]
+    check_names(map_files)
     recorded = log_to_resume(out) if resume else None
     settings_now = load_config(config, settings or (), base=recorded.config if recorded else None)
     scans = open_dataset(
@@ -81,6 +91,9 @@ def map_command(
         check_same(recorded, settings_now, dataset=scans.name, options=options)
         if is_finished(recorded, scans):
             say(f"{out}: finished already, all {len(scans)} scans; nothing is left to resume", quiet=quiet)
+            if missing := [file for file in map_files if not file.exists()]:
+                made = write_maps(recorded, missing, config=settings_now.map, quiet=quiet)
+                say(map_summary(made, missing), quiet=quiet)
             if json:
                 print_json(read_metrics(out))
             raise typer.Exit(0)
@@ -92,6 +105,7 @@ def map_command(
         odometry=given,
         options=options,
         recorded=recorded,
+        map_files=map_files,
         watch=scene.add if scene else _nobody,
         json=json,
         quiet=quiet,
@@ -112,6 +126,7 @@ def map_scans(
     odometry: "Odometry | None" = None,
     options: Mapping[str, str] = MappingProxyType({}),
     recorded: "RunLog | None" = None,
+    map_files: Sequence[Path] = (),
     watch: "Callable[[Step | BadScan], None]" = _nobody,
     json: bool,
     quiet: bool,
@@ -138,58 +153,10 @@ def map_scans(
             _take_over(run, recorded, scans, watch, quiet=quiet)
         resumed = {} if recorded is None else {"num_scans_resumed": run.num_scans_resumed}
         interrupted = _process(run, scans, watch, quiet=quiet)
-        metrics = finish(run, scans.reference, json=json, quiet=quiet, more=resumed)
+        metrics = finish(run, scans.reference, map_files=map_files, json=json, quiet=quiet, more=resumed)
     if interrupted:
         say(f"stopped: {metrics['num_scans']} of {len(scans)} scans are mapped", quiet=quiet)
         raise typer.Exit(130)
-
-
-def finish(
-    run: "Run",
-    reference: "Trajectory | None",
-    *,
-    json: bool,
-    quiet: bool,
-    more: Mapping[str, Any] = MappingProxyType({}),
-) -> dict[str, Any]:
-    """End a run: write its results, and show its figures, `more` among them, which are returned."""
-    from segslam.report import write_report
-    from segslam.run_files import write_metrics
-    from segslam.runs import accuracy
-
-    result, metrics = run.finish()
-    if reference is not None:
-        metrics |= accuracy(result, reference)
-    metrics |= more
-    write_metrics(run.folder, metrics)
-    write_report(run.folder)
-    if json:
-        print_json(metrics)
-    else:
-        say(summary(metrics, run.folder), quiet=quiet)
-    return metrics
-
-
-def summary(metrics: dict[str, Any], folder: Path) -> str:
-    """What a person wants to know of a run at a glance."""
-    lines = [
-        f"{metrics['num_scans']} scans in {metrics['seconds_total']:.1f} s ({metrics['scans_per_second']:.1f}/s), "
-        f"{metrics['num_keyframes']} keyframes, {metrics['num_loops_accepted']} loops of "
-        f"{metrics['num_candidates']} candidates"
-    ]
-    if skipped := metrics["num_scans_skipped"]:
-        lines.append(f"{skipped} bad scans were skipped")
-    if "ate_m" in metrics:
-        lines.append(
-            f"error after alignment: {metrics['ate_m']:.3f} m, odometry alone {metrics['odometry_ate_m']:.3f} m; "
-            f"false loops: {metrics['num_loops_false']}"
-        )
-    if "num_scans_resumed" in metrics:
-        lines.append(f"of these scans, {metrics['num_scans_resumed']} are from the log")
-    if "num_loops_won" in metrics:
-        before = f", error {metrics['recorded_ate_m']:.3f} m before" if "recorded_ate_m" in metrics else ""
-        lines.append(f"replayed: {metrics['num_loops_won']} loops won, {metrics['num_loops_lost']} lost{before}")
-    return "\n".join([*lines, f"results in {folder}"])
 
 
 def _take_over(

@@ -9,7 +9,7 @@ import typer
 
 from segslam.cli.checks import changed_settings
 from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, progress
-from segslam.cli.map import finish
+from segslam.cli.ending import finish
 
 if TYPE_CHECKING:
     from segslam.config import Config

@@ -1,0 +1,93 @@
+"""`segslam export`, and the maps that other commands write beside a run."""
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, print_json, progress, say
+
+if TYPE_CHECKING:
+    from segslam.config import MapConfig
+    from segslam.log import RunLog
+    from segslam.types import Keyframe, Transform
+
+WITH_MAP = ("map.ply", "map.png")
+"""What `--map` writes into the folder of a run."""
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="Run folder, finished.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="What to write: .ply, .pcd, .las, .laz the cloud; .png from above; .yaml occupancy grid."),
+    ],
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Write the map of a finished run: one clean cloud, a picture from above, an occupancy grid for map_server.
+
+    Example: segslam export runs/00 map.laz map.png grid.yaml --set map.color=height
+    """
+    from segslam.config import load_config
+    from segslam.log import read_log
+    from segslam.run_files import LOG
+
+    log = read_log(run / LOG)
+    figures = write_maps(log, files, config=load_config(config, settings or (), base=log.config).map, quiet=quiet)
+    if json:
+        print_json(figures)
+    else:
+        say(map_summary(figures, files), quiet=quiet)
+
+
+def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", quiet: bool) -> dict[str, Any]:
+    """Make the map of a finished run and write it to each of the files; the figures that tell what it was made of.
+
+    Raises SegslamError if the run did not finish or a name is no map's, and WorkFailed where the disk is full.
+    """
+    from time import perf_counter
+
+    from segslam.map import write_map
+    from segslam.run_files import room_for
+
+    started = perf_counter()
+    with room_for(files[0].parent):
+        made = write_map(_placed(log, quiet=quiet), files, config=config, show=partial(_shown, quiet=quiet))
+    return {
+        "num_map_points": made.num_points,
+        "num_map_moving_points": made.num_moving_points,
+        "num_map_voxels_seen_through": made.num_voxels_seen_through,
+        "map_seconds": perf_counter() - started,
+    }
+
+
+def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
+    """What a person wants to know of a map at a glance."""
+    removed = figures["num_map_moving_points"], figures["num_map_voxels_seen_through"]
+    return (
+        f"map of {figures['num_map_points']} points in {figures['map_seconds']:.1f} s; left out as moving: "
+        f"{removed[0]} points by class, {removed[1]} voxels that others saw through\n"
+        f"map in {', '.join(str(file) for file in files)}"
+    )
+
+
+def _placed(log: "RunLog", *, quiet: bool) -> "Iterator[tuple[Keyframe, Transform]]":
+    """Each keyframe with its T_world_keyframe at the end of the run."""
+    from segslam.types import SegslamError
+
+    result = log.result()
+    if result is None:
+        raise SegslamError(f"{log.path}: the run did not finish; `segslam replay` it, or go on with --resume")
+    estimate, _ = result
+    for step in progress(log.steps(), total=log.num_steps(), title="gather", quiet=quiet):
+        if step.keyframe is not None:
+            yield step.keyframe, estimate.T_world_keyframe[step.keyframe.id]
+
+
+def _shown(parts: "Iterator[Any]", total: int, *, quiet: bool) -> "Iterator[Any]":
+    return progress(parts, total=total, title="clean", quiet=quiet)

@@ -1,0 +1,41 @@
+"""Which voxels last: not those that other keyframes saw through more often than they saw them."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from segslam.config import MapConfig
+from segslam.map.views import count_votes
+from segslam.types import GROUND_LABELS, Labels, Mask, Points, Transform
+
+
+def moved(points: Points, labels: Labels, views: Iterable[tuple[np.ndarray, Transform]], *, config: MapConfig) -> Mask:
+    """Which points stood for a while only. `views` are pictures of keyframes, each with T_view_points.
+
+    A point that at least `min_views` saw through, and more than confirmed it, has moved; so has one in whose
+    neighbourhood most have. The ground stays: rays that graze it pass close above it.
+    """
+    stays = np.isin(labels, np.array(GROUND_LABELS, np.uint8))
+    votes = np.zeros((len(points), 2), np.uint32)
+    limits = np.array([config.view_range_m, config.view_margin_m, config.view_margin_ratio])
+    for nearest, T_view_points in views:
+        count_votes(points, T_view_points, nearest, limits, votes)
+    confirmed, seen_through = votes.T
+    has_moved = (seen_through >= config.min_views) & (seen_through > confirmed) & ~stays
+    return has_moved | _among_moved(points, has_moved, stays, config.moved_radius_m)
+
+
+def _among_moved(points: Points, has_moved: Mask, stays: Mask, radius_m: float) -> Mask:
+    """Points that may move and have more moved neighbours than others; those of the ground do not count."""
+    doubtful = np.flatnonzero(~stays & ~has_moved)
+    among = np.zeros(len(points), bool)
+    if not has_moved.any() or not len(doubtful):
+        return among
+    moved_tree = cKDTree(points[has_moved])
+    nearest_m, _ = moved_tree.query(points[doubtful], distance_upper_bound=radius_m)
+    doubtful = doubtful[np.isfinite(nearest_m)]
+    num_moved = moved_tree.query_ball_point(points[doubtful], radius_m, return_length=True)
+    others = cKDTree(points[~stays & ~has_moved]).query_ball_point(points[doubtful], radius_m, return_length=True)
+    among[doubtful] = num_moved > others - 1  # itself
+    return among

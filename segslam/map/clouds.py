@@ -1,0 +1,137 @@
+"""Clouds that are written piece by piece: PLY, PCD, and LAS or LAZ."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from segslam.config import MapConfig
+from segslam.map.part import Extent, Part
+from segslam.types import Label, SegslamError
+
+ROW = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")])
+PCD_ROW = np.dtype([("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")])
+HEADER_BYTES = 512
+"""Room for a header, which is written last: it tells the number of points."""
+LAS_SCALE_M = 0.001
+ASPRS_OF_LABEL = {
+    Label.ROAD: 11,
+    Label.PARKING: 11,
+    Label.SIDEWALK: 2,
+    Label.OTHER_GROUND: 2,
+    Label.TERRAIN: 2,
+    Label.BUILDING: 6,
+    Label.VEGETATION: 5,
+    Label.TRUNK: 5,
+}
+"""Classes of the LAS 1.4 specification, table 17: 2 ground, 5 high vegetation, 6 building, 11 road; else 1, none."""
+
+
+class PlyCloud:
+    """Binary PLY: x y z in float32 metres, red green blue, label (SemanticKITTI's learning id)."""
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        self._stream = _begin(file)
+        self._num_points = 0
+
+    def add(self, part: Part) -> None:
+        """Append the points of a part."""
+        rows = np.empty(len(part.points), ROW)
+        rows["xyz"], rows["rgb"], rows["label"] = part.points, part.colors, part.labels
+        rows.tofile(self._stream)
+        self._num_points += len(rows)
+
+    def close(self) -> None:
+        """Complete the file."""
+        lines = [
+            "ply",
+            "format binary_little_endian 1.0",
+            f"element vertex {self._num_points}",
+            *(f"property float {name}" for name in "xyz"),
+            *(f"property uchar {name}" for name in ("red", "green", "blue", "label")),
+        ]
+        _end(self._stream, lines, filler="comment", last="end_header")
+
+
+class PcdCloud:
+    """Binary PCD 0.7: x y z in float32 metres, rgb as PCL packs it, label."""
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        self._stream = _begin(file)
+        self._num_points = 0
+
+    def add(self, part: Part) -> None:
+        """Append the points of a part."""
+        rows = np.zeros(len(part.points), PCD_ROW)
+        rows["xyz"], rows["label"] = part.points, part.labels
+        rows["bgra"][:, :3] = part.colors[:, ::-1]
+        rows.tofile(self._stream)
+        self._num_points += len(rows)
+
+    def close(self) -> None:
+        """Complete the file."""
+        lines = [
+            "VERSION 0.7",
+            "FIELDS x y z rgb label",
+            "SIZE 4 4 4 4 4",
+            "TYPE F F F F U",
+            "COUNT 1 1 1 1 1",
+            f"WIDTH {self._num_points}",
+            "HEIGHT 1",
+            "VIEWPOINT 0 0 0 1 0 0 0",
+            f"POINTS {self._num_points}",
+        ]
+        _end(self._stream, lines, filler="#", last="DATA binary")
+
+
+class LasCloud:
+    """LAS 1.4, point format 7, compressed where the name ends in .laz: millimetres, colours, classes of ASPRS.
+
+    `user_data` holds the label (SemanticKITTI's learning id).
+    """
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        import laspy  # type: ignore[import-untyped]  # an extra: nothing else needs it
+
+        self._laspy = laspy
+        header = laspy.LasHeader(version="1.4", point_format=7)
+        header.scales = np.full(3, LAS_SCALE_M)
+        self._writer = laspy.open(file, mode="w", header=header)
+        self._class_of_label = np.array([ASPRS_OF_LABEL.get(label, 1) for label in Label], np.uint8)
+
+    def add(self, part: Part) -> None:
+        """Append the points of a part."""
+        record = self._laspy.ScaleAwarePointRecord.zeros(len(part.points), header=self._writer.header)
+        record.x, record.y, record.z = part.points.astype(np.float64).T
+        record.red, record.green, record.blue = 257 * part.colors.astype(np.uint16).T  # 255 to 65535
+        record.classification, record.user_data = self._class_of_label[part.labels], part.labels
+        self._writer.write_points(record)
+
+    def close(self) -> None:
+        """Complete the file."""
+        self._writer.close()
+
+
+def check_las(file: Path) -> None:
+    """Raises SegslamError if the packages that LAS and LAZ need are not there."""
+    missing = [name for name in ("laspy", "lazrs") if find_spec(name) is None]
+    if missing:
+        raise SegslamError(
+            f"{file}: LAS and LAZ need packages of their own: pip install 'segslam[las]'; .ply and .pcd need none"
+        )
+
+
+def _begin(file: Path) -> BinaryIO:
+    stream = file.open("wb")
+    stream.write(bytes(HEADER_BYTES))
+    return stream
+
+
+def _end(stream: BinaryIO, lines: list[str], *, filler: str, last: str) -> None:
+    """Write the header into its room, a comment filling what is left of it, and close the file."""
+    text = "".join(f"{line}\n" for line in lines)
+    spaces = HEADER_BYTES - len(text) - len(filler) - len(last) - 2
+    stream.seek(0)
+    stream.write(f"{text}{filler}{' ' * spaces}\n{last}\n".encode("ascii"))
+    stream.close()

@@ -1,0 +1,54 @@
+"""Colours of a map: of classes, or of heights."""
+
+from collections.abc import Callable
+
+import matplotlib
+import numpy as np
+
+from segslam.types import Label, Labels, Vector
+
+COLORS = {
+    Label.UNLABELLED: "#9a9a9a",
+    Label.CAR: "#3f7fd6",
+    Label.BICYCLE: "#43c6c9",
+    Label.MOTORCYCLE: "#2b8f9c",
+    Label.TRUCK: "#5a4fcf",
+    Label.OTHER_VEHICLE: "#7d6be0",
+    Label.PERSON: "#e0332e",
+    Label.BICYCLIST: "#e85a9b",
+    Label.MOTORCYCLIST: "#b03a7c",
+    Label.ROAD: "#6f5b73",
+    Label.PARKING: "#a488a8",
+    Label.SIDEWALK: "#8a6f8e",
+    Label.OTHER_GROUND: "#7c5a4a",
+    Label.BUILDING: "#e8b93c",
+    Label.FENCE: "#d9823b",
+    Label.VEGETATION: "#3f9b45",
+    Label.TRUNK: "#8b5a2b",
+    Label.TERRAIN: "#9bcf6a",
+    Label.POLE: "#f4e58c",
+    Label.TRAFFIC_SIGN: "#ff4f3f",
+}
+"""Of what a map keeps; own choice, kinds of ground in violet and green, vehicles in blue."""
+
+Colors = np.ndarray
+"""(n, 3) uint8: red, green, blue."""
+Painter = Callable[[Labels, Vector], Colors]
+"""Labels and heights (m) -> colours."""
+
+
+def by_class(labels: Labels, _: Vector) -> Colors:
+    """The colour of each label's class."""
+    table = np.array([list(bytes.fromhex(COLORS.get(label, "#000000")[1:])) for label in Label], np.uint8)
+    return table[labels]
+
+
+def by_height(low_m: float, high_m: float) -> Painter:
+    """Colours from dark blue at `low_m` and below to yellow at `high_m` and above."""
+    table = (255 * matplotlib.colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+
+    def paint(_: Labels, heights: Vector) -> Colors:
+        share = np.clip((heights - low_m) / max(high_m - low_m, 1e-9), 0.0, 1.0)
+        return table[(share * (len(table) - 1)).astype(np.int64)]
+
+    return paint

@@ -1,0 +1,79 @@
+"""The keyframes of a map, on disk: first all come in, then the clean voxels of one tile after the other go out."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import MapConfig
+from segslam.map import colors
+from segslam.map.cleaning import moved
+from segslam.map.part import Extent, Part
+from segslam.map.tiles import Tile, Tiles, corner, distance_m
+from segslam.map.views import Views
+from segslam.points import within_range
+from segslam.types import Keyframe, Label, Transform
+
+
+class Gathered:
+    """Voxels, and what each keyframe saw."""
+
+    def __init__(self, scratch: Path, config: MapConfig) -> None:
+        """`scratch` is an empty folder, which the caller removes."""
+        self._config = config
+        self._tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
+        self._views = Views(scratch / "views", spread_m=config.voxel_m)
+        self._T_keyframe_world: list[Transform] = []
+        self._places: list[np.ndarray] = []
+        self.num_moving_points = 0
+        self.num_voxels_seen_through = 0
+
+    @property
+    def num_keyframes(self) -> int:
+        """How many keyframes came in."""
+        return len(self._places)
+
+    @property
+    def num_tiles(self) -> int:
+        """How many parts there will be."""
+        return len(self._tiles)
+
+    def add(self, keyframe: Keyframe, T_world_keyframe: Transform) -> None:
+        """Take in a keyframe: its points near enough that no class says to move, and all of its view."""
+        moves = keyframe.labels >= Label.MOVING_CAR
+        kept = within_range(keyframe.points, 0.0, self._config.max_range_m) & ~moves
+        self.num_moving_points += int(moves.sum())
+        self._tiles.add(
+            geometry.apply(T_world_keyframe, keyframe.points[kept].astype(np.float64)), keyframe.labels[kept]
+        )
+        self._views.add(keyframe.points)
+        self._T_keyframe_world.append(geometry.inverse(T_world_keyframe))
+        self._places.append(T_world_keyframe[:3, 3])
+
+    def extent(self) -> Extent | None:
+        """Of the tiles that have voxels; None if there are none."""
+        tiles = list(self._tiles)
+        if not tiles:
+            return None
+        (west, south), (east, north) = np.min(tiles, axis=0).tolist(), np.max(tiles, axis=0).tolist()
+        return Extent(west=west, east=east, south=south, north=north)
+
+    def parts(self) -> Iterator[Part]:
+        """The clean voxels of each tile, in the order that `MapFile` names."""
+        tiles = list(self._tiles)
+        paint = colors.by_class if self._config.color == "class" else colors.by_height(*self._tiles.height_span_m())
+        for tile in tiles:
+            voxels = self._tiles.voxels(tile)
+            points, labels = voxels["point"], voxels["label"]
+            gone = moved(points, labels, self._views_of(tile), config=self._config)
+            self.num_voxels_seen_through += int(gone.sum())
+            world = points[~gone] + corner(tile)
+            yield Part(tile, world, labels[~gone], paint(labels[~gone], world[:, 2]))
+
+    def _views_of(self, tile: Tile) -> Iterator[tuple[np.ndarray, Transform]]:
+        """What each keyframe near a tile saw, and T_keyframe_tile."""
+        T_world_tile = geometry.transform(np.eye(3), corner(tile))
+        for number, place in enumerate(self._places):
+            if distance_m(tile, place) < self._config.view_range_m:
+                yield self._views[number], self._T_keyframe_world[number] @ T_world_tile

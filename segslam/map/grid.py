@@ -1,0 +1,94 @@
+"""A 2D occupancy grid for ROS's map_server: `NAME.yaml` beside `NAME.pgm`.
+
+A cell is occupied where enough voxels stand between two heights above the ground, free where the ground was seen and
+nothing stands on it, and else unknown. Rows of tiles are written as they are complete, so that memory holds one.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+from scipy.ndimage import distance_transform_edt
+
+from segslam.config import MapConfig
+from segslam.map.part import Extent, Part
+from segslam.map.tiles import TILE_M, corner
+from segslam.types import GROUND_LABELS, Points, Vector
+
+OCCUPIED, FREE, UNKNOWN = 0, 254, 205
+"""Values of map_server's `trinary` mode; 205 lies between its two thresholds."""
+OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
+GROUND_CELL_M = 2.0
+
+
+class Grid:
+    """Writes the grid; `file` is the .yaml."""
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        self._file = file
+        self._extent = extent
+        self._config = config
+        self._cells = round(TILE_M / config.cell_m)  # of a tile's edge
+        columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
+        self._band = np.full((self._cells, columns * self._cells), UNKNOWN, np.uint8)
+        self._row = extent.north
+        self._pgm = file.with_suffix(".pgm").open("wb")
+        self._pgm.write(f"P5\n{columns * self._cells} {rows * self._cells}\n255\n".encode("ascii"))
+
+    def add(self, part: Part) -> None:
+        """Set the cells of a part."""
+        self._write_bands_above(part.tile[1])
+        left = (part.tile[0] - self._extent.west) * self._cells
+        self._band[:, left : left + self._cells] = self._occupancy(part)[::-1]
+
+    def close(self) -> None:
+        """Complete both files."""
+        self._write_bands_above(self._extent.south - 1)
+        self._pgm.close()
+        about = {
+            "image": self._file.with_suffix(".pgm").name,
+            "resolution": TILE_M / self._cells,
+            "origin": [*corner((self._extent.west, self._extent.south)).tolist()],
+            "negate": 0,
+            "occupied_thresh": OCCUPIED_THRESHOLD,
+            "free_thresh": FREE_THRESHOLD,
+        }
+        self._file.write_text(yaml.safe_dump(about, sort_keys=False), encoding="utf-8")
+
+    def _write_bands_above(self, row: int) -> None:
+        while self._row > row:
+            self._pgm.write(self._band.tobytes())
+            self._band[:] = UNKNOWN
+            self._row -= 1
+
+    def _occupancy(self, part: Part) -> np.ndarray:
+        """(cells, cells) uint8, the southernmost row first."""
+        within = part.points - corner(part.tile)
+        is_ground = np.isin(part.labels, np.array(GROUND_LABELS, np.uint8))
+        height_m = within[:, 2] - ground_heights(within, within[is_ground] if is_ground.any() else within)
+        column, row = np.clip((within[:, :2] / TILE_M * self._cells).astype(np.int64), 0, self._cells - 1).T
+        low_m, high_m = self._config.obstacle_m
+        cell = row * self._cells + column
+        obstacles, ground = (
+            np.bincount(cell[chosen], minlength=self._cells**2).reshape(self._cells, self._cells)
+            for chosen in ((height_m >= low_m) & (height_m <= high_m) & ~is_ground, is_ground | (height_m < low_m))
+        )
+        occupied = obstacles >= self._config.min_obstacle_voxels
+        return np.select([occupied, ground > 0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
+
+
+def ground_heights(points: Points, ground: Points) -> Vector:
+    """Height of the ground (m) beneath each point: the lowest of `ground` in its cell, or in the nearest that has any.
+
+    Both lie within a tile, x and y from its corner.
+    """
+    size = round(TILE_M / GROUND_CELL_M)
+    lowest = np.full((size, size), np.inf)
+    np.minimum.at(lowest, _ground_cells(ground, size), ground[:, 2])
+    nearest = distance_transform_edt(np.isinf(lowest), return_distances=False, return_indices=True)
+    return lowest[tuple(nearest)][_ground_cells(points, size)]
+
+
+def _ground_cells(points: Points, size: int) -> tuple[np.ndarray, np.ndarray]:
+    column, row = np.clip((points[:, :2] / GROUND_CELL_M).astype(np.int64), 0, size - 1).T
+    return column, row

@@ -1,0 +1,45 @@
+"""What the writers of a map are given: its extent first, then part after part."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from segslam.config import MapConfig
+from segslam.map.tiles import Tile
+from segslam.types import Labels, Points
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """Which tiles a map may have: columns from `west` to `east`, rows from `south` to `north`, those included."""
+
+    west: int
+    east: int
+    south: int
+    north: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """The clean voxels of one tile; `points` (n, 3) float64 in metres of the world."""
+
+    tile: Tile
+    points: Points
+    labels: Labels
+    colors: np.ndarray
+    """(n, 3) uint8: red, green, blue."""
+
+
+class MapFile(Protocol):
+    """A file of a map while it is written. Parts come row by row, the northernmost first, each from west to east."""
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        """Begin a file."""
+
+    def add(self, part: Part) -> None:
+        """Write the points of a part, or keep what is needed of them."""
+
+    def close(self) -> None:
+        """Complete the file."""

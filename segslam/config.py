@@ -215,12 +215,12 @@ class VerifyConfig(Section):
     """When an alignment is believed."""
 
     max_hypotheses: int = Field(3, ge=1, description="coarse poses tried, the best first")
-    min_inliers: int = Field(5, ge=0, description="clique members that agree with a coarse pose worth refining")
-    min_overlap: float = Field(0.3, ge=0, le=1, description="share of points that meet the other surface")
+    min_inliers: int = Field(3, ge=0, description="clique members that agree with a coarse pose worth refining")
+    min_overlap: float = Field(0.2, ge=0, le=1, description="share of standing points that meet the other surface")
     inlier_m: float = Field(0.5, gt=0, description="a point this near the other surface meets it (m)")
     max_range_m: float = Field(50.0, gt=0, description="points farther from the other sensor are out of its reach (m)")
-    max_rms_m: float = Field(0.17, gt=0, description="of the points that meet, to the other surface's planes (m)")
-    max_free_space_violation: float = Field(0.025, ge=0, le=1, description="share of points in space seen empty")
+    max_rms_m: float = Field(0.165, gt=0, description="of the points that meet, to the other surface's planes (m)")
+    max_free_space_violation: float = Field(0.035, ge=0, le=1, description="share of points in space seen empty")
     free_space_margin_m: float = Field(1.0, gt=0, description="a point this far before a return violates it (m)")
     free_space_margin_ratio: float = Field(0.02, ge=0, description="and this much more per metre of range")
     max_coarse_fine_m: float = Field(2.0, gt=0, description="farthest that refinement may move (m)")

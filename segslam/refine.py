@@ -3,6 +3,7 @@
 The only importer of small_gicp. Its tangents are [rotation; translation] with the perturbation on the right, as ours.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,8 @@ from segslam.types import Points, Registration, Rejected, RejectReason, Transfor
 
 NUM_NEIGHBOURS = 10
 """For the covariance of a point; small_gicp's default."""
+STANDING_NORMAL_Z = math.cos(math.radians(45.0))
+"""Chosen: what is steeper than this stands."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +32,11 @@ class Surface:
     def points(self) -> Points:
         """(n, 3), in the scan's frame."""
         return self.cloud.points()[:, :3]
+
+    @property
+    def standing(self) -> Points:
+        """(k, 3): those on surfaces steeper than 45 degrees, where the scan's z points up."""
+        return self.points[np.abs(self.cloud.normals()[:, 2]) < STANDING_NORMAL_Z]
 
     def __len__(self) -> int:
         return self.cloud.size()

@@ -184,7 +184,7 @@ class Alignment:
     coarse: Registration
     fine: Registration
     overlap: float
-    """Share of the points within reach of the other scan that lie on its surface; of the two ways, the smaller."""
+    """Share of the standing points within reach of the other scan that lie on it; of the two ways, the smaller."""
     rms_m: float
     """Of those points, to the planes of the other surface."""
     free_space_violation: float

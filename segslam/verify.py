@@ -1,7 +1,8 @@
 """Is an alignment to be believed? Overlap of the surfaces, their distance, and the space that either scan saw empty.
 
-Two scans aligned as they should be share most of what both could see, their surfaces lie in one another, and neither
-has a point where the other looked through: a ray that returned from 30 m says that nothing stands at 20 m on its way.
+Of two scans aligned as they should be, what stands in one lies in the surfaces of the other, and neither has a point
+where the other looked through: a ray that returned from 30 m says that nothing stands at 20 m on its way. The ground
+says nothing: it lies in the ground of any other street as well.
 """
 
 import math
@@ -31,6 +32,9 @@ class Surface(Protocol):
     @property
     def points(self) -> Points: ...
 
+    @property
+    def standing(self) -> Points: ...
+
     def distances_m(self, points: Points) -> tuple[np.ndarray, np.ndarray]: ...
 
 
@@ -50,7 +54,7 @@ class Agreement:
     """How two aligned scans agree; of the two ways to look at it, the worse."""
 
     overlap: float
-    """Share of the points within reach of the other scan that lie within `inlier_m` of it."""
+    """Share of the standing points within reach of the other scan that lie within `inlier_m` of it."""
     rms_m: float
     """Of those points, to the plane of the other surface."""
     free_space_violation: float
@@ -96,10 +100,10 @@ def free_space_violation(points: Points, seen: View, T_view_points: Transform, *
 def early_rejection(
     source: tuple[Surface, View], target: tuple[Surface, View], T_target_source: Transform, *, config: VerifyConfig
 ) -> Rejected | None:
-    """Rejects a coarse pose that violates twice the free space allowed: no refinement mends that. Takes 1 ms."""
+    """Rejects a coarse pose that violates thrice the free space allowed: refinement hardly mends that. Takes 1 ms."""
     forth = free_space_violation(source[0].points, target[1], T_target_source, config=config)
     back = free_space_violation(target[0].points, source[1], geometry.inverse(T_target_source), config=config)
-    allowed = 2 * config.max_free_space_violation
+    allowed = 3 * config.max_free_space_violation
     if max(forth, back) > allowed:
         return Rejected(RejectReason.FREE_SPACE_VIOLATED, f"{max(forth, back):.4f} > {allowed} before refinement")
     return None
@@ -118,8 +122,8 @@ def rejection(found: Agreement, *, config: VerifyConfig) -> Rejected | None:
 
 
 def _surface_agreement(a: Surface, b: Surface, T_b_a: Transform, config: VerifyConfig) -> tuple[float, float]:
-    """Overlap and residual of a's points that are within reach of b's sensor; no overlap where none is."""
-    moved = geometry.apply(T_b_a, a.points)
+    """Overlap and residual of a's standing points within reach of b's sensor; no overlap where none is."""
+    moved = geometry.apply(T_b_a, a.standing)
     moved = moved[within_range(moved, 0.0, config.max_range_m)]
     if not len(moved):
         return 0.0, math.inf

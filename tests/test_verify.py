@@ -79,6 +79,18 @@ def test_scans_out_of_each_other_s_reach_do_not_overlap() -> None:
     assert math.isinf(far.rms_m)
 
 
+def test_ground_alone_is_no_overlap() -> None:
+    """The same ground, and other walls upon it."""
+    rng = np.random.default_rng(0)
+    one, other = (_prepared(points) for points in (corner(rng), corner(rng) * [1.0, -1.0, 1.0]))
+    found = agreement(one, other, np.eye(4), config=CONFIG)
+    to_point, _ = one[0].distances_m(other[0].points)
+    assert (to_point < CONFIG.inlier_m).mean() > 0.3, "the ground is a third of the points"
+    rejected = rejection(found, config=CONFIG)
+    assert rejected is not None
+    assert rejected.reason is RejectReason.LOW_OVERLAP
+
+
 def test_each_test_rejects_for_its_own_reason() -> None:
     assert rejection(RIGHT, config=CONFIG) is None
     cases = {

@@ -49,7 +49,7 @@ def _bin(fraction):
 
 @njit("int64(float64, float64)", cache=True, nogil=True, inline="always")
 def _angle_bin(y, x):
-    """The bin of atan2(y, x), which is not computed: its place around a diamond grows with it and is at most a bin off."""
+    """The bin of atan2(y, x), found without it: the place around a diamond grows with it and is at most a bin off."""
     diamond = y / (abs(x) + abs(y)) if x != 0.0 or y != 0.0 else 0.0
     if x < 0.0:
         diamond = (2.0 if y >= 0.0 else -2.0) - diamond

@@ -1,0 +1,7 @@
+"""The pose of each scan in the frame of the first: by KISS-ICP, or as given."""
+
+from segslam.odometry.given import GivenOdometry
+from segslam.odometry.kiss import KissOdometry
+from segslam.odometry.sweep import Odometry, OdometryResult
+
+__all__ = ["GivenOdometry", "KissOdometry", "Odometry", "OdometryResult"]

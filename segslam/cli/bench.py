@@ -1,5 +1,6 @@
 """`segslam bench`: the paper's experiments, each method on the same scans."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,6 +20,7 @@ from segslam.cli.console import print_json, say
 if TYPE_CHECKING:
     from segslam.experiments.job import Job
     from segslam.experiments.pairs import PairList
+    from segslam.experiments.rows import Row
     from segslam.experiments.trials import Trial
 
 app = typer.Typer(help="The paper's experiments, each method on the same scans.", no_args_is_help=True)
@@ -88,8 +90,10 @@ def deterioration(
     job = make_job(data, options)
     reference = reference_of(job)
     lists = read_lists(options, reference, default=PAPER_PAIR)
-    drawn = {"lost_percent": lost_percent, "num_draws": draws, "seed": options.seed, "both": clouds == "both"}
-    trials = [trial for one in lists for trial in robbed_trials(one, reference, **drawn)]
+    robbed = partial(
+        robbed_trials, lost_percent=lost_percent, num_draws=draws, seed=options.seed, both=clouds == "both"
+    )
+    trials = [trial for one in lists for trial in robbed(one, reference)]
     _run("deterioration", job, lists, trials, options, by="lost_percent", clouds=clouds, draws=draws)
 
 
@@ -114,40 +118,50 @@ def _run(
     **settings: Any,
 ) -> None:
     """Register, say what came out, and write the report where a folder is given."""
+    from segslam.experiments.paper import beside_paper
+    from segslam.experiments.provenance import account
     from segslam.experiments.summary import results
+    from segslam.report.bench_tables import overall, plain
 
     rows = run_trials(job, trials, options)
-    found = results(rows, by=by)
+    found = beside_paper(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
+    if options.out is not None:
+        asked = {"sample": options.sample, "seed": options.seed, "workers": options.workers, **settings}
+        report = account(experiment, job, lists, found, options=asked)
+        _write_report(options.out, report, _pictures(job, trials, rows, options.draw), quiet=options.quiet)
     if options.json:
         print_json(found)
     else:
-        say(table(found), quiet=options.quiet)
+        say(plain(overall(found)), quiet=options.quiet)
 
 
-def table(results: dict[str, dict[str, Any]]) -> str:
-    """Figures by method, for a person."""
-    columns = {
-        "success_percent": "success %",
-        "translation_m": "m",
-        "rotation_deg": "deg",
-        "num_false_accepted": "wrong",
-        "num_rejected": "rejected",
-        "median_ms": "median ms",
-        "p95_ms": "p95 ms",
-        "median_cpu_ms": "CPU ms",
-        "mean_edges": "edges",
-        "peak_mb": "MB",
-    }
-    lines = [f"{'':16}" + "".join(f"{title:>11}" for title in columns.values())]
-    for name, own in results.items():
-        lines.append(f"{name:16}" + "".join(f"{number(own[key]):>11}" for key in columns))
-    return "\n".join(lines)
+def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes], *, quiet: bool) -> None:
+    """The report and, beside it, the pictures as files."""
+    from segslam.report.bench import write_bench_report
+
+    write_bench_report(out, report, pictures=pictures)
+    for number, png in enumerate(pictures.values()):
+        (out / f"failure_{number:02d}.png").write_bytes(png)
+    say(f"{out / 'report.html'}, report.md, report.json, details.csv", quiet=quiet)
 
 
-def number(value: float | None) -> str:
-    """Some three digits; a dash for what is not known."""
-    if value is None:
-        return "-"
-    if isinstance(value, int):
-        return str(value)
-    return f"{value:.3f}" if abs(value) < 1 else f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"
+def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) -> dict[str, bytes]:
+    """The worst failures, drawn, by caption."""
+    from segslam.experiments.job import BAD_SCAN, points_of
+    from segslam.experiments.summary import worst_failures
+    from segslam.report.bench_figures import draw_registration
+
+    trial_of = {trial.key: trial for trial in trials}
+    pictures = {}
+    for row in worst_failures([row for row in rows if row.reason != BAD_SCAN], count):
+        trial = trial_of[row.key[:3]]
+        outcome = f"{row.error_m:.1f} m, {row.error_deg:.1f} deg off" if row.accepted else row.reason.replace("_", " ")
+        caption = f"{row.method}, {row.pairs}: {row.source} to {row.target}, {outcome}"
+        pictures[caption] = draw_registration(
+            points_of(job.source, trial.source),
+            points_of(job.source, trial.target),
+            T_true=trial.T_target_source,
+            T_estimate=row.estimate,
+            title=caption,
+        )
+    return pictures

@@ -16,7 +16,7 @@ from segslam.experiments.methods import METHODS, Part, prepare
 from segslam.experiments.rows import Row
 from segslam.experiments.trials import ScanVariant, Trial
 from segslam.semantics.encodings import Encoding
-from segslam.types import BadScan, Rejected
+from segslam.types import BadScan, Points, Rejected
 
 BAD_SCAN = "bad_scan"
 """The reason of a row whose scan could not be read."""
@@ -71,6 +71,13 @@ def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
             labels = shape_labels(scan.points, config=job.config)
     points, labels = variant.of(scan.points, labels)
     return SharedScan(prepare(points, labels, methods=job.methods, config=job.config), labelling)
+
+
+def points_of(source: DataSource, variant: ScanVariant) -> Points:
+    """The points of a variant, as the methods see them."""
+    dataset, row_of_scan = open_once(source)
+    scan = dataset[row_of_scan[variant.index]]
+    return variant.of(scan.points, scan.labels)[0]
 
 
 def register(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> list[Row]:

@@ -1,5 +1,10 @@
 """Values of the Segregator paper (Yin et al., ICRA 2023), to stand beside what is measured on the same lists."""
 
+from collections.abc import Sequence
+from typing import Any
+
+from segslam.experiments.pairs import PairList
+
 LISTS = {"easy": "3to5", "medium": "8to10", "hard": "10to15"}
 """How the files of the lists call them, by the metres between the scans."""
 NUM_PAIRS = {
@@ -82,3 +87,41 @@ def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
     if NUM_PAIRS[name][place] != num_pairs or method not in SUCCESS_PERCENT:
         return None
     return SUCCESS_PERCENT[method][name][place]
+
+
+def beside_paper(
+    results: dict[str, dict[str, Any]], *, experiment: str, sequence: str, lists: Sequence[PairList]
+) -> dict[str, dict[str, Any]]:
+    """The results with what the paper has for the same method and pairs, under `paper`; a list that was sampled counts.
+
+    Of `pairs` success by list; of `timing` all if the lists are the paper's three of 06; of `deterioration` the errors
+    if the pair is its 0 and 10 of 05.
+    """
+    whole = {one.name: one.num_whole for one in lists}
+    timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and _are_all(whole, TIMING_SEQUENCE)
+    robbed = experiment == "deterioration" and sequence.zfill(2) == "05" and _is_paper_pair(lists)
+    return {
+        method: own
+        | ({"paper": TIMING[method]} if timed and method in TIMING else {})
+        | {"by": [one | _paper_of(method, one, whole, robbed=robbed) for one in own["by"]]}
+        for method, own in results.items()
+    }
+
+
+def _paper_of(method: str, one: dict[str, Any], whole: dict[str, int], *, robbed: bool) -> dict[str, Any]:
+    """`paper` for one value of what was varied, or nothing."""
+    if robbed and method == "segregator" and one["lost_percent"] in DETERIORATION:
+        return {"paper": dict(zip(("translation_m", "rotation_deg"), DETERIORATION[one["lost_percent"]], strict=True))}
+    if "list" not in one:
+        return {}
+    value = success_percent(method, one["list"], whole[one["list"]])
+    return {} if value is None else {"paper": {"success_percent": value}}
+
+
+def _are_all(whole: dict[str, int], sequence: str) -> bool:
+    theirs = {f"kitti{sequence}_{band}": NUM_PAIRS[sequence][place] for place, band in enumerate(LISTS.values())}
+    return whole == theirs
+
+
+def _is_paper_pair(lists: Sequence[PairList]) -> bool:
+    return len(lists) == 1 and lists[0].pairs.tolist() == [[0, 10]]

@@ -14,7 +14,8 @@ STAGES = ("label_ms", "prepare_ms", "match_ms", "refine_ms", "verify_ms")
 def figures(rows: Sequence[Row]) -> dict[str, Any]:
     """What one method did on some pairs; None where nothing tells.
 
-    Errors are means over successes. Times are of a registration on its own, both scans prepared for it.
+    Errors are means over successes, `accepted_m` and `accepted_deg` over all poses that were given. Times are of a
+    registration on its own, both scans prepared for it.
     `mean_edges` is the mean over accepted registrations, the paper's average inlier count (AIC).
     """
     good = [row for row in rows if row.success]
@@ -24,6 +25,8 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
         "success_percent": 100.0 * len(good) / len(rows),
         "translation_m": _mean([row.error_m for row in good]),
         "rotation_deg": _mean([row.error_deg for row in good]),
+        "accepted_m": _mean([row.error_m for row in accepted]),
+        "accepted_deg": _mean([row.error_deg for row in accepted]),
         "num_false_accepted": len(accepted) - len(good),
         "num_rejected": len(rows) - len(accepted),
         "mean_ms": _mean([row.ms for row in rows]),

@@ -69,14 +69,14 @@ def draw_paths(run: FinishedRun) -> str:
         along_m = travelled_m(line.poses)
         height.plot(along_m, line.poses[:, 2, 3], line.style, color=line.color, linewidth=line.width)
     height.set(xlabel="travelled (m)", ylabel="height (m)")
-    return _svg(figure, "paths")
+    return svg(figure, "paths")
 
 
 def draw_loops(run: FinishedRun) -> str:
     """Every attempt to close a loop, on the corrected trajectory: closures join their ends, rejections are dots."""
     figure = Figure(figsize=(6.4, 6.2), layout="constrained")
     _plot_attempts(figure.subplots(), run)
-    return _svg(figure, "loops")
+    return svg(figure, "loops")
 
 
 def draw_picture(run: FinishedRun) -> bytes:
@@ -105,7 +105,7 @@ def draw_errors(poses: Compared) -> str:
     whole.set_ylim(bottom=0)
     height.set(xlabel="travelled (m)", ylabel="height error (m)")
     _legend_on_top(whole)
-    return _svg(figure, "errors")
+    return svg(figure, "errors")
 
 
 def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
@@ -118,7 +118,7 @@ def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
     axes.grid(visible=False, axis="y")
     axes.set(xlabel="time (ms)")
     _legend_on_top(axes)
-    return _svg(figure, "stages")
+    return svg(figure, "stages")
 
 
 def _plot_from_above(axes: Axes, paths: Iterable[Line]) -> None:
@@ -206,7 +206,7 @@ def _legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=num_columns, borderaxespad=0.2, fontsize=10)
 
 
-def _svg(figure: Figure, name: str) -> str:
+def svg(figure: Figure, name: str) -> str:
     """The picture; the same for the same data."""
     text = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": name}):

@@ -37,15 +37,23 @@ def page(run: FinishedRun, plots: dict[str, str]) -> str:
     title = (
         f"{run.dataset or run.folder.resolve().name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
     )
-    sections = [_plot(caption, svg) for caption, svg in plots.items()]
-    sections += [_section("Figures", _figures(run.metrics)), _section("Loop candidates", _outcomes(run))]
+    sections = [plot_section(caption, svg) for caption, svg in plots.items()]
+    sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
+    return document(
+        title,
+        f'<div class="soft">segslam run <code>{escape(run.folder.resolve().name)}</code></div>\n'
+        f'<div class="tiles">{_tiles(run.metrics)}</div>\n<div class="plots">{"".join(sections)}</div>\n'
+        f"{section('Settings', settings_tables(run.config))}",
+    )
+
+
+def document(title: str, body: str) -> str:
+    """A whole HTML file in the style of all reports."""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body><h1>{escape(title)}</h1>"
-        f'<div class="soft">segslam run <code>{escape(run.folder.resolve().name)}</code></div>\n'
-        f'<div class="tiles">{_tiles(run.metrics)}</div>\n<div class="plots">{"".join(sections)}</div>\n'
-        f"{_section('Settings', _settings(run.config))}</body></html>\n"
+        f"{body}</body></html>\n"
     )
 
 
@@ -62,9 +70,19 @@ def _tiles(metrics: dict[str, Any]) -> str:
     return "".join(f"<div><b>{_number(metrics[key])}{unit}</b>{text}</div>" for key, unit, text in known)
 
 
-def _plot(caption: str, svg: str) -> str:
-    data = base64.b64encode(svg.encode()).decode()
-    return _section(caption, f'<img alt="{escape(caption)}" src="data:image/svg+xml;base64,{data}">')
+def plot_section(caption: str, svg: str) -> str:
+    """A plot and its caption."""
+    return _picture_section(caption, svg.encode(), "svg+xml")
+
+
+def png_section(caption: str, png: bytes) -> str:
+    """A picture and its caption."""
+    return _picture_section(caption, png, "png")
+
+
+def _picture_section(caption: str, picture: bytes, kind: str) -> str:
+    data = base64.b64encode(picture).decode()
+    return section(caption, f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{data}">')
 
 
 def _figures(metrics: dict[str, Any]) -> str:
@@ -87,7 +105,7 @@ def _outcomes(run: FinishedRun) -> str:
     return _table(("", "attempts"), ((name.replace("_", " "), count) for name, count in names.most_common()))
 
 
-def _settings(config: Config) -> str:
+def settings_tables(config: Config) -> str:
     """Every setting by section; those that differ from the defaults are marked, and their sections open."""
     default = Config()
     return "".join(
@@ -110,7 +128,8 @@ def _setting(key: str, value: Any, field: FieldInfo, *, changed: bool) -> str:
     return f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
-def _section(title: str, body: str) -> str:
+def section(title: str, body: str) -> str:
+    """A box with a heading; `body` is HTML."""
     return f"<section><h2>{escape(title)}</h2>{body}</section>\n"
 
 

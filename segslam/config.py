@@ -182,7 +182,10 @@ class SegregatorConfig(Section):
         0.35, ge=0, description="and as a share of its cluster's standard deviation in that direction"
     )
     shared_noise_m: float = Field(
-        0.025, ge=0, description="noise that all share, being seen from one side; in the information alone (m)"
+        0.045, ge=0, description="noise that all share, being seen from one side; in the information alone (m)"
+    )
+    shared_noise_deg: float = Field(
+        0.05, ge=0, description="the same of the rotation: a sensor's bent rays; calibrated by tools/bench_registration"
     )
     ground_noise_m: float = Field(0.1, gt=0, description="noise of the distance of two patches of the ground (m)")
     ground_weight: float = Field(0.3, ge=0, description="weight of such a distance: neighbours err alike")
@@ -208,7 +211,13 @@ class RefineConfig(Section):
     max_iterations: int = Field(20, ge=1, description="in each stage")
     max_range_m: float = Field(60.0, gt=0, description="points farther away are left out (m)")
     min_points: int = Field(100, ge=10, description="fewest points, and fewest pairs, that can be aligned")
-    information_scale: float = Field(1.0, gt=0, description="Hessian to information: calibrated on simulated truth")
+    information_scale: float = Field(
+        0.05, gt=0, description="Hessian to information, neighbours err alike; calibrated by tools/bench_registration"
+    )
+    shared_noise_m: float = Field(
+        0.026, ge=0, description="noise of the translation that all points share: a sensor's bent rays (m)"
+    )
+    shared_noise_deg: float = Field(0.067, ge=0, description="the same of the rotation (degrees)")
 
 
 class VerifyConfig(Section):
@@ -239,6 +248,9 @@ class GraphConfig(Section):
     final: Literal["none", "gnc"] = Field("gnc", description="last optimisation: as before, or GNC-TLS")
     inlier_probability: float = Field(
         0.99, gt=0, lt=1, description="GNC keeps closures within this chi-square quantile"
+    )
+    systematic_drift: Literal["auto", "never"] = Field(
+        "auto", description="turn back what a leftover vertical angle bent, where held-out scans show it"
     )
 
 

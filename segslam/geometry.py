@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.types import Points, Rotation, Tangent, Transform
+from segslam.types import Information, Points, Rotation, Tangent, Transform
 
 Triple = float | Sequence[float] | np.ndarray
 """Three numbers, or one for all three."""
@@ -70,6 +70,16 @@ def distance(T_a_b: Transform) -> float:
 def interpolate(T_w_a: Transform, T_w_b: Transform, fraction: float) -> Transform:
     """The pose that lies `fraction` of the way along the screw motion from a (0) to b (1)."""
     return T_w_a @ exp(fraction * log(inverse(T_w_a) @ T_w_b))
+
+
+def with_noise(information: Information, *, rotation_rad: Triple, translation_m: Triple) -> Information:
+    """The information of a tangent that is also off by independent noise of these standard deviations.
+
+    Inverse(inverse(I) + S), written so that I may be singular: what was unknown stays so.
+    """
+    noise = np.diag(tangent(rotation_rad=rotation_rad, translation_m=translation_m) ** 2)
+    total = np.linalg.solve(np.eye(6) + information @ noise, information)
+    return (total + total.T) / 2
 
 
 def nearest_rotation(matrix: Rotation) -> Rotation:

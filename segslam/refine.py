@@ -68,7 +68,8 @@ def refine(
 ) -> Registration | Rejected:
     """The pose near `T_target_source` that aligns the source with the target (GICP, Segal et al. 2009).
 
-    `information` is the Hessian of the last stage times `config.information_scale`; `rms_m` is point to plane.
+    `information` is the Hessian of the last stage, scaled, and bounded by the noise that all points share; `rms_m` is
+    point to plane.
     Rejects TOO_FEW_POINTS, and REFINEMENT_DIVERGED where no pairs remain or the last stage does not converge.
     """
     if min(len(source), len(target)) < config.min_points:
@@ -94,5 +95,9 @@ def refine(
         num_correspondences=len(source),
         num_inliers=int(result.num_inliers),
         rms_m=float(np.sqrt(np.mean(paired**2))),
-        information=(result.H + result.H.T) / 2 * config.information_scale,
+        information=geometry.with_noise(
+            (result.H + result.H.T) / 2 * config.information_scale,
+            rotation_rad=math.radians(config.shared_noise_deg),
+            translation_m=config.shared_noise_m,
+        ),
     )

@@ -64,3 +64,20 @@ def test_nearest_rotation_mends_rounding_and_never_mirrors() -> None:
     np.testing.assert_allclose(mended @ mended.T, np.eye(3), atol=EXACT)
     assert np.abs(mended - rounded).max() < 1e-4
     assert np.linalg.det(geometry.nearest_rotation(np.diag([1.0, 1.0, -1.0]))) > 0
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=50)
+def test_noise_adds_to_the_covariance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(6, 6))
+    covariance = root @ root.T + 0.1 * np.eye(6)
+    noisier = geometry.with_noise(np.linalg.inv(covariance), rotation_rad=0.2, translation_m=[1.0, 2.0, 3.0])
+    expected = covariance + np.diag(np.array([0.2, 0.2, 0.2, 1.0, 2.0, 3.0]) ** 2)
+    np.testing.assert_allclose(np.linalg.inv(noisier), expected, atol=1e-9)
+
+
+def test_what_was_unknown_stays_unknown_under_noise() -> None:
+    known = np.diag([4.0, 0.0, 4.0, 4.0, 0.0, 4.0])
+    noisier = geometry.with_noise(known, rotation_rad=0.5, translation_m=0.5)
+    np.testing.assert_allclose(noisier, np.diag([2.0, 0.0, 2.0, 2.0, 0.0, 2.0]), atol=1e-12)

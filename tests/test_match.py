@@ -178,7 +178,7 @@ def test_first_hypothesis_is_the_match() -> None:
 
 def test_information_predicts_the_scatter_of_the_pose() -> None:
     """Centroids of both scans are moved by the noise that the model claims; xi^T information xi is then chi-square."""
-    config = SegregatorConfig(shared_noise_m=0.0)
+    config = SegregatorConfig(shared_noise_m=0.0, shared_noise_deg=0.0)
     scan = street(8)
     moved_scan = moved(T_TRUE, scan)
     errors = []

@@ -11,6 +11,7 @@ have m below a gate, these being chosen anew until they stay the same, as in gen
 RSS 2009). The ground adds the same cost for the distances of each scan's patches from the planes of the other's.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -46,8 +47,8 @@ def align_gaussians(
 ) -> PoseFit | Rejected:
     """The pose nearby that best lays the source on the target; its inliers are rows of `correspondences`.
 
-    `score` counts the inliers, each from 1 where it fits exactly down to 0 at the gate. `information` claims the noise
-    model and no more: on real and simulated pairs, xi^T information xi is 2 to 6 in the mean. Returns `Rejected` with
+    `score` counts the inliers, each from 1 where it fits exactly down to 0 at the gate. `information` is that of the
+    noise model, and of the noise that all clusters share. Returns `Rejected` with
     TOO_FEW_INLIERS below the size that a clique must have, and with DEGENERATE where the pose is left open by more than
     the paper calls a success.
     """
@@ -68,7 +69,11 @@ def align_gaussians(
         inliers=np.isin(np.arange(len(correspondences)), rows),
         rms_m=float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))),
         score=float(np.sum(1.0 - np.minimum(_squared(pairs, T_target_source, config) / GATE, 1.0))),
-        information=_with_shared_noise(information, config.shared_noise_m),
+        information=geometry.with_noise(
+            information,
+            rotation_rad=math.radians(config.shared_noise_deg),
+            translation_m=config.shared_noise_m,
+        ),
     )
 
 
@@ -121,12 +126,6 @@ def _squared(correspondences: Correspondences, T_target_source: Transform, confi
         config.centroid_noise_m,
         config.centroid_noise_share,
     )
-
-
-def _with_shared_noise(information: Information, noise_m: float) -> Information:
-    """The same for a translation that is also off by what no number of clusters averages out."""
-    shared = np.diag(geometry.tangent(rotation_rad=0.0, translation_m=noise_m) ** 2)
-    return np.linalg.inv(np.linalg.inv(information) + shared)
 
 
 def _leaves_open(information: Information) -> bool:

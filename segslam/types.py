@@ -12,6 +12,10 @@ from enum import IntEnum, StrEnum
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from segslam.errors import BadScan as BadScan
+from segslam.errors import SegslamError as SegslamError
+from segslam.errors import WorkFailed as WorkFailed
+
 Points = Float[np.ndarray, "_ 3"]
 """Points, a row each, in metres."""
 Labels = UInt8[np.ndarray, "_"]
@@ -28,18 +32,6 @@ Indices = Int[np.ndarray, "_"]
 IndexPairs = Int[np.ndarray, "_ 2"]
 Vector = Float[np.ndarray, "_"]
 Mask = Bool[np.ndarray, "_"]
-
-
-class SegslamError(Exception):
-    """Bad input or misuse: the message names the file or key and the remedy."""
-
-
-class WorkFailed(SegslamError):
-    """What was asked for was right and could not be done, as with a full disk."""
-
-
-class BadScan(SegslamError):
-    """One scan that cannot be used, the others are unaffected: report it, skip it, count it."""
 
 
 class Label(IntEnum):

@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from segslam.types import SegslamError, WorkFailed
+from segslam.errors import SegslamError, WorkFailed
 
 app = typer.Typer(
     name="segslam",

@@ -23,7 +23,7 @@ from segslam.cli.console import (
     say,
 )
 from segslam.experiments.settings import METHOD_NAMES
-from segslam.types import SegslamError
+from segslam.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.experiments.job import Job

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from segslam.cli.console import JsonOption, QuietOption, print_json, say
-from segslam.types import SegslamError
+from segslam.errors import SegslamError
 
 
 def optimize(

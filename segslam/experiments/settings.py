@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from segslam.types import SegslamError
+from segslam.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.config import Config

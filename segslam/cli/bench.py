@@ -156,7 +156,7 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
     for row in worst_failures([row for row in rows if row.reason != BAD_SCAN], count):
         trial = trial_of[row.key[:3]]
         outcome = f"{row.error_m:.1f} m, {row.error_deg:.1f} deg off" if row.accepted else row.reason.replace("_", " ")
-        caption = f"{row.method}, {row.pairs}: {row.source} to {row.target}, {outcome}"
+        caption = f"{row.method}, {row.pairs}: {row.source} to {row.target}{_changes(row)}, {outcome}"
         pictures[caption] = draw_registration(
             points_of(job.source, trial.source),
             points_of(job.source, trial.target),
@@ -165,3 +165,9 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
             title=caption,
         )
     return pictures
+
+
+def _changes(row: "Row") -> str:
+    """What was done to the scans."""
+    turned = f", turned {row.source_yaw_deg:g} deg" if row.source_yaw_deg else ""
+    return turned + (f", {100 * row.source_lost:g} % of labels lost" if row.source_lost else "")

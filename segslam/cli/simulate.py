@@ -22,6 +22,10 @@ def simulate(
         list[str] | None,
         typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change the world or the sensor, as in world.cars=3."),
     ] = None,
+    pairs: Annotated[
+        list[Path] | None,
+        typer.Option("--pairs", help="Write only the scans that this list of pairs names; may be repeated."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a sequence that was simulated here.")] = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -34,14 +38,29 @@ def simulate(
     config = simulation.simulation_config(sensor, settings or ())
     drive = simulation.made_up_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
     total = min(frames or len(drive.time_s), len(drive.time_s))
+    only = _named(pairs, total) if pairs else None
+    total = len(only) if only is not None else total
     simulation.prepare_folder(out, sequence, overwrite=overwrite)
     say(f"building the streets of {total} scans", quiet=quiet)
-    written = simulation.write_drive(out, sequence, drive, config=config, seed=seed, num_frames=total)
+    written = simulation.write_drive(out, sequence, drive, config=config, seed=seed, num_frames=frames, only=only)
     last = 0
     try:
         for done in progress(written, total=total, title="simulate", quiet=quiet):
             last = done
     except KeyboardInterrupt:
-        say(f"stopped: the first {last} scans are complete in {out / 'sequences' / sequence}", quiet=quiet)
+        say(f"stopped: {last} scans are complete in {out / 'sequences' / sequence}", quiet=quiet)
         raise typer.Exit(130) from None
     say(f"{last} scans in {out / 'sequences' / sequence}, true poses in {out / 'poses' / sequence}.txt", quiet=quiet)
+
+
+def _named(files: list[Path], num_scans: int) -> set[int]:
+    """The scans that the lists name. Raises SegslamError for one that the drive does not have."""
+    from segslam.experiments.pairs import read_pairs, scans_named
+    from segslam.types import SegslamError
+
+    only = scans_named([read_pairs(file) for file in files])
+    if max(only) >= num_scans:
+        raise SegslamError(
+            f"--pairs: scan {max(only)} is named, the drive has {num_scans}; take the list of this drive"
+        )
+    return only

@@ -1,6 +1,6 @@
 """A drive through a simulated world: sweep after sweep, each fixed by the seed and its own number alone."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
@@ -23,11 +23,19 @@ def simulate_drive(
 
 
 def drive_sweeps(
-    world: World, T_world_lidar: Poses, time_s: Vector, *, config: SensorConfig, seed: int
+    world: World,
+    T_world_lidar: Poses,
+    time_s: Vector,
+    *,
+    config: SensorConfig,
+    seed: int,
+    only: Collection[int] | None = None,
 ) -> Iterator[Sweep]:
-    """The sweeps of a drive through a world."""
+    """The sweeps of a drive through a world, in its order; of these numbers alone if given."""
     sensor = make_sensor(config, seed=seed)
     errors = sweep_errors(time_s, config=config, rng=np.random.default_rng([seed, 3]))
     for index, (T_world_now, now, error) in enumerate(zip(T_world_lidar, time_s, errors, strict=True)):
+        if only is not None and index not in only:
+            continue
         rng = np.random.default_rng([seed, 4, index])
         yield sweep(world, sensor, T_world_now, rng=rng, time_s=float(now), error=error)

@@ -2,8 +2,8 @@
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator
-from itertools import islice
+from collections.abc import Collection, Iterable, Iterator
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -53,21 +53,29 @@ def write_drive(
     config: SimulationConfig,
     seed: int,
     num_frames: int | None = None,
+    only: Collection[int] | None = None,
 ) -> Iterator[int]:
     """Simulate the first scans of a drive (None: all) into a prepared folder; yields how many are complete.
 
-    The world is that of the whole drive, so fewer scans are the same scans. Settings and seed are kept beside them.
+    `only` leaves out all others of them, but not their times and poses. The world is that of the whole drive, so fewer
+    scans are the same scans. Settings and seed are kept beside them.
     """
     settings = {"seed": seed, "config": config.model_dump(mode="json")}
     (out / "sequences" / sequence / SETTINGS_FILE).write_text(json.dumps(settings, indent=1) + "\n")
     world = build_world(drive.T_world_lidar, drive.time_s, config=config.world, seed=seed)
-    sweeps = drive_sweeps(world, drive.T_world_lidar, drive.time_s, config=config.sensor, seed=seed)
-    yield from write_sequence(out, sequence, drive, islice(sweeps, num_frames))
+    numbers = [index for index in range(num_frames or len(drive.time_s)) if only is None or index in only]
+    sweeps = drive_sweeps(
+        world, drive.T_world_lidar, drive.time_s, config=config.sensor, seed=seed, only=frozenset(numbers)
+    )
+    yield from write_sequence(out, sequence, drive, sweeps, numbers=numbers)
 
 
-def write_sequence(out: Path, sequence: str, drive: Drive, sweeps: Iterable[Sweep]) -> Iterator[int]:
+def write_sequence(
+    out: Path, sequence: str, drive: Drive, sweeps: Iterable[Sweep], *, numbers: Iterable[int] | None = None
+) -> Iterator[int]:
     """Write sweep after sweep into a prepared folder, yielding how many are complete.
 
+    `numbers` are those of the scans, ascending; 0, 1, ... unless given. Times and poses have no gap up to the last.
     Stopped at any moment, what is there is a shorter sequence: a scan appears whole, after its labels, time and pose.
     Poses are the camera's, in the frame of the first.
     """
@@ -77,14 +85,19 @@ def write_sequence(out: Path, sequence: str, drive: Drive, sweeps: Iterable[Swee
     T_first_lidar = geometry.inverse(drive.T_world_lidar[0]) @ drive.T_world_lidar
     T_first_camera = camera_from_lidar(T_first_lidar, T_camera_lidar)
     with (folder / "times.txt").open("w") as times, (out / "poses" / f"{sequence}.txt").open("w") as poses:
-        for index, one in enumerate(sweeps):
-            print(f"{drive.time_s[index]:.6e}", file=times, flush=True)
-            print(" ".join(f"{value:.9e}" for value in T_first_camera[index, :3].ravel()), file=poses, flush=True)
+        next_line = 0
+        for done, (index, one) in enumerate(zip(count() if numbers is None else numbers, sweeps, strict=False), start=1):
+            for line in range(next_line, index + 1):
+                print(f"{drive.time_s[line]:.6e}", file=times)
+                print(" ".join(f"{value:.9e}" for value in T_first_camera[line, :3].ravel()), file=poses)
+            next_line = index + 1
+            times.flush()
+            poses.flush()
             try:
                 _write_scan(folder, f"{index:06d}", one)
             except OSError as error:
-                raise WorkFailed(f"{folder}: stopped after {index} scans ({error}); make room there") from error
-            yield index + 1
+                raise WorkFailed(f"{folder}: stopped after {done - 1} scans ({error}); make room there") from error
+            yield done
 
 
 def _write_scan(folder: Path, name: str, one: Sweep) -> None:

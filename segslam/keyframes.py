@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Collection
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from segslam import geometry
 from segslam.config import KeyframeConfig
 from segslam.points import voxel_first
-from segslam.types import Label, Labels, Points, Transform
+from segslam.types import Keyframe, Label, Labels, Points, Transform
 
 
 class KeyframeSelector:
@@ -53,3 +54,35 @@ def thin(
     kept = np.sort(np.concatenate([np.flatnonzero(is_whole), others[voxel_first(points[others], config.voxel_m)]]))
     rounded = np.round(points[kept].astype(np.float64) / config.resolution_m) * config.resolution_m
     return rounded.astype(np.float32), labels[kept]
+
+
+@runtime_checkable
+class Clouds(Protocol):
+    """Where the points of keyframes are, until a loop asks for them."""
+
+    def keep(self, keyframe: Keyframe) -> None:
+        """Take note of the newest keyframe."""
+        ...
+
+    def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
+        """Points and labels of a keyframe, as they were."""
+        ...
+
+
+class CloudStore:
+    """Points and labels in memory, in 7 bytes each: coordinates are whole multiples of the keyframes' resolution."""
+
+    def __init__(self, resolution_m: float) -> None:
+        self._resolution_m = resolution_m
+        self._kept: dict[int, tuple[np.ndarray, Labels]] = {}
+
+    def keep(self, keyframe: Keyframe) -> None:
+        """Take note of the newest keyframe."""
+        steps = np.rint(keyframe.points.astype(np.float64) / self._resolution_m)
+        fits = np.abs(steps).max(initial=0.0) <= np.iinfo(np.int16).max
+        self._kept[keyframe.id] = (steps.astype(np.int16 if fits else np.int32), keyframe.labels)
+
+    def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
+        """Points and labels of a keyframe, as they were."""
+        steps, labels = self._kept[keyframe_id]
+        return (steps * self._resolution_m).astype(np.float32), labels

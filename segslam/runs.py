@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from segslam.beside import beside
 from segslam.config import config_to_yaml
 from segslam.datasets import Dataset
 from segslam.evaluation import loop_metrics, trajectory_metrics
 from segslam.log import LogWriter, RunLog
 from segslam.run_files import LOG, UNFINISHED, room_for, write_loops, write_poses
-from segslam.slam import Slam, SlamResult
+from segslam.slam import Slam, SlamResult, Tracked
 from segslam.trajectory import Poses, rows_of_same_scan
 from segslam.types import (
     BadScan,
@@ -32,6 +33,9 @@ from segslam.types import (
 )
 
 logger = logging.getLogger(__name__)
+
+MOST_WAITING = 8
+"""Chosen: scans that odometry may be ahead of the loops, some 2 MB each; a keyframe with two loops takes as long."""
 
 
 class Run:
@@ -71,6 +75,7 @@ class Run:
             reference=reference,
             options=options,
         )
+        slam.keep_clouds_in(self._log)
 
     def __enter__(self) -> "Run":
         return self
@@ -108,22 +113,15 @@ class Run:
         self.num_scans_skipped = self._next_row - len(taken)
 
     def map(self, dataset: Dataset) -> Iterator[Step | BadScan]:
-        """Process and log each scan after those resumed; a bad one is reported, counted and skipped."""
-        for row in range(self._next_row, len(dataset)):
-            try:
-                started = perf_counter()
-                scan = dataset[row]
-                self._note_ms("read", perf_counter() - started)
-                yield self._logged(self._slam.process(scan))
-            except BadScan as error:
-                self.num_scans_skipped += 1
-                logger.warning("%s; skipped", error)
-                yield error
+        """Process and log each scan after those resumed; a bad one is reported, counted and skipped.
+
+        Scans are read and tracked here while loops are closed and steps logged in a thread beside.
+        """
+        return beside(self._tracked(dataset), self._done, most_waiting=MOST_WAITING)
 
     def repeat(self, steps: Iterator[Step]) -> Iterator[Step]:
-        """Do again, from the keyframe on, what a log holds."""
-        for recorded in steps:
-            yield self._logged(self._slam.repeat(recorded))
+        """Do again, from the keyframe on, what a log holds; it is read here, while the rest is done beside."""
+        return beside(steps, lambda recorded: self._logged(self._slam.repeat(recorded)), most_waiting=MOST_WAITING)
 
     def finish(self) -> tuple[SlamResult, dict[str, Any]]:
         """Optimise once more and write all results; the figures of `metrics.json` that need no reference."""
@@ -151,6 +149,21 @@ class Run:
             "peak_rss_mb": peak_rss_mb(),
             "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
         }
+
+    def _tracked(self, dataset: Dataset) -> Iterator[Tracked | BadScan]:
+        for row in range(self._next_row, len(dataset)):
+            try:
+                started = perf_counter()
+                scan = dataset[row]
+                self._note_ms("read", perf_counter() - started)
+                yield self._slam.track(scan)
+            except BadScan as error:
+                self.num_scans_skipped += 1
+                logger.warning("%s; skipped", error)
+                yield error
+
+    def _done(self, tracked: Tracked | BadScan) -> Step | BadScan:
+        return tracked if isinstance(tracked, BadScan) else self._logged(self._slam.close_loops(tracked))
 
     def _logged(self, step: Step) -> Step:
         started = perf_counter()

@@ -6,24 +6,22 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from segslam import geometry, refine, segregator, verify
-from segslam.alignment import Labeller, PreparedScan, Stopwatch, align, shape_labels
+from segslam import geometry
+from segslam.alignment import Labeller, PreparedScan, Stopwatch, align, prepare_scan, shape_labels
 from segslam.config import Config
-from segslam.keyframes import KeyframeSelector, thin
+from segslam.keyframes import Clouds, CloudStore, KeyframeSelector, thin
 from segslam.odometry import KissOdometry, Odometry, OdometryResult
 from segslam.pose_graph import PoseGraph
 from segslam.proximity import ProximityDetector
 from segslam.trajectory import corrected_poses
 from segslam.types import (
     Alignment,
-    Description,
     GraphEstimate,
     Indices,
     Keyframe,
     LoopAttempt,
     LoopCandidate,
     LoopClosure,
-    Points,
     Registration,
     Rejected,
     RejectReason,
@@ -33,8 +31,8 @@ from segslam.types import (
     Transform,
 )
 
-NUM_SURFACES_KEPT = 64
-"""Search trees in memory, some 2 MB each; others are built again from thinned points in some 10 ms."""
+NUM_PREPARED = 64
+"""Keyframes ready for alignment in memory, some 2 MB each; others are made ready again, in some 40 ms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,16 +48,24 @@ class SlamResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Kept:
-    """What stays in memory of a keyframe."""
+class Tracked:
+    """A scan that odometry has placed. What follows, `Slam.close_loops`, may be done while the next is tracked."""
 
-    description: Description
-    thinned: Points
-    view: verify.View
+    scan_index: int
+    stamp_ns: int
+    registered: OdometryResult | None
+    """What a keyframe is cut from; None where none is to be cut."""
+    T_odom_lidar: Transform
+    travel_m: float
+    watch: Stopwatch
 
 
 class Slam:
-    """Odometry, keyframes, loops and graph. `process` each scan in order of time, then `finish`."""
+    """Odometry, keyframes, loops and graph. `process` each scan in order of time, then `finish`.
+
+    `process` is `track` and then `close_loops`. The first never waits for what the second finds, so the two may run in
+    two threads, each called for one scan after the other: the steps are the same.
+    """
 
     def __init__(
         self, config: Config | None = None, *, odometry: Odometry | None = None, labeller: Labeller | None = None
@@ -71,22 +77,37 @@ class Slam:
         self._selector = KeyframeSelector(self.config.keyframes)
         self._detector = ProximityDetector(self.config.proximity)
         self.graph = PoseGraph(self.config.graph)
-        self._kept: list[_Kept] = []
-        self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_SURFACES_KEPT)(self._prepare)
+        self._clouds: Clouds = CloudStore(self.config.keyframes.resolution_m)
+        self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self._prepare)
         self._steps: list[tuple[int, int, Transform]] = []
         self._keyframe_rows: list[int] = []
         self._attempts: list[LoopAttempt] = []
 
+    def keep_clouds_in(self, clouds: Clouds) -> None:
+        """Have the points of keyframes in another place than in memory; before the first scan."""
+        self._clouds = clouds
+
     def process(self, scan: Scan) -> Step:
         """All that this scan causes. Raises BadScan, and forgets the scan, if it cannot be used."""
+        return self.close_loops(self.track(scan))
+
+    def track(self, scan: Scan) -> Tracked:
+        """Where the scan was taken, and whether it becomes a keyframe. Raises BadScan as `process` does."""
         watch = Stopwatch()
         with watch("odometry"):
             registered = self._odometry.register(scan)
+        T_odom_lidar = registered.T_odom_lidar
+        is_keyframe = self._selector.update(T_odom_lidar)
+        kept = registered if is_keyframe else None
+        return Tracked(scan.index, scan.stamp_ns, kept, T_odom_lidar, self._selector.travel_m, watch)
+
+    def close_loops(self, tracked: Tracked) -> Step:
+        """What follows from a scan that was tracked."""
         keyframe = None
-        if self._selector.update(registered.T_odom_lidar):
-            with watch("keyframe"):
-                keyframe = self._cut(scan, registered)
-        return self._advance(scan.index, scan.stamp_ns, registered.T_odom_lidar, keyframe, watch)
+        if tracked.registered is not None:
+            with tracked.watch("keyframe"):
+                keyframe = self._cut(tracked, tracked.registered)
+        return self._advance(tracked.scan_index, tracked.stamp_ns, tracked.T_odom_lidar, keyframe, tracked.watch)
 
     def repeat(self, recorded: Step) -> Step:
         """As `process`, from a Step that was made before: all from the keyframe on is done again."""
@@ -122,15 +143,17 @@ class Slam:
         attempts: tuple[LoopAttempt, ...] = ()
         estimate = None
         if keyframe is not None:
-            self._keep(keyframe, watch)
-            attempts = self._close_loops(keyframe.id, watch)
+            self._clouds.keep(keyframe)
+            self._keyframe_rows.append(len(self._steps) - 1)
+            self.graph.add_keyframe(keyframe.id, keyframe.T_odom_keyframe, keyframe.travel_m)
+            attempts = self._attempt_loops(keyframe.id, watch)
             self._attempts += attempts
             if any(isinstance(attempt.outcome, LoopClosure) for attempt in attempts):
                 with watch("optimize"):
                     estimate = self.graph.optimize()
         return Step(scan_index, stamp_ns, T_odom_lidar, keyframe, attempts, estimate, watch.seconds)
 
-    def _cut(self, scan: Scan, registered: OdometryResult) -> Keyframe:
+    def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:
         """A keyframe of this scan, labelled by shape if it came without labels, and thinned to what is kept."""
         labels = registered.labels if registered.labels.any() else self._labeller(registered.points)
         points, labels = thin(
@@ -141,27 +164,19 @@ class Slam:
         )
         return Keyframe(
             id=self.graph.num_keyframes,
-            scan_index=scan.index,
-            stamp_ns=scan.stamp_ns,
-            T_odom_keyframe=registered.T_odom_lidar,
-            travel_m=self._selector.travel_m,
+            scan_index=tracked.scan_index,
+            stamp_ns=tracked.stamp_ns,
+            T_odom_keyframe=tracked.T_odom_lidar,
+            travel_m=tracked.travel_m,
             points=points,
             labels=labels,
         )
 
-    def _keep(self, keyframe: Keyframe, watch: Stopwatch) -> None:
-        with watch("describe"):
-            description = segregator.describe(keyframe.points, keyframe.labels, config=self.config.segregator)
-            thinned = refine.thin(keyframe.points, config=self.config.refine)
-            self._kept.append(_Kept(description, thinned, verify.view(keyframe.points)))
-        self._keyframe_rows.append(len(self._steps) - 1)
-        self.graph.add_keyframe(keyframe.id, keyframe.T_odom_keyframe, keyframe.travel_m)
-
     def _prepare(self, keyframe_id: int) -> PreparedScan:
-        kept = self._kept[keyframe_id]
-        return PreparedScan(kept.description, refine.prepare(kept.thinned, config=self.config.refine), kept.view)
+        points, labels = self._clouds.cloud(keyframe_id)
+        return prepare_scan(points, labels, config=self.config)
 
-    def _close_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+    def _attempt_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
         with watch("propose"):
             candidates = self._detector.candidates(keyframe_id, self.graph.T_world_keyframes, self.graph.travel_m)
         attempts = tuple(self._attempt(candidate, watch) for candidate in candidates)

@@ -3,7 +3,8 @@ import pytest
 
 from segslam import geometry
 from segslam.config import KeyframeConfig
-from segslam.keyframes import KeyframeSelector
+from segslam.keyframes import CloudStore, KeyframeSelector, thin
+from segslam.types import Keyframe, Label
 
 CONFIG = KeyframeConfig(distance_m=2.0, angle_deg=20.0)
 
@@ -41,3 +42,19 @@ def test_a_standing_sensor_that_jitters_cuts_no_keyframe() -> None:
     cut = [selector.update(_at(0.05 * (-1) ** i)) for i in range(200)]
     assert sum(cut) == 1
     assert selector.travel_m > 10.0, "else the test would not tell distance from path"
+
+
+@pytest.mark.parametrize("reach_m", [90.0, 400.0], ids=["two bytes a number", "four bytes"])
+def test_a_cloud_is_given_as_it_was_kept(reach_m: float) -> None:
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 20, 5_000).astype(np.uint8)
+    points, labels = thin(
+        rng.uniform(-reach_m, reach_m, (5_000, 3)), labels, config=CONFIG, whole_classes=(Label.CAR, Label.TRUNK)
+    )
+    store = CloudStore(CONFIG.resolution_m)
+    for keyframe_id in (0, 1):
+        store.keep(Keyframe(keyframe_id, 0, 0, np.eye(4), 0.0, points[keyframe_id:], labels[keyframe_id:]))
+    kept_points, kept_labels = store.cloud(1)
+    np.testing.assert_array_equal(kept_points, points[1:])
+    assert kept_points.dtype == np.float32
+    np.testing.assert_array_equal(kept_labels, labels[1:])

@@ -1,4 +1,3 @@
-raise RuntimeError("Lead to the speed engineer: read /work/main/NOTE_FROM_LEAD_TO_SPEED_ENGINEER.txt before going on")
 import numpy as np
 import pytest
 from kiss_icp.config.config import DataConfig, MappingConfig

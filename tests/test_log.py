@@ -48,6 +48,19 @@ def test_a_step_is_in_the_file_when_write_returns(steps: list[Step], tmp_path: P
             assert read_log(tmp_path / "log.mcap").num_steps() == number
 
 
+def test_a_keyframe_s_cloud_is_read_back_while_the_log_grows(steps: list[Step], tmp_path: Path) -> None:
+    keyframes = []
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
+        for step in steps:
+            if step.keyframe is not None:
+                keyframes.append(step.keyframe)
+                log.keep(step.keyframe)
+            for keyframe in keyframes[-1:] + keyframes[:2]:
+                assert_same((keyframe.points, keyframe.labels), log.cloud(keyframe.id))
+            log.write(step)
+    assert len(keyframes) > 5
+
+
 def test_result_read_again_is_that_written(steps: list[Step], tmp_path: Path) -> None:
     estimate, trajectory = made_result(steps)
     with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:

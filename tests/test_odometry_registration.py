@@ -1,4 +1,3 @@
-raise RuntimeError("Lead to the speed engineer: read /work/main/NOTE_FROM_LEAD_TO_SPEED_ENGINEER.txt before going on")
 """The compiled registration against KISS-ICP's own, and against plain NumPy."""
 
 import numpy as np

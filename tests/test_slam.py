@@ -1,13 +1,17 @@
+import time
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from drives import drifting, round_drive
 
+from segslam.beside import beside
 from segslam.config import load_config
 from segslam.evaluation import trajectory_metrics
 from segslam.odometry import GivenOdometry
 from segslam.runs import accuracy
-from segslam.slam import Slam, SlamResult
-from segslam.types import BadScan, LoopClosure, Rejected, Scan, Step
+from segslam.slam import Slam, SlamResult, Tracked
+from segslam.types import BadScan, LoopAttempt, LoopClosure, Rejected, Scan, Step
 
 CONFIG = load_config(None, ["proximity.min_travel_m=60"])
 
@@ -57,6 +61,33 @@ def test_repeating_the_steps_gives_the_same_attempts_and_poses(run: tuple[list[S
     assert [[_told(attempt.outcome) for attempt in step.attempts] for step in again] == outcomes
 
 
+@pytest.mark.parametrize(("most_waiting", "slow"), [(1, "tracking"), (8, "closing"), (8, "neither")])
+def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
+    run: tuple[list[Step], SlamResult], most_waiting: int, slow: str
+) -> None:
+    steps, result = run
+    slam = _slam()
+
+    def tracked() -> Iterator[Tracked]:
+        for scan in round_drive()[0]:
+            time.sleep(0.01 * (slow == "tracking"))
+            yield slam.track(scan)
+
+    def closed(scan: Tracked) -> Step:
+        time.sleep(0.02 * (slow == "closing"))
+        return slam.close_loops(scan)
+
+    for step, expected in zip(beside(tracked(), closed, most_waiting=most_waiting), steps, strict=True):
+        assert step.scan_index == expected.scan_index
+        np.testing.assert_array_equal(step.T_odom_lidar, expected.T_odom_lidar)
+        assert (step.keyframe is None) == (expected.keyframe is None)
+        if step.keyframe is not None:
+            np.testing.assert_array_equal(step.keyframe.points, expected.keyframe.points)
+            assert (step.keyframe.id, step.keyframe.travel_m) == (expected.keyframe.id, expected.keyframe.travel_m)
+        assert [_exactly(attempt) for attempt in step.attempts] == [_exactly(attempt) for attempt in expected.attempts]
+    np.testing.assert_array_equal(slam.finish().trajectory.T_world_lidar, result.trajectory.T_world_lidar)
+
+
 def test_other_gates_on_the_same_steps_reject_what_was_accepted(run: tuple[list[Step], SlamResult]) -> None:
     slam = Slam(load_config(None, ["proximity.min_travel_m=60", "verify.min_overlap=1"]))
     for step in run[0]:
@@ -82,6 +113,13 @@ def test_a_bad_scan_is_forgotten() -> None:
 def test_there_is_no_end_without_a_beginning() -> None:
     with pytest.raises(ValueError, match="no scan"):
         Slam(CONFIG).finish()
+
+
+def _exactly(attempt: LoopAttempt) -> tuple[object, ...]:
+    pair = (attempt.candidate.source_id, attempt.candidate.target_id)
+    if isinstance(attempt.outcome, Rejected):
+        return (*pair, attempt.outcome)
+    return (*pair, attempt.outcome.T_target_source.tolist(), attempt.outcome.information.tolist())
 
 
 def _told(outcome: LoopClosure | Rejected) -> str:

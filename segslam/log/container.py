@@ -54,6 +54,18 @@ def messages(path: Path) -> Iterator[Stored]:
                     yield Stored(channel.topic, schemas[channel.schema_id], record.data)
 
 
+def messages_within(records: bytes) -> Iterator[tuple[int, bytes]]:
+    """Channel and data of each message in a run of whole records. Raises CutError if they are damaged."""
+    offset = 0
+    while offset < len(records):
+        opcode, length = _RECORD_HEAD.unpack_from(records, offset)
+        body = records[offset + _RECORD_HEAD.size :][:length]
+        for record in _records_of_chunk(offset, body) if opcode == Opcode.CHUNK else ():
+            if isinstance(record, Message):
+                yield record.channel_id, record.data
+        offset += _RECORD_HEAD.size + length
+
+
 def metadata(path: Path) -> dict[str, dict[str, str]]:
     """The metadata before the first message, by name. Raises CutError, or OSError if the file cannot be opened."""
     found: dict[str, dict[str, str]] = {}

@@ -17,7 +17,7 @@ class Output:
 
     def __init__(self, path: Path) -> None:
         """Raises OSError if the file cannot be written, or another process does."""
-        self._raw = path.open("ab", buffering=0)
+        self._raw = path.open("a+b", buffering=0)
         fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._raw.truncate(0)
         self._raw.seek(0)
@@ -32,6 +32,10 @@ class Output:
         while rest:
             rest = rest[self._raw.write(rest) :]
         return len(data)
+
+    def read(self, offset: int, size: int) -> bytes:
+        """What was written there."""
+        return os.pread(self._raw.fileno(), size, offset)
 
     def tell(self) -> int:
         return self._raw.tell()

@@ -1,11 +1,10 @@
 """Steps into an MCAP file that can be read up to its last complete step at any moment."""
 
 import json
-import platform
 import resource
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import IO, Any, cast
@@ -17,16 +16,26 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from segslam.config import Config, config_to_yaml
+from segslam.config import Config
 from segslam.log import schema
-from segslam.log.cloud import KeyframePoints, keyframe_points
+from segslam.log.cloud import KeyframePoints, keyframe_points, points_and_labels
+from segslam.log.container import messages_within
 from segslam.log.drawing import Drawing, Topical, ground_truth
+from segslam.log.origin import metadata
 from segslam.log.output import Output
 from segslam.log.records import codec
-from segslam.types import GraphEstimate, SegslamError, Step, Trajectory, Transform, WorkFailed
+from segslam.types import (
+    GraphEstimate,
+    Keyframe,
+    Labels,
+    Points,
+    SegslamError,
+    Step,
+    Trajectory,
+    Transform,
+    WorkFailed,
+)
 
-PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
-"""Whose versions a log records: those that its figures depend on."""
 PROTOBUF_TOPICS = {
     schema.TRANSFORMS: FrameTransform,
     schema.KEYFRAME: KeyframePoints,
@@ -73,6 +82,9 @@ class LogWriter:
         self._drawing = Drawing(config.log)
         self._resolution_m = config.keyframes.resolution_m
         self._stamp_ns = 0
+        self._newest: Keyframe | None = None
+        self._steps_of_keyframes: dict[int, tuple[int, int]] = {}
+        """Where in the file the step of each keyframe is, and its size."""
         try:
             self._output = Output(path)
         except OSError as error:
@@ -81,7 +93,7 @@ class LogWriter:
         self._mcap = Writer(cast(IO[bytes], self._output), chunk_size=CHUNK_BYTES, compression=compression)
         with self._whole():
             self._mcap.start(library=f"segslam {version('segslam')}")
-            for name, data in _metadata(config, dataset, T_camera_lidar, options).items():
+            for name, data in metadata(config, dataset, T_camera_lidar, options).items():
                 self._mcap.add_metadata(name, data)
             self._channels = _register_channels(self._mcap)
         if reference is not None and len(reference):
@@ -89,7 +101,23 @@ class LogWriter:
 
     def write(self, step: Step) -> None:
         """Add a step."""
-        self._write(self._step_messages(step), stamp_ns=step.stamp_ns)
+        written = self._write(self._step_messages(step), stamp_ns=step.stamp_ns)
+        if step.keyframe is not None:
+            self._steps_of_keyframes[step.keyframe.id] = written
+
+    def keep(self, keyframe: Keyframe) -> None:
+        """Hold the newest keyframe until its step is written: `Clouds` of segslam.keyframes."""
+        self._newest = keyframe
+
+    def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
+        """Points and labels of a keyframe, read back from the file."""
+        if self._newest is not None and self._newest.id == keyframe_id:
+            return self._newest.points, self._newest.labels
+        offset, size = self._steps_of_keyframes[keyframe_id]
+        for channel_id, data in messages_within(self._output.read(offset, size)):
+            if channel_id == self._channels[schema.KEYFRAME]:
+                return points_and_labels(KeyframePoints.FromString(data))
+        raise SegslamError(f"{self._path}: keyframe {keyframe_id} has gone from the log; leave the file alone")
 
     def write_result(self, estimate: GraphEstimate, trajectory: Trajectory) -> None:
         """Add what the last optimisation gave, and the pose of every scan that follows from it."""
@@ -133,13 +161,16 @@ class LogWriter:
             yield _estimate_message(step.estimate)
         yield schema.STEP, _json(Step, step)
 
-    def _write(self, messages: Iterable[Encoded], *, stamp_ns: int) -> None:
+    def _write(self, messages: Iterable[Encoded], *, stamp_ns: int) -> tuple[int, int]:
+        """Where it went in the file, and its size."""
         encoded = list(messages)  # before anything is written: what cannot be encoded leaves no half of a step
         self._stamp_ns = stamp_ns
         with self._whole():
+            offset = self._output.tell()
             for topic, data in encoded:
                 self._mcap.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
             self._mcap.flush()
+            return offset, self._output.tell() - offset
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
@@ -170,31 +201,6 @@ def _register_channels(mcap: Writer) -> dict[str, int]:
         for topic, values in schema.json_schemas().items()
     }
     return protobuf | own
-
-
-def _metadata(
-    config: Config, dataset: str, T_camera_lidar: Transform | None, options: Mapping[str, str]
-) -> dict[str, dict[str, str]]:
-    calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
-    return {
-        schema.RUN_METADATA: {
-            "schema_version": str(schema.VERSION),
-            "dataset": dataset,
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            **calibration,
-        },
-        schema.CONFIG_METADATA: {"yaml": config_to_yaml(config)},
-        schema.OPTIONS_METADATA: dict(options),
-        schema.PACKAGES_METADATA: {name: _version(name) for name in PACKAGES},
-    }
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:  # open3d has other distributions of the same import
-        return "not installed"
 
 
 def _serialised(drawn: Iterable[Topical]) -> Iterator[Encoded]:

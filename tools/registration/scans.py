@@ -1,0 +1,178 @@
+"""The scans that registration is measured on: real ones (KITTI, a courtyard), simulated ones with exact poses."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import Config
+from segslam.datasets import open_dataset
+from segslam.semantics import geometric_labels
+from segslam.simulation import (
+    Drive,
+    LabelErrorConfig,
+    SimulationConfig,
+    SweepError,
+    WorldConfig,
+    build_world,
+    make_sensor,
+    network_like,
+    read_drive,
+    sweep,
+    sweep_errors,
+)
+from segslam.simulation.sensor import Sensor
+from segslam.simulation.world import World
+from segslam.types import Labels, Points, Transform
+
+Labelled = tuple[Points, Labels]
+
+WORLDS = {
+    "usual": WorldConfig(),
+    "hard": WorldConfig(cars=3, trees=4, lamps=1.5, signs=1.5, equal_tree_rows=True, parked_cars_gone=0.7),
+}
+"""Hard: sparse streets, rows of equal trees, most parked cars gone by the second visit; labels as a network's."""
+LISTED_M = {(8, 10): "8to10", (10, 15): "10to15"}
+"""Bands of distance that the paper has lists for."""
+BANDS_M = (*LISTED_M, (15, 20), (20, 30))
+MIN_GAP = 50
+"""Scans between the two of a pair, the protocol of the paper's lists."""
+PREDICTED = (0, 20, 30, 4413)
+"""Real scans with a network's labels."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    source: int
+    target: int
+    T_target_source: Transform
+    """True, or that of the reference."""
+
+
+class SimulatedPlace:
+    """Scans at the real poses of a KITTI sequence, levelled, in one made-up world; made on demand, kept in `cache`."""
+
+    def __init__(self, data: Path, sequence: str, world: str, *, seed: int, cache: Path) -> None:
+        self.name = f"{sequence} {world}"
+        self._lists = data / "pairs", f"kitti{sequence}_"
+        self._seed, self._hard = seed, world == "hard"
+        self._config = SimulationConfig(world=WORLDS[world])
+        digest = hashlib.sha256(self._config.model_dump_json().encode()).hexdigest()[:8]
+        self._folder = cache / f"{sequence}-{world}-{seed}-{digest}"
+        self._drive: Drive = read_drive(data / "kitti" / "poses" / f"{sequence}.txt", sequence=sequence)
+
+    def distance_m(self, a: int, b: int) -> float:
+        """Between two of its poses, as seen from above."""
+        T_world_lidar = self._drive.T_world_lidar
+        return float(np.linalg.norm(T_world_lidar[a, :2, 3] - T_world_lidar[b, :2, 3]))
+
+    def pair(self, source: int, target: int) -> Pair:
+        T_world_lidar = self._drive.T_world_lidar
+        return Pair(source, target, geometry.inverse(T_world_lidar[target]) @ T_world_lidar[source])
+
+    def pairs(self, band_m: tuple[int, int], count: int) -> list[Pair]:
+        """Up to `count` pairs of the paper's list for the band; where it has none, pairs cut by its protocol."""
+        rng = np.random.default_rng([self._seed, 6, *band_m])
+        candidates = self._listed(band_m) if band_m in LISTED_M else self._cut(band_m)
+        rows = rng.choice(len(candidates), min(count, len(candidates)), replace=False)
+        return [self.pair(int(source), int(target)) for source, target in candidates[np.sort(rows)]]
+
+    def scan(self, index: int) -> Labelled:
+        """Points (float32) and labels: the true ones, in a hard world those of a network."""
+        file = self._folder / f"{index:06d}.npz"
+        if not file.is_file():
+            self._folder.mkdir(parents=True, exist_ok=True)
+            points, labels = self._simulated(index)
+            np.savez(file, points=points, labels=labels)
+        stored = np.load(file)
+        return stored["points"], stored["labels"]
+
+    def _listed(self, band_m: tuple[int, int]) -> np.ndarray:
+        folder, prefix = self._lists
+        return np.loadtxt(folder / f"{prefix}{LISTED_M[band_m]}.txt", dtype=int)[:, :2]
+
+    def _cut(self, band_m: tuple[int, int]) -> np.ndarray:
+        at = self._drive.T_world_lidar[:, :2, 3]
+        early, late = np.triu_indices(len(at), MIN_GAP)
+        apart_m = np.linalg.norm(at[early] - at[late], axis=1)
+        within = (apart_m >= band_m[0]) & (apart_m < band_m[1])
+        return np.column_stack([early[within], late[within]])
+
+    @cached_property
+    def _world(self) -> tuple[World, Sensor, list[SweepError]]:
+        drive, config = self._drive, self._config
+        errors = sweep_errors(drive.time_s, config=config.sensor, rng=np.random.default_rng([self._seed, 3]))
+        world = build_world(drive.T_world_lidar, drive.time_s, config=config.world, seed=self._seed)
+        return world, make_sensor(config.sensor, seed=self._seed), list(errors)
+
+    def _simulated(self, index: int) -> Labelled:
+        world, sensor, errors = self._world
+        swept = sweep(
+            world,
+            sensor,
+            self._drive.T_world_lidar[index],
+            rng=np.random.default_rng([self._seed, 4, index]),
+            time_s=float(self._drive.time_s[index]),
+            error=errors[index],
+        )
+        rng = np.random.default_rng([self._seed, 5, index])
+        wrong = LabelErrorConfig() if self._hard else LabelErrorConfig(regions=0, bleeding=0.0, lost=0.0)
+        return swept.points.astype(np.float32), network_like(swept.points, swept.labels, config=wrong, rng=rng)
+
+
+def real_points(data: Path, index: int) -> Points:
+    """A scan of KITTI 00, corrected."""
+    return open_dataset(data / "kitti", sequence="00", labels="none", frames=f"{index}:{index + 1}")[0].points
+
+
+def real_labels(data: Path, index: int) -> Labels:
+    """A network's labels of one of the scans `PREDICTED`."""
+    return open_dataset(data / "kitti", sequence="00", labels="predicted_labels", frames=f"{index}:{index + 1}")[
+        0
+    ].labels
+
+
+def reference_pairs(data: Path) -> list[Pair]:
+    """The pairs of real scans whose pose is known to some centimetres."""
+    rows = json.loads((data / "kitti" / "reference_pairs.json").read_text())
+    return [Pair(row["source"], row["target"], np.array(row["T_target_source"])) for row in rows]
+
+
+def are_predicted(pair: Pair) -> bool:
+    """Whether both scans have a network's labels."""
+    return pair.source in PREDICTED and pair.target in PREDICTED
+
+
+def kitti_pose(data: Path, source: int, target: int) -> Transform:
+    """T_target_source by KITTI's own ground truth of 00, which errs by up to 1.6 m, more between scans far apart."""
+    reference = open_dataset(data / "kitti", sequence="00", labels="none").reference
+    rows = {int(index): row for row, index in enumerate(reference.scan_index)}
+    T_world_lidar = reference.T_world_lidar
+    return geometry.inverse(T_world_lidar[rows[target]]) @ T_world_lidar[rows[source]]
+
+
+def real_indices(data: Path) -> list[int]:
+    """The real scans of KITTI 00 that there are."""
+    files = (data / "kitti" / "sequences" / "00" / "velodyne").glob("*.bin")
+    return sorted(int(file.stem) for file in files)
+
+
+def courtyard_points(data: Path, index: int) -> Points:
+    """A scan of the handheld recording, which has no labels."""
+    file = data / "courtyard" / "velodyne" / f"{index:06d}.bin"
+    return np.fromfile(file, np.float32).reshape(-1, 4)[:, :3]
+
+
+def by_shape(points_of: Callable[[int], Points], config: Config) -> Callable[[int], Labelled]:
+    """The same scans with labels by shape alone."""
+
+    def scan(index: int) -> Labelled:
+        points = points_of(index)
+        return points, geometric_labels(points, config=config.geometric)
+
+    return scan

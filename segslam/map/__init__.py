@@ -67,11 +67,14 @@ def write_map(
     """Make the map of keyframes, each with its T_world_keyframe, and write it to each of the files, one at least.
 
     The ending of a name says what is written: .ply, .pcd, .las or .laz the cloud, .png the map from above, .yaml with a
-    .pgm beside it the occupancy grid. Files appear when they are whole. Raises SegslamError for another ending, or if
-    no keyframe has a point, and OSError where the disk is full. `show` is given the parts that are written and their
-    number, to show the progress.
+    .pgm beside it the occupancy grid. Files appear when they are whole. `show` is given the parts that are written and
+    their number, to show the progress. Raises SegslamError for another ending, for a folder that is not there, or if no
+    keyframe has a point, and OSError where the disk is full.
     """
     check_names(files)
+    for file in files:
+        if not file.parent.is_dir():
+            raise SegslamError(f"{file}: its folder is not there; make {file.parent}, or name another")
     with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name:
         scratch = Path(name)
         gathered = Gathered(scratch, config)

@@ -1,6 +1,7 @@
 """Two scans, from points to a verified pose: describe and prepare each once, then match, refine and verify a pair."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
@@ -53,10 +54,12 @@ def register(
     Labels are learning ids, a row a point; scans without are labelled by shape. The pose is `fine.T_target_source`.
     """
     config = config or Config()
-    source, target = (
-        prepare_scan(points, shape_labels(points, config=config) if labels is None else labels, config=config)
-        for points, labels in ((source_points, source_labels), (target_points, target_labels))
-    )
+
+    def prepared(points: Points, labels: Labels | None) -> PreparedScan:
+        return prepare_scan(points, shape_labels(points, config=config) if labels is None else labels, config=config)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        source, target = pool.map(prepared, (source_points, target_points), (source_labels, target_labels))
     return align(source, target, config=config)
 
 

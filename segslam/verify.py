@@ -63,8 +63,7 @@ class Agreement:
 
 def view(points: Points) -> View:
     """The view of a scan from its own sensor's place; `points` (n, 3) in the sensor's frame."""
-    far = points[within_range(points, MIN_RANGE_M, np.inf)].astype(np.float32)
-    nearest = _nearest_returns(far)
+    nearest = _nearest_returns(np.ascontiguousarray(points, np.float32))
     padded = np.pad(nearest, ((1, 1), (0, 0)), constant_values=np.inf)
     padded = np.pad(padded, ((0, 0), (1, 1)), mode="wrap")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
@@ -141,13 +140,16 @@ def _cell(x, y, z):
     return int(row), int(column) % NUM_COLUMNS
 
 
-@njit("float32[:, :](float32[:, :])", cache=True, nogil=True)
+@njit("float32[:, :](float32[:, ::1])", cache=True, nogil=True)
 def _nearest_returns(points):
     nearest = np.full((NUM_ROWS, NUM_COLUMNS), np.inf, np.float32)
-    for x, y, z in points:
-        row, column = _cell(x, y, z)
-        if 0 <= row < NUM_ROWS:
-            nearest[row, column] = min(nearest[row, column], math.sqrt(x * x + y * y + z * z))
+    for at in range(len(points)):
+        x, y, z = points[at, 0], points[at, 1], points[at, 2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if MIN_RANGE_M < distance < np.inf:  # false for NaN
+            row, column = _cell(x, y, z)
+            if 0 <= row < NUM_ROWS:
+                nearest[row, column] = min(nearest[row, column], distance)
     return nearest
 
 

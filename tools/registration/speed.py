@@ -9,7 +9,7 @@ import numpy as np
 from registration.scans import Labelled, Pair
 from registration.trials import Row
 from segslam import refine, segregator, verify
-from segslam.alignment import align, prepare_scan
+from segslam.alignment import prepare_scan, register
 from segslam.config import Config
 from segslam.experiments.baselines import align_gicp, prepare_gicp
 from segslam.experiments.meter import measured
@@ -58,7 +58,8 @@ def _surface_and_view(scan: Labelled, config: Config) -> None:
 
 
 def _cold(source: Labelled, target: Labelled, config: Config) -> None:
-    align(*(prepare_scan(*scan, config=config) for scan in (source, target)), config=config)
+    (source_points, source_labels), (target_points, target_labels) = source, target
+    register(source_points, target_points, source_labels=source_labels, target_labels=target_labels, config=config)
 
 
 def timed(work: Callable[[], object]) -> Seconds:

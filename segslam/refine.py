@@ -34,6 +34,11 @@ class Surface:
         return self.cloud.points()[:, :3]
 
     @property
+    def normals(self) -> Points:
+        """(n, 3), of unit length."""
+        return self.cloud.normals()[:, :3]
+
+    @property
     def standing(self) -> Points:
         """(k, 3): those on surfaces steeper than 45 degrees, where the scan's z points up."""
         return self.points[np.abs(self.cloud.normals()[:, 2]) < STANDING_NORMAL_Z]
@@ -41,11 +46,16 @@ class Surface:
     def __len__(self) -> int:
         return self.cloud.size()
 
+    def nearest(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) each: row of the point of the surface that is nearest to a point of this frame, and how far it is."""
+        rows, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
+        return np.asarray(rows), np.sqrt(squared)
+
     def distances_m(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """(n,) each: from points of this frame to the nearest point of the surface, and to the plane through it."""
-        nearest, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
-        to_plane = np.einsum("ij,ij->i", points - self.points[nearest], self.cloud.normals()[nearest, :3])
-        return np.sqrt(squared), np.abs(to_plane)
+        rows, to_point = self.nearest(points)
+        to_plane = np.einsum("ij,ij->i", points - self.points[rows], self.normals[rows])
+        return to_point, np.abs(to_plane)
 
 
 def thin(points: Points, *, config: RefineConfig) -> Points:

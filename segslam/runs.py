@@ -4,7 +4,7 @@ import logging
 import resource
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -147,6 +147,7 @@ class Run:
             "seconds_total": seconds,
             "scans_per_second": (len(result.trajectory) - self.num_scans_resumed) / seconds,
             "peak_rss_mb": peak_rss_mb(),
+            "systematic_drift": None if result.drift is None else asdict(result.drift),
             "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
         }
 

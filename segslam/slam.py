@@ -6,16 +6,17 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from segslam import geometry
+from segslam import geometry, refine
 from segslam.alignment import Labeller, PreparedScan, Stopwatch, align, prepare_scan, shape_labels
 from segslam.config import Config
 from segslam.keyframes import Clouds, CloudStore, KeyframeSelector, thin
 from segslam.odometry import KissOdometry, Odometry, OdometryResult
-from segslam.pose_graph import PoseGraph
+from segslam.pose_graph import PoseGraph, judge
 from segslam.proximity import ProximityDetector
 from segslam.trajectory import corrected_poses
 from segslam.types import (
     Alignment,
+    DriftEvidence,
     GraphEstimate,
     Indices,
     Keyframe,
@@ -30,6 +31,7 @@ from segslam.types import (
     Trajectory,
     Transform,
 )
+from segslam.vertical_angle import sample_angles
 
 NUM_PREPARED = 64
 """Keyframes ready for alignment in memory, some 2 MB each; others are made ready again, in some 40 ms."""
@@ -45,6 +47,8 @@ class SlamResult:
     keyframe_rows: Indices
     """Row of each keyframe, by id, in the two trajectories."""
     attempts: tuple[LoopAttempt, ...]
+    drift: DriftEvidence | None = None
+    """None where nobody asked, or the run was read from its log."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,6 +129,7 @@ class Slam:
         """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan."""
         if not self._steps:
             raise ValueError("no scan was processed")
+        drift = self._straighten() if self.config.graph.systematic_drift == "auto" else None
         estimate = self.graph.finish()
         odometry = Trajectory(
             scan_index=np.array([index for index, _, _ in self._steps]),
@@ -134,7 +139,7 @@ class Slam:
         rows = np.array(self._keyframe_rows)
         T_world_lidar = corrected_poses(odometry.T_world_lidar, rows, self.graph.T_world_keyframes)
         trajectory = replace(odometry, T_world_lidar=T_world_lidar)
-        return SlamResult(trajectory, odometry, estimate, rows, tuple(self._attempts))
+        return SlamResult(trajectory, odometry, estimate, rows, tuple(self._attempts), drift)
 
     def _advance(
         self, scan_index: int, stamp_ns: int, T_odom_lidar: Transform, keyframe: Keyframe | None, watch: Stopwatch
@@ -171,6 +176,19 @@ class Slam:
             points=points,
             labels=labels,
         )
+
+    def _straighten(self) -> DriftEvidence:
+        """Turn back what a leftover vertical angle bent, if held-out scans show that it did."""
+        T_odom_keyframes = np.stack([self._steps[row][2] for row in self._keyframe_rows])
+        samples = sample_angles(self._surface, T_odom_keyframes, self.graph.travel_m)
+        evidence = judge(samples)
+        if evidence.chosen:
+            self.graph.straighten(samples)
+        return evidence
+
+    def _surface(self, keyframe_id: int) -> refine.Surface:
+        points, _ = self._clouds.cloud(keyframe_id)
+        return refine.prepare(refine.thin(points, config=self.config.refine), config=self.config.refine)
 
     def _prepare(self, keyframe_id: int) -> PreparedScan:
         points, labels = self._clouds.cloud(keyframe_id)

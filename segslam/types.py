@@ -214,6 +214,40 @@ class GraphEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class AngleSamples:
+    """What pairs of scans along a drive tell of a leftover vertical angle, a row a pair."""
+
+    travel_m: Vector
+    """Of the middle between the two scans."""
+    angle_rad: Vector
+    """By which all points lie too low."""
+    excess_rad_per_m: Vector
+    """How much too far down the odometry turned."""
+
+    def rows(self, rows: Indices) -> "AngleSamples":
+        """Some of the pairs."""
+        return AngleSamples(self.travel_m[rows], self.angle_rad[rows], self.excess_rad_per_m[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class DriftEvidence:
+    """Whether a leftover vertical angle bent the odometry, and what speaks for it. None: too few scans to say."""
+
+    chosen: bool
+    reason: str
+    num_pairs: int
+    angle_deg: float | None = None
+    """Median over the drive; positive where points lie too low."""
+    chi2_before: float | None = None
+    """Of the odometry's excess pitch in stretches held out of the fit, as it is."""
+    chi2_after: float | None = None
+    """The same, less what the angles of the other stretches predict."""
+    t_value: float | None = None
+    """Of the agreement between prediction and excess, over stretches."""
+    t_needed: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Step:
     """All that one scan caused."""
 

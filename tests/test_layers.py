@@ -12,7 +12,8 @@ LAYERS = (  # top first; a room is a module or a folder
     {"runs", "results", "viewer"},
     {"slam", "log", "run_files", "map", "evaluation"},
     {"alignment"},
-    {"odometry", "keyframes", "proximity", "segregator", "refine", "vertical_angle", "verify", "pose_graph", "datasets", "simulation"},
+    {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "simulation",
+     "vertical_angle"},
     {"semantics"},  # below datasets, whose scans come with labels
     {"trajectory"},
     {"geometry", "points", "beside"},

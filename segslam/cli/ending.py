@@ -64,9 +64,20 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
             f"error after alignment: {metrics['ate_m']:.3f} m, odometry alone {metrics['odometry_ate_m']:.3f} m; "
             f"false loops: {metrics['num_loops_false']}"
         )
+    if drift := metrics.get("systematic_drift"):
+        lines.append(drift_summary(drift))
     if "num_scans_resumed" in metrics:
         lines.append(f"of these scans, {metrics['num_scans_resumed']} are from the log")
     if "num_loops_won" in metrics:
         before = f", error {metrics['recorded_ate_m']:.3f} m before" if "recorded_ate_m" in metrics else ""
         lines.append(f"replayed: {metrics['num_loops_won']} loops won, {metrics['num_loops_lost']} lost{before}")
     return "\n".join([*lines, f"results in {folder}"])
+
+
+def drift_summary(drift: dict[str, Any]) -> str:
+    """What was found of a systematic drift, and what was done."""
+    if drift["angle_deg"] is None:
+        return f"no word on a leftover vertical angle: {drift['reason']}"
+    done = "turned back" if drift["chosen"] else "left alone"
+    held_out = f"held-out chi-square {drift['chi2_before']:.0f} -> {drift['chi2_after']:.0f}"
+    return f"leftover vertical angle {drift['angle_deg']:.2f} degrees, {done}: {drift['reason']} ({held_out})"

@@ -1,7 +1,17 @@
 """The pose graph: the only room that knows GTSAM."""
 
 from segslam.pose_graph.batch import Optimized, Robust, optimize_graph
+from segslam.pose_graph.drift import judge
 from segslam.pose_graph.g2o import G2oGraph, read_g2o, write_g2o
 from segslam.pose_graph.graph import PoseGraph
 
-__all__ = ["G2oGraph", "Optimized", "PoseGraph", "Robust", "optimize_graph", "read_g2o", "write_g2o"]
+__all__ = [
+    "G2oGraph",
+    "Optimized",
+    "PoseGraph",
+    "Robust",
+    "judge",
+    "optimize_graph",
+    "read_g2o",
+    "write_g2o",
+]

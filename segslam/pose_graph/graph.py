@@ -13,10 +13,11 @@ import numpy as np
 from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import gnc, noise
-from segslam.pose_graph.edges import Edge, Transforms, joined, poses_by_id, squared_errors
+from segslam.pose_graph.drift import pitch_per_m, straightened
+from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
 from segslam.pose_graph.solver import search
-from segslam.types import GraphEstimate, LoopClosure, SegslamError, Transform, Vector
+from segslam.types import AngleSamples, GraphEstimate, LoopClosure, SegslamError, Transform, Vector
 
 RUNNING_TOLERANCE = 1e-3
 """Where an optimisation ends while running. Chosen: the same trajectories to a centimetre, a third fewer iterations."""
@@ -32,6 +33,8 @@ class PoseGraph:
     def __init__(self, config: GraphConfig) -> None:
         self._config = config
         self._odometry: list[Edge] = []
+        self._turned_rad = np.zeros(0)
+        """By how much the first of these motions have been turned up."""
         self._closures: list[Edge] = []
         self._trusted = gtsam.NonlinearFactorGraph()
         """The prior of the first pose and the factors of odometry: never doubted."""
@@ -97,6 +100,21 @@ class PoseGraph:
         self._closures.append(edge)
         self._doubted.add(edge.factor())
         self._robust.add(edge.factor(kernel=self._kernel))
+
+    def straighten(self, samples: AngleSamples) -> None:
+        """Turn back in the odometry what a leftover vertical angle bent; it takes effect with the next optimisation.
+
+        What an earlier call turned back is put in place again first.
+        """
+        travel_m = self.travel_m
+        turned_rad = pitch_per_m(samples, (travel_m[:-1] + travel_m[1:]) / 2) * np.diff(travel_m)
+        earlier = np.pad(self._turned_rad, (0, len(turned_rad) - len(self._turned_rad)))
+        self._odometry = straightened(self._odometry, turned_rad - earlier)
+        self._turned_rad = turned_rad
+        prior = self._trusted.at(0)
+        self._trusted = gtsam.NonlinearFactorGraph()
+        self._trusted.add(prior)
+        self._trusted.push_back(factor_graph(self._odometry))
 
     def optimize(self) -> GraphEstimate:
         """The optimum under the robust kernel, searched from the last estimate, good enough to go on with."""

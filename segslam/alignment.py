@@ -91,17 +91,39 @@ def align(
     pose before it is refined. Where none stands, the rejection is that of the best.
     """
     watch = watch or Stopwatch()
-    with watch("match"):
-        ranked = segregator.hypotheses(source.description, target.description, config=config.segregator)
-    if isinstance(ranked, Rejected):
-        return ranked
     rejections = []
-    for coarse in ranked[: config.verify.max_hypotheses]:
+    for coarse in _coarse(source, target, config=config, watch=watch):
+        if isinstance(coarse, Rejected):
+            rejections.append(coarse)
+            continue
         outcome = gate(coarse) or _sharpened(source, target, coarse, config=config, watch=watch)
         if isinstance(outcome, Alignment):
             return outcome
         rejections.append(outcome)
     return rejections[0]
+
+
+def _coarse(
+    source: PreparedScan, target: PreparedScan, *, config: Config, watch: Stopwatch
+) -> Iterator[Registration | Rejected]:
+    """Those of clusters and features; after these, those of floor plans where both scans know which way is up."""
+    with watch("match"):
+        ranked = segregator.hypotheses(source.description, target.description, config=config.segregator)
+    yield from [ranked] if isinstance(ranked, Rejected) else ranked[: config.verify.max_hypotheses]
+    source_up, target_up = segregator.upward(source.description), segregator.upward(target.description)
+    if source_up is None or target_up is None:
+        return
+    with watch("match"):
+        plans = list(
+            segregator.plan_hypotheses(
+                source.surface.standing,
+                target.surface.standing,
+                source_up,
+                target_up,
+                num_poses=config.verify.max_plan_hypotheses,
+            )
+        )
+    yield from plans
 
 
 def _sharpened(

@@ -224,6 +224,9 @@ class VerifyConfig(Section):
     """When an alignment is believed."""
 
     max_hypotheses: int = Field(3, ge=1, description="coarse poses tried, the best first")
+    max_plan_hypotheses: int = Field(
+        2, ge=0, description="after these, poses tried that lay the floor plans on one another"
+    )
     min_inliers: int = Field(3, ge=0, description="clique members that agree with a coarse pose worth refining")
     min_overlap: float = Field(0.2, ge=0, le=1, description="share of standing points that meet the other surface")
     inlier_m: float = Field(0.5, gt=0, description="a point this near the other surface meets it (m)")

@@ -1,0 +1,1 @@
+"""What bench_labels.py is made of."""

@@ -1,0 +1,77 @@
+"""One registration after the other, each judged against the truth, and what they come to."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from segslam import geometry
+from segslam.alignment import PreparedScan, align, prepare_scan, shape_labels
+from segslam.config import Config
+from segslam.types import Labels, Points, Rejected, Transform
+
+SUCCESS_M, SUCCESS_DEG = 2.0, 5.0
+
+Trial = dict[str, Any]
+"""accepted, success, seconds; reason or, of coarse and refined pose, error_m and error_deg."""
+
+
+def prepared(points: Points, labels: Labels | None, config: Config) -> tuple[PreparedScan, float]:
+    """A scan made ready, by these labels or by labels from shape, and the seconds that took, labelling included."""
+    started = time.perf_counter()
+    classes = shape_labels(points, config=config) if labels is None else labels
+    scan = prepare_scan(points, classes, config=config)
+    return scan, time.perf_counter() - started
+
+
+def attempt(source: PreparedScan, target: PreparedScan, T_true: Transform, config: Config) -> Trial:
+    """The whole pipeline on two scans, verification included."""
+    started = time.perf_counter()
+    found = align(source, target, config=config)
+    seconds = time.perf_counter() - started
+    if isinstance(found, Rejected):
+        return rejected_trial(found, seconds)
+    trial = judged_trial(found.fine.T_target_source, T_true, seconds)
+    coarse_m, coarse_deg = pose_error(found.coarse.T_target_source, T_true)
+    return trial | {"coarse_error_m": coarse_m, "coarse_error_deg": coarse_deg}
+
+
+def rejected_trial(found: Rejected, seconds: float) -> Trial:
+    """Of a method that gave no pose."""
+    return {"accepted": False, "success": False, "reason": found.reason.value, "seconds": seconds}
+
+
+def judged_trial(T_target_source: Transform, T_true: Transform, seconds: float) -> Trial:
+    """Of a method that gave a pose."""
+    error_m, error_deg = pose_error(T_target_source, T_true)
+    success = error_m < SUCCESS_M and error_deg < SUCCESS_DEG
+    return {"accepted": True, "success": success, "error_m": error_m, "error_deg": error_deg, "seconds": seconds}
+
+
+def pose_error(T_target_source: Transform, T_true: Transform) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    T_error = T_target_source @ geometry.inverse(T_true)
+    return geometry.distance(T_error), math.degrees(geometry.angle(T_error))
+
+
+def summary(trials: Sequence[Trial]) -> dict[str, Any]:
+    """Rates over all trials, errors over the successes."""
+    good = [trial for trial in trials if trial["success"]]
+    milliseconds = [1e3 * trial["seconds"] for trial in trials]
+    figures: dict[str, Any] = {
+        "num": len(trials),
+        "num_success": len(good),
+        "success_percent": round(100 * len(good) / len(trials), 1),
+        "num_false_accepted": sum(trial["accepted"] and not trial["success"] for trial in trials),
+        "rejected": dict(Counter(trial["reason"] for trial in trials if not trial["accepted"])),
+        "ms_median": round(float(np.median(milliseconds)), 1),
+        "ms_p95": round(float(np.percentile(milliseconds, 95)), 1),
+    }
+    for name in ("coarse_error_m", "coarse_error_deg", "error_m", "error_deg"):
+        values = [trial[name] for trial in good if name in trial]
+        if values:
+            figures |= {f"{name}_mean": round(float(np.mean(values)), 4), f"{name}_max": round(max(values), 4)}
+    return figures

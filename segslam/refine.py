@@ -17,6 +17,8 @@ from segslam.types import Points, Registration, Rejected, RejectReason, Transfor
 
 NUM_NEIGHBOURS = 10
 """For the covariance of a point; small_gicp's default."""
+NUM_THREADS = 2
+"""For those covariances, each of which is made by itself: the bits are the same. Sums over pairs keep to one."""
 STANDING_NORMAL_Z = math.cos(math.radians(45.0))
 """Chosen: what is steeper than this stands."""
 
@@ -69,7 +71,7 @@ def prepare(thinned: Points, *, config: RefineConfig) -> Surface:
     cloud = small_gicp.PointCloud(thinned.astype(np.float64))
     tree = small_gicp.KdTree(cloud)
     if len(thinned) >= config.min_points:
-        small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, 1)
+        small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, NUM_THREADS)
     return Surface(cloud, tree)
 
 

@@ -1,0 +1,19 @@
+"""Find the pose of one scan in another with no initial guess, from two (n, 3) arrays in files of NumPy.
+
+python docs/examples/register_scans.py source.npy target.npy
+"""
+
+import sys
+
+import numpy as np
+
+import segslam
+from segslam.types import Rejected
+
+source_points, target_points = (np.load(file) for file in sys.argv[1:])
+found = segslam.register(source_points, target_points)
+if isinstance(found, Rejected):
+    print(f"no pose: {found.reason} ({found.detail})")
+else:
+    print(f"overlap {found.overlap:.2f}, pose of the source in the target:")
+    print(found.fine.T_target_source.round(3))

@@ -1,0 +1,125 @@
+"""The documents say what the code does: examples run, the options page is the code's, commands explain themselves."""
+
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives import round_drive, write_kitti_sequence
+from finished_run import make_run
+from typer.main import get_command
+
+from segslam import cli
+from segslam.cli import commands
+from segslam.trajectory import read_poses
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "docs" / "examples"
+
+
+def _run_example(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: Path) -> None:
+    monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+    runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+
+def test_the_example_that_maps_writes_a_pose_a_scan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_kitti_sequence(tmp_path / "kitti", num_scans=5)
+    _run_example(monkeypatch, "map_scans.py", tmp_path / "kitti", tmp_path / "poses.txt")
+    assert len(read_poses(tmp_path / "poses.txt")) == 5
+    assert "5 poses in" in capsys.readouterr().out
+
+
+def test_the_example_that_registers_finds_the_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scans, truth = round_drive()
+    files = [tmp_path / "source.npy", tmp_path / "target.npy"]
+    for file, scan in zip(files, (scans[53], scans[2]), strict=True):
+        np.save(file, scan.points)
+    _run_example(monkeypatch, "register_scans.py", *files)
+    shown = np.array([float(value) for value in re.findall(r"-?\d+\.\d*", capsys.readouterr().out)][1:]).reshape(4, 4)
+    T_target_source = np.linalg.inv(truth.T_world_lidar[2]) @ truth.T_world_lidar[53]
+    np.testing.assert_allclose(shown[:3, 3], T_target_source[:3, 3], atol=0.3)
+
+
+def test_the_example_that_reads_a_log_counts_its_loops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _run_example(monkeypatch, "read_log.py", make_run(tmp_path / "run").folder)
+    told = capsys.readouterr().out
+    assert "'accepted': 4" in told
+    assert "120 scans; keyframe 59 has 4 points" in told
+
+
+@pytest.mark.data
+def test_the_example_that_scores_agrees_with_the_known_error(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimate = next((data_dir / "trajectories").glob("KITTI_00_ORB*"))
+    _run_example(monkeypatch, "score_trajectory.py", estimate, data_dir / "kitti" / "poses" / "00.txt")
+    [ate] = re.findall(r"ate_m +(\d+\.\d+)", capsys.readouterr().out)
+    assert float(ate) == pytest.approx(1.30, abs=0.005)  # as the data's description has it
+
+
+def test_every_example_is_run_by_a_test_here() -> None:
+    tests = Path(__file__).read_text()
+    assert all(f'"{example.name}"' in tests for example in EXAMPLES.glob("*.py"))
+
+
+def test_the_page_of_options_is_that_of_the_configuration() -> None:
+    page = runpy.run_path(str(ROOT / "tools" / "options.py"))["page"]
+    assert (ROOT / "docs" / "options.md").read_text(encoding="utf-8") == page(), "run: python tools/options.py"
+
+
+def test_every_command_has_an_example_and_every_option_is_explained() -> None:
+    commands.add_all(cli.app)
+    for name, command in _all_commands(get_command(cli.app)):
+        assert "Example" in (command.help or ""), f"segslam {name}"
+        for parameter in command.params:
+            assert getattr(parameter, "help", None), f"segslam {name}: {parameter.name}"
+
+
+def test_help_starts_without_the_heavy_packages() -> None:
+    code = (
+        "import sys; from segslam.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'numpy', 'scipy', 'open3d', 'gtsam', 'numba', 'matplotlib', 'pydantic'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md"))])
+def test_the_commands_and_options_that_a_page_names_exist(page: str) -> None:
+    commands.add_all(cli.app)
+    known = dict(_all_commands(get_command(cli.app)))
+    for line in re.findall(r"(?m)^(?:    |\$ )?segslam .*$|`segslam [^`]*`", (ROOT / page).read_text()):
+        words = line.strip(" `$").split("#")[0].split()
+        name = " ".join(words[1:3]) if " ".join(words[1:3]) in known else words[1] if len(words) > 1 else ""
+        if name.startswith("-") or not name:
+            continue
+        assert name in known or name == "bench", f"{page}: {line}"
+        options = {option for parameter in known[name].params for option in parameter.opts} if name in known else set()
+        for word in words:
+            if word.startswith("--") and options:
+                assert word.split("=")[0] in options | {"--help"}, f"{page}: {line}"
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md"))])
+def test_the_files_that_a_page_links_to_exist(page: str) -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text()):
+        assert target.startswith("http") or ((ROOT / page).parent / target).exists(), f"{page}: {target}"
+
+
+def _all_commands(command: object, name: str = "") -> list[tuple[str, object]]:
+    """Each command by its words."""
+    children = getattr(command, "commands", {})
+    if not children:
+        return [(name, command)]
+    return [found for key, child in children.items() for found in _all_commands(child, f"{name} {key}".strip())]

@@ -1,0 +1,99 @@
+"""Writes docs/options.md: every setting with unit, default, range and meaning, from the classes of segslam/config.py.
+
+python tools/options.py
+"""
+
+import re
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+import yaml
+from annotated_types import Ge, Gt, Le, Lt, MinLen
+from pydantic.fields import FieldInfo
+
+from segslam.config import Config, Section
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "options.md"
+INTRODUCTION = """# Every setting
+
+Generated from `segslam/config.py` by `python tools/options.py`; change it there.
+
+Give what differs from the defaults in a YAML file, `--config strict.yaml`, or one setting after the other,
+`--set verify.min_overlap=0.4 --set map.color=height`. Unknown keys and values out of range are refused by name. A run
+keeps its settings in `config.yaml`, which `--config` reads again.
+
+```yaml
+verify:
+  min_overlap: 0.4
+keyframes:
+  distance_m: 1.5
+```
+
+P in a meaning marks a value of the Segregator paper, A one of its authors' program.
+"""
+SIGNS = {Ge: ("at least", "ge"), Gt: ("above", "gt"), Le: ("at most", "le"), Lt: ("below", "lt")}
+TRAILING_UNITS = re.compile(r" \((m|s|degrees|m\^2|m per m)\)$")
+
+
+def main() -> None:
+    """Write the page."""
+    PAGE.parent.mkdir(exist_ok=True)
+    PAGE.write_text(page(), encoding="utf-8")
+
+
+def page() -> str:
+    """The page's text."""
+    default = Config()
+    return INTRODUCTION + "".join(_section(name, getattr(default, name)) for name in Config.model_fields)
+
+
+def _section(name: str, section: Section) -> str:
+    values = section.model_dump(mode="json")
+    rows = [_row(key, values[key], field) for key, field in type(section).model_fields.items()]
+    about = f"{type(section).__doc__}\n\n" if type(section).__doc__ != Section.__doc__ and type(section).__doc__ else ""
+    head = "| setting | default | unit | allowed | meaning |\n|---|---|---|---|---|\n"
+    return f"\n## {name}\n\n{about}{head}{''.join(rows)}"
+
+
+def _row(key: str, value: Any, field: FieldInfo) -> str:
+    meaning = field.description or ""
+    unit = TRAILING_UNITS.search(meaning)
+    cells = (
+        f"`{key}`",
+        f"`{_shown(value)}`",
+        unit[1] if unit else "",
+        _allowed(field),
+        TRAILING_UNITS.sub("", meaning).replace("|", "\\|"),
+    )
+    return f"| {' | '.join(cells)} |\n"
+
+
+def _shown(value: Any) -> str:
+    """As YAML writes it in one line."""
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).strip().removesuffix("\n...")
+
+
+def _allowed(field: FieldInfo) -> str:
+    if choices := _choices(field.annotation):
+        return ", ".join(f"`{_shown(choice)}`" for choice in choices)
+    bounds = [f"{words} {getattr(limit, name):g}" for limit in field.metadata for words, name in _sign(limit)]
+    return ", ".join(bounds)
+
+
+def _sign(limit: object) -> list[tuple[str, str]]:
+    if isinstance(limit, MinLen):
+        return [("length at least", "min_length")]
+    return [SIGNS[type(limit)]] if type(limit) in SIGNS else []
+
+
+def _choices(hint: Any) -> tuple[object, ...]:
+    if get_origin(hint) is Literal:
+        return get_args(hint)
+    if get_origin(hint) in (Union, UnionType):
+        return tuple(choice for part in get_args(hint) for choice in _choices(part))
+    return (True, False) if hint is bool else ()
+
+
+if __name__ == "__main__":
+    main()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from segslam.segregator.bits import count_bits, lowest_bit, members, pack_flags, pairs, part
+from segslam.cliques.bits import count_bits, lowest_bit, members, pack_flags, pack_rows, pairs, part
 
 WORDS = st.integers(0, 2**64 - 1)
 
@@ -14,9 +14,7 @@ def random_graph(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Adjacency as flags and as bits."""
     upper = np.triu(np.random.default_rng(seed).random((count, count)) < 0.2, 1)
     flags = upper | upper.T
-    padded = np.zeros((count, (count + 63) // 64 * 64), bool)
-    padded[:, :count] = flags
-    return flags, np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
+    return flags, pack_rows(flags)
 
 
 @given(word=WORDS)

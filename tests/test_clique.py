@@ -8,16 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from segslam.segregator.clique import degeneracy_order, maximum_cliques
+from segslam.cliques import maximum_cliques, pack_rows
+from segslam.cliques.search import degeneracy_order
 
 ENOUGH = 10_000_000
-
-
-def packed(flags: np.ndarray) -> np.ndarray:
-    count = len(flags)
-    padded = np.zeros((count, (count + 63) // 64 * 64), bool)
-    padded[:, :count] = flags
-    return np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
 
 
 def random_graph(rng: np.random.Generator, count: int, density: float) -> np.ndarray:
@@ -40,8 +34,8 @@ def test_one_and_all_maximum_cliques_are_those_of_networkx(seed: int, count: int
     count = min(count, 30) if density > 0.5 else count  # a dense graph has too many cliques to list them all
     flags = random_graph(np.random.default_rng(seed), count, density)
     expected = all_maximum(flags)
-    one = maximum_cliques(packed(flags), max_cliques=1, max_nodes=ENOUGH)
-    every = maximum_cliques(packed(flags), max_cliques=5000, max_nodes=ENOUGH)
+    one = maximum_cliques(pack_rows(flags), max_cliques=1, max_nodes=ENOUGH)
+    every = maximum_cliques(pack_rows(flags), max_cliques=5000, max_nodes=ENOUGH)
     assert one.proved
     assert every.proved
     assert as_set(one.cliques) <= expected
@@ -53,7 +47,7 @@ def test_one_and_all_maximum_cliques_are_those_of_networkx(seed: int, count: int
 def test_size_in_larger_graphs_is_that_of_networkx(count: int, density: float) -> None:
     flags = random_graph(np.random.default_rng(count), count, density)
     size = len(nx.max_weight_clique(nx.from_numpy_array(flags), weight=None)[0])
-    search = maximum_cliques(packed(flags), max_cliques=1, max_nodes=ENOUGH)
+    search = maximum_cliques(pack_rows(flags), max_cliques=1, max_nodes=ENOUGH)
     assert len(search.cliques[0]) == size
     assert search.proved
 
@@ -63,7 +57,7 @@ def test_core_numbers_are_those_of_networkx_and_the_order_takes_the_least_connec
     count: int, density: float
 ) -> None:
     flags = random_graph(np.random.default_rng(count), count, density)
-    order, core_numbers = degeneracy_order(packed(flags))
+    order, core_numbers = degeneracy_order(pack_rows(flags))
     assert dict(enumerate(core_numbers.tolist())) == nx.core_number(nx.from_numpy_array(flags))
     left = flags.copy()
     for v in order:
@@ -76,7 +70,7 @@ def test_planted_clique_is_found_among_a_thousand_vertices() -> None:
     flags = random_graph(rng, 1000, 0.1)
     planted = np.sort(rng.permutation(1000)[:25])
     flags[np.ix_(planted, planted)] = ~np.eye(25, dtype=bool)
-    search = maximum_cliques(packed(flags), max_cliques=3, max_nodes=ENOUGH)
+    search = maximum_cliques(pack_rows(flags), max_cliques=3, max_nodes=ENOUGH)
     assert search.proved
     assert [clique.tolist() for clique in search.cliques] == [planted.tolist()]
 
@@ -88,27 +82,27 @@ def test_graph_without_vertices_has_no_clique_and_that_is_proved() -> None:
 
 
 def test_graph_without_edges_has_each_vertex_as_a_clique() -> None:
-    assert len(maximum_cliques(packed(np.zeros((3, 3), bool)), max_cliques=9, max_nodes=ENOUGH).cliques) == 3
+    assert len(maximum_cliques(pack_rows(np.zeros((3, 3), bool)), max_cliques=9, max_nodes=ENOUGH).cliques) == 3
 
 
 def test_complete_graph_is_one_clique() -> None:
     flags = ~np.eye(500, dtype=bool)
-    search = maximum_cliques(packed(flags), max_cliques=4, max_nodes=ENOUGH)
+    search = maximum_cliques(pack_rows(flags), max_cliques=4, max_nodes=ENOUGH)
     assert [len(clique) for clique in search.cliques] == [500]
 
 
 def test_no_more_cliques_are_given_than_asked_for() -> None:
     flags = ~np.eye(8, dtype=bool)
     flags[0, 1] = flags[1, 0] = flags[2, 3] = flags[3, 2] = False
-    assert len(maximum_cliques(packed(flags), max_cliques=3, max_nodes=ENOUGH).cliques) == 3
-    assert len(maximum_cliques(packed(flags), max_cliques=9, max_nodes=ENOUGH).cliques) == 4
+    assert len(maximum_cliques(pack_rows(flags), max_cliques=3, max_nodes=ENOUGH).cliques) == 3
+    assert len(maximum_cliques(pack_rows(flags), max_cliques=9, max_nodes=ENOUGH).cliques) == 4
 
 
 @pytest.mark.parametrize("max_nodes", [1, 10, 1000])
 def test_search_that_is_cut_short_says_so_and_gives_a_true_clique(max_nodes: int) -> None:
     flags = random_graph(np.random.default_rng(1), 300, 0.7)
     for max_cliques in (1, 5):
-        search = maximum_cliques(packed(flags), max_cliques=max_cliques, max_nodes=max_nodes)
+        search = maximum_cliques(pack_rows(flags), max_cliques=max_cliques, max_nodes=max_nodes)
         assert not search.proved
         assert len(search.cliques) >= 1
         for clique in search.cliques:
@@ -117,7 +111,7 @@ def test_search_that_is_cut_short_says_so_and_gives_a_true_clique(max_nodes: int
 
 def test_same_graph_gives_the_same_cliques_in_the_same_order() -> None:
     flags = random_graph(np.random.default_rng(2), 120, 0.4)
-    first, second = (maximum_cliques(packed(flags), max_cliques=20, max_nodes=ENOUGH) for _ in range(2))
+    first, second = (maximum_cliques(pack_rows(flags), max_cliques=20, max_nodes=ENOUGH) for _ in range(2))
     assert [clique.tolist() for clique in first.cliques] == [clique.tolist() for clique in second.cliques]
 
 
@@ -131,7 +125,7 @@ def test_clique_of_a_real_graph_has_the_size_that_the_authors_program_found(
     flags = np.zeros((count, count), bool)
     flags[tuple(golden["edges"].T)] = True
     flags |= flags.T
-    search = maximum_cliques(packed(flags), max_cliques=50, max_nodes=ENOUGH)
+    search = maximum_cliques(pack_rows(flags), max_cliques=50, max_nodes=ENOUGH)
     assert search.proved
     assert len(search.cliques[0]) == size
     assert tuple(np.sort(golden["clique"]).tolist()) in as_set(search.cliques)

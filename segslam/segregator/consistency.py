@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from segslam.cliques.bits import Bits, lowest_bit, pack_flags, pairs, part
 from segslam.config import SegregatorConfig
-from segslam.segregator.bits import Bits, lowest_bit, pack_flags, pairs, part
 from segslam.segregator.correspondences import Correspondences
 from segslam.types import IndexPairs
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from segslam import geometry
+from segslam.cliques import maximum_cliques
 from segslam.config import SegregatorConfig
-from segslam.segregator.clique import maximum_cliques
 from segslam.segregator.consistency import consistency_graph
 from segslam.segregator.correspondences import (
     Correspondences,

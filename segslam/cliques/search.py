@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from segslam.segregator.bits import Bits, count_bits, lowest_bit, members
+from segslam.cliques.bits import Bits, count_bits, lowest_bit, members
 from segslam.types import Indices
 
 _FLOOR, _SIZE, _FOUND, _NODES = range(4)  # what `state` holds: only larger cliques count; size and number of those kept

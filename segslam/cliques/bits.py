@@ -1,11 +1,19 @@
-"""Adjacency as bits: what the consistency graph and the clique search share."""
+"""Adjacency as bits: what consistency graphs and the clique search share."""
 
 import numpy as np
-from jaxtyping import UInt64
+from jaxtyping import Bool, UInt64
 from numba import njit
 
 Bits = UInt64[np.ndarray, "_ _"]
 """A row a vertex: bit k of word w says whether there is an edge to vertex 64 w + k."""
+
+
+def pack_rows(joined: Bool[np.ndarray, "n n"]) -> Bits:
+    """The adjacency of n vertices as bits; nobody is joined to itself."""
+    num = len(joined)
+    padded = np.zeros((num, (num + 63) // 64 * 64), bool)
+    padded[:, :num] = joined & ~np.eye(num, dtype=bool)
+    return np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
 
 
 @njit("uint64(uint64)", cache=True, nogil=True, inline="always")

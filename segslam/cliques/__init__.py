@@ -1,0 +1,6 @@
+"""The largest sets of vertices that are all joined to each other, and adjacency as bits."""
+
+from segslam.cliques.bits import Bits, pack_rows
+from segslam.cliques.search import CliqueSearch, maximum_cliques
+
+__all__ = ["Bits", "CliqueSearch", "maximum_cliques", "pack_rows"]

@@ -90,3 +90,23 @@ def wait_for(file: Path) -> None:
             return
         time.sleep(0.05)
     pytest.fail(f"{file} did not appear within a minute")
+
+
+def test_it_writes_only_the_scans_that_lists_of_pairs_name(tmp_path):
+    (tmp_path / "pairs.txt").write_text("1 4\n4 2\n")
+    assert simulate(tmp_path / "some", "--pairs", tmp_path / "pairs.txt", "--sensor", "vlp16", "--quiet") == 0
+    dataset = open_dataset(tmp_path / "some")
+    assert dataset.scan_index.tolist() == [1, 2, 4]
+    assert len(dataset.reference) == 3
+    assert simulate(tmp_path / "all", "--frames", 5, "--sensor", "vlp16", "--quiet") == 0
+    scan = "sequences/00/velodyne/000004.bin"
+    assert (tmp_path / "some" / scan).read_bytes() == (tmp_path / "all" / scan).read_bytes()
+    whole = open_dataset(tmp_path / "all").reference
+    np.testing.assert_allclose(dataset.reference.T_world_lidar, whole.T_world_lidar[[1, 2, 4]])
+
+
+def test_a_list_of_another_drive_is_refused(tmp_path, capsys):
+    (tmp_path / "pairs.txt").write_text("1 400000\n")
+    assert simulate(tmp_path / "out", "--pairs", tmp_path / "pairs.txt", "--sensor", "vlp16", "--quiet") == 2
+    assert "scan 400000" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -22,8 +22,8 @@ from segslam.cli.console import (
     progress,
     say,
 )
-from segslam.experiments.settings import METHOD_NAMES
 from segslam.errors import SegslamError
+from segslam.experiments.settings import METHOD_NAMES
 
 if TYPE_CHECKING:
     from segslam.experiments.job import Job
@@ -152,7 +152,7 @@ def read_lists(
 def run_trials(job: "Job", trials: list["Trial"], options: Options) -> list["Row"]:
     """All rows in the order of the trials. Stopped by Ctrl-C, those that are done stay in the folder of `--out`."""
     from segslam.experiments.benchmark import Pool, in_order, run
-    from segslam.experiments.rows import row_writer
+    from segslam.experiments.rows import write_rows
 
     rows: list[Row] = []
     pool = Pool(options.workers, options.scheduler)
@@ -166,8 +166,7 @@ def run_trials(job: "Job", trials: list["Trial"], options: Options) -> list["Row
         raise typer.Exit(130) from None
     rows = in_order(rows, job, trials)
     if options.details is not None:
-        with row_writer(options.details, rows):
-            pass
+        write_rows(options.details, rows)
     return rows
 
 

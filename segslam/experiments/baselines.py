@@ -22,6 +22,8 @@ GICP_NEIGHBOURS = 10
 """small_gicp's defaults (Koide, JOSS 2024), for outdoor LiDAR."""
 GICP_ITERATIONS = 64
 """Of its author's fast_gicp, which the paper ran. small_gicp's 20 stop two of three pairs 4 m apart on their way."""
+KISS_MIN_POINTS = 100
+"""Chosen: KISS-Matcher 1.0.2 ends the process at a dozen points."""
 KISS_VOXEL_M = 0.3
 """KISS-Matcher's own voxel for outdoor scans (Lim et al., ICRA 2025)."""
 OPEN3D_VOXEL_M = 0.5
@@ -87,6 +89,8 @@ def align_kiss_matcher(source: Points, target: Points) -> Estimate | Rejected:
     """KISS-Matcher on the whole scans, the ground included."""
     import kiss_matcher  # optional: extra `bench`
 
+    if min(len(source), len(target)) < KISS_MIN_POINTS:
+        return Rejected(RejectReason.TOO_FEW_POINTS, f"{len(source)} and {len(target)} points")
     found = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(KISS_VOXEL_M))
     pose = found.estimate(source, target)
     if not pose.valid:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from segslam.experiments.job import Job
-from segslam.experiments.rows import Row, read_rows, row_writer
+from segslam.experiments.rows import Row, RowFile, read_rows
+from segslam.experiments.summary import grouped
 from segslam.experiments.trials import Trial
 from segslam.experiments.workers import LOST_WORKER, cluster, run_here, run_on
 from segslam.types import SegslamError
@@ -33,14 +34,13 @@ def run(job: Job, trials: Sequence[Trial], *, pool: Pool = Pool(), folder: Path 
     it was stopped; raises SegslamError if the folder holds another one.
     """
     done = _rows_before(folder, job, trials) if folder else []
-    tried = {row.key[:3] for row in done}
-    if done:
-        yield done
+    tried = grouped(done, lambda row: row.key[:3])
     left = [trial for trial in trials if trial.key not in tried]
-    with row_writer(folder / ROWS_FILE, done) if folder else nullcontext() as writer:
+    with RowFile(folder / ROWS_FILE, done) if folder else nullcontext() as file:
+        yield from tried.values()
         for rows in _work(job, left, pool):
-            if writer is not None:
-                writer.write(rows)
+            if file is not None:
+                file.write(rows)
             yield rows
 
 
@@ -82,10 +82,8 @@ def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
 
 def _of_whole_trials(rows: list[Row], job: Job) -> list[Row]:
     """Those of trials that every method has finished."""
-    methods: dict[Any, set[str]] = {}
-    for row in rows:
-        methods.setdefault(row.key[:3], set()).add(row.method)
-    return [row for row in rows if methods[row.key[:3]] == set(job.methods)]
+    trials = grouped(rows, lambda row: row.key[:3]).values()
+    return [row for some in trials if {one.method for one in some} == set(job.methods) for row in some]
 
 
 def _asked(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:

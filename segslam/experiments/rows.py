@@ -1,17 +1,17 @@
-"""One row for each registration that was tried: made, written to a CSV file as it comes, read back to go on."""
+"""A row for each registration tried: written to a CSV file as it comes, read back to go on."""
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from segslam.evaluation import FALSE_LOOP_DEG, FALSE_LOOP_M
 from segslam.experiments.trials import ScanVariant
-from segslam.types import SegslamError, Transform
+from segslam.types import SegslamError, Transform, WorkFailed
 
 SUCCESS_M, SUCCESS_DEG = FALSE_LOOP_M, FALSE_LOOP_DEG
 """The paper's: a registration with less error is a success."""
@@ -84,36 +84,52 @@ def _below(value: float | None, bound: float) -> bool:
     return value is not None and value < bound
 
 
-@contextmanager
-def row_writer(file: Path, rows: list[Row]) -> Iterator["RowWriter"]:
-    """A file that holds these rows and takes more. What was written of them before stays until the new file has all."""
-    part = file.with_suffix(".part")
-    try:
-        with part.open("w", newline="", encoding="utf-8") as stream:
-            writer = RowWriter(stream)
-            writer.write(rows)
+class RowFile:
+    """A CSV file that takes rows, all of one call on the disk before it returns; a context manager.
+
+    What the file held before stays until the first rows are in the new one. Raises WorkFailed if it cannot be written.
+    """
+
+    def __init__(self, file: Path, rows: Sequence[Row]) -> None:
+        self._file = file
+        part = file.with_suffix(".part")
+        with self._room():
+            self._stream = part.open("w", newline="", encoding="utf-8")
+        self._csv = csv.DictWriter(self._stream, [*Row.model_fields, "success"])
+        with self._room():
+            self._csv.writeheader()
+        self.write(rows)
+        with self._room():
             part.replace(file)
-            yield writer
-    except OSError as error:
-        raise SegslamError(f"{file}: cannot be written ({error.strerror}); make room, or check permissions") from error
+
+    def __enter__(self) -> "RowFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def write(self, rows: Sequence[Row]) -> None:
+        """Add rows."""
+        with self._room():
+            self._csv.writerows(row.model_dump() | {"success": row.success} for row in rows)
+            self._stream.flush()
+
+    @contextmanager
+    def _room(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise WorkFailed(f"{self._file}: cannot be written ({error.strerror}); make room there") from error
 
 
-class RowWriter:
-    """Rows as lines of CSV, all of one call on the disk before it returns."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self._csv = csv.DictWriter(stream, [*Row.model_fields, "success"])
-        self._csv.writeheader()
-
-    def write(self, rows: list[Row]) -> None:
-        """Add them to the file, at once."""
-        self._csv.writerows(row.model_dump() | {"success": row.success} for row in rows)
-        self._stream.flush()
+def write_rows(file: Path, rows: Sequence[Row]) -> None:
+    """A file of these rows. Raises WorkFailed if it cannot be written."""
+    with RowFile(file, rows):
+        pass
 
 
 def read_rows(file: Path) -> list[Row]:
-    """The rows of a file that `row_writer` made. A last line that was cut off is left out.
+    """The rows of a file that `RowFile` wrote. A last line that was cut off is left out.
 
     Raises SegslamError that names the line for one that is broken.
     """

@@ -16,6 +16,7 @@ NUM_SCANS_KEPT = 128
 """Chosen: of one process, up to 15 MB each with all methods; lists that follow the drive come back within as many."""
 PAIRS_AHEAD = 8
 """Pairs handed out for each worker: enough that none waits, few enough that their scans fit in memory."""
+CONNECT_S = 5
 LOST_WORKER = "worker_lost"
 """The reason of a row whose pair ended every worker that tried it."""
 
@@ -39,7 +40,7 @@ def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
         raise SegslamError("--workers and --scheduler need Dask; pip install 'segslam[cluster]'") from error
     if scheduler is not None:
         try:
-            client = Client(scheduler)
+            client = Client(scheduler, timeout=CONNECT_S)
         except (OSError, ValueError) as error:
             raise SegslamError(
                 f"--scheduler {scheduler}: nothing answers there ({error}); start `dask scheduler`"

@@ -20,7 +20,9 @@ def write_report(folder: Path) -> Path:
     run = read_run(folder)
     with matplotlib.rc_context(figures.STYLE):
         plots = _plots(run)
-    return _write(folder / "report.html", page(run, plots).encode())
+    map_file = folder / "map.png"
+    pictures = {"Map from above": map_file.read_bytes()} if map_file.is_file() else {}
+    return _write(folder / "report.html", page(run, plots, pictures).encode())
 
 
 def draw_picture(folder: Path) -> Path:

@@ -22,6 +22,8 @@ TRUTH, CORRECTED, ODOMETRY = "#B8B8B8", "#0072B2", "#E69F00"
 ACCEPTED, SWITCHED_OFF, FALSE = "#009E73", "#CC79A7", "#D55E00"
 REJECTED = ("#56B4E9", "#8C564B", "#7F7F7F", "#9467BD", "#BCBD22", "#17BECF", "#1F3A93")
 STYLE: Any = {"svg.fonttype": "none", "font.size": 11, "axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
+WIDTH_IN = 5.4
+"""Letters of 11 points are then 10 pixels high on a phone."""
 SWITCHED_OFF_BELOW = 0.5
 """Weight of a closure under which the graph has let go of it."""
 
@@ -61,7 +63,7 @@ def compared(run: FinishedRun) -> Compared | None:
 
 def draw_paths(run: FinishedRun) -> str:
     """Truth, odometry and corrected trajectory from above, and their heights along the way."""
-    figure = Figure(figsize=(6.4, 7.6), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 6.6), layout="constrained")
     above, height = figure.subplots(2, 1, height_ratios=(3, 1))
     paths = _paths(run)
     _plot_from_above(above, paths)
@@ -74,7 +76,7 @@ def draw_paths(run: FinishedRun) -> str:
 
 def draw_loops(run: FinishedRun) -> str:
     """Every attempt to close a loop, on the corrected trajectory: closures join their ends, rejections are dots."""
-    figure = Figure(figsize=(6.4, 6.2), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
     _plot_attempts(figure.subplots(), run)
     return svg(figure, "loops")
 
@@ -92,7 +94,7 @@ def draw_picture(run: FinishedRun) -> bytes:
 
 def draw_errors(poses: Compared) -> str:
     """Distance from the truth along the way, all of it and its height, after the alignment of the ATE."""
-    figure = Figure(figsize=(6.4, 5.4), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 4.8), layout="constrained")
     whole, height = figure.subplots(2, 1, sharex=True)
     along_m = travelled_m(poses.truth)
     for name, estimate, color in (("odometry", poses.odometry, ODOMETRY), ("corrected", poses.corrected, CORRECTED)):
@@ -110,7 +112,7 @@ def draw_errors(poses: Compared) -> str:
 
 def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
     """Median and 95th percentile of the time of each stage, each time that it ran; the longest first."""
-    figure = Figure(figsize=(6.4, 0.9 + 0.32 * len(stage_ms)), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 0.9 + 0.32 * len(stage_ms)), layout="constrained")
     axes = figure.subplots()
     stages = sorted(stage_ms, key=lambda stage: stage_ms[stage]["median"])
     axes.barh(stages, [stage_ms[stage]["p95"] for stage in stages], color="#CFE3F1", label="95th percentile")

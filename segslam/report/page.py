@@ -2,8 +2,9 @@
 
 import base64
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from html import escape
+from types import MappingProxyType
 from typing import Any
 
 from pydantic.fields import FieldInfo
@@ -28,16 +29,21 @@ td, th { text-align: left; padding: .2rem .6rem .2rem 0; border-bottom: 1px soli
 td.number, th + th { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: anywhere; }
 details { margin: .3rem 0; } summary { cursor: pointer; }
-@media print { body { max-width: none; padding: 0; font-size: 11px; } .tiles div { break-inside: avoid; } }
+@media (max-width: 40rem) { body, section { padding: .5rem; } td code { display: block; }
+  th + th { white-space: normal; } }
+@media print { body { max-width: none; padding: 0; font-size: 11px; } .tiles div, details { break-inside: avoid; }
+  section:has(details) { break-inside: auto; }
+  details::details-content { content-visibility: visible; height: auto; } }
 """
 
 
-def page(run: FinishedRun, plots: dict[str, str]) -> str:
-    """The page of a run; `plots` maps a caption to the text of an SVG."""
+def page(run: FinishedRun, plots: dict[str, str], pictures: Mapping[str, bytes] = MappingProxyType({})) -> str:
+    """The page of a run; `plots` maps a caption to the text of an SVG, `pictures` one to a PNG."""
     title = (
         f"{run.dataset or run.folder.resolve().name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
     )
     sections = [plot_section(caption, svg) for caption, svg in plots.items()]
+    sections += [png_section(caption, png) for caption, png in pictures.items()]
     sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
     return document(
         title,

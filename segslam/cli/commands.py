@@ -2,7 +2,7 @@
 
 import typer
 
-from segslam.cli import bench, demo, evaluate, export, map, optimize, register, replay, report, simulate, view
+from segslam.cli import bench, demo, evaluate, export, map, optimize, register, replay, report, simulate, view, warm_up
 
 
 def add_all(app: typer.Typer) -> None:
@@ -18,3 +18,4 @@ def add_all(app: typer.Typer) -> None:
     app.command("report")(report.report)
     app.command("simulate")(simulate.simulate)
     app.command("view")(view.view)
+    app.command("warm-up")(warm_up.warm_up)

@@ -1,5 +1,6 @@
 """Simulated pairs at real poses: success by distance, what the gates let through and lose, the errors claimed."""
 
+import sys
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
@@ -48,6 +49,7 @@ def simulated(
             tables.success.extend(name | _success(band_m, some) for band_m, some in trials.items())
             tables.gates.append(name | _gates(whole, negatives))
             tables.information.append(name | _information(whole))
+            print(tables.gates[-1], tables.information[-1], file=sys.stderr, flush=True)
     return tables
 
 

@@ -179,8 +179,9 @@ class Run:
 
 
 def peak_rss_mb() -> float:
-    """Most memory that this process has had so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Most memory that this process has had so far, and that of the odometry's own, which has ended."""
+    processes = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return sum(resource.getrusage(process).ru_maxrss for process in processes) / 1024
 
 
 def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:

@@ -1,3 +1,4 @@
+import multiprocessing
 from pathlib import Path
 
 import numpy as np
@@ -5,8 +6,8 @@ import pytest
 
 from segslam import geometry
 from segslam.config import OdometryConfig
-from segslam.odometry import GivenOdometry, KissOdometry
-from segslam.types import BadScan, Scan, Trajectory
+from segslam.odometry import GivenOdometry, KissOdometry, OdometryApart
+from segslam.types import BadScan, Scan, SegslamError, Trajectory
 
 CONFIG = OdometryConfig()
 
@@ -61,6 +62,36 @@ def test_one_thread_repeats_to_the_bit() -> None:
     runs = [KissOdometry(CONFIG) for _ in range(2)]
     first, second = ([odometry.register(scan).T_odom_lidar for scan in scans] for odometry in runs)
     np.testing.assert_array_equal(first, second)
+
+
+def test_a_process_of_its_own_changes_no_bit() -> None:
+    """Poses, points, labels; a scan that cannot be used between them; and what follows a resumed run."""
+    scans = _street(6)
+    within = KissOdometry(CONFIG)
+    expected = [within.register(scan) for scan in scans]
+    with OdometryApart(CONFIG) as apart:
+        found = [apart.register(scan) for scan in scans[:5]]
+        with pytest.raises(BadScan, match="scan 5: none of its 1 points"):
+            apart.register(_scan(np.zeros((1, 3)), index=5))
+        found.append(apart.register(scans[5]))
+    with OdometryApart(CONFIG) as resumed:
+        resumed.restore(np.stack([result.T_odom_lidar for result in expected[:5]]), scans.__getitem__)
+        found.append(resumed.register(scans[5]))
+    for mine, theirs in zip(found, [*expected, expected[5]], strict=True):
+        np.testing.assert_array_equal(mine.T_odom_lidar, theirs.T_odom_lidar)
+        np.testing.assert_array_equal(mine.points, theirs.points)
+        np.testing.assert_array_equal(mine.labels, theirs.labels)
+
+
+def test_a_process_that_was_killed_is_told_of_with_the_remedy() -> None:
+    scan = _street(1)[0]
+    odometry = OdometryApart(CONFIG)
+    odometry.register(scan)
+    (process,) = multiprocessing.active_children()
+    process.kill()
+    process.join()
+    with pytest.raises(SegslamError, match=r"exit code -9.*--resume"):
+        odometry.register(scan)
 
 
 def test_points_out_of_range_leave_with_their_labels() -> None:

@@ -1,7 +1,7 @@
 """`segslam map`."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
@@ -135,24 +135,27 @@ def map_scans(
 
     `watch` is given each step. Raises typer.Exit(130) if Ctrl-C ended it early.
     """
+    from segslam.odometry import OdometryApart
     from segslam.run_files import new_folder
     from segslam.runs import Run
     from segslam.slam import Slam
 
-    slam = Slam(settings, odometry=odometry, labeller=_labeller(scans))
+    folder = out if recorded else new_folder(out)
+    apart = OdometryApart(settings.odometry) if odometry is None else None
     with Run(
-        out if recorded else new_folder(out),
-        slam,
+        folder,
+        Slam(settings, odometry=odometry or apart, labeller=_labeller(scans)),
         dataset=scans.name,
         T_camera_lidar=scans.T_camera_lidar,
         reference=scans.reference,
         options=options,
         resumes=recorded is not None,
     ) as run:
-        if recorded is not None:
-            _take_over(run, recorded, scans, watch, quiet=quiet)
+        with apart or nullcontext():
+            if recorded is not None:
+                _take_over(run, recorded, scans, watch, quiet=quiet)
+            interrupted = _process(run, scans, watch, quiet=quiet)
         resumed = {} if recorded is None else {"num_scans_resumed": run.num_scans_resumed}
-        interrupted = _process(run, scans, watch, quiet=quiet)
         metrics = finish(run, scans.reference, map_files=map_files, json=json, quiet=quiet, more=resumed)
     if interrupted:
         say(f"stopped: {metrics['num_scans']} of {len(scans)} scans are mapped", quiet=quiet)

@@ -1,7 +1,8 @@
 """The pose of each scan in the frame of the first: by KISS-ICP, or as given."""
 
+from segslam.odometry.apart import OdometryApart
 from segslam.odometry.given import GivenOdometry
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.sweep import Odometry, OdometryResult
 
-__all__ = ["GivenOdometry", "KissOdometry", "Odometry", "OdometryResult"]
+__all__ = ["GivenOdometry", "KissOdometry", "Odometry", "OdometryApart", "OdometryResult"]

@@ -1,9 +1,4 @@
-"""KISS-ICP (Vizzo et al., RA-L 2023), its two loops over points compiled here.
-
-Nine tenths of KISS-ICP's time go into aligning a scan with the local map, which it does with Python's lock held. The
-same arithmetic in `registration` and `local_map` gives the same poses to rounding, in a sixth of the time, with the
-lock released. All else is KISS-ICP's own: motion compensation, voxels, the adaptive threshold, the motion model.
-"""
+"""KISS-ICP (Vizzo et al., RA-L 2023), by its authors' package."""
 
 from collections.abc import Callable
 
@@ -13,19 +8,17 @@ from kiss_icp.config.parser import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
 from segslam.config import OdometryConfig
-from segslam.odometry.local_map import LocalMap
-from segslam.odometry.registration import Registration
 from segslam.odometry.sweep import OdometryResult, prepare
 from segslam.trajectory import Poses
 from segslam.types import Scan
 
 
 class KissOdometry:
-    """KISS-ICP, scan to local map. It repeats to the bit."""
+    """KISS-ICP, scan to local map. It repeats to the bit on one thread, to millimetres on several."""
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
-        self._kiss = _kiss(config)
+        self._kiss = KissICP(_kiss_config(config))
 
     def register(self, scan: Scan) -> OdometryResult:
         """The pose and the kept points of the next scan, in order of time.
@@ -54,20 +47,6 @@ class KissOdometry:
             kiss.adaptive_threshold.update_model_deviation(np.linalg.inv(T_odom_predicted) @ T_odom_now)
             kiss.last_delta = np.linalg.inv(kiss.last_pose) @ T_odom_now  # inverted as by KISS-ICP: same bits
             kiss.last_pose = T_odom_now
-
-
-def _kiss(config: OdometryConfig) -> KissICP:
-    kiss = KissICP(_kiss_config(config))
-    kiss.registration = Registration(
-        max_iterations=kiss.config.registration.max_num_iterations,
-        convergence=kiss.config.registration.convergence_criterion,
-    )
-    kiss.local_map = LocalMap(
-        voxel_m=config.voxel_size_m,
-        max_range_m=config.max_range_m,
-        max_points_per_voxel=kiss.config.mapping.max_points_per_voxel,
-    )
-    return kiss
 
 
 def _kiss_config(config: OdometryConfig) -> KISSConfig:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from segslam import geometry
-from segslam.types import AngleSamples, Points, Transform, Vector
+from segslam.types import AngleSamples, Mask, Points, Transform, Vector
 
 APART_M = 20.0
 """Travel between the two scans of a pair. Chosen: far enough for the angle to show, and scans still overlap."""
@@ -27,10 +27,13 @@ MOST_TURN_RAD = math.radians(45.0)
 MOST_POINTS = 4000  # chosen: of the source; all others would find the same
 REACH_M = (1.0, 0.8, 0.6, *[0.5] * 17)
 """Search distance of each step, at most. Chosen: odometry is off by less than the first."""
-SETTLED = 1e-4
-"""A step smaller than this (rad, m) is the last. Chosen: a tenth of what the angle can be known to."""
+SETTLED = 3e-4
+"""A step smaller than this (rad, m) is the last. Chosen: a third of what the angle of one pair can be known to."""
 RESIDUAL_M = 0.05
 """Where a point has lost three quarters of its weight. Chosen: above the noise of ranges, below what has moved."""
+LEVEL_NORMAL_Z, STANDING_NORMAL_Z = 0.95, 0.15
+"""Chosen: what is neither level nor upright is mostly foliage, which looks another from each side and shows an angle of
+0.02 degrees that is none."""
 LEAST_PAIRED = 500  # chosen: fewer points are no scan of a street
 
 
@@ -74,11 +77,13 @@ def register(source: Surface, target: Surface, T_target_source: Transform) -> tu
     """
     if min(len(source.points), len(target.points)) < LEAST_PAIRED:
         return None
-    points = source.points[:: math.ceil(len(source.points) / MOST_POINTS)]
+    points = source.points[_is_clear(source.normals)]
+    points = points[:: math.ceil(max(len(points), 1) / MOST_POINTS)]
+    target_is_clear = _is_clear(target.normals)
     angle_rad = 0.0
     for reach_m in REACH_M:
         nearest, distance_m = target.nearest(geometry.apply(T_target_source, points))
-        paired = distance_m < reach_m
+        paired = (distance_m < reach_m) & target_is_clear[nearest]
         if paired.sum() < LEAST_PAIRED:
             return None
         rows = nearest[paired]
@@ -95,6 +100,12 @@ def raising(points: Points) -> Points:
     flat = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
     x, y, z = points.T
     return np.column_stack([-z * x / flat, -z * y / flat, flat])
+
+
+def _is_clear(normals: Points) -> Mask:
+    """(n,) whether each surface is level or upright, as the ground and walls are."""
+    upward = np.abs(normals[:, 2])
+    return (upward > LEVEL_NORMAL_Z) | (upward < STANDING_NORMAL_Z)
 
 
 def _step(

@@ -103,10 +103,17 @@ def test_folder_without_a_label_for_any_scan_is_refused(tmp_path: Path) -> None:
         open_labels("mine", beside=tmp_path, scan_names=NAMES, encoding=None)
 
 
-def test_undecided_encoding_names_the_folder_and_the_option(tmp_path: Path) -> None:
-    _write(tmp_path / "mine", "000000", [0, 0, 0])
-    with pytest.raises(SegslamError, match=r"mine: the ids cannot tell .*--encoding"):
-        open_labels("mine", beside=tmp_path, scan_names=NAMES, encoding=None)
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [(["1", "2", "3"], r"mine"), (["1", "2"], r"mine.1\.label and .*mine.2\.label"), (["1"], r"mine.1\.label")],
+)
+def test_undecided_encoding_names_the_files_or_their_folder_and_the_option(
+    tmp_path: Path, names: list[str], said: str
+) -> None:
+    for name in names:
+        _write(tmp_path / "mine", name, [0, 0, 0])
+    with pytest.raises(SegslamError, match=said + r": the ids cannot tell .*--encoding"):
+        open_labels("mine", beside=tmp_path, scan_names=names, encoding=None)
 
 
 def test_missing_network_is_named(tmp_path: Path) -> None:

@@ -112,7 +112,8 @@ def encoding_of(files: Sequence[Path]) -> Encoding:
     try:
         return detect_encoding(sum((_histogram(file) for file in files), np.zeros(2**16, dtype=np.int64)))
     except SegslamError as error:
-        raise SegslamError(f"{files[0].parent}: {error}") from error
+        where = files[0].parent if len(files) > 2 else " and ".join(str(file) for file in files)
+        raise SegslamError(f"{where}: {error}") from error
 
 
 def unlabelled(num_points: int) -> Labels:

@@ -1,0 +1,1 @@
+"""What tools/bench.py measures, a file a part: each gives figures that go into its JSON."""

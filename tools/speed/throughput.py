@@ -1,0 +1,87 @@
+"""Scans per second of `segslam map` and of what it is compared with, in turn, on the same scans; and its memory."""
+
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+
+from segslam.log import schema
+
+RIVALS = Path(__file__).with_name("rivals.py")
+
+
+def throughput(
+    data: Path, sequence: str, frames: tuple[int, int], *, kiss_slam: Path | None, labels: str, rounds: int
+) -> dict[str, Any]:
+    """Medians over the rounds, in each of which all run one after the other, and the ratios to bare KISS-ICP."""
+    pythons = {"kiss-icp": sys.executable, "kiss-icp-1": sys.executable}
+    if kiss_slam is not None:
+        pythons["kiss-slam"] = str(kiss_slam)
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in ("segslam", *pythons)}
+    for _ in range(rounds):
+        found["segslam"].append(_mapped(data, sequence, frames, labels))
+        for name, python in pythons.items():
+            command = [python, str(RIVALS), name, str(data), sequence, *map(str, frames)]
+            found[name].append(json.loads(_output(command).splitlines()[-1]))
+    result: dict[str, Any] = {name: _median_of(runs) for name, runs in found.items()}
+    for name in pythons:
+        ratios = [
+            a["scans_per_second"] / b["scans_per_second"] for a, b in zip(found["segslam"], found[name], strict=True)
+        ]
+        result[name]["segslam_is_faster_by"] = statistics.median(ratios)
+    return result | {"labels": labels, "frames": list(frames), "rounds": rounds, "load_average": os.getloadavg()[0]}
+
+
+def _mapped(data: Path, sequence: str, frames: tuple[int, int], labels: str) -> dict[str, Any]:
+    """One run of the command, with the memory that its log records."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        command = [sys.executable, "-m", "segslam", "map", str(data), "--sequence", sequence, "--out", str(out)]
+        options = ["--frames", f"{frames[0]}:{frames[1]}", "--labels", labels, "--json", "--quiet"]
+        before = _cpu_seconds()
+        metrics = json.loads(_output([*command, *options]))
+        cpu_ms = 1e3 * (_cpu_seconds() - before) / metrics["num_scans"]
+        chosen = (
+            "scans_per_second",
+            "num_keyframes",
+            "num_candidates",
+            "num_loops_accepted",
+            "peak_rss_mb",
+            "stage_ms",
+        )
+        return {name: metrics[name] for name in chosen} | {"cpu_ms_per_scan": cpu_ms} | memory(out / "log.mcap")
+
+
+def memory(log: Path) -> dict[str, float]:
+    """Growth of the resident memory, in MB per 1,000 scans, over the second half of a run: what a longer one adds."""
+    with log.open("rb") as stream:
+        messages = make_reader(stream).iter_messages(topics=[schema.MEMORY])
+        rss_mb = np.array([json.loads(message.data)["rss_mb"] for _, _, message in messages])
+    half = len(rss_mb) // 2
+    slope = np.polyfit(np.arange(half, len(rss_mb)), rss_mb[half:], 1)[0] if half > 1 else 0.0
+    return {"growth_mb_per_1000_scans": float(1000 * slope)}
+
+
+def _cpu_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _output(command: list[str]) -> str:
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def _median_of(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """The median of each number; of what is no number, that of the last run."""
+    return {
+        name: statistics.median(run[name] for run in runs) if isinstance(value, (int, float)) else value
+        for name, value in runs[-1].items()
+    }

@@ -1,9 +1,10 @@
-"""Systematic drift: a vertical angle left over in the scans bends every drive up or down, and loops do not see it.
+"""Systematic drift: a vertical angle left over in the scans bends every drive up or down, and loops hardly see it.
 
 A drive that pitches evenly with every metre lies on a sphere instead of a plane, and there every loop closes as it does
 on the plane: what a constant pitch adds to the transform around a closed loop is the integral of d(|p|^2) / 2 in height
-and of the direction of travel in tilt, both zero. So no closure, however exact, tells the bend from a hill, and the
-twist that fits closures best is noise. The scans tell (`vertical_angle`), and decide whether to believe them:
+and of the direction of travel in tilt, both zero. What closures tell of the bend is of second order, below the noise
+of any but exact ones, and the twist that fits them best is noise. The scans tell (`vertical_angle`). Whether to believe
+them:
 
 - the angle is estimated along the drive, as a constant and a slow change (an Ornstein-Uhlenbeck process);
 - it predicts how much too far the odometry turned, which was measured apart for each pair of scans;
@@ -36,7 +37,7 @@ SAMPLE_SIGMA_RAD = math.radians(0.06)
 LEAST_ANGLE_RAD = math.radians(0.04)
 """Chosen: twice the 0.02 degrees by which the estimate is off on simulated 06."""
 NUM_STRETCHES = 8
-"""Chosen: seven degrees of freedom, and stretches of 100 m or more, within which angles are alike."""
+"""Chosen: seven degrees of freedom for the test; on a drive of 1 km a stretch is as long as angles stay alike."""
 LEAST_SAMPLES = 2 * NUM_STRETCHES
 MOST_SIGMAS = 5.0  # chosen: far above noise, and one failed pair of scans does not decide
 SIGNIFICANCE = 0.01

@@ -1,5 +1,6 @@
 """The log gives back what was written, and other tools can read it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,20 @@ def test_a_keyframe_s_cloud_is_read_back_while_the_log_grows(steps: list[Step], 
                 assert_same((keyframe.points, keyframe.labels), log.cloud(keyframe.id))
             log.write(step)
     assert len(keyframes) > 5
+
+
+def test_the_poses_of_all_estimates_stay_in_proportion_to_the_keyframes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some steps then come back without theirs, and otherwise whole."""
+    monkeypatch.setattr("segslam.log.writer.POSES_PER_KEYFRAME", 8)
+    steps = list(made_steps(260))
+    read = list(read_log(write_log(tmp_path / "log.mcap", steps)).steps())
+    logged = [len(step.estimate.T_world_keyframe) for step in read if step.estimate is not None]
+    assert 0.8 * 8 * 130 < sum(logged) <= 8 * 130 < sum(len(s.estimate.T_world_keyframe) for s in steps if s.estimate)
+    assert len(decoded(tmp_path / "log.mcap", schema.TRAJECTORY)) == len(logged)
+    for step, again in zip(steps, read, strict=True):
+        assert_same(step if again.estimate is not None else replace(step, estimate=None), again)
 
 
 def test_result_read_again_is_that_written(steps: list[Step], tmp_path: Path) -> None:

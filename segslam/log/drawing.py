@@ -58,8 +58,8 @@ class Drawing:
         self._T_world_odom = np.eye(4)
         self._num_on_path = 0
 
-    def draw(self, step: Step) -> Iterator[Topical]:
-        """The messages of the next step."""
+    def draw(self, step: Step, *, path: bool = True) -> Iterator[Topical]:
+        """The messages of the next step; those of an estimate that grow with the drive only if `path`."""
         yield (
             schema.TRANSFORMS,
             foxglove.frame_transform(step.T_odom_lidar, parent=schema.ODOM, child=schema.LIDAR, stamp_ns=step.stamp_ns),
@@ -67,20 +67,21 @@ class Drawing:
         if step.keyframe is not None:
             yield from self._keyframe(step.keyframe)
         if step.estimate is not None:
-            yield from self.draw_estimate(step.estimate, stamp_ns=step.stamp_ns)
+            yield from self.draw_estimate(step.estimate, stamp_ns=step.stamp_ns, path=path)
         else:
             yield self._odom_in_world(step.stamp_ns)
         yield from self._attempts(step.attempts, step.stamp_ns)
 
-    def draw_estimate(self, estimate: GraphEstimate, *, stamp_ns: int) -> Iterator[Topical]:
-        """The corrected path, where odom lies now, and the closures."""
+    def draw_estimate(self, estimate: GraphEstimate, *, stamp_ns: int, path: bool = True) -> Iterator[Topical]:
+        """Where odom lies now and, if `path`, the corrected path and the closures."""
         self._T_world_keyframe = estimate.T_world_keyframe
         last = max(estimate.T_world_keyframe)
         self._T_world_odom = estimate.T_world_keyframe[last] @ geometry.inverse(self._T_odom_keyframe[last])
         yield self._odom_in_world(stamp_ns)
-        path = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
-        yield schema.TRAJECTORY, path
-        yield schema.GRAPH, self._graph(estimate, stamp_ns)
+        if path:
+            poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
+            yield schema.TRAJECTORY, poses
+            yield schema.GRAPH, self._graph(estimate, stamp_ns)
 
     def _odom_in_world(self, stamp_ns: int) -> Topical:
         """Wanted at every step: viewers interpolate, and a correction would begin before the step that made it."""

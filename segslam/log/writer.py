@@ -47,6 +47,9 @@ PROTOBUF_TOPICS = {
     schema.REJECTED: SceneUpdate,
     schema.GRAPH: SceneUpdate,
 }
+POSES_PER_KEYFRAME = 50
+"""Chosen: of estimates, so many poses are logged for each keyframe of a run, in some 4 kB, so that a log grows with the
+drive; each of them whole, until closures times keyframes outgrow it: then every second estimate, and so on."""
 CHUNK_BYTES = 4 * 2**20
 """Above the largest step by far: a chunk ends with its step, which makes a step complete or absent."""
 
@@ -82,6 +85,7 @@ class LogWriter:
         self._drawing = Drawing(config.log)
         self._resolution_m = config.keyframes.resolution_m
         self._stamp_ns = 0
+        self._num_poses = 0
         self._newest: Keyframe | None = None
         self._steps_of_keyframes: dict[int, tuple[int, int]] = {}
         """Where in the file the step of each keyframe is, and its size."""
@@ -151,15 +155,23 @@ class LogWriter:
 
     def _step_messages(self, step: Step) -> Iterator[Encoded]:
         """Last comes the step itself, which says that the others are complete."""
-        yield from _serialised(self._drawing.draw(step))
+        logs_estimate = step.estimate is not None and self._affords(len(step.estimate.T_world_keyframe))
+        yield from _serialised(self._drawing.draw(step, path=logs_estimate))
         if (rss_mb := _rss_mb()) is not None:
             yield schema.MEMORY, json.dumps({"rss_mb": rss_mb}).encode()
         if step.keyframe is not None:
             points, labels = step.keyframe.points, step.keyframe.labels
             yield schema.KEYFRAME, keyframe_points(points, labels, resolution_m=self._resolution_m).SerializeToString()
-        if step.estimate is not None:
+        if step.estimate is not None and logs_estimate:
             yield _estimate_message(step.estimate)
         yield schema.STEP, _json(Step, step)
+
+    def _affords(self, num_poses: int) -> bool:
+        """Whether the estimates logged may have so many poses more; counted if so."""
+        if self._num_poses + num_poses > POSES_PER_KEYFRAME * num_poses:
+            return False
+        self._num_poses += num_poses
+        return True
 
     def _write(self, messages: Iterable[Encoded], *, stamp_ns: int) -> tuple[int, int]:
         """Where it went in the file, and its size."""

@@ -215,7 +215,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[ScanVariant]:
 
     def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
         prepared.append(variant)
-        return SharedScan({}, problem="no file")
+        return SharedScan({}, unusable=True)
 
     monkeypatch.setattr("segslam.experiments.workers.prepare_scan", prepare_scan)
     return prepared

@@ -126,7 +126,8 @@ def _run(
     rows = run_trials(job, trials, options)
     found = beside_paper(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
     if options.out is not None:
-        asked = {"sample": options.sample, "seed": options.seed, "workers": options.workers, **settings}
+        workers = "those of a Dask cluster" if options.scheduler else options.workers
+        asked = {"sample": options.sample, "seed": options.seed, "workers": workers, **settings}
         report = account(experiment, job, lists, found, options=asked)
         _write_report(options.out, report, _pictures(job, trials, rows, options.draw), quiet=options.quiet)
     if options.json:

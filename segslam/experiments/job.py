@@ -1,5 +1,6 @@
 """One benchmark's scans, methods and settings, and the two pieces of work it consists of, wherever they are done."""
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from segslam.experiments.rows import Row
 from segslam.experiments.trials import ScanVariant, Trial
 from segslam.semantics.encodings import Encoding
 from segslam.types import BadScan, Points, Rejected
+
+logger = logging.getLogger(__name__)
 
 BAD_SCAN = "bad_scan"
 """The reason of a row whose scan could not be read."""
@@ -50,12 +53,12 @@ class Job:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedScan:
-    """All that the methods need of one scan, made once; or why it cannot be used."""
+    """All that the methods need of one scan, made once; nothing if it cannot be used."""
 
     parts: Mapping[str, Part]
     labelling: Cost | None = None
     """Labels by shape; None where labels came from files, whose making nobody timed."""
-    problem: str = ""
+    unusable: bool = False
 
 
 def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
@@ -64,7 +67,8 @@ def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
     try:
         scan = dataset[row_of_scan[variant.index]]
     except BadScan as error:
-        return SharedScan({}, problem=str(error))
+        logger.warning("scan %d left out: %s", variant.index, error)
+        return SharedScan({}, unusable=True)
     labels, labelling = scan.labels, None
     if dataset.labels.geometric and not labels.any():
         with measured() as labelling:
@@ -93,8 +97,7 @@ def open_once(source: DataSource) -> tuple[Dataset, dict[int, int]]:
 
 
 def _register(method: str, config: Config, trial: Trial, source: SharedScan, target: SharedScan) -> Row:
-    problem = source.problem or target.problem
-    if problem:
+    if source.unusable or target.unusable:
         return failed_row(method, trial, BAD_SCAN)
     scans = [{name: shared.parts[name] for name in METHODS[method].parts} for shared in (source, target)]
     values = [{name: part.value for name, part in parts.items()} for parts in scans]

@@ -1,5 +1,6 @@
 """Trials done in this process, or by the workers of a Dask cluster: rows come out as they are finished."""
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from segslam.experiments.trials import ScanVariant, Trial
 from segslam.types import SegslamError
 
 NUM_SCANS_KEPT = 128
-"""Chosen: of one process, up to 15 MB each with all methods; lists that follow the drive come back within as many."""
+"""Chosen: by one process, up to 15 MB each with all methods; lists that follow the drive come back within as many."""
 PAIRS_AHEAD = 8
 """Pairs handed out for each worker: enough that none waits, few enough that their scans fit in memory."""
 CONNECT_S = 5
@@ -38,6 +39,7 @@ def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
         from distributed import Client, LocalCluster  # optional: extra `cluster`
     except ImportError as error:
         raise SegslamError("--workers and --scheduler need Dask; pip install 'segslam[cluster]'") from error
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # it tells of each connection else
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=CONNECT_S)
@@ -78,7 +80,7 @@ def run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]
 
     pending: dict[str, Trial] = {}
     waiting = iter(trials)
-    ahead = PAIRS_AHEAD * max(len(client.scheduler_info()["workers"]), 1)
+    ahead = PAIRS_AHEAD * max(sum(client.nthreads().values()), 1)
     running = as_completed([submit(trial) for trial in islice(waiting, ahead)])
     for future in running:
         trial = pending.pop(future.key)

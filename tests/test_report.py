@@ -56,6 +56,14 @@ def _scored_run(folder: Path) -> Path:
     return made.folder
 
 
+def test_a_map_from_above_is_on_the_page(tmp_path: Path) -> None:
+    folder = _scored_run(tmp_path / "run")
+    assert "Map from above" not in write_report(folder).read_text()
+    (folder / "map.png").write_bytes(b"a picture")
+    [data] = re.findall(r'alt="Map from above" src="data:image/png;base64,([^"]*)">', write_report(folder).read_text())
+    assert base64.b64decode(data) == b"a picture"
+
+
 def test_page_is_whole_and_loads_nothing(tmp_path: Path) -> None:
     file = write_report(_scored_run(tmp_path / "run"))
     assert file == tmp_path / "run" / "report.html"

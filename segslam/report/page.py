@@ -28,10 +28,11 @@ table { border-collapse: collapse; width: 100%; font-size: .92rem; }
 td, th { text-align: left; padding: .2rem .6rem .2rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 td.number, th + th { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: anywhere; }
-details { margin: .3rem 0; } summary { cursor: pointer; }
+details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child { white-space: nowrap; }
 @media (max-width: 40rem) { body, section { padding: .5rem; } td code { display: block; }
   th + th { white-space: normal; } }
-@media print { body { max-width: none; padding: 0; font-size: 11px; } .tiles div, details { break-inside: avoid; }
+@media print { body { max-width: none; padding: 0; font-size: 11px; } .plots { columns: 2 7cm; }
+  .tiles div, tr, img { break-inside: avoid; } h2, summary { break-after: avoid; }
   section:has(details) { break-inside: auto; }
   details::details-content { content-visibility: visible; height: auto; } }
 """

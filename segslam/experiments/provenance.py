@@ -40,10 +40,11 @@ def conditions(job: Job) -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores and system."""
+    """Processor, cores, system, and how much there was to do in the last quarter of an hour (1: one busy core)."""
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count(),
+        "load": round(os.getloadavg()[2], 1),
         "system": _system(),
         "python": platform.python_version(),
     }
@@ -132,8 +133,8 @@ def _notes(simulation: dict[str, Any] | None, sampled: Sequence[PairList], lists
     notes = []
     if simulation is not None:
         notes.append(
-            f"The scans were SIMULATED (seed {simulation['seed']}) at real poses, with true labels or labels by shape: "
-            "no figure here is one on KITTI's own scans."
+            f"The scans were SIMULATED (seed {simulation['seed']}), at the real poses if they are KITTI's; the labels "
+            "beside them are true. No figure here is one on KITTI's own scans."
         )
     if sampled:
         counts = ", ".join(f"{one.name} {len(one.pairs)} of {one.num_whole}" for one in sampled)

@@ -66,12 +66,13 @@ def _page(report: dict[str, Any], plots: Mapping[str, str], pictures: Mapping[st
     )
 
 
-def _facts(report: dict[str, Any]) -> dict[str, str]:
+def _facts(report: dict[str, Any]) -> dict[str, Any]:
     """What the figures depend on, but the settings."""
     machine = report["machine"]
     simulation = report["simulation"]
     return {
         "machine": f"{machine['cpu']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']}",
+        "load over 15 minutes": machine["load"],
         "commit": report["commit"] or "installed package",
         "packages": ", ".join(f"{name} {version}" for name, version in report["packages"].items()),
         "scans": "real" if simulation is None else f"simulated, seed {simulation['seed']}",

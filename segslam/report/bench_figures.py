@@ -42,7 +42,8 @@ def draw_success(results: dict[str, Any]) -> str:
         for y, one in zip(at, own["by"], strict=True):
             if "paper" in one:
                 axes.plot(one["paper"]["success_percent"], y, "D", color="black", markersize=4)
-    axes.plot([], [], "D", color="black", markersize=4, label="paper")
+    if any("paper" in one for own in results.values() for one in own["by"]):
+        axes.plot([], [], "D", color="black", markersize=4, label="paper")
     axes.set(xlabel="success (%)", xlim=(0, 102))
     axes.set_yticks(places + (len(results) - 1) / 2, lists)
     axes.invert_yaxis()
@@ -90,7 +91,7 @@ def draw_registration(
 ) -> bytes:
     """The two scans from above as a PNG: as they should lie, and beside it as they were laid, if they were."""
     views = [("truth", T_true)] + ([] if T_estimate is None else [("estimate", T_estimate)])
-    figure = Figure(figsize=(5.5 * len(views), 5.8), layout="constrained")
+    figure = Figure(figsize=(5.5 * len(views), 6.2), layout="compressed")
     figure.suptitle(title, fontsize=11)
     for axes, (name, T_target_source) in zip(figure.subplots(1, len(views), squeeze=False)[0], views, strict=True):
         for points, color, label in (

@@ -106,7 +106,8 @@ def _success(results: dict[str, Any]) -> Table:
     """Success of each method by list, with the paper's value and the difference where it has one."""
     lists = [one["list"] for one in next(iter(results.values()))["by"]]
     rows = [(method, *(_compared(one) for one in own["by"])) for method, own in results.items()]
-    return Table("Success by list, % (paper, difference)", ("method", *lists), rows)
+    compared = any("paper" in one for own in results.values() for one in own["by"])
+    return Table("Success by list, %" + (" (paper, difference)" if compared else ""), ("method", *lists), rows)
 
 
 def _compared(one: dict[str, Any]) -> str:
@@ -133,7 +134,9 @@ def _errors(results: dict[str, Any], by: str) -> Table:
         (f"{value:g}", *(_error_pair(own["by"][place]) for own in results.values()))
         for place, value in enumerate(values)
     ]
-    return Table(f"Mean error of successes by {TITLES[by]}, m / deg (paper)", (TITLES[by], *results), rows)
+    return Table(
+        f"Mean error of successes by {TITLES[by]}, m / deg, the paper's in brackets", (TITLES[by], *results), rows
+    )
 
 
 def _error_pair(one: dict[str, Any]) -> str:

@@ -110,8 +110,9 @@ def _coarse(
     with watch("match"):
         ranked = segregator.hypotheses(source.description, target.description, config=config.segregator)
     yield from [ranked] if isinstance(ranked, Rejected) else ranked[: config.verify.max_hypotheses]
+    num_plans = config.verify.max_plan_hypotheses
     source_up, target_up = segregator.upward(source.description), segregator.upward(target.description)
-    if source_up is None or target_up is None:
+    if num_plans == 0 or source_up is None or target_up is None:
         return
     with watch("match"):
         plans = list(
@@ -120,7 +121,7 @@ def _coarse(
                 target.surface.standing,
                 source_up,
                 target_up,
-                num_poses=config.verify.max_plan_hypotheses,
+                num_poses=num_plans,
             )
         )
     yield from plans

@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from segslam import geometry
+from segslam.alignment import register
+from segslam.config import load_config
 from segslam.segregator.plan import CELL_M, NUM_YAWS, plan_hypotheses
-from segslam.types import Points, Registration, Transform
+from segslam.types import Alignment, Label, Points, Registration, Transform
 
 UP = np.array([0.0, 0.0, 1.0])
 HALF_STEP_RAD = math.pi / NUM_YAWS
 
 
-def _court() -> Points:
+def _court(points_per_metre: int = 8) -> Points:
     """Walls of a court of 18 x 26 m with a recess, of different heights; the sensor stands in a corner of it."""
     rng = np.random.default_rng(0)
     parts = []
@@ -25,7 +27,7 @@ def _court() -> Points:
         ((9, 20), (-4, 20), 2.5),
         ((-4, 20), (-4, -6), 5.0),
     ):
-        along = rng.uniform(0, 1, int(8 * math.hypot(x1 - x0, y1 - y0)))
+        along = rng.uniform(0, 1, int(points_per_metre * math.hypot(x1 - x0, y1 - y0)))
         parts.append(
             np.column_stack([x0 + along * (x1 - x0), y0 + along * (y1 - y0), rng.uniform(-1.5, top_m, len(along))])
         )
@@ -85,3 +87,20 @@ def test_nothing_upright_gives_no_pose() -> None:
     assert list(plan_hypotheses(np.empty((0, 3)), _court(), UP, UP, num_poses=3)) == []
     far = _court() + np.array([200.0, 0.0, 0.0])
     assert list(plan_hypotheses(_court(), far, UP, UP, num_poses=3)) == []
+
+
+@pytest.mark.parametrize(("num_plans", "aligned"), [(2, True), (0, False)])
+def test_scans_that_share_nothing_but_walls_are_aligned_by_these(num_plans: int, aligned: bool) -> None:
+    config = load_config(overrides=["segregator.features=never", f"verify.max_plan_hypotheses={num_plans}"])
+    ground = np.column_stack([column.ravel() for column in np.mgrid[-4:14:0.3, -6:20:0.3, -1.7:-1.6:1]])
+    walls = _court(points_per_metre=60)
+    labels = np.repeat(np.array([Label.ROAD, Label.BUILDING], np.uint8), [len(ground), len(walls)])
+    target = np.concatenate([ground, walls])
+    T_target_source = geometry.transform(geometry.yaw(2.5), np.array([5.0, 9.0, 0.0]))
+    source = geometry.apply(geometry.inverse(T_target_source), target)
+    found = register(source, target, source_labels=labels, target_labels=labels, config=config)
+    assert isinstance(found, Alignment) == aligned
+    if isinstance(found, Alignment):
+        apart_m, apart_rad = _error(found.fine, T_target_source)
+        assert apart_m < 0.02  # the clouds are the same but for the way they were thinned
+        assert apart_rad < math.radians(0.2)

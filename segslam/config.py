@@ -185,7 +185,7 @@ class SegregatorConfig(Section):
         0.045, ge=0, description="noise that all share, being seen from one side; in the information alone (m)"
     )
     shared_noise_deg: float = Field(
-        0.05, ge=0, description="the same of the rotation: a sensor's bent rays; calibrated by tools/bench_registration"
+        0.05, ge=0, description="the same of the rotation, as of a sensor's bent rays (degrees)"
     )
     ground_noise_m: float = Field(0.1, gt=0, description="noise of the distance of two patches of the ground (m)")
     ground_weight: float = Field(0.3, ge=0, description="weight of such a distance: neighbours err alike")
@@ -212,7 +212,7 @@ class RefineConfig(Section):
     max_range_m: float = Field(60.0, gt=0, description="points farther away are left out (m)")
     min_points: int = Field(100, ge=10, description="fewest points, and fewest pairs, that can be aligned")
     information_scale: float = Field(
-        0.05, gt=0, description="Hessian to information, neighbours err alike; calibrated by tools/bench_registration"
+        0.05, gt=0, description="Hessian to information, for neighbours err alike: calibrated on simulated truth"
     )
     shared_noise_m: float = Field(
         0.026, ge=0, description="noise of the translation that all points share: a sensor's bent rays (m)"

@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from html import escape
 from typing import Any, NamedTuple
 
+from segslam.report.page import number
+
 FIGURES = {
     "num_pairs": "pairs",
     "success_percent": "success %",
@@ -48,15 +50,10 @@ def tables(report: dict[str, Any]) -> list[Table]:
     made = [_by_value(results, by)] if by != "list" else [_success(results)]
     if by == "lost_percent":
         made.append(_errors(results, by))
-    made.append(_all(results))
+    made.append(overall(results))
     if any("paper" in own for own in results.values()):
         made.append(_beside_paper(results))
     return [*made, _stages(results)]
-
-
-def overall(results: dict[str, Any]) -> Table:
-    """The figures of each method over all pairs."""
-    return _all(results)
 
 
 def varied(results: dict[str, Any]) -> str:
@@ -87,14 +84,9 @@ def plain(table: Table) -> str:
     )
 
 
-def number(value: float | None) -> str:
-    """Some three digits; a dash for what is not known."""
-    if value is None:
-        return UNKNOWN
-    if isinstance(value, int):
-        return str(value)
-    digits = 3 if abs(value) < 1 else 2 if abs(value) < 10 else 1 if abs(value) < 1000 else 0
-    return f"{value:.{digits}f}"
+def text(value: float | None) -> str:
+    """A number as reports have them, a dash for what is not known."""
+    return UNKNOWN if value is None else number(value)
 
 
 def percent(value: float) -> str:
@@ -141,12 +133,13 @@ def _errors(results: dict[str, Any], by: str) -> Table:
 
 def _error_pair(one: dict[str, Any]) -> str:
     def both(values: dict[str, Any]) -> str:
-        return f"{number(values['translation_m'])} / {number(values['rotation_deg'])}"
+        return f"{text(values['translation_m'])} / {text(values['rotation_deg'])}"
 
     return both(one) + (f" ({both(one['paper'])})" if "paper" in one else "")
 
 
-def _all(results: dict[str, Any]) -> Table:
+def overall(results: dict[str, Any]) -> Table:
+    """The figures of each method over all pairs."""
     return _figures_table("All pairs", FIGURES, results)
 
 
@@ -156,7 +149,7 @@ def _stages(results: dict[str, Any]) -> Table:
 
 def _figures_table(caption: str, titles: dict[str, str], results: dict[str, Any]) -> Table:
     rows = [
-        (method, *(percent(own[key]) if key == "success_percent" else number(own[key]) for key in titles))
+        (method, *(percent(own[key]) if key == "success_percent" else text(own[key]) for key in titles))
         for method, own in results.items()
     ]
     return Table(caption, ("method", *titles.values()), rows)
@@ -168,7 +161,7 @@ def _beside_paper(results: dict[str, Any]) -> Table:
         for key, title in PAPER_FIGURES.items():
             if key in own.get("paper", {}) and own[key] is not None:
                 theirs = own["paper"][key]
-                rows.append((f"{method}, {title}", number(own[key]), f"{theirs:g}", f"{own[key] - theirs:+.2f}"))
+                rows.append((f"{method}, {title}", text(own[key]), f"{theirs:g}", f"{own[key] - theirs:+.2f}"))
     return Table("Beside the paper's timing table", ("", "measured", "paper", "difference"), rows)
 
 

@@ -74,7 +74,7 @@ def _tiles(metrics: dict[str, Any]) -> str:
         ("peak_rss_mb", " MB", "memory at most"),
     ]
     known = [(key, unit, text) for key, unit, text in tiles if key in metrics]
-    return "".join(f"<div><b>{_number(metrics[key])}{unit}</b>{text}</div>" for key, unit, text in known)
+    return "".join(f"<div><b>{number(metrics[key])}{unit}</b>{text}</div>" for key, unit, text in known)
 
 
 def plot_section(caption: str, svg: str) -> str:
@@ -147,11 +147,11 @@ def _table(head: tuple[str, ...], rows: Iterable[tuple[str, *tuple[float | None,
 
 
 def _row(name: str, *values: float | None) -> str:
-    cells = ("" if value is None else _number(value) for value in values)
+    cells = ("" if value is None else number(value) for value in values)
     return f"<tr><td>{name}</td>" + "".join(f'<td class="number">{cell}</td>' for cell in cells) + "</tr>"
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     """Some four digits, none of them beyond the third after the point."""
     if isinstance(value, int):
         return str(value)

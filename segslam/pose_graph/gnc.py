@@ -40,17 +40,26 @@ class Solution:
     weights: Vector
     """(k,) 1 believed, 0 switched off."""
     truncated_cost: float
-    """Error of all that is believed, and half the bound for each closure that is not."""
+    """Error of all that is believed, and half the bound, times its say, for each closure that is not."""
 
 
 class TruncatedProblem:
-    """Factors that are never doubted, and closures that cost at most half of `inlier_bound`.
+    """Factors that are never doubted, and closures that are believed or cost their say times half of `inlier_bound`.
 
     The bound is of the squared whitened error (chi-square, not half of it).
     """
 
-    def __init__(self, trusted: gtsam.NonlinearFactorGraph, closures: Sequence[Edge], inlier_bound: float) -> None:
+    def __init__(
+        self,
+        trusted: gtsam.NonlinearFactorGraph,
+        closures: Sequence[Edge],
+        inlier_bound: float,
+        *,
+        says: Vector | None = None,
+    ) -> None:
+        """`says` (k,) 0 to 1: what not to believe a closure costs; less for closures that may be wrong together."""
         self.inlier_bound = inlier_bound
+        self._says = np.ones(len(closures)) if says is None else says
         self._trusted = trusted
         self._closures = closures
         self._factors = factor_graph(closures)
@@ -63,6 +72,10 @@ class TruncatedProblem:
         """(k,) 1 for each closure within the bound, else 0."""
         return (self.squared_errors(values) <= self.inlier_bound).astype(float)
 
+    def cost(self, error: float, weights: Vector) -> float:
+        """Of poses with this error of all that is believed: what is compared between solutions."""
+        return error + 0.5 * self.inlier_bound * float(self._says[weights == 0.0].sum())
+
     def weighted(self, weights: Vector) -> gtsam.NonlinearFactorGraph:
         """The least-squares problem in which closure i has its information times `weights[i]`."""
         graph = gtsam.NonlinearFactorGraph(self._trusted)
@@ -74,18 +87,19 @@ class TruncatedProblem:
         return graph
 
 
-def solve(problem: TruncatedProblem, start: gtsam.Values) -> Solution:
+def solve(problem: TruncatedProblem, start: gtsam.Values, *, likely: Vector | None = None) -> Solution:
     """The poses, and for each closure whether to believe it.
 
     Graduated non-convexity promises no global optimum, so unless it believes all, what it finds competes with the
-    optimum next to `start`.
+    optimum next to `start`. Where others say which closures are `likely` (k,), 1 or 0, the optimum next to those
+    competes too; if it is the one next to `start`, nothing else is tried.
     """
-    values, iterations = _graduate(problem, start)
-    graduated = _settle(problem, values, iterations)
-    if graduated.weights.all():
-        return graduated
-    near_start = _settle(problem, start)
-    return min((graduated, near_start), key=lambda solution: solution.truncated_cost)
+    found = [_settle(problem, start)]
+    if likely is not None:
+        found.append(_settle(problem, search(problem.weighted(likely), start).values))
+    if likely is None or (found[0].weights != found[1].weights).any():
+        found.insert(0, _settle(problem, *_graduate(problem, start)))
+    return min(found, key=lambda solution: solution.truncated_cost)
 
 
 def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Values, int]:
@@ -126,5 +140,4 @@ def _settle(problem: TruncatedProblem, values: gtsam.Values, iterations: int = 0
         within = problem.inliers(values)
         if (within == weights).all():
             break
-    truncated_cost = found.error + 0.5 * problem.inlier_bound * float((weights == 0.0).sum())
-    return Solution(found._replace(iterations=iterations), weights, truncated_cost)
+    return Solution(found._replace(iterations=iterations), weights, problem.cost(found.error, weights))

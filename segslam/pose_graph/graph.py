@@ -13,6 +13,7 @@ import numpy as np
 from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import gnc, noise
+from segslam.pose_graph.consistency import consistent_closures, crowds
 from segslam.pose_graph.drift import pitch_per_m, straightened
 from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
@@ -22,6 +23,11 @@ from segslam.types import AngleSamples, GraphEstimate, LoopClosure, SegslamError
 RUNNING_TOLERANCE = 1e-3
 """Where an optimisation ends while running. Chosen: the same trajectories to a centimetre, a third fewer iterations."""
 FINAL_TOLERANCE = 1e-5
+PLACE_M = 30.0
+"""Closures whose ends are this near in travel see the same things, and are wrong together. Chosen."""
+VOICES_OF_A_PLACE = 2.0
+"""All closures between two places have the say of this many. Chosen of 0.5 to 5 with `tools/bench_back_end.py`: with
+less a place of true closures is given up, with more a repeated street outvotes the odometry."""
 
 
 class PoseGraph:
@@ -121,15 +127,18 @@ class PoseGraph:
         return self._optimize(RUNNING_TOLERANCE)
 
     def finish(self) -> GraphEstimate:
-        """The final optimum, each closure kept or switched off by graduated non-convexity (unless configured not to).
+        """The final optimum, each closure kept or switched off (unless configured not to).
 
-        Odometry and the first pose are never doubted.
+        Three solutions compete: next to the last estimate, next to the largest set of closures that agree with each
+        other, and by graduated non-convexity. Odometry and the first pose are never doubted.
         """
         robust = self._optimize(FINAL_TOLERANCE)
         if self._config.final == "none":
             return robust
-        problem = gnc.TruncatedProblem(self._trusted, self._closures, self._inlier_bound)
-        solution = gnc.solve(problem, self._values)
+        says = np.minimum(1.0, VOICES_OF_A_PLACE / crowds(self._closures, self.travel_m, PLACE_M))
+        problem = gnc.TruncatedProblem(self._trusted, self._closures, self._inlier_bound, says=says)
+        likely = consistent_closures(self._odometry, self._closures, self._inlier_bound).astype(float)
+        solution = gnc.solve(problem, self._values, likely=likely)
         self._values = solution.search.values
         return self._estimate(solution.search.error, solution.weights)
 

@@ -248,9 +248,11 @@ class GraphConfig(Section):
     robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = Field(
         "cauchy", description="kernel of the closures while running"
     )
-    final: Literal["none", "gnc"] = Field("gnc", description="last optimisation: as before, or GNC-TLS")
+    final: Literal["none", "gnc", "consistent"] = Field(
+        "consistent", description="last optimisation: as before, or truncated; by GNC, or from closures that agree"
+    )
     inlier_probability: float = Field(
-        0.99, gt=0, lt=1, description="GNC keeps closures within this chi-square quantile"
+        0.99, gt=0, lt=1, description="the truncated ones keep closures within this chi-square quantile"
     )
     systematic_drift: Literal["auto", "never"] = Field(
         "auto", description="turn back what a leftover vertical angle bent, where held-out scans show it"

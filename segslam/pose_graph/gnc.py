@@ -1,4 +1,4 @@
-"""Graduated non-convexity over a pose graph: which closures to believe, decided together with the poses.
+"""Truncated least squares over a pose graph: which closures to believe, decided together with the poses.
 
 Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020:
 truncated least squares, in which a closure costs at most its bound.
@@ -88,18 +88,20 @@ class TruncatedProblem:
 
 
 def solve(problem: TruncatedProblem, start: gtsam.Values, *, likely: Vector | None = None) -> Solution:
-    """The poses, and for each closure whether to believe it.
+    """The poses, and for each closure whether to believe it: the better of two solutions.
 
-    Graduated non-convexity promises no global optimum, so unless it believes all, what it finds competes with the
-    optimum next to `start`. Where others say which closures are `likely` (k,), 1 or 0, the optimum next to those
-    competes too; if it is the one next to `start`, nothing else is tried.
+    One is next to `start`. The other is next to the optimum of those closures that are `likely` (k,), 1 or 0, or, where
+    nobody says which, by graduated non-convexity, which promises no global optimum either.
     """
-    found = [_settle(problem, start)]
     if likely is not None:
-        found.append(_settle(problem, search(problem.weighted(likely), start).values))
-    if likely is None or (found[0].weights != found[1].weights).any():
-        found.insert(0, _settle(problem, *_graduate(problem, start)))
-    return min(found, key=lambda solution: solution.truncated_cost)
+        return _better(_settle(problem, search(problem.weighted(likely), start).values), _settle(problem, start))
+    values, iterations = _graduate(problem, start)
+    graduated = _settle(problem, values, iterations)
+    return graduated if graduated.weights.all() else _better(graduated, _settle(problem, start))
+
+
+def _better(first: Solution, second: Solution) -> Solution:
+    return second if second.truncated_cost < first.truncated_cost else first
 
 
 def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Values, int]:

@@ -129,15 +129,16 @@ class PoseGraph:
     def finish(self) -> GraphEstimate:
         """The final optimum, each closure kept or switched off (unless configured not to).
 
-        Three solutions compete: next to the last estimate, next to the largest set of closures that agree with each
-        other, and by graduated non-convexity. Odometry and the first pose are never doubted.
+        Odometry and the first pose are never doubted.
         """
         robust = self._optimize(FINAL_TOLERANCE)
         if self._config.final == "none":
             return robust
         says = np.minimum(1.0, VOICES_OF_A_PLACE / crowds(self._closures, self.travel_m, PLACE_M))
         problem = gnc.TruncatedProblem(self._trusted, self._closures, self._inlier_bound, says=says)
-        likely = consistent_closures(self._odometry, self._closures, self._inlier_bound).astype(float)
+        likely = None
+        if self._config.final == "consistent":
+            likely = consistent_closures(self._odometry, self._closures, self._inlier_bound).astype(float)
         solution = gnc.solve(problem, self._values, likely=likely)
         self._values = solution.search.values
         return self._estimate(solution.search.error, solution.weights)

@@ -107,7 +107,7 @@ def test_yaw_turns_the_source_of_the_papers_pair(
     assert [one["yaw_deg"] for one in by] == [0, 90, 180, 270]
     errors = [one["accepted_m"] for one in by]
     assert np.ptp(errors) < 0.1  # a turn changes the bins of the clusters and no more
-    assert "Success by yaw" in (tmp_path / "report.md").read_text()
+    assert "Success (%) by yaw" in (tmp_path / "report.md").read_text()
 
 
 def test_deterioration_takes_labels_from_one_scan_or_both(

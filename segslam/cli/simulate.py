@@ -26,6 +26,9 @@ def simulate(
         list[Path] | None,
         typer.Option("--pairs", help="Write only the scans that this list of pairs names; may be repeated."),
     ] = None,
+    sample: Annotated[
+        int | None, typer.Option(min=1, help="Of so many pairs of each list: those of bench's --sample with --seed 0.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a sequence that was simulated here.")] = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -38,7 +41,7 @@ def simulate(
     config = simulation.simulation_config(sensor, settings or ())
     drive = simulation.made_up_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
     total = min(frames or len(drive.time_s), len(drive.time_s))
-    only = _named(pairs, total) if pairs else None
+    only = _named(pairs, total, sample=sample) if pairs else None
     total = len(only) if only is not None else total
     simulation.prepare_folder(out, sequence, overwrite=overwrite)
     say(f"building the streets of {total} scans", quiet=quiet)
@@ -53,12 +56,13 @@ def simulate(
     say(f"{last} scans in {out / 'sequences' / sequence}, true poses in {out / 'poses' / sequence}.txt", quiet=quiet)
 
 
-def _named(files: list[Path], num_scans: int) -> set[int]:
+def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]:
     """The scans that the lists name. Raises SegslamError for one that the drive does not have."""
-    from segslam.experiments.pairs import read_pairs, scans_named
+    from segslam.experiments.pairs import read_pairs, sample_pairs, scans_named
     from segslam.types import SegslamError
 
-    only = scans_named([read_pairs(file) for file in files])
+    lists = [read_pairs(file) for file in files]
+    only = scans_named(lists if sample is None else [sample_pairs(one, num_pairs=sample, seed=0) for one in lists])
     if max(only) >= num_scans:
         raise SegslamError(
             f"--pairs: scan {max(only)} is named, the drive has {num_scans}; take the list of this drive"

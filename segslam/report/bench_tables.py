@@ -1,6 +1,6 @@
 """The tables of a benchmark, once for Markdown, HTML and the terminal: a caption, titles and rows of text."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from html import escape
 from typing import Any, NamedTuple
 
@@ -111,24 +111,20 @@ def _compared(one: dict[str, Any]) -> str:
 
 
 def _by_value(results: dict[str, Any], by: str) -> Table:
-    values = [one[by] for one in next(iter(results.values()))["by"]]
-    rows = [
-        (f"{value:g}", *(percent(own["by"][place]["success_percent"]) for own in results.values()))
-        for place, value in enumerate(values)
-    ]
-    return Table(f"Success by {TITLES[by]}, %", (TITLES[by], *results), rows)
+    return _table_by(results, by, f"Success (%) by {TITLES[by]}", lambda one: percent(one["success_percent"]))
 
 
 def _errors(results: dict[str, Any], by: str) -> Table:
-    """Mean errors of the successes; the paper's in brackets."""
-    values = [one[by] for one in next(iter(results.values()))["by"]]
-    rows = [
-        (f"{value:g}", *(_error_pair(own["by"][place]) for own in results.values()))
-        for place, value in enumerate(values)
-    ]
-    return Table(
-        f"Mean error of successes by {TITLES[by]}, m / deg, the paper's in brackets", (TITLES[by], *results), rows
+    return _table_by(
+        results, by, f"Mean error of successes (m / deg; paper's in brackets) by {TITLES[by]}", _error_pair
     )
+
+
+def _table_by(results: dict[str, Any], by: str, caption: str, cell: Callable[[dict[str, Any]], str]) -> Table:
+    """A row for each value of what was varied, a column for each method."""
+    values = [one[by] for one in next(iter(results.values()))["by"]]
+    rows = [(f"{value:g}", *(cell(own["by"][place]) for own in results.values())) for place, value in enumerate(values)]
+    return Table(caption, (TITLES[by], *results), rows)
 
 
 def _error_pair(one: dict[str, Any]) -> str:

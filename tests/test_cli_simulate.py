@@ -94,7 +94,8 @@ def wait_for(file: Path) -> None:
 
 def test_it_writes_only_the_scans_that_lists_of_pairs_name(tmp_path):
     (tmp_path / "pairs.txt").write_text("1 4\n4 2\n")
-    assert simulate(tmp_path / "some", "--pairs", tmp_path / "pairs.txt", "--sample", 2, "--sensor", "vlp16", "--quiet") == 0
+    chosen = ("--pairs", tmp_path / "pairs.txt", "--sample", 2)
+    assert simulate(tmp_path / "some", *chosen, "--sensor", "vlp16", "--quiet") == 0
     dataset = open_dataset(tmp_path / "some")
     assert dataset.scan_index.tolist() == [1, 2, 4]
     assert len(dataset.reference) == 3

@@ -45,4 +45,4 @@ def _street_seen_from(x: float) -> "Points":
     poles = np.concatenate([feet, np.broadcast_to(np.linspace(-1.7, 1.5, 80)[:, None], (NUM_POLES, 80, 1))], axis=2)
     along, up = rng.uniform(-SIGHT_M, SIGHT_M, 10_000), rng.uniform(-1.7, 4.0, 10_000)
     walls = np.column_stack([along, np.where(np.arange(10_000) % 2, 20.0, -20.0), up])
-    return np.concatenate([ground, poles.reshape(-1, 3), walls]).astype(np.float32) - np.float32([x, 0.0, 0.0])
+    return (np.concatenate([ground, poles.reshape(-1, 3), walls]) - [x, 0.0, 0.0]).astype(np.float32)

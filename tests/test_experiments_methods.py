@@ -1,6 +1,7 @@
 """Every method on two scans of a simulated street, and on scans that hold too little."""
 
 import pickle
+import sys
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,6 @@ def test_settings_of_a_method_leave_all_else_as_it_was() -> None:
 def test_unknown_and_missing_methods_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SegslamError, match="known: segregator"):
         find_method("magic")
-    monkeypatch.setitem(__import__("sys").modules, "kiss_matcher", None)  # as if it were not installed
+    monkeypatch.setitem(sys.modules, "kiss_matcher", None)  # as if it were not installed
     with pytest.raises(SegslamError, match=r"segslam\[bench\]"):
         find_method("kiss-matcher")

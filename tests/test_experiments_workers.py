@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -69,3 +70,9 @@ def test_a_worker_that_is_killed_changes_nothing_in_the_table(
 def test_no_cluster_at_the_address_is_said(job: Job, trials: list[Trial]) -> None:
     with pytest.raises(SegslamError, match="nothing answers there"):
         next(run(job, trials, pool=Pool(scheduler="tcp://127.0.0.1:9")))
+
+
+def test_without_dask_it_says_what_to_install(job: Job, trials: list[Trial], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)  # as if it were not installed
+    with pytest.raises(SegslamError, match=r"segslam\[cluster\]"):
+        next(run(job, trials, pool=Pool(workers=2)))

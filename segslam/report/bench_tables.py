@@ -17,7 +17,7 @@ FIGURES = {
     "p95_ms": "p95 ms",
     "median_cpu_ms": "CPU ms",
     "mean_edges": "edges (AIC)",
-    "peak_mb": "MB",
+    "p95_mb": "p95 MB",
 }
 PAPER_FIGURES = {
     "success_percent": "success %",

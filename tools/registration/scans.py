@@ -76,11 +76,14 @@ class SimulatedPlace:
         return Pair(source, target, geometry.inverse(T_world_lidar[target]) @ T_world_lidar[source])
 
     def pairs(self, band_m: tuple[int, int], count: int) -> list[Pair]:
-        """Up to `count` pairs of the paper's list for the band; where it has none, pairs cut by its protocol."""
+        """Up to `count` pairs of the paper's list for the band; where it has none, pairs cut by its protocol.
+
+        Fewer are the first of more, so that scans made once serve again.
+        """
         rng = np.random.default_rng([self._seed, 6, *band_m])
         candidates = self._listed(band_m) if band_m in LISTED_M else self._cut(band_m)
-        rows = rng.choice(len(candidates), min(count, len(candidates)), replace=False)
-        return [self.pair(int(source), int(target)) for source, target in candidates[np.sort(rows)]]
+        rows = rng.permutation(len(candidates))[:count]
+        return [self.pair(int(source), int(target)) for source, target in candidates[rows]]
 
     def scan(self, index: int) -> Labelled:
         """Points (float32) and labels: the true ones, in a hard world those of a network."""

@@ -86,7 +86,8 @@ def write_sequence(
     T_first_camera = camera_from_lidar(T_first_lidar, T_camera_lidar)
     with (folder / "times.txt").open("w") as times, (out / "poses" / f"{sequence}.txt").open("w") as poses:
         next_line = 0
-        for done, (index, one) in enumerate(zip(count() if numbers is None else numbers, sweeps, strict=False), start=1):
+        numbers = count() if numbers is None else numbers
+        for done, (index, one) in enumerate(zip(numbers, sweeps, strict=False), start=1):
             for line in range(next_line, index + 1):
                 print(f"{drive.time_s[line]:.6e}", file=times)
                 print(" ".join(f"{value:.9e}" for value in T_first_camera[line, :3].ravel()), file=poses)

@@ -22,6 +22,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        """The time within goes to this stage."""
         started = perf_counter()
         try:
             yield
@@ -29,6 +30,7 @@ class Stopwatch:
             self.add(stage, perf_counter() - started)
 
     def add(self, stage: str, seconds: float) -> None:
+        """What was measured elsewhere, in seconds."""
         self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
 

@@ -45,6 +45,8 @@ StaticLabel = Annotated[LabelName, AfterValidator(_check_static)]
 
 
 class Section(BaseModel):
+    """What all sections share: they cannot be changed, and refuse unknown keys."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
 
@@ -60,6 +62,8 @@ class OdometryConfig(Section):
 
 
 class KeyframeConfig(Section):
+    """When a keyframe is cut, and how much of it is kept."""
+
     distance_m: float = Field(2.0, gt=0, description="cut a keyframe this far from the last (m)")
     angle_deg: float = Field(20.0, gt=0, le=180, description="or after this turn (degrees)")
     voxel_m: float = Field(0.2, gt=0, description="thinning of a keyframe, cluster classes excepted (m)")
@@ -67,6 +71,8 @@ class KeyframeConfig(Section):
 
 
 class ProximityConfig(Section):
+    """Where loops are looked for."""
+
     min_travel_m: float = Field(50.0, ge=0, description="travel between the two ends of a loop (m)")
     base_radius_m: float = Field(6.0, gt=0, description="search radius without any drift (m)")
     drift_ratio: float = Field(0.015, ge=0, description="growth of the radius per metre of chain between the two")
@@ -240,6 +246,8 @@ class VerifyConfig(Section):
 
 
 class GraphConfig(Section):
+    """What odometry and closures are believed to err by, and how their graph is solved."""
+
     odometry_sigma_m: float = Field(0.04, gt=0, description="odometry's translation noise per metre^0.5 travelled")
     odometry_sigma_deg: float = Field(0.05, gt=0, description="odometry's rotation noise per metre^0.5 travelled")
     turn_m: float = Field(5.0, ge=0, description="a turn of one radian adds as much noise as this travel (m)")
@@ -260,6 +268,8 @@ class GraphConfig(Section):
 
 
 class LogConfig(Section):
+    """How the log is written."""
+
     view_every: int = Field(8, ge=1, description="every n-th point of a keyframe is drawn; all are kept for replay")
     compression: Literal["none", "lz4", "zstd"] = Field("zstd", description="of the chunks of the log")
 
@@ -281,6 +291,8 @@ class MapConfig(Section):
 
 
 class Config(Section):
+    """All sections."""
+
     odometry: OdometryConfig = OdometryConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     proximity: ProximityConfig = ProximityConfig()

@@ -196,6 +196,8 @@ class LoopClosure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopAttempt:
+    """A candidate and what came of it."""
+
     candidate: LoopCandidate
     outcome: LoopClosure | Rejected
     seconds: dict[str, float]

@@ -30,12 +30,18 @@ class Surface(Protocol):
     """What refinement prepared of a scan."""
 
     @property
-    def points(self) -> Points: ...
+    def points(self) -> Points:
+        """(n, 3) m, in the scan's frame."""
+        ...
 
     @property
-    def standing(self) -> Points: ...
+    def standing(self) -> Points:
+        """Those above the ground."""
+        ...
 
-    def distances_m(self, points: Points) -> tuple[np.ndarray, np.ndarray]: ...
+    def distances_m(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) each, of some points in its frame: to the nearest point of the surface, and to the plane there (m)."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -42,10 +42,14 @@ class Surface(Protocol):
     """A scan to register, in its own frame."""
 
     @property
-    def points(self) -> Points: ...
+    def points(self) -> Points:
+        """(n, 3) m."""
+        ...
 
     @property
-    def normals(self) -> Points: ...
+    def normals(self) -> Points:
+        """(n, 3) unit vectors."""
+        ...
 
     def nearest(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """(n,) each: row of the point of the scan that is nearest to each of some points, and how far it is (m)."""

@@ -1,4 +1,4 @@
-"""How much of what moves a map leaves out, and how much of what stands: a run on simulated data against its true labels.
+"""How much of what moves a map leaves out, and how much of what stands: a simulated run against its true labels.
 
 Moving classes are hidden from the map first, so that the views of other keyframes alone decide:
 

@@ -25,7 +25,9 @@ class Dataset(Protocol):
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """For people and logs, such as `kitti/00`."""
+        ...
 
     @property
     def scan_index(self) -> Indices:
@@ -33,7 +35,9 @@ class Dataset(Protocol):
         ...
 
     @property
-    def labels(self) -> LabelSource: ...
+    def labels(self) -> LabelSource:
+        """Where its labels come from."""
+        ...
 
     @property
     def reference(self) -> Trajectory | None:

@@ -63,6 +63,7 @@ class Row(BaseModel):
 
     @property
     def success(self) -> bool:
+        """By the paper's rule: 2 m and 5 degrees."""
         return self.accepted and _below(self.error_m, SUCCESS_M) and _below(self.error_deg, SUCCESS_DEG)
 
     @property

@@ -23,6 +23,7 @@ class ScanVariant:
 
     @property
     def T_variant_scan(self) -> Transform:  # noqa: N802  (a transform)
+        """The turn."""
         return geometry.transform(geometry.yaw(math.radians(self.yaw_deg)), 0.0)
 
     def of(self, points: Points, labels: Labels) -> tuple[Points, Labels]:
@@ -47,6 +48,7 @@ class Trial:
 
     @property
     def key(self) -> tuple[str, ScanVariant, ScanVariant]:
+        """Tells trials apart."""
         return self.pairs, self.source, self.target
 
 

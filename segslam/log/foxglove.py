@@ -99,6 +99,7 @@ def entity(
 
 
 def scene(entities: Iterable[SceneEntity]) -> SceneUpdate:
+    """What is drawn, as one message."""
     return SceneUpdate(entities=entities)
 
 

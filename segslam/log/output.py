@@ -24,6 +24,7 @@ class Output:
 
     @property
     def closed(self) -> bool:
+        """As of any stream."""
         return self._raw.closed
 
     def write(self, data: bytes) -> int:
@@ -38,12 +39,14 @@ class Output:
         return os.pread(self._raw.fileno(), size, offset)
 
     def tell(self) -> int:
+        """Bytes written so far."""
         return self._raw.tell()
 
     def flush(self) -> None:
         """Nothing is held back."""
 
     def close(self) -> None:
+        """As of any stream."""
         self._raw.close()
 
     def sync(self) -> None:

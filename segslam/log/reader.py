@@ -48,6 +48,7 @@ class RunLog:
         return np.array(json.loads(self.run["T_camera_lidar"])) if "T_camera_lidar" in self.run else None
 
     def num_steps(self) -> int:
+        """The complete steps in the log."""
         return container.count(self.path, schema.STEP)
 
     def steps(self) -> Iterator[Step]:

@@ -27,6 +27,8 @@ class OdometryResult:
 
 @runtime_checkable
 class Odometry(Protocol):
+    """Gives every scan a pose in the frame of the first."""
+
     def register(self, scan: Scan) -> OdometryResult:
         """The pose and the kept points of the next scan, in order of time. Raises BadScan for an unusable scan."""
         ...

@@ -56,6 +56,7 @@ class PoseGraph:
 
     @property
     def num_keyframes(self) -> int:
+        """Those added so far."""
         return len(self._travel_m)
 
     @property

@@ -38,6 +38,8 @@ TITLES = {"list": "list", "yaw_deg": "yaw (deg)", "lost_percent": "labels lost (
 
 
 class Table(NamedTuple):
+    """As Markdown and HTML show it."""
+
     caption: str
     head: tuple[str, ...]
     rows: list[tuple[str, ...]]

@@ -31,6 +31,8 @@ AlignRotation = Callable[[Points, Points, Vector], Rotation]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFit:
+    """A pose and what supports it."""
+
     T_target_source: Transform
     inliers: Mask
     """The rows that the pose explains."""

@@ -39,10 +39,12 @@ class Ground:
         return np.clip(nearest, 0, np.array(self.height_m.shape)[:, None] - 1)
 
     def label_at(self, x: Vector, y: Vector) -> Labels:
+        """(n,) class of the ground at these places (m)."""
         row, column = self.cells(x, y)
         return self.labels[row, column]
 
     def height_at(self, x: Vector, y: Vector) -> Vector:
+        """(n,) m, between the cells' heights."""
         at = np.stack([x - self.origin[0], y - self.origin[1]]) / CELL_M
         return map_coordinates(self.height_m, at, order=1, mode="nearest")
 

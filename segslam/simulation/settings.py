@@ -66,6 +66,8 @@ class SensorConfig(Section):
 
 
 class SimulationConfig(Section):
+    """The world and the sensor that drives through it."""
+
     world: WorldConfig = WorldConfig()
     sensor: SensorConfig = SensorConfig()
 

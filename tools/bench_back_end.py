@@ -28,7 +28,7 @@ def measure(data: Path, sequence: str, odometry: str, seed: int, shares: list[fl
     row = {"sequence": sequence, "odometry": odometry, "seed": seed, "keyframes": len(drive.truth), "search": found}
     row["without_lies"] = believe(drive, true, [])
     row["lies"] = []
-    for kind in KINDS:
+    for kind in KINDS if true else ():
         for share in shares:
             rng = np.random.default_rng([seed, 2, round(100 * share)])
             result = believe(drive, true, lies(drive, kind, round(len(true) * share / (1.0 - share)), rng))

@@ -1,4 +1,4 @@
-"""Proposals as while driving, closures where the truth is within reach; what searching again at the end would add."""
+"""Proposals as while driving, closures where the truth is within reach; what another search at the end would add."""
 
 import time
 from collections.abc import Iterator
@@ -81,7 +81,7 @@ def search(drive: Drive, rng: np.random.Generator) -> tuple[list[LoopClosure], d
             started = time.perf_counter()
             looking.graph.optimize()
             seconds.append(time.perf_counter() - started)
-    last = np.array(seconds[-max(1, len(seconds) // 10) :])
+    last = np.array(seconds[-max(1, len(seconds) // 10) :] or [np.nan])
     looking.graph.finish()
     closures, figures = list(looking.closures), looking.figures()
     figures["optimize_ms_last_tenth"] = {"median": 1e3 * np.median(last), "p95": 1e3 * np.percentile(last, 95)}

@@ -26,7 +26,7 @@ def kiss_icp(*, threads: int) -> Step:
 
 
 def kiss_slam() -> Step:
-    from kiss_slam.config.parser import load_config
+    from kiss_slam.config import load_config
     from kiss_slam.slam import KissSLAM
 
     return KissSLAM(load_config(None)).process_scan

@@ -5,6 +5,7 @@ import sys
 
 import typer
 
+from segslam.cli.warn import FirstOfEachKind
 from segslam.errors import SegslamError, WorkFailed
 
 app = typer.Typer(
@@ -28,10 +29,13 @@ def main(arguments: list[str] | None = None) -> None:
     """
     from segslam.cli import commands
 
-    logging.basicConfig(level=logging.WARNING, format="segslam: %(levelname)s: %(message)s", stream=sys.stderr)
+    warnings = FirstOfEachKind()
+    logging.basicConfig(level=logging.WARNING, handlers=[warnings])
     commands.add_all(app)
     try:
         app(arguments)
     except SegslamError as error:
         print(f"segslam: {error}", file=sys.stderr)
         sys.exit(1 if isinstance(error, WorkFailed) else 2)
+    finally:
+        warnings.tell_counts()

@@ -115,9 +115,10 @@ class Run:
     def map(self, dataset: Dataset) -> Iterator[Step | BadScan]:
         """Process and log each scan after those resumed; a bad one is reported, counted and skipped.
 
-        Scans are read and tracked here while loops are closed and steps logged in a thread beside.
+        Scans are read here, tracked in a thread beside, and in another loops are closed and steps logged.
         """
-        return beside(self._tracked(dataset), self._done, most_waiting=MOST_WAITING)
+        tracked = beside(self._read(dataset), self._track, most_waiting=1)
+        return beside(tracked, self._done, most_waiting=MOST_WAITING)
 
     def repeat(self, steps: Iterator[Step]) -> Iterator[Step]:
         """Do again, from the keyframe on, what a log holds; it is read here, while the rest is done beside."""
@@ -151,20 +152,28 @@ class Run:
             "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
         }
 
-    def _tracked(self, dataset: Dataset) -> Iterator[Tracked | BadScan]:
+    def _read(self, dataset: Dataset) -> Iterator[Scan | BadScan]:
         for row in range(self._next_row, len(dataset)):
+            started = perf_counter()
             try:
-                started = perf_counter()
-                scan = dataset[row]
-                self._note_ms("read", perf_counter() - started)
-                yield self._slam.track(scan)
+                scan: Scan | BadScan = dataset[row]
             except BadScan as error:
-                self.num_scans_skipped += 1
-                logger.warning("%s; skipped", error)
-                yield error
+                scan = error
+            self._note_ms("read", perf_counter() - started)
+            yield scan
+
+    def _track(self, scan: Scan | BadScan) -> Tracked | BadScan:
+        try:
+            return scan if isinstance(scan, BadScan) else self._slam.track(scan)
+        except BadScan as error:
+            return error
 
     def _done(self, tracked: Tracked | BadScan) -> Step | BadScan:
-        return tracked if isinstance(tracked, BadScan) else self._logged(self._slam.close_loops(tracked))
+        if isinstance(tracked, BadScan):
+            self.num_scans_skipped += 1
+            logger.warning("%s; skipped", tracked)
+            return tracked
+        return self._logged(self._slam.close_loops(tracked))
 
     def _logged(self, step: Step) -> Step:
         started = perf_counter()

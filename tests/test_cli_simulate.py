@@ -67,16 +67,20 @@ def test_what_is_there_is_kept_unless_overwriting_is_asked_for(tmp_path, capsys)
 
 
 def test_ctrl_c_leaves_a_shorter_sequence(tmp_path):
-    command = "from segslam.cli import main; main()"
-    run = subprocess.Popen(
+    not_ignored = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # as in a job of a script
+    command = f"{not_ignored}; from segslam.cli import main; main()"
+    with subprocess.Popen(
         [sys.executable, "-c", command, "simulate", str(tmp_path), "--sensor", "vlp16", "--frames", "5000"],
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )
-    wait_for(tmp_path / "sequences/00/velodyne/000003.bin")
-    run.send_signal(signal.SIGINT)
-    _, said = run.communicate(timeout=60)
+    ) as run:
+        try:
+            wait_for(tmp_path / "sequences/00/velodyne/000003.bin")
+            run.send_signal(signal.SIGINT)
+            _, said = run.communicate(timeout=60)
+        finally:
+            run.kill()
     assert run.returncode == 130
     assert "scans are complete" in said
     dataset = open_dataset(tmp_path, sequence="00")

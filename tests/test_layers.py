@@ -16,7 +16,7 @@ LAYERS = (  # top first; a room is a module or a folder
      "vertical_angle"},
     {"semantics"},  # below datasets, whose scans come with labels
     {"trajectory"},
-    {"geometry", "points", "beside", "cliques"},
+    {"geometry", "points", "beside", "interrupts", "cliques"},
     {"types", "config"},
     {"errors"},
 )  # fmt: skip

@@ -86,6 +86,7 @@ def _end_of_data(path: Path) -> int:
 def test_ctrl_c_in_mid_record_waits_until_the_step_is_complete(
     steps: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored when a script's job runs the tests
     with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
         log.write(steps[0])
         write = Output.write
@@ -97,6 +98,7 @@ def test_ctrl_c_in_mid_record_waits_until_the_step_is_complete(
         monkeypatch.setattr(Output, "write", interrupted_write)
         with pytest.raises(KeyboardInterrupt):
             log.write(steps[1])
+        signal.signal(signal.SIGINT, before)
         monkeypatch.undo()
         log.write(steps[2])
     assert_same(tuple(steps[:3]), tuple(read_log(tmp_path / "log.mcap").steps()))

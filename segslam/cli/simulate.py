@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from segslam.cli.console import QuietOption, progress, say
+from segslam.interrupts import interrupts_wait
 
 
 def simulate(
@@ -48,8 +49,11 @@ def simulate(
     written = simulation.write_drive(out, sequence, drive, config=config, seed=seed, num_frames=frames, only=only)
     last = 0
     try:
-        for done in progress(written, total=total, title="simulate", quiet=quiet):
-            last = done
+        with interrupts_wait() as interrupts:
+            for done in progress(written, total=total, title="simulate", quiet=quiet):
+                last = done
+                if interrupts:
+                    break
     except KeyboardInterrupt:
         say(f"stopped: {last} scans are complete in {out / 'sequences' / sequence}", quiet=quiet)
         raise typer.Exit(130) from None

@@ -2,11 +2,11 @@
 
 import fcntl
 import os
-import signal
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from segslam.interrupts import interrupts_wait
 
 
 class Output:
@@ -60,7 +60,7 @@ class Output:
         If the disk is full or fails, the file is cut back to what was before, closed, and the OSError goes on.
         """
         size = self.tell()
-        with _interrupts_wait():
+        with interrupts_wait():
             try:
                 yield
             except OSError:
@@ -77,19 +77,3 @@ def is_being_written(path: Path) -> bool:
         except BlockingIOError:
             return True
         return False
-
-
-@contextmanager
-def _interrupts_wait() -> Iterator[None]:
-    """Ctrl-C takes effect at the end. Only the main thread can be interrupted by it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    interrupts: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
-    if interrupts:
-        signal.raise_signal(signal.SIGINT)

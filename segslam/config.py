@@ -279,7 +279,9 @@ class MapConfig(Section):
 
     voxel_m: float = Field(0.2, ge=0.02, le=5, description="edge of the voxels, a point each (m)")
     max_range_m: float = Field(50.0, gt=0, le=300, description="points farther from their keyframe are left out (m)")
-    color: Literal["class", "height"] = Field("class", description="what the colours of the cloud say")
+    color: Literal["class", "height", "intensity"] = Field(
+        "class", description="what the colours of the cloud say; a run keeps intensities only if mapped with it"
+    )
     view_range_m: float = Field(30.0, ge=0, description="keyframes nearer than this are asked; 0: none (m)")
     view_margin_m: float = Field(0.3, gt=0, description="a return this far behind a voxel saw through it (m)")
     view_margin_ratio: float = Field(0.01, ge=0, description="and this much more per metre of range")

@@ -9,7 +9,7 @@ import numpy as np
 from segslam import geometry
 from segslam.config import KeyframeConfig
 from segslam.points import voxel_first
-from segslam.types import Keyframe, Label, Labels, Points, Transform
+from segslam.types import Indices, Keyframe, Label, Labels, Points, Transform
 
 
 class KeyframeSelector:
@@ -44,16 +44,17 @@ class KeyframeSelector:
 
 def thin(
     points: Points, labels: Labels, *, config: KeyframeConfig, whole_classes: Collection[Label]
-) -> tuple[Points, Labels]:
+) -> tuple[Points, Labels, Indices]:
     """What a keyframe keeps of a scan: all points of `whole_classes`, one a voxel of the others; float32, rounded.
 
+    Their labels and rows come with them.
     Every later stage works on these points and the log holds exactly these, so that a replay repeats the run.
     """
     is_whole = np.isin(labels, np.array([int(label) for label in whole_classes], dtype=np.uint8))
     others = np.flatnonzero(~is_whole)
     kept = np.sort(np.concatenate([np.flatnonzero(is_whole), others[voxel_first(points[others], config.voxel_m)]]))
     rounded = np.round(points[kept].astype(np.float64) / config.resolution_m) * config.resolution_m
-    return rounded.astype(np.float32), labels[kept]
+    return rounded.astype(np.float32), labels[kept], kept
 
 
 @runtime_checkable

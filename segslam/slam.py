@@ -161,7 +161,7 @@ class Slam:
     def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:
         """A keyframe of this scan, labelled by shape if it came without labels, and thinned to what is kept."""
         labels = registered.labels if registered.labels.any() else self._labeller(registered.points)
-        points, labels = thin(
+        points, labels, rows = thin(
             registered.points,
             labels,
             config=self.config.keyframes,
@@ -175,6 +175,7 @@ class Slam:
             travel_m=tracked.travel_m,
             points=points,
             labels=labels,
+            intensities=None if registered.intensities is None else registered.intensities[rows],
         )
 
     def _straighten(self) -> DriftEvidence:

@@ -94,6 +94,8 @@ class Scan:
     labels: Labels
     times: Vector = field(default_factory=lambda: np.empty(0))
     """Per point, 0 at the sweep's start to 1 at its end; empty if unknown or already motion-compensated."""
+    intensities: Vector | None = None
+    """Per point, in the sensor's own unit; None if unknown or not asked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +111,8 @@ class Keyframe:
     points: Points
     """Motion-compensated, in the keyframe's frame, float32."""
     labels: Labels
+    intensities: Vector | None = None
+    """Per point, as its scan has them; None if it has none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

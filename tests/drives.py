@@ -44,6 +44,11 @@ def drifting(truth: Trajectory, *, turn_deg: float = 0.15, climb_m: float = 0.01
     return replace(truth, T_world_lidar=np.stack(poses))
 
 
+def intensities(points: np.ndarray) -> np.ndarray:
+    """What made scans say of points: how far they are, in hundreds of metres, so that a row out of step shows."""
+    return np.linalg.norm(points, axis=1) / 100
+
+
 def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
     """The drive's first scans as sequence 00 of KITTI's format; returns the folder of the scans.
 
@@ -55,7 +60,7 @@ def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
     (root / "poses").mkdir()
     scans, truth = round_drive()
     for scan in scans[:num_scans]:
-        rows = np.column_stack([uncorrected(scan.points), np.zeros(len(scan.points))])
+        rows = np.column_stack([uncorrected(scan.points), intensities(scan.points)])
         rows.astype("<f4").tofile(folder / "velodyne" / f"{scan.index:06d}.bin")
         RAW_OF_LABEL[scan.labels].astype("<u4").tofile(folder / "true_labels" / f"{scan.index:06d}.label")
     (folder / "calib.txt").write_text(made_up_drive(1).calib)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from drives import round_drive
+from drives import intensities, round_drive
 from mcap_ros2.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
@@ -78,6 +78,7 @@ def clouds(num_scans: int = 30) -> tuple[tuple[int, np.ndarray], ...]:
         rows = np.zeros(len(points), CLOUD)
         rows["x"], rows["y"], rows["z"] = points.T
         rows["t"] = times * SWEEP_NS
+        rows["intensity"] = intensities(points)
         for name in "xyz":
             rows[name][::100] = np.nan
         recorded.append((FIRST_STAMP_NS + SWEEP_NS * scan.index, rows[::3]))

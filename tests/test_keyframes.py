@@ -48,7 +48,7 @@ def test_a_standing_sensor_that_jitters_cuts_no_keyframe() -> None:
 def test_a_cloud_is_given_as_it_was_kept(reach_m: float) -> None:
     rng = np.random.default_rng(0)
     labels = rng.integers(0, 20, 5_000).astype(np.uint8)
-    points, labels = thin(
+    points, labels, _ = thin(
         rng.uniform(-reach_m, reach_m, (5_000, 3)), labels, config=CONFIG, whole_classes=(Label.CAR, Label.TRUNK)
     )
     store = CloudStore(CONFIG.resolution_m)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from google.protobuf.message import Message
 from hypothesis import given
 from hypothesis import strategies as st
 from made_logs import CONFIG, assert_same, boundaries, decoded, made_result, made_steps, write_log
@@ -13,8 +14,8 @@ from mcap.stream_reader import StreamReader
 
 from segslam.config import Config
 from segslam.log import LogWriter, read_log, schema
-from segslam.log.cloud import keyframe_points, points_and_labels
-from segslam.types import Step
+from segslam.log.cloud import intensities, keyframe_points, points_and_labels
+from segslam.types import Keyframe, Step
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +131,7 @@ def test_points_on_the_grid_come_back_exactly(steps: list[tuple[int, int, int]],
     on_grid = np.abs(points / np.float32(resolution_m)) < 2**22  # float32 tells neighbours on the grid apart
     points = points[on_grid.all(axis=1)]
     labels = np.arange(len(points), dtype=np.uint8)
-    again, labels_again = points_and_labels(keyframe_points(points, labels, resolution_m=resolution_m))
+    again, labels_again = points_and_labels(keyframe_points(_keyframe(points, labels), resolution_m=resolution_m))
     np.testing.assert_array_equal(points, again)
     np.testing.assert_array_equal(labels, labels_again)
     assert again.dtype == np.float32
@@ -138,8 +139,51 @@ def test_points_on_the_grid_come_back_exactly(steps: list[tuple[int, int, int]],
 
 def test_points_off_the_grid_move_by_half_a_step_at_most() -> None:
     points = np.random.default_rng(0).uniform(-120, 120, size=(1000, 3)).astype(np.float32)
-    again, _ = points_and_labels(keyframe_points(points, np.zeros(1000, np.uint8), resolution_m=0.004))
+    again, _ = points_and_labels(keyframe_points(_keyframe(points, np.zeros(1000, np.uint8)), resolution_m=0.004))
     assert np.abs(points - again).max() <= 0.002 + 1e-5  # float32 at 120 m resolves 8e-6 m
+
+
+@pytest.mark.parametrize("greatest", [0.99, 255.0, 65535.0], ids=["KITTI", "a byte", "photons"])
+def test_intensities_come_back_to_the_byte_and_stay_so(greatest: float) -> None:
+    """A step of the root is 1/255 of that of the greatest; of faint returns it is a small step."""
+    sent = (greatest * np.random.default_rng(1).random(5000) ** 3).astype(np.float32)
+    sent[0] = greatest
+    once = intensities(_sent(sent))
+    assert np.abs(np.sqrt(once / greatest) - np.sqrt(sent / greatest)).max() <= 0.5 / 255 + 1e-6
+    np.testing.assert_array_equal(intensities(_sent(once)), once)  # a replay of a replay loses nothing more
+
+
+def test_intensities_that_are_no_numbers_or_negative_are_zero() -> None:
+    np.testing.assert_array_equal(intensities(_sent(np.array([np.nan, -3.0, np.inf, 4.0]))), [0.0, 0.0, 0.0, 4.0])
+    np.testing.assert_array_equal(intensities(_sent(np.zeros(3))), np.zeros(3))
+
+
+def test_a_cloud_without_intensities_holds_no_byte_for_them() -> None:
+    """So it was written before there were any, and so it is read."""
+    without = keyframe_points(_keyframe(np.ones((7, 3), np.float32), np.zeros(7, np.uint8)), resolution_m=0.004)
+    assert {field.name for field, _ in without.ListFields()} == {
+        "resolution_m",
+        "num_points",
+        "folded_difference_planes",
+        "labels",
+    }
+    assert intensities(without) is None
+
+
+def test_steps_with_intensities_are_read_again(steps: list[Step], tmp_path: Path) -> None:
+    known = np.array([0.0, 1.0, 16.0, 255.0] * 50, np.float32)  # whole 255ths of the root
+    known = (255 * np.rint(255 * np.sqrt(known / 255)) ** 2 / 255**2).astype(np.float32)
+    sent = replace(steps[0], keyframe=replace(steps[0].keyframe, intensities=known))
+    assert_same(sent, next(read_log(write_log(tmp_path / "log.mcap", [sent])).steps()))
+
+
+def _keyframe(points: np.ndarray, labels: np.ndarray, intensities: np.ndarray | None = None) -> Keyframe:
+    return Keyframe(0, 0, 0, np.eye(4), 0.0, points, labels, intensities)
+
+
+def _sent(intensities: np.ndarray) -> Message:
+    points, labels = np.ones((len(intensities), 3), np.float32), np.zeros(len(intensities), np.uint8)
+    return keyframe_points(_keyframe(points, labels, intensities), resolution_m=0.004)
 
 
 def test_any_mcap_reader_finds_the_index_and_the_checksums_in_order(steps: list[Step], whole: Path) -> None:

@@ -5,8 +5,10 @@ from collections import Counter, defaultdict
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from segslam.map.grid import ground_heights
+from segslam.map.histogram import Histogram
 from segslam.map.tiles import TILE_M, Tiles, corner, distance_m
 from segslam.map.views import CELL_RAD, NOTHING, NUM_COLUMNS, NUM_ROWS, STEP_M, Views, count_votes
 from segslam.map.voxels import VOXEL, merged
@@ -19,6 +21,7 @@ def _random_voxels(rng: np.random.Generator, num: int = 400) -> np.ndarray:
     voxels = np.zeros(num, VOXEL)
     voxels["point"] = rng.uniform((0, 0, -2), (3, 3, 2), (num, 3))
     voxels["count"], voxels["label"] = rng.integers(1, 5, num), rng.integers(0, 4, num)
+    voxels["intensity"] = rng.uniform(0, 255, num)
     return voxels
 
 
@@ -41,6 +44,8 @@ def test_voxels_are_weighted_means_with_the_commonest_label() -> None:
         np.testing.assert_allclose(
             voxel["point"], np.average([m["point"] for m in members], axis=0, weights=counts), atol=1e-5
         )
+        mean = np.average([m["intensity"] for m in members], weights=counts)
+        assert voxel["intensity"] == pytest.approx(mean, rel=1e-6)  # float32
 
 
 def test_voxels_of_pieces_are_those_of_the_whole() -> None:
@@ -50,6 +55,7 @@ def test_voxels_of_pieces_are_those_of_the_whole() -> None:
     a, b = (v[np.lexsort(np.floor(v["point"] / VOXEL_M).T)] for v in (merged(voxels, VOXEL_M), merged(halves, VOXEL_M)))
     assert a["count"].tolist() == b["count"].tolist()
     np.testing.assert_allclose(a["point"], b["point"], atol=1e-6)
+    np.testing.assert_allclose(a["intensity"], b["intensity"], rtol=1e-6)
 
 
 def test_tiles_give_back_what_was_added_wherever_it_lies(tmp_path: Path) -> None:
@@ -57,12 +63,22 @@ def test_tiles_give_back_what_was_added_wherever_it_lies(tmp_path: Path) -> None
     points = rng.uniform((-70, -70, -5), (70, 70, 5), (3000, 3))
     tiles = Tiles(tmp_path / "tiles", voxel_m=0.01)  # so small that each point has its own
     for part in np.array_split(points, 7):
-        tiles.add(part, np.full(len(part), Label.POLE, np.uint8))
+        tiles.add(part, np.full(len(part), Label.POLE, np.uint8), np.zeros(len(part)))
         tiles.flush()
     found = np.concatenate([tiles.voxels(tile)["point"] + corner(tile) for tile in tiles])
     np.testing.assert_allclose(_sorted(found), _sorted(points), atol=1e-5)
     rows = [tile[1] for tile in tiles]
     assert rows == sorted(rows, reverse=True)
+
+
+def test_the_span_of_a_stream_is_that_of_its_shares_to_an_edge() -> None:
+    values = np.random.default_rng(4).permutation(np.arange(1000.0))
+    counted = Histogram(np.arange(0.0, 1001.0, 50.0))
+    for some in np.array_split(values, 6):
+        counted.add(some)
+    assert counted.span(0.12, 0.88) == (100.0, 900.0)  # 120 and 880, to the edges below and above
+    counted.add(np.array([-5.0, 2e6]))
+    assert counted.span(0.0, 1.0) == (0.0, 1000.0)
 
 
 def test_a_places_distance_to_a_tile_is_nought_within_and_to_its_border_outside() -> None:

@@ -1,4 +1,5 @@
 import multiprocessing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,17 @@ def test_points_out_of_range_leave_with_their_labels() -> None:
     np.testing.assert_array_equal(result.points, points[[1, 3, 5]].astype(np.float32))
     np.testing.assert_array_equal(result.labels, [1, 3, 5])
     assert result.points.dtype == np.float32
+
+
+def test_intensities_go_with_their_points_through_the_process_apart() -> None:
+    scan = _street(1)[0]
+    told = replace(scan, intensities=np.linalg.norm(scan.points, axis=1).astype(np.float32))
+    given = GivenOdometry(_trajectory(np.eye(4)[None]), CONFIG)
+    with OdometryApart(CONFIG) as apart:
+        for result in (apart.register(told), given.register(told)):
+            np.testing.assert_allclose(result.intensities, np.linalg.norm(result.points, axis=1), rtol=1e-6)
+            assert 0 < len(result.points) < len(scan.points), "those out of range have gone"
+    assert KissOdometry(CONFIG).register(scan).intensities is None
 
 
 def test_a_scan_that_moved_is_brought_to_the_end_of_its_sweep() -> None:

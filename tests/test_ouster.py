@@ -14,7 +14,13 @@ from segslam.types import SegslamError
 
 NUM_COLUMNS, PER_PACKET = 16, 4
 ALTITUDE_DEG = [0.0, 30.0]
-CHANNEL_BYTES = {"LEGACY": 12, "RNG19_RFL8_SIG16_NIR16": 12, "RNG15_RFL8_NIR8_DUAL": 8}
+CHANNEL_BYTES = {
+    "LEGACY": 12,
+    "RNG19_RFL8_SIG16_NIR16": 12,
+    "RNG19_RFL8_SIG16_NIR16_DUAL": 16,
+    "RNG15_RFL8_NIR8_DUAL": 8,
+}
+REFLECTIVITY = 201
 START_NS = 1_700_000_000_123_456_789
 
 
@@ -41,9 +47,13 @@ def _column(profile: str, frame: int, number: int, ranges_mm: np.ndarray, *, val
     channels = b""
     for range_mm in ranges_mm:
         if profile.startswith("RNG15"):
-            channels += struct.pack("<HH", int(range_mm) // 8 | 0x8000, 7).ljust(CHANNEL_BYTES[profile], b"\xff")
+            beam = struct.pack("<HBB", int(range_mm) // 8 | 0x8000, REFLECTIVITY, 7)
+        elif profile.endswith("DUAL"):
+            beam = struct.pack("<I", int(range_mm) | 0xF80000 | REFLECTIVITY << 24)
         else:
-            channels += struct.pack("<I", int(range_mm) | 0xFFF00000).ljust(CHANNEL_BYTES[profile], b"\xff")
+            size = "H" if profile == "LEGACY" else "Bx"
+            beam = struct.pack(f"<I{size}", int(range_mm) | 0xFFF00000, REFLECTIVITY)
+        channels += beam.ljust(CHANNEL_BYTES[profile], b"\xff")
     if profile == "LEGACY":
         header = struct.pack("<QHHI", stamp_ns, number, frame, 0)
         return header + channels + (b"\xff" * 4 if valid else b"\0" * 4)
@@ -106,6 +116,7 @@ def test_beams_point_where_the_manual_says(tmp_path: Path, profile: str) -> None
     np.testing.assert_allclose(right.points, [[0.0, -2.0, 0.036]], atol=1e-6)
     along, height = 1.985 * np.cos(np.pi / 6) + 0.015, 1.985 * 0.5 + 0.036
     np.testing.assert_allclose(up.points, [[along, 0.0, height]], atol=1e-6)
+    assert [scan.intensities for scan in open_dataset(file, intensities=True)] == [REFLECTIVITY] * 3
 
 
 def test_stamps_and_times_are_the_sensors(tmp_path: Path) -> None:

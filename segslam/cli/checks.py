@@ -1,6 +1,7 @@
-"""What a run that was begun allows: how it can be resumed or replayed."""
+"""What data, and a run that was begun, allow: how they can be mapped, resumed or replayed."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,19 @@ if TYPE_CHECKING:
     from segslam.config import Config
     from segslam.datasets import Dataset
     from segslam.log import RunLog
+
+
+def check_intensities(scans: "Dataset") -> None:
+    """Raises SegslamError if the first scan that can be read has no intensities."""
+    from segslam.types import BadScan, SegslamError
+
+    for row in range(len(scans)):
+        with suppress(BadScan):
+            if scans[row].intensities is None:
+                raise SegslamError(
+                    f"map.color=intensity: {scans.name} has no intensities that are known; take class or height"
+                )
+            return
 
 
 def log_to_resume(folder: Path) -> "RunLog":

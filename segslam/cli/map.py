@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from segslam.cli.checks import check_same, is_finished, log_to_resume
+from segslam.cli.checks import check_intensities, check_same, is_finished, log_to_resume
 from segslam.cli.console import (
     ConfigOption,
     DatasetOption,
@@ -76,9 +76,19 @@ def map_command(
     check_names(map_files)
     recorded = log_to_resume(out) if resume else None
     settings_now = load_config(config, settings or (), base=recorded.config if recorded else None)
+    by_intensity = settings_now.map.color == "intensity"
     scans = open_dataset(
-        data, sequence=sequence, dataset=dataset, labels=labels, encoding=encoding, frames=frames, topic=topic
+        data,
+        sequence=sequence,
+        dataset=dataset,
+        labels=labels,
+        encoding=encoding,
+        frames=frames,
+        topic=topic,
+        intensities=by_intensity,
     )
+    if by_intensity:
+        check_intensities(scans)
     options = {
         "frames": frames or "",
         "topic": topic,

@@ -20,21 +20,32 @@ def open_dataset(
     encoding: Encoding | None = None,
     frames: str | None = None,
     topic: str = "",
+    intensities: bool = False,
 ) -> Dataset:
     """The scans of a folder or recording, read one by one when asked for.
 
     `dataset` is the kind of data (`kitti`, or a name of kiss_icp's readers), found from the folder where it can be;
     `labels` a source as `auto`, `none`, `geometric` or a folder; `frames` the scans as `A:B` by number, B not included;
-    `topic` that of the points in a recording with several. Raises SegslamError that names the file and the remedy.
+    `topic` that of the points in a recording with several. Scans have `intensities` only if these are asked for, and
+    known. Raises SegslamError that names the file and the remedy.
     """
     folder = Path(data).expanduser()
     if not folder.exists():
         raise SegslamError(f"{folder}: no such file or folder; name the folder with sequences/ or with the scans")
     try:
         if dataset == "kitti" or (dataset is None and is_kitti(folder)):
-            return open_kitti(folder, sequence=sequence, labels=labels, encoding=encoding, frames=frames)
+            return open_kitti(
+                folder, sequence=sequence, labels=labels, encoding=encoding, frames=frames, intensities=intensities
+            )
         return open_recording(
-            folder, kind=dataset, sequence=sequence, topic=topic, labels=labels, encoding=encoding, frames=frames
+            folder,
+            kind=dataset,
+            sequence=sequence,
+            topic=topic,
+            labels=labels,
+            encoding=encoding,
+            frames=frames,
+            intensities=intensities,
         )
     except OSError as error:
         raise SegslamError(f"{folder}: cannot be read ({error}); check the path and its permissions") from error

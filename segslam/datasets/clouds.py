@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from segslam.datasets.kitti import read_returns
+from segslam.datasets.point_cloud2 import INTENSITY_FIELDS
 from segslam.types import Points, SegslamError, Vector
 
 
@@ -27,13 +28,16 @@ def read_cloud(file: Path) -> Points:
 
 
 def read_intensities(file: Path) -> Vector | None:
-    """The intensity of each point of a file that `read_cloud` reads: the fourth column of .bin and .npy; None else."""
+    """The intensity of each point of a file that `read_cloud` reads; None if it has none.
+
+    It is the fourth column of .bin and .npy, and of .ply and .pcd a field of one of the usual names.
+    """
     if file.suffix == ".bin":
         return read_returns(file)[:, 3]
     if file.suffix == ".npy":
         values = _read_npy(file)
         return values[:, 3] if values.shape[1] > 3 else None
-    return None
+    return _intensities_by_open3d(file) if file.suffix in (".ply", ".pcd") else None
 
 
 def _read_npy(file: Path) -> Float64[np.ndarray, "_ _"]:
@@ -55,3 +59,12 @@ def _read_by_open3d(file: Path) -> Points:
     if not len(points):
         raise SegslamError(f"{file}: no points could be read; is it a whole {file.suffix} file?")
     return points
+
+
+def _intensities_by_open3d(file: Path) -> Vector | None:
+    import open3d
+
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        fields = open3d.t.io.read_point_cloud(file).point
+    name = next((name for name in INTENSITY_FIELDS if name in fields), None)
+    return fields[name].numpy().ravel().astype(np.float64) if name else None

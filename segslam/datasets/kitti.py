@@ -36,6 +36,7 @@ class KittiSequence:
     labels: LabelSource
     T_camera_lidar: Transform
     reference: Trajectory | None
+    has_intensities: bool
 
     def __len__(self) -> int:
         return len(self.scan_files)
@@ -44,10 +45,14 @@ class KittiSequence:
         """The scan, its vertical angle corrected. Raises BadScan if the file or its labels cannot be used."""
         file = self.scan_files[row]
         returns = read_returns(file)
-        points = returns[:, :3]
-        labels = self.labels.read(file.stem, points, returns[:, 3])
+        points, intensities = returns[:, :3], returns[:, 3]
         return make_scan(
-            file, int(self.scan_index[row]), int(self.stamp_ns[row]), correct_vertical_angle(points), labels
+            file,
+            int(self.scan_index[row]),
+            int(self.stamp_ns[row]),
+            correct_vertical_angle(points),
+            self.labels.read(file.stem, points, intensities),
+            intensities=intensities if self.has_intensities else None,
         )
 
     def __iter__(self) -> Iterator[Scan]:
@@ -60,7 +65,13 @@ def is_kitti(data: Path) -> bool:
 
 
 def open_kitti(
-    data: Path, *, sequence: str, labels: str, encoding: Encoding | None, frames: str | None
+    data: Path,
+    *,
+    sequence: str,
+    labels: str,
+    encoding: Encoding | None,
+    frames: str | None,
+    intensities: bool = False,
 ) -> KittiSequence:
     """The sequence `sequence` of a folder with `sequences/`, or the one that the folder itself is.
 
@@ -80,6 +91,7 @@ def open_kitti(
         labels=open_labels(labels, beside=folder, scan_names=[file.stem for file in chosen], encoding=encoding),
         T_camera_lidar=T_camera_lidar,
         reference=_reference(poses_file, numbers[rows], stamps[rows], T_camera_lidar),
+        has_intensities=intensities,
     )
 
 

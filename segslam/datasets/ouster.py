@@ -19,25 +19,34 @@ from segslam.types import Points, Vector
 
 
 class _Channel(NamedTuple):
-    """What a packet holds of each beam, its (first) range ahead of the rest."""
+    """What a packet holds of each beam: its (first) range ahead of the rest, and the reflectivity that goes with it."""
 
     num_bytes: int
     range_type: str
     range_bits: int
     mm_per_count: int
+    reflectivity_type: str
+    reflectivity_offset: int
 
     @property
     def dtype(self) -> np.dtype:
-        return np.dtype({"names": ["range"], "formats": [self.range_type], "itemsize": self.num_bytes})
+        return np.dtype(
+            {
+                "names": ["range", "reflectivity"],
+                "formats": [self.range_type, self.reflectivity_type],
+                "offsets": [0, self.reflectivity_offset],
+                "itemsize": self.num_bytes,
+            }
+        )
 
 
 CHANNELS = {
-    "LEGACY": _Channel(12, "<u4", 20, 1),
-    "RNG19_RFL8_SIG16_NIR16": _Channel(12, "<u4", 19, 1),
-    "RNG19_RFL8_SIG16_NIR16_DUAL": _Channel(16, "<u4", 19, 1),
-    "RNG15_RFL8_NIR8": _Channel(4, "<u2", 15, 8),
-    "RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8),
-    "FUSA_RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8),
+    "LEGACY": _Channel(12, "<u4", 20, 1, "<u2", 4),
+    "RNG19_RFL8_SIG16_NIR16": _Channel(12, "<u4", 19, 1, "u1", 4),
+    "RNG19_RFL8_SIG16_NIR16_DUAL": _Channel(16, "<u4", 19, 1, "u1", 3),
+    "RNG15_RFL8_NIR8": _Channel(4, "<u2", 15, 8, "u1", 2),
+    "RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8, "u1", 2),
+    "FUSA_RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8, "u1", 2),
 }
 """By the name of the packet's profile."""
 HEADER_BYTES = FOOTER_BYTES = 32
@@ -90,6 +99,8 @@ class OusterFrames:
         self._frames = self._find_frames()
         self.stamp_ns = 0
         """Of the first column of the last frame read."""
+        self.intensities = np.empty(0)
+        """The sensor's reflectivity, of each point of the last frame read."""
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -105,6 +116,7 @@ class OusterFrames:
         counts = columns["channels"]["range"] & ((1 << channel.range_bits) - 1)
         ranges_mm = counts.astype(np.float64) * channel.mm_per_count
         column, beam = np.nonzero(ranges_mm)
+        self.intensities = columns["channels"]["reflectivity"][column, beam].astype(np.float64)
         rays, origins = self._rays_and_origins
         measured = columns["measurement"][column].astype(np.intp)
         points_mm = rays[measured, beam] * ranges_mm[column, beam, None] + origins[measured, beam]

@@ -8,6 +8,8 @@ from segslam.types import Points, Vector
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time")
 """What drivers (Ouster, Velodyne, Hesai, Robosense, Livox) call the time of a point, in whatever unit."""
+INTENSITY_FIELDS = ("intensity", "reflectivity", "signal")
+"""What drivers and programs call the strength of a return; the first that there is counts."""
 KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's numbers."""
 
@@ -30,8 +32,8 @@ class CloudReader:
         self.stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
         rows = _rows(message)
         points = np.column_stack([rows[axis].ravel() for axis in "xyz"]).astype(np.float64)
-        has_intensity = any(field.name == "intensity" for field in message.fields)
-        self.intensities = rows["intensity"].ravel().astype(np.float64) if has_intensity else None
+        name = next((name for name in INTENSITY_FIELDS if name in (rows.dtype.names or ())), None)
+        self.intensities = rows[name].ravel().astype(np.float64) if name else None
         time_field = next((field.name for field in message.fields if field.name in TIME_FIELDS), None)
         return points, rows[time_field].ravel().astype(np.float64) if time_field else np.empty(0)
 

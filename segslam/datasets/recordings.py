@@ -57,11 +57,13 @@ class Recording:
         labels: str,
         encoding: Encoding | None,
         frames: str | None,
+        intensities: bool,
     ) -> None:
         beside = _beside(source)
         self.name = f"{kind}/{beside.resolve().name}"
         self._source = source
         self._loader = loader
+        self._has_intensities = intensities
         self._in_order = kind in READ_IN_ORDER
         self._clouds = CloudReader()
         if self._in_order:
@@ -81,8 +83,16 @@ class Recording:
         index = int(self.scan_index[row])
         file = self._file(index)
         points, times = self._read(index, file)
-        labels = self.labels.read(file.stem, points, self._intensities(file, len(points)))
-        return make_scan(file, index, self._stamp_ns(index), points, labels, _from_0_to_1(times, len(points)))
+        intensities = self._intensities(file, len(points))
+        return make_scan(
+            file,
+            index,
+            self._stamp_ns(index),
+            points,
+            self.labels.read(file.stem, points, intensities),
+            _from_0_to_1(times, len(points)),
+            intensities=intensities if self._has_intensities else None,
+        )
 
     def __iter__(self) -> Iterator[Scan]:
         return usable_scans(self)
@@ -99,9 +109,12 @@ class Recording:
 
     def _intensities(self, file: Path, num_points: int) -> Vector | None:
         """Of the scan read last, where they are wanted and known."""
-        if self.labels.network is None:
+        if not self._has_intensities and self.labels.network is None:
             return None
-        known = self._clouds.intensities if self._in_order else read_intensities(file)
+        known = self._clouds.intensities if self._in_order else getattr(self._loader, "intensities", None)
+        if known is None and not self._in_order:
+            with contextlib.suppress(BadScan):  # a .bin file of another layout than KITTI's
+                known = read_intensities(file)
         return known if known is not None and len(known) == num_points else None
 
     def _go_to(self, index: int) -> None:
@@ -154,6 +167,7 @@ def open_recording(
     labels: str,
     encoding: Encoding | None,
     frames: str | None,
+    intensities: bool = False,
 ) -> Recording:
     """A recording by the name of its kind in kiss_icp, or by what the file or folder looks like.
 
@@ -182,7 +196,7 @@ def open_recording(
         raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset") from error
     if num_scans == 0:
         raise SegslamError(f"{data}: holds no scan that the reader for {kind} data finds; see --dataset")
-    return Recording(kind, source, loader, labels=labels, encoding=encoding, frames=frames)
+    return Recording(kind, source, loader, labels=labels, encoding=encoding, frames=frames, intensities=intensities)
 
 
 def _kind_of(data: Path) -> str:

@@ -68,11 +68,18 @@ def usable_scans(dataset: Dataset) -> Iterator[Scan]:
 
 
 def make_scan(
-    source: Path, index: int, stamp_ns: int, points: Points, labels: Labels, times: Vector = NO_TIMES
+    source: Path,
+    index: int,
+    stamp_ns: int,
+    points: Points,
+    labels: Labels,
+    times: Vector = NO_TIMES,
+    *,
+    intensities: Vector | None = None,
 ) -> Scan:
     """The scan without its unusable points: those with a NaN or infinity, and those at the origin, which are no return.
 
-    Labels and times lose the same rows. Raises BadScan, naming `source`, if no point is left.
+    All that goes with them loses the same rows. Raises BadScan, naming `source`, if no point is left.
     """
     squared_range = np.einsum("ij,ij->i", points, points)
     kept = np.isfinite(squared_range) & (squared_range > 0)
@@ -83,7 +90,10 @@ def make_scan(
         raise BadScan(f"{source}: {what}; fetch the file again or leave the scan out with --frames")
     if not kept.all():
         points, labels, times = points[kept], labels[kept], times[kept] if len(times) else times
-    return Scan(index, stamp_ns, np.ascontiguousarray(points, dtype=np.float32), labels, times)
+        intensities = intensities if intensities is None else intensities[kept]
+    if intensities is not None:
+        intensities = np.ascontiguousarray(intensities, dtype=np.float32)
+    return Scan(index, stamp_ns, np.ascontiguousarray(points, dtype=np.float32), labels, times, intensities)
 
 
 def selected_rows(scan_index: Indices, frames: str | None, source: Path) -> Indices:

@@ -4,6 +4,9 @@ Coordinates are whole multiples of `resolution_m`. Each is written as its differ
 points follow the beam, so they are near each other), folded to be non-negative (0, -1, 1, -2 become 0, 1, 2, 3), and
 split into planes: the lowest byte of every x, the second byte of every x, and so on to the fourth byte of every z.
 Bytes of one kind side by side compress well, interleaved floats do not.
+
+Intensities, of a run that keeps them, take a byte each: 255 times the root of their share of the greatest of the cloud.
+The noise of a photon count grows with its root, so no more is lost of faint returns beside a reflector than of others.
 """
 
 import numpy as np
@@ -11,16 +14,18 @@ from google.protobuf import descriptor_pool, message_factory
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto
 from google.protobuf.message import Message
 
-from segslam.types import Labels, Points
+from segslam.types import Keyframe, Labels, Points, Vector
 
 
 def _message_class() -> type[Message]:
-    """Built here rather than generated: four fields need no compiler, and no version of one."""
+    """Built here rather than generated: six fields need no compiler, and no version of one."""
     kinds = {
         "resolution_m": FieldDescriptorProto.TYPE_DOUBLE,
         "num_points": FieldDescriptorProto.TYPE_UINT32,
         "folded_difference_planes": FieldDescriptorProto.TYPE_BYTES,
         "labels": FieldDescriptorProto.TYPE_BYTES,
+        "intensity_greatest": FieldDescriptorProto.TYPE_DOUBLE,
+        "intensity_roots": FieldDescriptorProto.TYPE_BYTES,
     }
     optional = FieldDescriptorProto.LABEL_OPTIONAL
     fields = [
@@ -41,8 +46,9 @@ def _message_class() -> type[Message]:
 KeyframePoints = _message_class()
 
 
-def keyframe_points(points: Points, labels: Labels, *, resolution_m: float) -> Message:
-    """Points and labels in their order; coordinates that are no multiples of `resolution_m` go to the nearest."""
+def keyframe_points(keyframe: Keyframe, *, resolution_m: float) -> Message:
+    """The points in their order; coordinates that are no multiples of `resolution_m` go to the nearest."""
+    points = keyframe.points
     steps = np.ascontiguousarray(np.rint(points.T.astype(np.float64) / resolution_m), dtype=np.int32)
     differences = np.diff(steps, axis=1, prepend=np.int32(0))
     folded = ((differences << 1) ^ (differences >> 31)).astype("<u4", order="C")
@@ -50,7 +56,8 @@ def keyframe_points(points: Points, labels: Labels, *, resolution_m: float) -> M
         resolution_m=resolution_m,
         num_points=len(points),
         folded_difference_planes=folded.view(np.uint8).reshape(3, -1, 4).transpose(0, 2, 1).tobytes(),
-        labels=labels.tobytes(),
+        labels=keyframe.labels.tobytes(),
+        **({} if keyframe.intensities is None else _roots(keyframe.intensities)),
     )
 
 
@@ -61,3 +68,19 @@ def points_and_labels(message: Message) -> tuple[Points, Labels]:
     differences = (folded >> 1).astype(np.int32) ^ -(folded & 1).astype(np.int32)
     points = (np.cumsum(differences, axis=1, dtype=np.int32).T * message.resolution_m).astype(np.float32)
     return points, np.frombuffer(message.labels, np.uint8).copy()
+
+
+def intensities(message: Message) -> Vector | None:
+    """The intensity of each point (float32), to the byte; None if they were not kept."""
+    if not message.intensity_roots:
+        return None
+    shares = (np.frombuffer(message.intensity_roots, np.uint8) / 255) ** 2
+    return (message.intensity_greatest * shares).astype(np.float32)
+
+
+def _roots(intensities: Vector) -> dict[str, object]:
+    """The two fields; what is no number, or negative, is 0."""
+    known = np.maximum(np.nan_to_num(intensities.astype(np.float64), posinf=0.0), 0.0)
+    greatest = known.max(initial=0.0)
+    roots = np.rint(255 * np.sqrt(known / (greatest or 1.0))).astype(np.uint8)
+    return {"intensity_greatest": greatest, "intensity_roots": roots.tobytes()}

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 
 from segslam.config import Config, config_from_yaml
 from segslam.log import container, schema
-from segslam.log.cloud import KeyframePoints, points_and_labels
+from segslam.log.cloud import KeyframePoints, intensities, points_and_labels
 from segslam.log.container import CutError
 from segslam.log.foxglove import transforms
 from segslam.log.records import codec
@@ -136,8 +136,9 @@ def read_log(path: Path) -> RunLog:
 def _step(parts: Parts) -> Step:
     keyframe: dict = {}
     if schema.KEYFRAME in parts:
-        points, labels = points_and_labels(KeyframePoints.FromString(parts[schema.KEYFRAME]))
-        keyframe = {"points": points, "labels": labels}
+        message = KeyframePoints.FromString(parts[schema.KEYFRAME])
+        points, labels = points_and_labels(message)
+        keyframe = {"points": points, "labels": labels, "intensities": intensities(message)}
     estimate = _estimate(parts) if schema.ESTIMATE in parts else None
     return codec(Step).decode(json.loads(parts[schema.STEP]), {Step: {"estimate": estimate}, Keyframe: keyframe})
 

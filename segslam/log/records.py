@@ -28,7 +28,7 @@ Bulk = Mapping[type, Mapping[str, Any]]
 
 BULK: Mapping[type, frozenset[str]] = {
     Step: frozenset({"estimate"}),
-    Keyframe: frozenset({"points", "labels"}),
+    Keyframe: frozenset({"points", "labels", "intensities"}),
     GraphEstimate: frozenset({"T_world_keyframe"}),
 }
 """Fields that the JSON leaves out."""

@@ -160,8 +160,7 @@ class LogWriter:
         if (rss_mb := _rss_mb()) is not None:
             yield schema.MEMORY, json.dumps({"rss_mb": rss_mb}).encode()
         if step.keyframe is not None:
-            points, labels = step.keyframe.points, step.keyframe.labels
-            yield schema.KEYFRAME, keyframe_points(points, labels, resolution_m=self._resolution_m).SerializeToString()
+            yield schema.KEYFRAME, keyframe_points(step.keyframe, resolution_m=self._resolution_m).SerializeToString()
         if step.estimate is not None and logs_estimate:
             yield _estimate_message(step.estimate)
         yield schema.STEP, _json(Step, step)

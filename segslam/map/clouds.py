@@ -10,8 +10,10 @@ from segslam.config import MapConfig
 from segslam.map.part import Extent, Part
 from segslam.types import Label, SegslamError
 
-ROW = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")])
-PCD_ROW = np.dtype([("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")])
+PLY_ROW = [("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")]
+PCD_ROW = [("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")]
+INTENSITY = [("intensity", "<f4")]
+"""Last of a row, where intensities are known."""
 HEADER_BYTES = 512
 """Room for a header, which is written last: it tells the number of points."""
 LAS_SCALE_M = 0.001
@@ -29,16 +31,20 @@ ASPRS_OF_LABEL = {
 
 
 class PlyCloud:
-    """Binary PLY: x y z in float32 metres, red green blue, label (SemanticKITTI's learning id)."""
+    """Binary PLY: x y z in float32 metres, red green blue, label (SemanticKITTI's learning id), intensity if known."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._stream = _begin(file)
+        self._more = [] if extent.brightest is None else INTENSITY
+        self._row = np.dtype([*PLY_ROW, *self._more])
         self._num_points = 0
 
     def add(self, part: Part) -> None:
         """Append the points of a part."""
-        rows = np.empty(len(part.points), ROW)
+        rows = np.empty(len(part.points), self._row)
         rows["xyz"], rows["rgb"], rows["label"] = part.points, part.colors, part.labels
+        for name, _ in self._more:
+            rows[name] = part.intensities
         rows.tofile(self._stream)
         self._num_points += len(rows)
 
@@ -50,33 +56,39 @@ class PlyCloud:
             f"element vertex {self._num_points}",
             *(f"property float {name}" for name in "xyz"),
             *(f"property uchar {name}" for name in ("red", "green", "blue", "label")),
+            *(f"property float {name}" for name, _ in self._more),
         ]
         _end(self._stream, lines, filler="comment", last="end_header")
 
 
 class PcdCloud:
-    """Binary PCD 0.7: x y z in float32 metres, rgb as PCL packs it, label."""
+    """Binary PCD 0.7: x y z in float32 metres, rgb as PCL packs it, label, intensity if known."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._stream = _begin(file)
+        self._more = [] if extent.brightest is None else INTENSITY
+        self._row = np.dtype([*PCD_ROW, *self._more])
         self._num_points = 0
 
     def add(self, part: Part) -> None:
         """Append the points of a part."""
-        rows = np.zeros(len(part.points), PCD_ROW)
+        rows = np.zeros(len(part.points), self._row)
         rows["xyz"], rows["label"] = part.points, part.labels
         rows["bgra"][:, :3] = part.colors[:, ::-1]
+        for name, _ in self._more:
+            rows[name] = part.intensities
         rows.tofile(self._stream)
         self._num_points += len(rows)
 
     def close(self) -> None:
         """Complete the file."""
+        names = ["x", "y", "z", "rgb", "label", *(name for name, _ in self._more)]
         lines = [
             "VERSION 0.7",
-            "FIELDS x y z rgb label",
-            "SIZE 4 4 4 4 4",
-            "TYPE F F F F U",
-            "COUNT 1 1 1 1 1",
+            f"FIELDS {' '.join(names)}",
+            f"SIZE{' 4' * len(names)}",
+            f"TYPE {' '.join('U' if name == 'label' else 'F' for name in names)}",
+            f"COUNT{' 1' * len(names)}",
             f"WIDTH {self._num_points}",
             "HEIGHT 1",
             "VIEWPOINT 0 0 0 1 0 0 0",
@@ -88,7 +100,7 @@ class PcdCloud:
 class LasCloud:
     """LAS 1.4, point format 7, compressed where the name ends in .laz: millimetres, colours, classes of ASPRS.
 
-    `user_data` holds the label (SemanticKITTI's learning id).
+    `user_data` holds the label (SemanticKITTI's learning id); intensities are spread over 16 bits, as LAS asks.
     """
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
@@ -97,6 +109,7 @@ class LasCloud:
         self._laspy = laspy
         header = laspy.LasHeader(version="1.4", point_format=7)
         header.scales = np.full(3, LAS_SCALE_M)
+        self._intensity_step = None if extent.brightest is None else (extent.brightest or 1.0) / 65535
         self._writer = laspy.open(file, mode="w", header=header)
         self._class_of_label = np.array([ASPRS_OF_LABEL.get(label, 1) for label in Label], np.uint8)
 
@@ -106,6 +119,8 @@ class LasCloud:
         record.x, record.y, record.z = part.points.astype(np.float64).T
         record.red, record.green, record.blue = 257 * part.colors.astype(np.uint16).T  # 255 to 65535
         record.classification, record.user_data = self._class_of_label[part.labels], part.labels
+        if self._intensity_step is not None:
+            record.intensity = np.rint(part.intensities / self._intensity_step).astype(np.uint16)
         self._writer.write_points(record)
 
     def close(self) -> None:

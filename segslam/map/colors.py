@@ -1,9 +1,8 @@
-"""Colours of a map: of classes, or of heights."""
-
-from collections.abc import Callable
+"""Colours of a map: of classes, heights or intensities."""
 
 import matplotlib
 import numpy as np
+from jaxtyping import UInt8
 
 from segslam.types import Label, Labels, Vector
 
@@ -31,24 +30,18 @@ COLORS = {
 }
 """Of what a map keeps; own choice, kinds of ground in violet and green, vehicles in blue."""
 
-Colors = np.ndarray
-"""(n, 3) uint8: red, green, blue."""
-Painter = Callable[[Labels, Vector], Colors]
-"""Labels and heights (m) -> colours."""
+Colors = UInt8[np.ndarray, "_ 3"]
+"""Red, green, blue."""
 
 
-def by_class(labels: Labels, _: Vector) -> Colors:
+def of_classes(labels: Labels) -> Colors:
     """The colour of each label's class."""
     table = np.array([list(bytes.fromhex(COLORS.get(label, "#000000")[1:])) for label in Label], np.uint8)
     return table[labels]
 
 
-def by_height(low_m: float, high_m: float) -> Painter:
-    """Colours from dark blue at `low_m` and below to yellow at `high_m` and above."""
-    table = (255 * matplotlib.colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
-
-    def paint(_: Labels, heights: Vector) -> Colors:
-        share = np.clip((heights - low_m) / max(high_m - low_m, 1e-9), 0.0, 1.0)
-        return table[(share * (len(table) - 1)).astype(np.int64)]
-
-    return paint
+def of_numbers(values: Vector, *, low: float, high: float, colormap: str) -> Colors:
+    """Colours from the colour map's first at `low` and below to its last at `high` and above."""
+    table = (255 * matplotlib.colormaps[colormap](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+    share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
+    return table[(share * (len(table) - 1)).astype(np.int64)]

@@ -13,7 +13,7 @@ from segslam.map.part import Extent, Part
 from segslam.map.tiles import Tile, Tiles, corner, distance_m
 from segslam.map.views import Views
 from segslam.points import within_range
-from segslam.types import Keyframe, Label, Transform
+from segslam.types import Keyframe, Label, Labels, SegslamError, Transform, Vector
 
 
 class Gathered:
@@ -26,6 +26,7 @@ class Gathered:
         self._views = Views(scratch / "views", spread_m=config.voxel_m)
         self._T_keyframe_world: list[Transform] = []
         self._places: list[np.ndarray] = []
+        self._has_intensities = True
         self.num_moving_points = 0
         self.num_voxels_seen_through = 0
 
@@ -40,13 +41,22 @@ class Gathered:
         return len(self._tiles)
 
     def add(self, keyframe: Keyframe, T_world_keyframe: Transform) -> None:
-        """Take in a keyframe: its points near enough that no class says to move, and all of its view."""
+        """Take in a keyframe: its points near enough that no class says to move, and all of its view.
+
+        Raises SegslamError if it has no intensities and the colours are to show them.
+        """
+        if keyframe.intensities is None and self._config.color == "intensity":
+            raise SegslamError(
+                f"map.color=intensity: keyframe {keyframe.id} has none; a run keeps them if it is mapped with `--set "
+                "map.color=intensity` from data that has them; or take map.color=class or height"
+            )
+        self._has_intensities &= keyframe.intensities is not None
         moves = keyframe.labels >= Label.MOVING_CAR
         kept = within_range(keyframe.points, 0.0, self._config.max_range_m) & ~moves
         self.num_moving_points += int(moves.sum())
-        self._tiles.add(
-            geometry.apply(T_world_keyframe, keyframe.points[kept].astype(np.float64)), keyframe.labels[kept]
-        )
+        intensities = np.zeros(len(kept)) if keyframe.intensities is None else keyframe.intensities
+        points = geometry.apply(T_world_keyframe, keyframe.points[kept].astype(np.float64))
+        self._tiles.add(points, keyframe.labels[kept], intensities[kept])
         self._views.add(keyframe.points)
         self._T_keyframe_world.append(geometry.inverse(T_world_keyframe))
         self._places.append(T_world_keyframe[:3, 3])
@@ -57,19 +67,30 @@ class Gathered:
         if not tiles:
             return None
         (west, south), (east, north) = np.min(tiles, axis=0).tolist(), np.max(tiles, axis=0).tolist()
-        return Extent(west=west, east=east, south=south, north=north)
+        brightest = self._tiles.brightest if self._has_intensities else None
+        return Extent(west=west, east=east, south=south, north=north, brightest=brightest)
 
     def parts(self) -> Iterator[Part]:
         """The clean voxels of each tile, in the order that `MapFile` names."""
-        tiles = list(self._tiles)
-        paint = colors.by_class if self._config.color == "class" else colors.by_height(*self._tiles.height_span_m())
-        for tile in tiles:
+        for tile in self._tiles:
             voxels = self._tiles.voxels(tile)
-            points, labels = voxels["point"], voxels["label"]
-            gone = moved(points, labels, self._views_of(tile), config=self._config)
+            gone = moved(voxels["point"], voxels["label"], self._views_of(tile), config=self._config)
             self.num_voxels_seen_through += int(gone.sum())
-            world = points[~gone] + corner(tile)
-            yield Part(tile, world, labels[~gone], paint(labels[~gone], world[:, 2]))
+            kept = voxels[~gone]
+            world = kept["point"] + corner(tile)
+            paint = self._colors(kept["label"], world[:, 2], kept["intensity"])
+            yield Part(tile, world, kept["label"], kept["intensity"], paint)
+
+    def _colors(self, labels: Labels, heights: Vector, intensities: Vector) -> colors.Colors:
+        match self._config.color:
+            case "class":
+                return colors.of_classes(labels)
+            case "height":
+                low, high = self._tiles.height_span_m()
+                return colors.of_numbers(heights, low=low, high=high, colormap="viridis")
+            case "intensity":
+                low, high = self._tiles.intensity_span()
+                return colors.of_numbers(intensities, low=low, high=high, colormap="gray")
 
     def _views_of(self, tile: Tile) -> Iterator[tuple[np.ndarray, Transform]]:
         """What each keyframe near a tile saw, and T_keyframe_tile."""

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
 from segslam.config import MapConfig
+from segslam.map.colors import Colors
 from segslam.map.tiles import Tile
-from segslam.types import Labels, Points
+from segslam.types import Labels, Points, Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +18,8 @@ class Extent:
     east: int
     south: int
     north: int
+    brightest: float | None = None
+    """No voxel's intensity is above it; None if intensities are not known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,8 +29,9 @@ class Part:
     tile: Tile
     points: Points
     labels: Labels
-    colors: np.ndarray
-    """(n, 3) uint8: red, green, blue."""
+    intensities: Vector
+    """Means of the sensor's own numbers; 0 if they are not known."""
+    colors: Colors
 
 
 class MapFile(Protocol):

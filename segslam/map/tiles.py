@@ -10,14 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
+from segslam.map.histogram import Histogram
 from segslam.map.voxels import MAX_HEIGHT_M, VOXEL, merged
-from segslam.types import Indices, Labels, Points
+from segslam.types import Indices, Labels, Points, Vector
 
 TILE_M = 32.0
 """Chosen: some 100,000 voxels of 0.2 m in a street."""
 GATHERED = 1_000_000
 """Points that are merged before they go to disk, and voxels that are read at once."""
-HEIGHT_STEP_M = 0.5
+HEIGHTS_M = np.arange(-MAX_HEIGHT_M, MAX_HEIGHT_M + 0.5, 0.5)
+INTENSITIES = np.append(0.0, 2.0 ** np.arange(-10.0, 16.1, 0.125))
+"""Steps of 9 %, from a thousandth of 1 to the most that 16 bits hold: sensors have scales of their own."""
+SHARES = 0.01, 0.99
+"""Of the voxels, between which the colours differ: a few outliers do not take them all."""
 
 Tile = tuple[int, int]
 """Column (along x) and row (along y)."""
@@ -31,15 +36,17 @@ class Tiles:
         folder.mkdir()
         self._folder = folder
         self._voxel_m = voxel_m
-        self._gathered: list[tuple[Points, Labels]] = []
+        self._gathered: list[tuple[Points, Labels, Vector]] = []
         self._num_gathered = 0
         self._known: set[Tile] = set()
-        self._heights = np.zeros(round(2 * MAX_HEIGHT_M / HEIGHT_STEP_M), np.int64)
+        self._heights, self._intensities = Histogram(HEIGHTS_M), Histogram(INTENSITIES)
+        self.brightest = 0.0
+        """No voxel's intensity is above it."""
 
-    def add(self, points: Points, labels: Labels) -> None:
+    def add(self, points: Points, labels: Labels, intensities: Vector) -> None:
         """Points of the world, float64 rows in metres; those more than 2 km above or below its origin are left out."""
         near = np.abs(points[:, 2]) < MAX_HEIGHT_M
-        self._gathered.append((points[near], labels[near]))
+        self._gathered.append((points[near], labels[near], intensities[near]))
         self._num_gathered += int(near.sum())
         if self._num_gathered >= GATHERED:
             self.flush()
@@ -48,13 +55,13 @@ class Tiles:
         """Write what is gathered."""
         if not self._num_gathered:
             return
-        points, labels = (np.concatenate(parts) for parts in zip(*self._gathered, strict=True))
+        points, labels, intensities = (np.concatenate(parts) for parts in zip(*self._gathered, strict=True))
         self._gathered, self._num_gathered = [], 0
         tiles = np.floor(points[:, :2] / TILE_M).astype(np.int64)
         for tile, rows in _groups(tiles):
             voxels = np.zeros(len(rows), VOXEL)
             voxels["point"] = points[rows] - corner(tile)
-            voxels["count"], voxels["label"] = 1, labels[rows]
+            voxels["count"], voxels["label"], voxels["intensity"] = 1, labels[rows], intensities[rows]
             self._append(tile, merged(voxels, self._voxel_m))
 
     def __len__(self) -> int:
@@ -76,13 +83,16 @@ class Tiles:
 
     def height_span_m(self) -> tuple[float, float]:
         """Heights that 1 and 99 % of the voxels written lie below, to half a metre."""
-        shares = np.cumsum(self._heights) / max(self._heights.sum(), 1)
-        low, high = np.searchsorted(shares, (0.01, 0.99)).tolist()
-        return low * HEIGHT_STEP_M - MAX_HEIGHT_M, (high + 1) * HEIGHT_STEP_M - MAX_HEIGHT_M
+        return self._heights.span(*SHARES)
+
+    def intensity_span(self) -> tuple[float, float]:
+        """Intensities that 1 and 99 % of the voxels written have less than, to 9 %."""
+        return self._intensities.span(*SHARES)
 
     def _append(self, tile: Tile, voxels: np.ndarray) -> None:
-        steps = ((voxels["point"][:, 2] + MAX_HEIGHT_M) / HEIGHT_STEP_M).astype(np.int64)
-        self._heights += np.bincount(steps, minlength=len(self._heights))
+        self._heights.add(voxels["point"][:, 2])
+        self._intensities.add(voxels["intensity"])
+        self.brightest = max(self.brightest, float(voxels["intensity"].max()))
         self._known.add(tile)
         with self._file(tile).open("ab") as stream:
             voxels.tofile(stream)

@@ -1,11 +1,11 @@
-"""Voxels of one tile: a mean point, how many points it stands for, and the class that most of them have."""
+"""Voxels of one tile: a mean point and intensity, how many points they stand for, and the class of most of them."""
 
 import numpy as np
 
 from segslam.points import hash_keys
 from segslam.types import Indices
 
-VOXEL = np.dtype([("point", "<f4", 3), ("count", "<u4"), ("label", "u1")])
+VOXEL = np.dtype([("point", "<f4", 3), ("count", "<u4"), ("label", "u1"), ("intensity", "<f4")])
 """`point` in metres: x and y from the tile's corner, z of the world."""
 NUM_LABELS = 32
 """More than there are classes."""
@@ -24,9 +24,9 @@ def merged(voxels: np.ndarray, voxel_m: float) -> np.ndarray:
     result = np.zeros(num_cells, VOXEL)
     weights = voxels["count"].astype(np.float64)
     counts = np.bincount(cells, weights, minlength=num_cells)
-    for axis in range(3):
-        sums = np.bincount(cells, weights * voxels["point"][:, axis], minlength=num_cells)
-        result["point"][:, axis] = sums / np.maximum(counts, 1)
+    means = [*result["point"].T, result["intensity"]]
+    for mean, values in zip(means, [*voxels["point"].T, voxels["intensity"]], strict=True):
+        mean[:] = np.bincount(cells, weights * values, minlength=num_cells) / np.maximum(counts, 1)
     result["count"] = counts
     result["label"] = _commonest_labels(cells, voxels["label"], weights)
     return result

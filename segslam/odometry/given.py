@@ -31,9 +31,9 @@ class GivenOdometry:
         T_given_lidar = self._trajectory.T_world_lidar[self._row(scan)]
         T_given_first = T_given_lidar if self._T_given_first is None else self._T_given_first
         T_odom_lidar = geometry.inverse(T_given_first) @ T_given_lidar
-        points, labels = prepare(scan, geometry.inverse(self._T_odom_last) @ T_odom_lidar, self._config)
+        points, labels, intensities = prepare(scan, geometry.inverse(self._T_odom_last) @ T_odom_lidar, self._config)
         self._T_given_first, self._T_odom_last = T_given_first, T_odom_lidar
-        return OdometryResult(T_odom_lidar, points.astype(np.float32), labels)
+        return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
     def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
         """Go on after the scans that were given these poses; the first of them is read, with `scan_of`."""

@@ -25,9 +25,9 @@ class KissOdometry:
 
         Raises BadScan, and forgets the scan, if none of its points is within range.
         """
-        points, labels = prepare(scan, self._kiss.last_delta, self._config)
+        points, labels, intensities = prepare(scan, self._kiss.last_delta, self._config)
         self._kiss.register_frame(points, np.empty(0))
-        return OdometryResult(np.array(self._kiss.last_pose), points.astype(np.float32), labels)
+        return OdometryResult(np.array(self._kiss.last_pose), points.astype(np.float32), labels, intensities)
 
     def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
         """The state, to the bit, that registering the scans of these poses has left. `scan_of` reads the scan of a row.
@@ -41,7 +41,7 @@ class KissOdometry:
         first = forgotten[-1] + 1 if len(forgotten) else 0
         for row, T_odom_now in enumerate(T_odom_lidar):
             if row >= first:
-                points, _ = prepare(scan_of(row), kiss.last_delta, self._config)
+                points, *_ = prepare(scan_of(row), kiss.last_delta, self._config)
                 kiss.local_map.update(kiss.voxelize(points)[1], T_odom_now)
             T_odom_predicted = kiss.last_pose @ kiss.last_delta
             kiss.adaptive_threshold.update_model_deviation(np.linalg.inv(T_odom_predicted) @ T_odom_now)

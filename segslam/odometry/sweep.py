@@ -10,7 +10,7 @@ from kiss_icp.preprocess import Preprocessor
 from segslam.config import OdometryConfig
 from segslam.points import within_range
 from segslam.trajectory import Poses
-from segslam.types import BadScan, Labels, Points, Scan, Transform
+from segslam.types import BadScan, Labels, Points, Scan, Transform, Vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,6 +23,8 @@ class OdometryResult:
     """In the LiDAR's frame at the sweep's end, motion-compensated where the scan has times, within range, float32."""
     labels: Labels
     """A row for each point."""
+    intensities: Vector | None = None
+    """The same, where the scan has them."""
 
 
 @runtime_checkable
@@ -38,8 +40,8 @@ class Odometry(Protocol):
         ...
 
 
-def prepare(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> tuple[Points, Labels]:
-    """The points (float64) as at the sweep's end, those within range, and their labels.
+def prepare(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> tuple[Points, Labels, Vector | None]:
+    """The points (float64) as at the sweep's end, those within range, their labels and, where known, intensities.
 
     The crop comes after the motion compensation, as in KISS-ICP, which would crop without the labels:
     it is handed what this leaves.
@@ -51,7 +53,8 @@ def prepare(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> tupl
             f"scan {scan.index}: none of its {len(kept)} points lies between {config.min_range_m} and "
             f"{config.max_range_m} m; leave the scan out or change odometry.min_range_m, odometry.max_range_m"
         )
-    return np.ascontiguousarray(points[kept]), scan.labels[kept]
+    intensities = None if scan.intensities is None else scan.intensities[kept]
+    return np.ascontiguousarray(points[kept]), scan.labels[kept], intensities
 
 
 def _at_sweep_end(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> Points:

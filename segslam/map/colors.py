@@ -40,8 +40,9 @@ def of_classes(labels: Labels) -> Colors:
     return table[labels]
 
 
-def of_numbers(values: Vector, *, low: float, high: float, colormap: str) -> Colors:
-    """Colours from the colour map's first at `low` and below to its last at `high` and above."""
-    table = (255 * matplotlib.colormaps[colormap](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:
+    """Colours from dark violet at the span's start and below to yellow at its end and above."""
+    low, high = span
+    table = (255 * matplotlib.colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
     share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
     return table[(share * (len(table) - 1)).astype(np.int64)]

@@ -86,11 +86,9 @@ class Gathered:
             case "class":
                 return colors.of_classes(labels)
             case "height":
-                low, high = self._tiles.height_span_m()
-                return colors.of_numbers(heights, low=low, high=high, colormap="viridis")
+                return colors.of_numbers(heights, span=self._tiles.height_span_m())
             case "intensity":
-                low, high = self._tiles.intensity_span()
-                return colors.of_numbers(intensities, low=low, high=high, colormap="gray")
+                return colors.of_numbers(intensities, span=self._tiles.intensity_span())
 
     def _views_of(self, tile: Tile) -> Iterator[tuple[np.ndarray, Transform]]:
         """What each keyframe near a tile saw, and T_keyframe_tile."""

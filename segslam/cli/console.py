@@ -1,6 +1,7 @@
 """What all commands share: options, progress on standard error, one JSON object on standard output."""
 
 import json
+import logging
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -9,10 +10,26 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
+from segslam.cli.warn import FirstOfEachKind
+
 Item = TypeVar("Item")
 
+
+def _without_warnings(quiet: bool) -> bool:
+    """What `--quiet` says; if it does, no warning is told from now on."""
+    for handler in logging.getLogger().handlers:
+        if quiet and isinstance(handler, FirstOfEachKind):
+            handler.setLevel(logging.ERROR)
+    return quiet
+
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
+QuietOption = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", callback=_without_warnings, help="Nothing on standard error but what ends the command."
+    ),
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="YAML file with the settings that differ.")]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", help="One setting, as section.key=value; may be repeated.")

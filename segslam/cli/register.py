@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from segslam.cli.console import ConfigOption, EncodingOption, JsonOption, SetOption, print_json, say
+from segslam.cli.console import (
+    ConfigOption,
+    EncodingOption,
+    JsonOption,
+    QuietOption,
+    SetOption,
+    print_json,
+    say,
+)
 from segslam.experiments.settings import METHOD_NAMES
 
 if TYPE_CHECKING:
@@ -51,6 +59,7 @@ def register(
     config: ConfigOption = None,
     settings: SetOption = None,
     json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Align two scans with no initial guess.
 
@@ -72,7 +81,7 @@ def register(
             parts = prepare(points, classes, methods=[method], config=settings_now)
         scans.append({part: made.value for part, made in parts.items()})
     found = chosen.align(scans[0], scans[1], settings_now, watch)
-    _show(_figures(found, watch), json=json)
+    _show(_figures(found, watch), json=json, quiet=quiet)
 
 
 def _read(
@@ -133,18 +142,18 @@ def _figures(found: "Estimate | Rejected", watch: "Stopwatch") -> dict[str, Any]
     return answer | told | {"seconds": watch.seconds}
 
 
-def _show(figures: dict[str, Any], *, json: bool) -> None:
+def _show(figures: dict[str, Any], *, json: bool, quiet: bool) -> None:
     import numpy as np
 
     if json:
         print_json(figures)
         return
     if not figures["accepted"]:
-        say(f"rejected: {figures['reason']} ({figures['detail']})")
+        say(f"rejected: {figures['reason']} ({figures['detail']})", quiet=quiet)
         return
     rows = np.array(figures["T_target_source"]).reshape(4, 4)
     print("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
     overlap = "" if figures["overlap"] is None else f", overlap {figures['overlap']:.2f}"
     times = ", ".join(f"{stage} {1000 * seconds:.0f} ms" for stage, seconds in figures["seconds"].items())
     inliers = "" if figures["num_inliers"] is None else f"{figures['num_inliers']} inliers{overlap}; "
-    say(f"{inliers}{times}")
+    say(f"{inliers}{times}", quiet=quiet)

@@ -5,11 +5,13 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.console import QuietOption, say
+from segslam.cli.console import JsonOption, QuietOption, print_json, say
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Run folder; report.html is written there.")], quiet: QuietOption = False
+    run: Annotated[Path, typer.Argument(help="Run folder; report.html is written there.")],
+    json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Draw a run: one HTML page with plots and tables.
 
@@ -17,4 +19,8 @@ def report(
     """
     from segslam.report import write_report
 
-    say(f"report in {write_report(run)}", quiet=quiet)
+    page = write_report(run)
+    if json:
+        print_json({"report": str(page)})
+    else:
+        say(f"report in {page}", quiet=quiet)

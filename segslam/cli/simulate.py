@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.console import QuietOption, progress, say
+from segslam.cli.console import JsonOption, QuietOption, print_json, progress, say
 from segslam.interrupts import interrupts_wait
 
 
@@ -31,6 +31,7 @@ def simulate(
         int | None, typer.Option(min=1, help="Of so many pairs of each list: those of bench's --sample with --seed 0.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a sequence that was simulated here.")] = False,
+    json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate a labelled drive in KITTI's format, with exact poses.
@@ -57,7 +58,11 @@ def simulate(
     except KeyboardInterrupt:
         say(f"stopped: {last} scans are complete in {out / 'sequences' / sequence}", quiet=quiet)
         raise typer.Exit(130) from None
-    say(f"{last} scans in {out / 'sequences' / sequence}, true poses in {out / 'poses' / sequence}.txt", quiet=quiet)
+    folder, true_poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
+    if json:
+        print_json({"num_scans": last, "sequence": str(folder), "poses": str(true_poses)})
+    else:
+        say(f"{last} scans in {folder}, true poses in {true_poses}", quiet=quiet)
 
 
 def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from segslam.cli.console import QuietOption, progress, say
+from segslam.cli.console import JsonOption, QuietOption, print_json, progress, say
 
 if TYPE_CHECKING:
     from segslam.viewer import Scene
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 def view(
     run: Annotated[Path, typer.Argument(help="Run folder, finished or not.")],
     save: Annotated[Path | None, typer.Option(help="Write a .rrd file for Rerun in place of opening it.")] = None,
+    json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Open a run in Rerun's viewer: trajectory, clouds and loops, step by step.
@@ -25,10 +26,15 @@ def view(
 
     log = read_log(run / LOG)
     scene = open_scene(save, view_every=log.config.log.view_every)
+    num_steps = 0
     for step in progress(log.steps(), total=log.num_steps(), title="view", quiet=quiet):
         scene.add(step)
+        num_steps += 1
     scene.end()
-    say(f"written to {save}" if save else "all steps are in the viewer", quiet=quiet)
+    if json:
+        print_json({"num_steps": num_steps, "file": str(save) if save else None})
+    else:
+        say(f"written to {save}" if save else "all steps are in the viewer", quiet=quiet)
 
 
 def open_scene(save: Path | None, *, view_every: int) -> "Scene":

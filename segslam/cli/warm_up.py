@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from segslam.cli.console import QuietOption, say
+from segslam.cli.console import JsonOption, QuietOption, print_json, say
 
 if TYPE_CHECKING:
     from segslam.types import Points
@@ -11,7 +11,7 @@ NUM_POLES = 16
 SIGHT_M = 30.0
 
 
-def warm_up(quiet: QuietOption = False) -> None:
+def warm_up(json: JsonOption = False, quiet: QuietOption = False) -> None:
     """Compile what is compiled on first use, so that the first run does not wait for it: after installing, in an image.
 
     Compiled code is kept beside the package, or in NUMBA_CACHE_DIR where that cannot be written.
@@ -32,7 +32,11 @@ def warm_up(quiet: QuietOption = False) -> None:
         points = _street_seen_from(0.5 * index)
         slam.process(Scan(index, index * 100_000_000, points, np.zeros(len(points), np.uint8)))
     result = slam.finish()
-    say(f"ready in {perf_counter() - started:.1f} s; {len(result.attempts)} loops were tried", quiet=quiet)
+    seconds, num_tried = perf_counter() - started, len(result.attempts)
+    if json:
+        print_json({"seconds": seconds, "num_loops_tried": num_tried})
+    else:
+        say(f"ready in {seconds:.1f} s; {num_tried} loops were tried", quiet=quiet)
 
 
 def _street_seen_from(x: float) -> "Points":

@@ -57,7 +57,9 @@ class OdometryConfig(Section):
     min_range_m: float = Field(3.0, ge=0, description="points nearer than this are dropped: the car's own roof (m)")
     voxel_size_m: float = Field(1.0, gt=0, description="edge of the local map's voxels (m)")
     deskew: bool = Field(True, description="compensate the motion within a sweep, where points carry times")
-    max_num_threads: int = Field(1, ge=0, description="of KISS-ICP, for the process; 0: all; 1 repeats to the bit")
+    max_num_threads: int = Field(
+        0, ge=0, description="of KISS-ICP, for the process; 0: all, poses repeat to 1e-9 m; 1: to the bit"
+    )
     stamp_tolerance_s: float = Field(0.01, ge=0, description="a given pose this near in time is the scan's (s)")
 
 

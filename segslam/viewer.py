@@ -2,13 +2,28 @@
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from segslam import geometry
-from segslam.log.drawing import ACCEPTED_COLOR, REJECTED_COLORS
-from segslam.types import BadScan, GraphEstimate, Keyframe, LoopAttempt, Rejected, Step, Transform
+from segslam.log.drawing import ACCEPTED_COLOR, PATH_GROWTH, REJECTED_COLORS
+from segslam.map.colors import COLORS
+from segslam.types import BadScan, GraphEstimate, Keyframe, Label, LoopAttempt, Rejected, Step, Transform
 
-WORLD, LIDAR = "world", "world/lidar"
-CORRECTED_COLOR, ODOMETRY_COLOR = "#00a0ff", "#ff9000"
+WORLD, LIDAR, TIMES = "world", "world/lidar", "stage_ms"
+CORRECTED_COLOR, ODOMETRY_COLOR, MOVING_COLOR = "#00a0ff", "#ff9000", "#ff2a2a"
+STAGE_COLORS = {
+    "odometry": "#ff9000",
+    "keyframe": "#3fa9f5",
+    "propose": "#9a9a9a",
+    "prepare": "#b07cf0",
+    "match": "#f2d03b",
+    "refine": "#43c6a0",
+    "verify": "#e85a9b",
+    "optimize": "#ff4f3f",
+}
+"""Those that the viewer gives by itself may be alike."""
+SCANS_TIMED = 300
+"""How far back from the scan looked at the times are drawn: the first is often the longest by far."""
 
 
 class Scene:
@@ -21,7 +36,15 @@ class Scene:
         self._T_odom_keyframe: list[Transform] = []
         self._T_world_keyframe: list[Transform] = []
         self._T_world_odom = np.eye(4)
+        self._num_on_paths = 0
+        viewer.send_blueprint(_layout())
         viewer.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        classes = [
+            rr.AnnotationInfo(label, label.name.lower(), _rgb(COLORS.get(label, MOVING_COLOR))) for label in Label
+        ]
+        viewer.log(WORLD, rr.AnnotationContext(classes), static=True)
+        for stage, color in STAGE_COLORS.items():
+            viewer.log(f"{TIMES}/{stage}", rr.SeriesLines(colors=[_rgb(color)], names=[stage]), static=True)
 
     def add(self, step: Step | BadScan) -> None:
         """Show a step; a bad scan has nothing to show."""
@@ -37,7 +60,7 @@ class Scene:
         for attempt in step.attempts:
             self._add_attempt(attempt)
         for stage, seconds in step.stage_seconds.items():
-            self._viewer.log(f"stage_ms/{stage}", rr.Scalars(1000 * seconds))
+            self._viewer.log(f"{TIMES}/{stage}", rr.Scalars(1000 * seconds))
 
     def end(self) -> None:
         """Draw the last of the paths, and wait until the viewer has all."""
@@ -46,6 +69,7 @@ class Scene:
 
     def _draw_paths(self) -> None:
         """Both paths through the keyframes so far."""
+        self._num_on_paths = len(self._T_odom_keyframe)
         for name, poses, color in (
             ("trajectory", self._T_world_keyframe, CORRECTED_COLOR),
             ("odometry", self._T_odom_keyframe, ODOMETRY_COLOR),
@@ -60,6 +84,8 @@ class Scene:
         some = slice(None, None, self._view_every)
         self._viewer.log(entity, rr.Points3D(keyframe.points[some], class_ids=keyframe.labels[some], radii=0.05))
         self._viewer.log(entity, _pose(self._T_world_keyframe[-1]))
+        if len(self._T_odom_keyframe) >= PATH_GROWTH * self._num_on_paths:
+            self._draw_paths()
 
     def _correct(self, estimate: GraphEstimate) -> None:
         """Move the clouds to where the graph has their keyframes now."""
@@ -80,6 +106,15 @@ class Scene:
             f"{WORLD}/loops/{'rejected' if rejected else 'accepted'}/{ids[0]}-{ids[1]}",
             rr.LineStrips3D([ends], colors=[_rgb(color)], labels=[told], show_labels=False),
         )
+
+
+def _layout() -> rrb.Blueprint:
+    """The world, and beneath it how long each stage took."""
+    now = rrb.TimeRangeBoundary.cursor_relative(seq=0)
+    lately = rrb.VisibleTimeRange("scan", start=rrb.TimeRangeBoundary.cursor_relative(seq=-SCANS_TIMED), end=now)
+    world = rrb.Spatial3DView(origin=WORLD, name="world")
+    times = rrb.TimeSeriesView(origin=TIMES, name="milliseconds by stage", time_ranges=[lately])
+    return rrb.Blueprint(rrb.Vertical(world, times, row_shares=[4, 1]), collapse_panels=True)
 
 
 def _pose(T_world_child: Transform) -> rr.Transform3D:

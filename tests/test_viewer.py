@@ -1,5 +1,6 @@
 """What a viewer is given of a run; and that its absence is told."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -43,6 +44,22 @@ def test_mapping_can_be_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     write_kitti_sequence(tmp_path, num_scans=4)
     assert run("map", tmp_path, "--frames", "0:4", "--out", tmp_path / "run", "--view", "--quiet") == 0
     assert {f"/world/keyframes/{number}" for number in range(4)} <= _entities(tmp_path / "run.rrd")
+
+
+def test_the_viewer_is_found_beside_python_though_not_on_the_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And where it does not start, the first line of its complaint is told."""
+
+    def spawn(_: RecordingStream) -> None:
+        raise RuntimeError(f"found {shutil.which('rerun')}\nand how to install it, in many lines")
+
+    write_log(tmp_path / "log.mcap", [])
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(RecordingStream, "spawn", spawn)
+    assert run("view", tmp_path) == 2
+    (message,) = capsys.readouterr().err.splitlines()
+    assert f"found {Path(sys.executable).parent}" in message
 
 
 def _entities(file: Path) -> set[str]:

@@ -1,5 +1,7 @@
 """`segslam view`."""
 
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -52,9 +54,19 @@ def open_scene(save: Path | None, *, view_every: int) -> "Scene":
     viewer = rerun.RecordingStream("segslam")
     try:
         if save is None:
+            _help_the_viewer()
             viewer.spawn()
         else:
             viewer.save(save)
     except (OSError, RuntimeError) as error:
-        raise SegslamError(f"{save or 'the viewer'}: cannot be opened ({error}); --save FILE.rrd needs none") from error
+        reason = str(error).partition("\n")[0]
+        raise SegslamError(
+            f"{save or 'the viewer'}: cannot be opened ({reason}); --save FILE.rrd needs none"
+        ) from error
     return Scene(viewer, view_every=view_every)
+
+
+def _help_the_viewer() -> None:
+    """Have it found where Python is, which need not be on the path, and keep it from telling of all that it does."""
+    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+    os.environ.setdefault("RUST_LOG", "error")

@@ -250,11 +250,11 @@ class VerifyConfig(Section):
 class GraphConfig(Section):
     """What odometry and closures are believed to err by, and how their graph is solved."""
 
-    odometry_sigma_m: float = Field(0.04, gt=0, description="odometry's translation noise per metre^0.5 travelled")
-    odometry_sigma_deg: float = Field(0.05, gt=0, description="odometry's rotation noise per metre^0.5 travelled")
+    odometry_sigma_m: float = Field(0.01, gt=0, description="odometry's translation noise per metre^0.5 travelled")
+    odometry_sigma_deg: float = Field(0.02, gt=0, description="odometry's rotation noise per metre^0.5 travelled")
     turn_m: float = Field(5.0, ge=0, description="a turn of one radian adds as much noise as this travel (m)")
-    closure_sigma_m: float = Field(0.10, gt=0, description="least translation noise of a closure (m)")
-    closure_sigma_deg: float = Field(0.20, gt=0, description="least rotation noise of a closure (degrees)")
+    closure_sigma_m: float = Field(0.04, gt=0, description="least translation noise of a closure (m)")
+    closure_sigma_deg: float = Field(0.08, gt=0, description="least rotation noise of a closure (degrees)")
     robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = Field(
         "cauchy", description="kernel of the closures while running"
     )
@@ -263,6 +263,11 @@ class GraphConfig(Section):
     )
     inlier_probability: float = Field(
         0.99, gt=0, lt=1, description="the truncated ones keep closures within this chi-square quantile"
+    )
+    error_allowance: float = Field(
+        3.0,
+        ge=1,
+        description="of errors this many times as large as claimed: not every odometry is as good as KISS-ICP's",
     )
     systematic_drift: Literal["auto", "never"] = Field(
         "auto", description="turn back what a leftover vertical angle bent, where held-out scans show it"

@@ -1,7 +1,7 @@
-"""What registrations claim of their error, held against the truth; the calibration itself is on other drives."""
+"""What registrations and odometry claim of their error, held against the truth; calibrated on other drives."""
 
 from functools import cache
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -10,8 +10,20 @@ from drives import NUM_SCANS, RADIUS_M, STEP_M
 from segslam import geometry
 from segslam.alignment import PreparedScan, align, prepare_scan, register
 from segslam.config import Config
-from segslam.simulation import SensorConfig, WorldConfig, build_world, make_sensor, sweep, sweep_errors
-from segslam.types import Alignment, Registration
+from segslam.keyframes import KeyframeSelector
+from segslam.odometry import KissOdometry
+from segslam.pose_graph.noise import closure_information, odometry_information
+from segslam.simulation import (
+    SensorConfig,
+    SimulationConfig,
+    WorldConfig,
+    build_world,
+    make_sensor,
+    simulate_drive,
+    sweep,
+    sweep_errors,
+)
+from segslam.types import Alignment, Information, Transform
 
 CONFIG = Config()
 CHI2_95 = 12.592
@@ -51,9 +63,9 @@ def _pairs() -> list[tuple[Alignment, np.ndarray]]:
     return found
 
 
-def _squared(registration: Registration, T_true: np.ndarray) -> float:
-    xi = geometry.log(geometry.inverse(T_true) @ registration.T_target_source)
-    return float(xi @ registration.information @ xi)
+def _squared(T_found: Transform, information: Information, T_true: Transform) -> float:
+    xi = geometry.log(geometry.inverse(T_true) @ T_found)
+    return float(xi @ information @ xi)
 
 
 @pytest.mark.parametrize("stage", ["coarse", "fine"])
@@ -63,9 +75,69 @@ def test_squared_errors_are_what_the_information_claims(stage: str) -> None:
     36 pairs of 12 scans, whose own errors change slowly, are some 4 independent draws: three standard deviations of
     their mean, 3 sqrt(12 / 4), are 5 above 6, and as a factor below it. The Hessian alone would give hundreds.
     """
-    squared = np.array([_squared(getattr(alignment, stage), T_true) for alignment, T_true in _pairs()])
+    found = [(getattr(alignment, stage), T_true) for alignment, T_true in _pairs()]
+    squared = np.array([_squared(one.T_target_source, one.information, T_true) for one, T_true in found])
     assert 1.0 < squared.mean() < 11.0
     assert (squared < CHI2_95).mean() > 0.8
+
+
+def test_closures_of_one_place_err_together_as_much_as_their_edges_claim() -> None:
+    """The graph adds up the six closures of each target as if they were independent; they share that scan, and the rays
+    that the sensor bends. Bounds as above: 36 pairs are no more draws for being grouped. Single ones err less.
+    """
+    means, singles = [], []
+    for start in range(0, 36, len(SECOND_ROUND)):
+        pairs = _pairs()[start : start + len(SECOND_ROUND)]
+        informations = [closure_information(alignment.fine.information, CONFIG.graph) for alignment, _ in pairs]
+        errors = [geometry.log(geometry.inverse(T) @ alignment.fine.T_target_source) for alignment, T in pairs]
+        weighed = sum(information @ xi for information, xi in zip(informations, errors, strict=True))
+        means.append(weighed @ np.linalg.solve(sum(informations), weighed))
+        singles += [xi @ information @ xi for information, xi in zip(informations, errors, strict=True)]
+    assert 1.0 < np.mean(means) < 11.0
+    assert max(means) < CHI2_95
+    assert max(singles) < CHI2_95
+
+
+@cache
+def _odometry() -> tuple[np.ndarray, np.ndarray]:
+    """Keyframes of KISS-ICP on a drive from rest along a winding street, and their true poses, from the second on.
+
+    The first motion is left out: KISS-ICP has nothing yet to predict it from, and errs by 0.2 m.
+    """
+    way_m = np.cumsum(np.minimum(0.1 * np.arange(70), 1.1))
+    heading = 0.5 * np.sin(way_m / 25.0)
+    steps = np.diff(way_m, prepend=0.0)[:, None] * np.column_stack([np.cos(heading), np.sin(heading), 0.0 * heading])
+    positions = np.cumsum(steps, axis=0) + np.array([0.0, 0.0, 1.73])
+    truth = np.stack([geometry.transform(geometry.yaw(a), at) for a, at in zip(heading, positions, strict=True)])
+    odometry, selector = KissOdometry(CONFIG.odometry), KeyframeSelector(CONFIG.keyframes)
+    scans = simulate_drive(truth, 0.1 * np.arange(len(truth)), seed=6, config=SimulationConfig())
+    poses = np.stack([odometry.register(scan).T_odom_lidar for scan in scans])
+    rows = [row for row, T_odom_lidar in enumerate(poses) if selector.update(T_odom_lidar)][1:]
+    return poses[rows], truth[rows]
+
+
+@pytest.mark.parametrize("length", [1, 8])
+def test_odometry_errs_as_much_as_its_edges_claim(length: int) -> None:
+    """Single edges, and chains of 8 (17 m). Identities would claim a ten-thousandth of it, sigmas thrice as large nine
+    times as much.
+
+    Some 30 edges whose errors change slowly are some 10 independent draws: three standard deviations of their mean,
+    3 sqrt(12 / 10), are 3.3. Chains may err by as little as a third of the variance: parts of the errors do not add up.
+    """
+    poses, truth = _odometry()
+    motions = [geometry.inverse(a) @ b for a, b in pairwise(poses)]
+    covariances = [np.linalg.inv(odometry_information(0.0, T_a_b, CONFIG.graph)) for T_a_b in motions]
+    squared = []
+    for start in range(len(motions) - length + 1):
+        end = start + length
+        covariance = sum(
+            _seen_from(geometry.inverse(poses[end]) @ poses[k + 1], covariances[k]) for k in range(start, end)
+        )
+        T_true = geometry.inverse(truth[start]) @ truth[end]
+        squared.append(_squared(geometry.inverse(poses[start]) @ poses[end], np.linalg.inv(covariance), T_true))
+    least = 2.7 if length == 1 else 1.5
+    assert least < np.mean(squared) < 9.3
+    assert np.mean(np.array(squared) < CHI2_95) > 0.8
 
 
 @pytest.mark.data

@@ -283,6 +283,7 @@ def test_a_standing_sensor_still_has_noise() -> None:
 
 def test_the_inlier_bound_is_the_chi_square_quantile() -> None:
     assert inlier_bound(0.99) == pytest.approx(16.8119, abs=1e-4), "tables, 6 degrees"
+    assert inlier_bound(0.99, error_allowance=2.0) == pytest.approx(4 * 16.8119, abs=1e-3), "errors twice as large"
 
 
 def test_the_squared_error_is_twice_gtsams() -> None:
@@ -319,7 +320,8 @@ def test_gnc_agrees_with_gtsams_own(tmp_path: Path) -> None:
     parameters = gtsam.GncLMParams()
     parameters.setKnownInliers(list(range(120)))
     optimizer = gtsam.GncLMOptimizer(factors, values, parameters)
-    optimizer.setInlierCostThresholds(0.5 * inlier_bound(CONFIG.inlier_probability))  # GTSAM bounds the error
+    bound = inlier_bound(CONFIG.inlier_probability, error_allowance=CONFIG.error_allowance)
+    optimizer.setInlierCostThresholds(0.5 * bound)  # GTSAM bounds the error
     found = optimizer.optimize()
     weights = graph.finish().closure_weights
     np.testing.assert_allclose(optimizer.getWeights()[120:], list(weights.values()))

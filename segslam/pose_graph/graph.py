@@ -48,7 +48,7 @@ class PoseGraph:
         """The factors of the closures, without robust kernel."""
         self._robust = gtsam.NonlinearFactorGraph()
         """The same under the kernel."""
-        self._inlier_bound = noise.inlier_bound(config.inlier_probability)
+        self._inlier_bound = noise.inlier_bound(config.inlier_probability, error_allowance=config.error_allowance)
         self._kernel = noise.kernel(config.robust, self._inlier_bound)
         self._values = gtsam.Values()
         self._T_odom_last = np.eye(4)

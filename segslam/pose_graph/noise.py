@@ -24,7 +24,10 @@ def first_pose() -> gtsam.noiseModel.Base:
 def odometry_information(travel_m: float, T_a_b: Transform, config: GraphConfig) -> Information:
     """Of the motion between two keyframes: variances grow with the way travelled, and a turn counts as a way.
 
-    One radian counts as much as `config.turn_m` metres.
+    One radian counts as much as `config.turn_m` metres. The defaults are calibrated on KISS-ICP in simulated streets,
+    for single edges and for chains of a hundred. In between, for ten, they claim two to three times the variance: part
+    of an edge's error is of its scans alone and does not add up, part is alike for hundreds of metres and adds up
+    faster than independent steps do, and edges that know nothing of each other can be right at two lengths only.
     """
     way_m = max(travel_m, geometry.distance(T_a_b)) + config.turn_m * geometry.angle(T_a_b)
     growth = math.sqrt(max(way_m, LEAST_STEP_M))
@@ -38,8 +41,10 @@ def closure_information(information: Information, config: GraphConfig) -> Inform
     """A closure's information once the least noise of any closure is added to its covariance.
 
     The registration's information knows the shape of the uncertainty; what it cannot know (two scans that saw the place
-    differently, a leftover vertical angle) is the least noise. Where the registration knows nothing, a billionth of the
-    least noise's information keeps the sum positive definite.
+    differently, a leftover vertical angle) is the least noise. The graph takes closures for independent, but neighbours
+    are off by much the same: with the default, means of eight neighbours have the chi-square that is claimed (simulated
+    06), single closures a third of it. Where the registration knows nothing, 1e-10 of the least noise's information
+    keeps the sum positive definite.
     Raises ValueError if `information` is not symmetric positive semidefinite.
     """
     if not is_positive_semidefinite(information):
@@ -47,7 +52,7 @@ def closure_information(information: Information, config: GraphConfig) -> Inform
     sigmas = geometry.tangent(rotation_rad=math.radians(config.closure_sigma_deg), translation_m=config.closure_sigma_m)
     least = np.diag(sigmas**-2.0)
     total = information @ np.linalg.solve(information + least, least)  # inverse(inverse(I) + inverse(L)), I may be flat
-    return (total + total.T) / 2 + 1e-9 * least
+    return (total + total.T) / 2 + 1e-10 * least
 
 
 def is_positive_semidefinite(matrix: Information) -> bool:
@@ -58,9 +63,12 @@ def is_positive_semidefinite(matrix: Information) -> bool:
     return bool(np.abs(matrix - matrix.T).max() <= tolerance and np.linalg.eigvalsh(matrix).min() >= -tolerance)
 
 
-def inlier_bound(probability: float) -> float:
-    """The squared whitened error (chi-square, not half of it) below which a true edge lies with this probability."""
-    return float(chdtri(DEGREES_OF_FREEDOM, 1.0 - probability))
+def inlier_bound(probability: float, *, error_allowance: float = 1.0) -> float:
+    """The squared whitened error (chi-square, not half of it) below which a true edge lies with this probability.
+
+    `error_allowance`: when errors are so many times as large as claimed.
+    """
+    return error_allowance**2 * float(chdtri(DEGREES_OF_FREEDOM, 1.0 - probability))
 
 
 def kernel(name: str, inlier_bound: float) -> Kernel | None:

@@ -1,6 +1,7 @@
-"""Keyframes of real drives: levelled truth, and an odometry that is measured or drifts as the graph expects it to."""
+"""Keyframes of real drives: levelled truth, and an odometry that is measured, or errs as the graph expects or fears."""
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,14 +44,27 @@ class Drive:
 
 
 def closure(source: int, target: int, T_target_source: np.ndarray, rng: np.random.Generator) -> LoopClosure:
-    measured = T_target_source @ geometry.exp(CLOSURE_SIGMAS * rng.normal(size=6))
-    registration = Registration(measured, 0, 0, 0.0, np.diag(CLOSURE_SIGMAS**-2.0))
+    """A loop with the noise that it claims."""
+    return exact_closure(source, target, T_target_source @ geometry.exp(CLOSURE_SIGMAS * rng.normal(size=6)))
+
+
+def exact_closure(source: int, target: int, T_target_source: np.ndarray) -> LoopClosure:
+    """A loop that claims the noise of the others."""
+    registration = Registration(T_target_source, 0, 0, 0.0, np.diag(CLOSURE_SIGMAS**-2.0))
     alignment = Alignment(registration, registration, 1.0, 0.0, 0.0)
-    return LoopClosure(source, target, measured, registration.information, alignment)
+    return LoopClosure(source, target, T_target_source, registration.information, alignment)
+
+
+def exact(loops: Iterable[LoopClosure], truth: np.ndarray) -> list[LoopClosure]:
+    """Loops between the same keyframes, as the truth has them."""
+    return [
+        exact_closure(loop.source_id, loop.target_id, geometry.inverse(truth[loop.target_id]) @ truth[loop.source_id])
+        for loop in loops
+    ]
 
 
 def read_drive(data: Path, sequence: str, odometry: str, rng: np.random.Generator) -> Drive:
-    """`odometry`: measured (trajectories/simple_online_NN.txt), drifting, or calibrated to what the graph expects."""
+    """`odometry`: measured (trajectories/simple_online_NN.txt), drifting, or what the graph expects or just allows."""
     T_camera_lidar = read_calibration(data / "kitti" / "sequences" / sequence / "calib.txt")
     truth = level(upright(_lidar_poses(data / "kitti" / "poses" / f"{sequence}.txt", T_camera_lidar)))
     if odometry == "measured":
@@ -58,7 +72,10 @@ def read_drive(data: Path, sequence: str, odometry: str, rng: np.random.Generato
         rows = _keyframe_rows(measured)
         return Drive(truth[rows], measured[rows], travelled_m(measured)[rows])
     rows = _keyframe_rows(truth)
-    drifted = (drifting if odometry == "drifting" else calibrated)(truth[rows], rng)
+    if odometry == "drifting":
+        drifted = drifting(truth[rows], rng)
+    else:
+        drifted = claimed(truth[rows], rng, times=CONFIG.graph.error_allowance if odometry == "allowed" else 1.0)
     return Drive(truth[rows], drifted, travelled_m(drifted))
 
 
@@ -75,13 +92,13 @@ def drifting(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.array(poses)
 
 
-def calibrated(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Odometry with the errors that the graph's noise model claims."""
+def claimed(truth: np.ndarray, rng: np.random.Generator, *, times: float) -> np.ndarray:
+    """Odometry with the errors that the graph's noise model claims, so many times as large."""
     poses = [truth[0]]
     for T_a, T_b in itertools.pairwise(truth):
         T_a_b = geometry.inverse(T_a) @ T_b
         information = odometry_information(geometry.distance(T_a_b), T_a_b, CONFIG.graph)
-        poses.append(poses[-1] @ T_a_b @ geometry.exp(np.diag(information) ** -0.5 * rng.normal(size=6)))
+        poses.append(poses[-1] @ T_a_b @ geometry.exp(times * np.diag(information) ** -0.5 * rng.normal(size=6)))
     return np.array(poses)
 
 

@@ -2,22 +2,37 @@
 
 import multiprocessing
 import signal
-from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any
 
 from segslam.config import OdometryConfig
-from segslam.odometry.kiss import KissOdometry
-from segslam.odometry.sweep import OdometryResult
-from segslam.trajectory import Poses
-from segslam.types import Scan, SegslamError
+from segslam.odometry.kiss import KissAligner, KissOdometry
+from segslam.types import Points, SegslamError, Transform
 
 
-class OdometryApart:
-    """As `KissOdometry`, to the bit; the thread that asks waits with Python's lock released.
+class OdometryApart(KissOdometry):
+    """As `KissOdometry`; while a scan is aligned, the thread that asks waits with Python's lock released.
 
-    Its process starts at once; close it, or leave its `with`, when no more scans follow.
+    Its process starts at once; close it, or leave its `with`, when no more scans follow. Every method raises
+    SegslamError if the process has ended.
     """
+
+    def __init__(self, config: OdometryConfig) -> None:
+        self._apart = _AlignerApart(config)
+        super().__init__(config, self._apart)
+
+    def __enter__(self) -> "OdometryApart":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process; nothing is lost."""
+        self._apart.close()
+
+
+class _AlignerApart:
+    """A `KissAligner` in another process: points go there, poses come back."""
 
     def __init__(self, config: OdometryConfig) -> None:
         context = multiprocessing.get_context("spawn")  # a fork would take along the locks of other threads
@@ -26,42 +41,26 @@ class OdometryApart:
         self._process.start()
         theirs.close()
 
-    def __enter__(self) -> "OdometryApart":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def register(self, scan: Scan) -> OdometryResult:
-        """As `KissOdometry.register`. Raises SegslamError if the process has ended."""
-        self._send(scan)
-        return self._received()
-
-    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
-        """As `KissOdometry.restore`; the scans are read here."""
-        self._send(T_odom_lidar)
-        while (row := self._received()) is not None:
-            self._send(scan_of(row))
-
-    def close(self) -> None:
-        """End the process; nothing is lost."""
-        self._pipe.close()
-        self._process.join()
-
-    def _send(self, what: Any) -> None:
+    def align(self, points: Points) -> Transform:
+        """T_odom_lidar of the next sweep."""
         try:
-            self._pipe.send(what)
+            self._pipe.send((None, points))
+            T_odom_lidar: Transform = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            raise self._ended() from error
+        return T_odom_lidar
+
+    def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
+        """As `KissAligner.restore`."""
+        try:
+            self._pipe.send((T_odom_lidar, points))
         except OSError as error:
             raise self._ended() from error
 
-    def _received(self) -> Any:
-        try:
-            answer = self._pipe.recv()
-        except (EOFError, OSError) as error:
-            raise self._ended() from error
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+    def close(self) -> None:
+        """End the process."""
+        self._pipe.close()
+        self._process.join()
 
     def _ended(self) -> SegslamError:
         self._process.join(timeout=1.0)
@@ -72,25 +71,15 @@ class OdometryApart:
 
 
 def _serve(pipe: Connection, config: OdometryConfig) -> None:
-    """Answer until the other side closes: a scan by its result, poses by the rows to be read, then None."""
+    """Until the other side closes: points without a pose are aligned and answered, points with one restored."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other side, which then closes
-
-    def scan_of(row: int) -> Scan:
-        pipe.send(row)
-        scan: Scan = pipe.recv()
-        return scan
-
-    odometry = KissOdometry(config)
+    aligner = KissAligner(config)
     try:
         while True:
-            asked = pipe.recv()
-            try:
-                if isinstance(asked, Scan):
-                    pipe.send(odometry.register(asked))
-                else:
-                    odometry.restore(asked, scan_of)
-                    pipe.send(None)
-            except (SegslamError, ValueError) as error:
-                pipe.send(error)
+            T_odom_lidar, points = pipe.recv()
+            if T_odom_lidar is None:
+                pipe.send(aligner.align(points))
+            else:
+                aligner.restore(T_odom_lidar, points)
     except (EOFError, OSError):
         return

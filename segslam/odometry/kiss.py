@@ -1,6 +1,7 @@
 """KISS-ICP (Vizzo et al., RA-L 2023), by its authors' package."""
 
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
@@ -10,24 +11,61 @@ from kiss_icp.kiss_icp import KissICP
 from segslam.config import OdometryConfig
 from segslam.odometry.sweep import OdometryResult, prepare
 from segslam.trajectory import Poses
-from segslam.types import Scan
+from segslam.types import Points, Scan, Transform
+
+
+@runtime_checkable
+class Aligner(Protocol):
+    """Aligns sweep after sweep with a local map of those before; here or in another process."""
+
+    def align(self, points: Points) -> Transform:
+        """T_odom_lidar of the next sweep, from its points, float64."""
+        ...
+
+    def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
+        """As if the next sweep had been aligned there; without points where all have left the local map since."""
+        ...
+
+
+class KissAligner:
+    """KISS-ICP's own. Several threads add up in any order: poses repeat to 1e-9 m, on one to the bit."""
+
+    def __init__(self, config: OdometryConfig) -> None:
+        self._kiss = KissICP(_kiss_config(config))
+
+    def align(self, points: Points) -> Transform:
+        """T_odom_lidar of the next sweep, from its points, float64."""
+        self._kiss.register_frame(points, np.empty(0))
+        return np.array(self._kiss.last_pose)
+
+    def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
+        """As if the next sweep had been aligned there; without points where all have left the local map since."""
+        kiss = self._kiss
+        if points is not None:
+            kiss.local_map.update(kiss.voxelize(points)[1], T_odom_lidar)
+        T_odom_predicted = kiss.last_pose @ kiss.last_delta
+        kiss.adaptive_threshold.update_model_deviation(np.linalg.inv(T_odom_predicted) @ T_odom_lidar)
+        kiss.last_delta = _since(kiss.last_pose, T_odom_lidar)
+        kiss.last_pose = T_odom_lidar
 
 
 class KissOdometry:
-    """KISS-ICP, scan to local map. Several threads add up in any order: poses repeat to 1e-9 m, on one to the bit."""
+    """Scan to local map: the scan made ready, and a pose from the aligner, KISS-ICP's in this process unless given."""
 
-    def __init__(self, config: OdometryConfig) -> None:
+    def __init__(self, config: OdometryConfig, aligner: Aligner | None = None) -> None:
         self._config = config
-        self._kiss = KissICP(_kiss_config(config))
+        self._aligner = aligner or KissAligner(config)
+        self._T_odom_last = self._T_last_lidar = np.eye(4)
 
     def register(self, scan: Scan) -> OdometryResult:
         """The pose and the kept points of the next scan, in order of time.
 
         Raises BadScan, and forgets the scan, if none of its points is within range.
         """
-        points, labels, intensities = prepare(scan, self._kiss.last_delta, self._config)
-        self._kiss.register_frame(points, np.empty(0))
-        return OdometryResult(np.array(self._kiss.last_pose), points.astype(np.float32), labels, intensities)
+        points, labels, intensities = prepare(scan, self._T_last_lidar, self._config)
+        T_odom_lidar = self._aligner.align(points)
+        self._now_at(T_odom_lidar)
+        return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
     def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
         """The state, to the bit, that registering the scans of these poses has left. `scan_of` reads the scan of a row.
@@ -35,18 +73,23 @@ class KissOdometry:
         Read are those that can have left points in the local map: it forgets what lies farther than its range, so a
         scan taken at twice the range from the last, and all before it, have nothing in it.
         """
-        kiss = self._kiss
         apart_m = np.linalg.norm(T_odom_lidar[:, :3, 3] - T_odom_lidar[-1, :3, 3], axis=1)
         forgotten = np.flatnonzero(apart_m > 2 * self._config.max_range_m)
         first = forgotten[-1] + 1 if len(forgotten) else 0
         for row, T_odom_now in enumerate(T_odom_lidar):
-            if row >= first:
-                points, *_ = prepare(scan_of(row), kiss.last_delta, self._config)
-                kiss.local_map.update(kiss.voxelize(points)[1], T_odom_now)
-            T_odom_predicted = kiss.last_pose @ kiss.last_delta
-            kiss.adaptive_threshold.update_model_deviation(np.linalg.inv(T_odom_predicted) @ T_odom_now)
-            kiss.last_delta = np.linalg.inv(kiss.last_pose) @ T_odom_now  # inverted as by KISS-ICP: same bits
-            kiss.last_pose = T_odom_now
+            points = prepare(scan_of(row), self._T_last_lidar, self._config)[0] if row >= first else None
+            self._aligner.restore(T_odom_now, points)
+            self._now_at(T_odom_now)
+
+    def _now_at(self, T_odom_lidar: Transform) -> None:
+        self._T_last_lidar = _since(self._T_odom_last, T_odom_lidar)
+        self._T_odom_last = T_odom_lidar
+
+
+def _since(T_odom_last: Transform, T_odom_lidar: Transform) -> Transform:
+    """The motion, inverted as by KISS-ICP: the same bits."""
+    T_last_lidar: Transform = np.linalg.inv(T_odom_last) @ T_odom_lidar
+    return T_last_lidar
 
 
 def _kiss_config(config: OdometryConfig) -> KISSConfig:

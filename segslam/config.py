@@ -3,6 +3,7 @@
 P marks a value of the Segregator paper (Yin et al., ICRA 2023), A one of its authors' program.
 """
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,6 +21,8 @@ from pydantic import (
 )
 
 from segslam.types import Label, SegslamError
+
+logger = logging.getLogger(__name__)
 
 
 def _label_from_name(value: object) -> object:
@@ -342,8 +345,30 @@ def config_to_yaml(config: Config) -> str:
 
 
 def config_from_yaml(text: str, source: str) -> Config:
-    """The Config that a text holds; `source` names it in the SegslamError raised if it holds none."""
-    return _validate(_parse_yaml(text, source), source)
+    """The Config that a text of this or an older version holds; `source` names it to a person.
+
+    Settings that there are no longer are left out, with a warning. Raises SegslamError if it holds no Config.
+    """
+    known, gone = _known(_parse_yaml(text, source))
+    if gone:
+        logger.warning("%s: left out what this version does not have: %s", source, ", ".join(gone))
+    return _validate(known, source)
+
+
+def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """The settings that this version has, and the names of the others."""
+    known: dict[str, Any] = {}
+    gone: list[str] = []
+    for name, section in values.items():
+        if name not in Config.model_fields:
+            gone.append(name)
+        elif isinstance(section, dict):
+            fields = type(getattr(Config(), name)).model_fields
+            gone += [f"{name}.{key}" for key in section if key not in fields]
+            known[name] = {key: value for key, value in section.items() if key in fields}
+        else:
+            known[name] = section
+    return known, gone
 
 
 def _changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

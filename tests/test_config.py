@@ -12,6 +12,17 @@ def test_the_effective_settings_read_back_equal() -> None:
     assert config_from_yaml(config_to_yaml(config), "test") == config
 
 
+def test_settings_of_an_older_version_are_read_without_those_that_have_gone(caplog: pytest.LogCaptureFixture) -> None:
+    text = config_to_yaml(load_config(None, ["keyframes.distance_m=3.5"]))
+    older = text.replace("keyframes:\n", "keyframes:\n  shape: round\n") + "weather:\n  rain: true\n"
+    assert config_from_yaml(older, "log.mcap") == config_from_yaml(text, "test")
+    assert [record.getMessage() for record in caplog.records] == [
+        "log.mcap: left out what this version does not have: keyframes.shape, weather"
+    ]
+    with pytest.raises(SegslamError, match=r"log\.mcap: keyframes\.distance_m: .* got -1"):
+        config_from_yaml("keyframes: {distance_m: -1}", "log.mcap")
+
+
 def test_a_file_holds_differences_and_set_wins_over_it(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("keyframes: {distance_m: 4.0, angle_deg: 30}\n")

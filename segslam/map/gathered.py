@@ -54,7 +54,7 @@ class Gathered:
         moves = keyframe.labels >= Label.MOVING_CAR
         kept = within_range(keyframe.points, 0.0, self._config.max_range_m) & ~moves
         self.num_moving_points += int(moves.sum())
-        intensities = np.zeros(len(kept)) if keyframe.intensities is None else keyframe.intensities
+        intensities = np.zeros(len(kept), np.float32) if keyframe.intensities is None else keyframe.intensities
         points = geometry.apply(T_world_keyframe, keyframe.points[kept].astype(np.float64))
         self._tiles.add(points, keyframe.labels[kept], intensities[kept])
         self._views.add(keyframe.points)

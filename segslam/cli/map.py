@@ -29,7 +29,7 @@ from segslam.cli.view import open_scene
 
 if TYPE_CHECKING:
     from segslam.alignment import Labeller
-    from segslam.config import Config, OdometryConfig
+    from segslam.config import Config, MapConfig, OdometryConfig
     from segslam.datasets import Dataset
     from segslam.log import RunLog
     from segslam.odometry import Odometry
@@ -70,7 +70,6 @@ def map_command(
     from segslam.config import load_config
     from segslam.datasets import open_dataset
     from segslam.map import check_names
-    from segslam.results import read_metrics
 
     map_files = [out / name for name in (*(WITH_MAP if with_map else ()), *(map_file or ()))]
     check_names(map_files)
@@ -100,12 +99,7 @@ def map_command(
     if recorded is not None:
         check_same(recorded, settings_now, dataset=scans.name, options=options)
         if is_finished(recorded, scans):
-            say(f"{out}: finished already, all {len(scans)} scans; nothing is left to resume", quiet=quiet)
-            if missing := [file for file in map_files if not file.exists()]:
-                made = write_maps(recorded, missing, config=settings_now.map, quiet=quiet)
-                say(map_summary(made, missing), quiet=quiet)
-            if json:
-                print_json(read_metrics(out))
+            _complete(recorded, map_files, config=settings_now.map, json=json, quiet=quiet)
             raise typer.Exit(0)
     scene = open_scene(None, view_every=settings_now.log.view_every) if view else None
     map_scans(
@@ -122,6 +116,19 @@ def map_command(
     )
     if scene:
         scene.end()
+
+
+def _complete(recorded: "RunLog", map_files: Sequence[Path], *, config: "MapConfig", json: bool, quiet: bool) -> None:
+    """Give a finished run the maps that it lacks, and show its figures."""
+    from segslam.results import read_metrics
+
+    folder = recorded.path.parent
+    say(f"{folder}: finished already, with all scans; nothing is left to resume", quiet=quiet)
+    if missing := [file for file in map_files if not file.exists()]:
+        made = write_maps(recorded, missing, config=config, quiet=quiet)
+        say(map_summary(made, missing), quiet=quiet)
+    if json:
+        print_json(read_metrics(folder))
 
 
 def _nobody(_: "Step | BadScan") -> None:

@@ -19,13 +19,13 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import numpy as np
+from open3d.io import read_point_cloud
 from scipy.spatial import cKDTree
 
 from segslam import geometry, open_dataset
 from segslam.config import load_config
 from segslam.log import read_log
 from segslam.map import write_map
-from segslam.map.clouds import HEADER_BYTES, PLY_ROW
 from segslam.types import Keyframe, Label, Transform
 
 STANDING = {
@@ -59,14 +59,14 @@ def main() -> None:
     def placed() -> Iterator[tuple[Keyframe, Transform]]:
         for step in log.steps():
             if step.keyframe is not None:
-                hidden = replace(step.keyframe, labels=HIDDEN[step.keyframe.labels], intensities=None)
+                hidden = replace(step.keyframe, labels=HIDDEN[step.keyframe.labels])
                 yield hidden, T_world_keyframe[hidden.id]
 
     started = perf_counter()
     with TemporaryDirectory() as folder:
         cloud = Path(folder) / "map.ply"
         summary = write_map(placed(), [cloud], config=config.map)
-        points = np.fromfile(cloud, np.dtype(PLY_ROW), offset=HEADER_BYTES)["xyz"].astype(np.float64)
+        points = np.asarray(read_point_cloud(cloud).points)
     seconds = perf_counter() - started
     kept = np.unique(_cells(points, config.map.voxel_m))
     counts: Counter[str] = Counter()

@@ -47,7 +47,7 @@ def write_loops(file: Path, attempts: tuple[LoopAttempt, ...], weights: dict[tup
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
-    """`metrics.json`, last of a run's files and whole; a figure that is unknown is left out by the caller."""
+    """`metrics.json`, whole or not at all; a figure that is unknown is left out by the caller."""
     text = json.dumps(metrics, indent=2, allow_nan=False)
     part = folder / ("metrics.json" + UNFINISHED)
     with room_for(folder):

@@ -9,6 +9,8 @@ from drives import write_kitti_sequence
 from finished_run import make_run
 from test_cli_map import run
 
+from segslam.types import WorkFailed
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -70,3 +72,18 @@ def test_map_writes_the_map_with_the_run_and_a_finished_run_is_given_what_it_lac
     assert (out / "map.png").is_file()
     assert run("map", kitti, "--out", out, "--map-file", "grid.yaml", "--resume", "--quiet") == 0
     assert (out / "grid.pgm").is_file()
+
+
+def test_a_map_that_cannot_be_made_costs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_room(*_: object, **__: object) -> None:
+        raise WorkFailed("no room")
+
+    kitti, out = tmp_path / "kitti", tmp_path / "run"
+    write_kitti_sequence(kitti, num_scans=3)
+    with monkeypatch.context() as broken:
+        broken.setattr("segslam.cli.ending.write_maps", no_room)
+        assert run("map", kitti, "--out", out, "--map", "--quiet") != 0
+    assert json.loads((out / "metrics.json").read_text())["num_scans"] == 3
+    assert (out / "report.html").is_file()
+    assert run("map", kitti, "--out", out, "--map", "--resume", "--quiet") == 0
+    assert (out / "map.ply").is_file()

@@ -34,13 +34,16 @@ def finish(
     result, metrics = run.finish()
     if reference is not None:
         metrics |= accuracy(result, reference)
-    if map_files:
-        log = read_log(run.folder / LOG)
-        metrics |= write_maps(log, map_files, config=log.config.map, quiet=quiet)
-        metrics["peak_rss_mb"] = peak_rss_mb()
     metrics |= more
     write_metrics(run.folder, metrics)
-    write_report(run.folder)
+    try:
+        if map_files:
+            log = read_log(run.folder / LOG)
+            metrics |= write_maps(log, map_files, config=log.config.map, quiet=quiet)
+            metrics["peak_rss_mb"] = peak_rss_mb()
+            write_metrics(run.folder, metrics)
+    finally:
+        write_report(run.folder)  # a map that cannot be made costs nothing else
     if json:
         print_json(metrics)
     else:

@@ -95,6 +95,11 @@ def test_no_angle_is_no_bend(seed: int) -> None:
     assert not judge(samples(0.0, seed=seed)).chosen
 
 
+def test_few_drives_are_straightened_that_a_small_angle_did_not_bend() -> None:
+    """2 of 100 in the mean; more than 6 in one of 200 such tests."""
+    assert sum(judge(samples(0.1, excess_of_angle=0.0, seed=seed)).chosen for seed in range(100)) <= 6
+
+
 @pytest.mark.parametrize("angle_deg", [-0.05, 0.05])
 def test_an_angle_that_estimates_may_be_off_by_is_left_alone(angle_deg: float) -> None:
     evidence = judge(samples(angle_deg))

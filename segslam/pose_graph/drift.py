@@ -40,8 +40,10 @@ NUM_STRETCHES = 8
 """Chosen: seven degrees of freedom for the test; on a drive of 1 km a stretch is as long as angles stay alike."""
 LEAST_SAMPLES = 2 * NUM_STRETCHES
 MOST_SIGMAS = 5.0  # chosen: far above noise, and one failed pair of scans does not decide
-SIGNIFICANCE = 0.01
-"""Chance that prediction and measurement pass as alike where the one has nothing to do with the other."""
+SIGNIFICANCE = 0.05
+"""Chance that prediction and measurement pass as alike where the one has nothing to do with the other. Chosen: as the
+prediction must also be nearer than zero is, 2 of 100 drives that an angle did not bend are straightened, and 94 that
+0.1 degrees did; at 0.01 it would be none and 76."""
 
 
 class HeldOut(NamedTuple):

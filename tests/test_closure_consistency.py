@@ -9,7 +9,7 @@ from scipy.stats import chi2, kstest
 
 from segslam import geometry
 from segslam.config import GraphConfig
-from segslam.pose_graph.consistency import adjoints, consistent_closures, crowds, pairwise_chi2
+from segslam.pose_graph.consistency import adjoints, agreements, largest_agreeing, neighbours, pairwise_chi2
 from segslam.pose_graph.edges import Edge, factor_graph
 from segslam.pose_graph.noise import inlier_bound, odometry_information
 from segslam.pose_graph.solver import search
@@ -59,6 +59,10 @@ def plain_chi2(edges: list[Edge], p: Edge, q: Edge) -> float:
         covariance += part @ np.linalg.inv(edge.information) @ part.T
     error = geometry.log(shift[0] @ geometry.inverse(shift[1]))
     return float(error @ np.linalg.solve(covariance, error))
+
+
+def largest(edges: list[Edge], closures: list[Edge]) -> np.ndarray:
+    return largest_agreeing(agreements(edges, closures, BOUND), np.ones(len(closures), dtype=bool))
 
 
 def test_the_chi_square_of_two_closures_is_that_of_plain_sums() -> None:
@@ -130,19 +134,27 @@ def test_true_closures_agree_among_groups_of_lies(seed: int) -> None:
     for first in (10, 35, 60):
         slide = geometry.transform(np.eye(3), [rng.choice([-1.0, 1.0]) * rng.uniform(8.0, 20.0), 0.0, 0.0])
         lies += [closure(T_world, first + k, 110 + first + k, rng, slide) for k in range(5)]
-    chosen = consistent_closures(edges, true + lies, BOUND)
+    chosen = largest(edges, true + lies)
     assert not chosen[len(true) :].any()
     assert chosen[: len(true)].sum() >= len(true) - 4, "each pair of true ones is lost with one percent"
 
 
 def test_without_closures_none_is_chosen() -> None:
-    assert consistent_closures(odometry(drive(), np.random.default_rng(0)), [], BOUND).shape == (0,)
+    assert largest(odometry(drive(), np.random.default_rng(0)), []).shape == (0,)
 
 
 def test_one_closure_agrees_with_itself() -> None:
     rng = np.random.default_rng(0)
     T_world = drive()
-    assert consistent_closures(odometry(T_world, rng), [closure(T_world, 3, 103, rng)], BOUND).tolist() == [True]
+    assert largest(odometry(T_world, rng), [closure(T_world, 3, 103, rng)]).tolist() == [True]
+
+
+def test_the_largest_set_is_looked_for_among_those_asked_for() -> None:
+    agree = np.eye(6, dtype=bool)
+    agree[:3, :3] = agree[3:5, 3:5] = True
+    assert largest_agreeing(agree, np.ones(6, dtype=bool)).tolist() == [True] * 3 + [False] * 3
+    assert largest_agreeing(agree, np.arange(6) > 1).tolist() == [False] * 3 + [True, True, False]
+    assert not largest_agreeing(agree, np.zeros(6, dtype=bool)).any()
 
 
 def test_an_adjoint_carries_a_tangent_to_the_other_side() -> None:
@@ -153,9 +165,11 @@ def test_an_adjoint_carries_a_tangent_to_the_other_side() -> None:
     np.testing.assert_allclose(geometry.exp(adjoints(T_a_b[None])[0] @ tangent), moved, atol=1e-12)
 
 
-def test_closures_are_a_crowd_where_both_ends_are_near() -> None:
+def test_closures_are_neighbours_where_both_ends_are_near() -> None:
     travel_m = np.array([0.0, 20.0, 100.0, 500.0, 520.0, 600.0])
     ends = [(0, 3), (1, 4), (2, 4), (1, 5)]
     edges = [Edge(a, b, np.eye(4), np.eye(6)) for a, b in ends]
-    assert crowds(edges, travel_m, 30.0).tolist() == [2, 2, 1, 1]
-    assert crowds([], travel_m, 30.0).tolist() == []
+    expected = np.eye(4, dtype=bool)
+    expected[0, 1] = expected[1, 0] = True
+    np.testing.assert_array_equal(neighbours(edges, travel_m, 30.0), expected)
+    assert neighbours([], travel_m, 30.0).shape == (0, 0)

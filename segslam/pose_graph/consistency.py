@@ -22,7 +22,7 @@ from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import njit
 
 from segslam.cliques import maximum_cliques, pack_rows
@@ -34,6 +34,7 @@ MOST_NODES = 20_000
 NO_AGREEMENT = 1e12
 """Chi-square of two closures that differ by half a turn, where it has no meaning."""
 Matrices = Float[np.ndarray, "_ 6 6"]
+Agreements = Bool[np.ndarray, "_ _"]
 
 
 class Shifts(NamedTuple):
@@ -46,16 +47,23 @@ class Shifts(NamedTuple):
     targets: Indices
 
 
-def consistent_closures(odometry: Sequence[Edge], closures: Sequence[Edge], bound: float) -> Mask:
-    """(k,) the largest set of closures of which every two have a chi-square, with 6 degrees of freedom, within `bound`.
+def agreements(odometry: Sequence[Edge], closures: Sequence[Edge], bound: float) -> Agreements:
+    """(k, k) which two closures have a chi-square, with 6 degrees of freedom, within `bound`.
 
     `odometry` leads from each vertex 0, 1, 2, ... to the next.
     """
-    chosen = np.zeros(len(closures), dtype=bool)
-    if closures:
-        joined = pairwise_chi2(odometry, closures, enough=bound) <= bound
-        found = maximum_cliques(pack_rows(joined), max_cliques=1, max_nodes=MOST_NODES)
-        chosen[found.cliques[0]] = True
+    if not closures:
+        return np.zeros((0, 0), dtype=bool)
+    return pairwise_chi2(odometry, closures, enough=bound) <= bound
+
+
+def largest_agreeing(agree: Agreements, among: Mask) -> Mask:
+    """(k,) the largest set of closures among some of which every two agree."""
+    chosen = np.zeros(len(among), dtype=bool)
+    rows = np.flatnonzero(among)
+    if len(rows):
+        found = maximum_cliques(pack_rows(agree[np.ix_(rows, rows)]), max_cliques=1, max_nodes=MOST_NODES)
+        chosen[rows[found.cliques[0]]] = True
     return chosen
 
 
@@ -80,11 +88,11 @@ def pairwise_chi2(
     return chi2
 
 
-def crowds(closures: Sequence[Edge], travel_m: Vector, within_m: float) -> Indices:
-    """(k,) how many closures, itself included, join the same two places as each: both ends within so much travel."""
+def neighbours(closures: Sequence[Edge], travel_m: Vector, within_m: float) -> Agreements:
+    """(k, k) which two closures join the same two places: both ends within so much travel, as are its own."""
     ends_m = travel_m[np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64).reshape(-1, 2)]
     apart_m = np.abs(ends_m[:, None] - ends_m)
-    return (apart_m < within_m).all(axis=2).sum(axis=1)
+    return (apart_m < within_m).all(axis=2)
 
 
 def adjoints(T_a_b: Transforms) -> Matrices:

@@ -23,7 +23,7 @@ import numpy as np
 
 from segslam.pose_graph.edges import Edge, factor_graph, squared_errors
 from segslam.pose_graph.solver import Search, search
-from segslam.types import Vector
+from segslam.types import Mask, Vector
 
 CONTROL_FACTOR = 1.4  # growth of mu in the paper
 MAX_STEPS = 100
@@ -87,21 +87,25 @@ class TruncatedProblem:
         return graph
 
 
-def solve(problem: TruncatedProblem, start: gtsam.Values, *, likely: Vector | None = None) -> Solution:
-    """The poses, and for each closure whether to believe it: the better of two solutions.
+def solve(problem: TruncatedProblem, start: gtsam.Values) -> Solution:
+    """The poses, and for each closure whether to believe it: by graduated non-convexity, or next to `start` if better.
 
-    One is next to `start`. The other is next to the optimum of those closures that are `likely` (k,), 1 or 0, or, where
-    nobody says which, by graduated non-convexity, which promises no global optimum either.
+    Neither promises the global optimum.
     """
-    if likely is not None:
-        return _better(_settle(problem, search(problem.weighted(likely), start).values), _settle(problem, start))
     values, iterations = _graduate(problem, start)
-    graduated = _settle(problem, values, iterations)
-    return graduated if graduated.weights.all() else _better(graduated, _settle(problem, start))
+    graduated = settle(problem, values, iterations)
+    return graduated if graduated.weights.all() else better(graduated, settle(problem, start))
 
 
-def _better(first: Solution, second: Solution) -> Solution:
+def better(first: Solution, second: Solution) -> Solution:
+    """That of the lower cost."""
     return second if second.truncated_cost < first.truncated_cost else first
+
+
+def settle_from(problem: TruncatedProblem, start: gtsam.Values, likely: Mask) -> Solution:
+    """The solution next to the optimum, searched from `start`, of those closures that are `likely` (k,)."""
+    found = search(problem.weighted(likely.astype(float)), start)
+    return settle(problem, found.values, found.iterations)
 
 
 def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Values, int]:
@@ -129,7 +133,7 @@ def tls_weights(squared: Vector, control: float, inlier_bound: float) -> Vector:
     return np.clip(weights, 0.0, 1.0)
 
 
-def _settle(problem: TruncatedProblem, values: gtsam.Values, iterations: int = 0) -> Solution:
+def settle(problem: TruncatedProblem, values: gtsam.Values, iterations: int = 0) -> Solution:
     """The optimum of the truncated cost next to `values`: believe what is within the bound, optimise, look again.
 
     Neither half raises the cost, so this ends; MAX_STEPS guards against rounding at the bound.

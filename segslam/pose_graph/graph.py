@@ -13,7 +13,8 @@ import numpy as np
 from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import gnc, noise
-from segslam.pose_graph.consistency import consistent_closures, crowds
+from segslam.pose_graph.agreeing import believe_agreeing
+from segslam.pose_graph.consistency import agreements, neighbours
 from segslam.pose_graph.drift import pitch_per_m, straightened
 from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
@@ -135,12 +136,14 @@ class PoseGraph:
         robust = self._optimize(FINAL_TOLERANCE)
         if self._config.final == "none":
             return robust
-        says = np.minimum(1.0, VOICES_OF_A_PLACE / crowds(self._closures, self.travel_m, PLACE_M))
+        near = neighbours(self._closures, self.travel_m, PLACE_M)
+        says = np.minimum(1.0, VOICES_OF_A_PLACE / near.sum(axis=1))
         problem = gnc.TruncatedProblem(self._trusted, self._closures, self._inlier_bound, says=says)
-        likely = None
-        if self._config.final == "consistent":
-            likely = consistent_closures(self._odometry, self._closures, self._inlier_bound).astype(float)
-        solution = gnc.solve(problem, self._values, likely=likely)
+        if self._config.final == "gnc":
+            solution = gnc.solve(problem, self._values)
+        else:
+            agree = agreements(self._odometry, self._closures, self._inlier_bound)
+            solution = believe_agreeing(problem, self._values, agree, near)
         self._values = solution.search.values
         return self._estimate(solution.search.error, solution.weights)
 

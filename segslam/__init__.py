@@ -5,15 +5,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from segslam.alignment import register
+    from segslam.allocator import keep_freed_memory
     from segslam.config import Config, load_config
     from segslam.datasets import open_dataset
     from segslam.slam import Slam
 
-__all__ = ["Config", "Slam", "load_config", "open_dataset", "register"]
+__all__ = ["Config", "Slam", "keep_freed_memory", "load_config", "open_dataset", "register"]
 
 _HOMES = {
     "Config": "config",
     "Slam": "slam",
+    "keep_freed_memory": "allocator",
     "load_config": "config",
     "open_dataset": "datasets",
     "register": "alignment",

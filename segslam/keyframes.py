@@ -50,10 +50,11 @@ def thin(
     Their labels and rows come with them.
     Every later stage works on these points and the log holds exactly these, so that a replay repeats the run.
     """
-    is_whole = np.isin(labels, np.array([int(label) for label in whole_classes], dtype=np.uint8))
-    others = np.flatnonzero(~is_whole)
-    kept = np.sort(np.concatenate([np.flatnonzero(is_whole), others[voxel_first(points[others], config.voxel_m)]]))
-    rounded = np.round(points[kept].astype(np.float64) / config.resolution_m) * config.resolution_m
+    is_kept = np.isin(labels, np.array([int(label) for label in whole_classes], dtype=np.uint8))
+    others = np.flatnonzero(~is_kept)
+    is_kept[others[voxel_first(points.take(others, axis=0), config.voxel_m)]] = True
+    kept = np.flatnonzero(is_kept)
+    rounded = np.round(points.take(kept, axis=0).astype(np.float64) / config.resolution_m) * config.resolution_m
     return rounded.astype(np.float32), labels[kept], kept
 
 

@@ -24,8 +24,21 @@ class Neighbours(NamedTuple):
 
 def within_range(points: Points, min_m: float, max_m: float) -> np.ndarray:
     """(n,) bool: strictly farther than `min_m` and nearer than `max_m` from the origin; false for NaN."""
-    squared = np.einsum("ij,ij->i", points, points)
+    squared = squared_ranges(points)
     return (squared > min_m**2) & (squared < max_m**2)
+
+
+def squared_ranges(points: Points) -> np.ndarray:
+    """(n,) m^2: how far each point is from the origin, squared; not finite where a coordinate is not."""
+    with np.errstate(over="ignore"):
+        x, y, z = (points * points).T  # column by column: sums along rows of three take five times as long
+    return x + y + z
+
+
+def is_finite(points: Points) -> np.ndarray:
+    """(n,) bool: whether all of a point's coordinates are."""
+    x, y, z = np.isfinite(points).T
+    return x & y & z
 
 
 def canonical_order(points: Points) -> Indices:
@@ -39,8 +52,8 @@ def voxel_first(points: Points, voxel_m: float) -> Indices:
 
     Raises ValueError if voxel_m <= 0, or if the points spread over more voxels than there are numbers for.
     """
-    rows = np.flatnonzero(np.isfinite(points).all(axis=1))
-    keys, _ = _cell_keys(points[rows], voxel_m)
+    rows = np.flatnonzero(is_finite(points))
+    keys, _ = _cell_keys(points.take(rows, axis=0), voxel_m)
     return rows[hash_keys(keys)[1] == np.arange(len(keys))]
 
 
@@ -50,7 +63,7 @@ def voxel_means(points: Points, voxel_m: float) -> Points:
     It does not depend on the order of float32 points: their sums are exact, but for coordinates below 1e-5 m.
     Raises ValueError as `voxel_first` does.
     """
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points.compress(is_finite(points), axis=0)
     keys, _ = _cell_keys(points, voxel_m)
     _, first = hash_keys(keys)
     occupied = np.flatnonzero(first == np.arange(len(keys)))

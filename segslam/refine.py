@@ -62,7 +62,7 @@ class Surface:
 
 def thin(points: Points, *, config: RefineConfig) -> Points:
     """What alignment needs of a scan: one mean point a voxel within `max_range_m`, float32; some 100 KB."""
-    near = points[within_range(points, 0.0, config.max_range_m)].astype(np.float64)
+    near = points.compress(within_range(points, 0.0, config.max_range_m), axis=0).astype(np.float64)
     return small_gicp.voxelgrid_sampling(near, config.voxel_m, 1).points()[:, :3].astype(np.float32)
 
 

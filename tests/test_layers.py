@@ -18,7 +18,7 @@ LAYERS = (  # top first; a room is a module or a folder
     {"trajectory"},
     {"geometry", "points", "beside", "interrupts", "cliques"},
     {"types", "config"},
-    {"errors"},
+    {"errors", "allocator"},
 )  # fmt: skip
 BOTTOM = {"types", "config"}  # config names the classes of types
 FOREIGN = {

@@ -88,6 +88,16 @@ def test_a_process_of_its_own_changes_nothing() -> None:
         np.testing.assert_array_equal(mine.labels, theirs.labels)
 
 
+def test_a_sweep_too_large_for_the_shared_memory_is_aligned_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    scans = _street(3)
+    monkeypatch.setattr("segslam.odometry.apart.MOST_SHARED", 100)
+    with OdometryApart(ONE_THREAD) as apart:
+        found = [apart.register(scan).T_odom_lidar for scan in scans]
+    monkeypatch.undo()
+    with OdometryApart(ONE_THREAD) as apart:
+        np.testing.assert_array_equal(found, [apart.register(scan).T_odom_lidar for scan in scans])
+
+
 def test_a_process_that_was_killed_is_told_of_with_the_remedy() -> None:
     scan = _street(1)[0]
     odometry = OdometryApart(CONFIG)

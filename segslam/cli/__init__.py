@@ -5,6 +5,7 @@ import sys
 
 import typer
 
+from segslam.allocator import keep_freed_memory
 from segslam.cli.warn import FirstOfEachKind
 from segslam.errors import SegslamError, WorkFailed
 
@@ -29,6 +30,7 @@ def main(arguments: list[str] | None = None) -> None:
     """
     from segslam.cli import commands
 
+    keep_freed_memory()
     warnings = FirstOfEachKind()
     logging.basicConfig(level=logging.WARNING, handlers=[warnings])
     commands.add_all(app)

@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from segslam.points import squared_ranges
 from segslam.semantics.label_files import LabelSource
 from segslam.trajectory import nanoseconds
 from segslam.types import BadScan, Indices, Labels, Points, Scan, SegslamError, Trajectory, Transform, Vector
@@ -81,7 +82,7 @@ def make_scan(
 
     All that goes with them loses the same rows. Raises BadScan, naming `source`, if no point is left.
     """
-    squared_range = np.einsum("ij,ij->i", points, points)
+    squared_range = squared_ranges(points)
     kept = np.isfinite(squared_range) & (squared_range > 0)
     if not kept.any():
         what = (

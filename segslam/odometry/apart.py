@@ -3,10 +3,17 @@
 import multiprocessing
 import signal
 from multiprocessing.connection import Connection
+from typing import Any
 
+import numpy as np
+
+from segslam.allocator import keep_freed_memory
 from segslam.config import OdometryConfig
 from segslam.odometry.kiss import KissAligner, KissOdometry
 from segslam.types import Points, SegslamError, Transform
+
+MOST_SHARED = 2**18
+"""Points of a sweep that two processes hand over in memory they share, 6 MB; a larger sweep goes through the pipe."""
 
 
 class OdometryApart(KissOdometry):
@@ -32,30 +39,37 @@ class OdometryApart(KissOdometry):
 
 
 class _AlignerApart:
-    """A `KissAligner` in another process: points go there, poses come back."""
+    """A `KissAligner` in another process: points go there, poses come back. It has one request at a time."""
 
     def __init__(self, config: OdometryConfig) -> None:
         context = multiprocessing.get_context("spawn")  # a fork would take along the locks of other threads
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, config), name="odometry", daemon=True)
+        shared = context.RawArray("d", 3 * MOST_SHARED)
+        self._shared = _as_points(shared)
+        self._process = context.Process(target=_serve, args=(theirs, shared, config), name="odometry", daemon=True)
         self._process.start()
         theirs.close()
 
     def align(self, points: Points) -> Transform:
         """T_odom_lidar of the next sweep."""
-        try:
-            self._pipe.send((None, points))
-            T_odom_lidar: Transform = self._pipe.recv()
-        except (EOFError, OSError) as error:
-            raise self._ended() from error
-        return T_odom_lidar
+        return self._asked(None, points)
 
     def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
         """As `KissAligner.restore`."""
+        self._asked(T_odom_lidar, points)
+
+    def _asked(self, T_odom_lidar: Transform | None, points: Points | None) -> Transform:
+        """The pose of the sweep: the one given or, where it is None, the one it is found at."""
+        sent: Points | int | None = points
+        if points is not None and len(points) <= MOST_SHARED:
+            self._shared[: len(points)] = points
+            sent = len(points)
         try:
-            self._pipe.send((T_odom_lidar, points))
-        except OSError as error:
+            self._pipe.send((T_odom_lidar, sent))
+            answer: Transform = self._pipe.recv()
+        except (EOFError, OSError) as error:
             raise self._ended() from error
+        return answer
 
     def close(self) -> None:
         """End the process."""
@@ -70,16 +84,28 @@ class _AlignerApart:
         )
 
 
-def _serve(pipe: Connection, config: OdometryConfig) -> None:
-    """Until the other side closes: points without a pose are aligned and answered, points with one restored."""
+def _as_points(shared: Any) -> Points:
+    """The shared memory as rows of float64 coordinates."""
+    return np.frombuffer(shared).reshape(-1, 3)
+
+
+def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
+    """Until the other side closes: points without a pose are aligned, points with one restored; the pose is answered.
+
+    The points come themselves, or their number where they are in the shared memory.
+    """
+    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other side, which then closes
     aligner = KissAligner(config)
+    shared_points = _as_points(shared)
     try:
         while True:
-            T_odom_lidar, points = pipe.recv()
+            T_odom_lidar, sent = pipe.recv()
+            points = shared_points[:sent] if isinstance(sent, int) else sent
             if T_odom_lidar is None:
-                pipe.send(aligner.align(points))
+                T_odom_lidar = aligner.align(points)
             else:
                 aligner.restore(T_odom_lidar, points)
+            pipe.send(T_odom_lidar)
     except (EOFError, OSError):
         return

@@ -8,7 +8,7 @@ import numpy as np
 from kiss_icp.preprocess import Preprocessor
 
 from segslam.config import OdometryConfig
-from segslam.points import within_range
+from segslam.points import is_finite, within_range
 from segslam.trajectory import Poses
 from segslam.types import BadScan, Labels, Points, Scan, Transform, Vector
 
@@ -54,7 +54,7 @@ def prepare(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> tupl
             f"{config.max_range_m} m; leave the scan out or change odometry.min_range_m, odometry.max_range_m"
         )
     intensities = None if scan.intensities is None else scan.intensities[kept]
-    return np.ascontiguousarray(points[kept]), scan.labels[kept], intensities
+    return points.compress(kept, axis=0), scan.labels[kept], intensities
 
 
 def _at_sweep_end(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> Points:
@@ -63,6 +63,6 @@ def _at_sweep_end(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -
     if len(scan.times) == 0 or np.ptp(scan.times) == 0:
         return points
     everything = Preprocessor(max_range=np.inf, min_range=-1.0, deskew=True, max_num_threads=config.max_num_threads)
-    finite = np.isfinite(points).all(axis=1)  # KISS-ICP drops the others, and with them the order of rows
+    finite = is_finite(points)  # KISS-ICP drops the others, and with them the order of rows
     points[finite] = everything.preprocess(points[finite], scan.times[finite].astype(np.float64), T_last_lidar)
     return points

@@ -114,10 +114,12 @@ def _result(log: RunLog) -> SlamResult:
     estimate, trajectory = final
     T_odom_lidar, keyframe_rows = [], []
     attempts: list[LoopAttempt] = []
-    for row, step in enumerate(log.steps()):
+    for row, step in enumerate(log.steps(clouds=False)):
         T_odom_lidar.append(step.T_odom_lidar)
         attempts += step.attempts
         if step.keyframe is not None:
             keyframe_rows.append(row)
+    if len(T_odom_lidar) < len(trajectory):
+        raise SegslamError(f"{log.path}: damaged, {len(T_odom_lidar)} of its {len(trajectory)} steps are left; replay it")
     odometry = Trajectory(trajectory.scan_index, trajectory.stamp_ns, np.array(T_odom_lidar))
     return SlamResult(trajectory, odometry, estimate, np.array(keyframe_rows), tuple(attempts))

@@ -72,8 +72,9 @@ def view(points: Points) -> View:
     nearest = _nearest_returns(np.ascontiguousarray(points, np.float32))
     padded = np.pad(nearest, ((1, 1), (0, 0)), constant_values=np.inf)
     padded = np.pad(padded, ((0, 0), (1, 1)), mode="wrap")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
-    return View(np.where(np.isfinite(nearest), windows.min(axis=(2, 3)), np.float32(np.inf)))
+    across = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
+    around = np.minimum(np.minimum(across[:-2], across[1:-1]), across[2:])
+    return View(np.where(np.isfinite(nearest), around, np.float32(np.inf)))
 
 
 def agreement(

@@ -88,6 +88,37 @@ def test_result_read_again_is_that_written(steps: list[Step], tmp_path: Path) ->
     assert len(list(log.steps())) == len(steps)
 
 
+@pytest.mark.parametrize("chunk_bytes", [100, 4_000_000])
+def test_a_result_is_found_by_the_index_however_many_chunks_it_takes(
+    steps: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
+) -> None:
+    """The steps before it are not read: here they cannot be."""
+    monkeypatch.setattr("segslam.log.writer.CHUNK_BYTES", chunk_bytes)
+    estimate, trajectory = made_result(steps)
+    path = tmp_path / "log.mcap"
+    with LogWriter(path, config=CONFIG) as log:
+        for step in steps:
+            log.write(step)
+        end_of_steps = path.stat().st_size
+        log.write_result(estimate, trajectory)
+    content = bytearray(path.read_bytes())
+    content[end_of_steps // 2 : end_of_steps] = bytes(end_of_steps - end_of_steps // 2)
+    path.write_bytes(content)
+    log = read_log(path)
+    assert_same((estimate, trajectory), log.result())
+    assert 0 < len(list(log.steps())) < len(steps)
+
+
+def test_steps_without_clouds_are_the_same_but_for_the_points(steps: list[Step], whole: Path) -> None:
+    for step, again in zip(steps, read_log(whole).steps(clouds=False), strict=True):
+        if step.keyframe is not None:
+            assert again.keyframe is not None
+            assert again.keyframe.points.shape == (0, 3)
+            none = {"points": again.keyframe.points, "labels": again.keyframe.labels, "intensities": None}
+            step = replace(step, keyframe=replace(step.keyframe, **none))
+        assert_same(step, again)
+
+
 def test_a_run_without_an_end_has_no_result(whole: Path) -> None:
     assert read_log(whole).result() is None
 

@@ -77,6 +77,13 @@ def test_folder_without_a_whole_run_is_refused(tmp_path: Path) -> None:
         read_run(tmp_path)
     with pytest.raises(SegslamError, match="did not finish"):
         read_run(make_run(tmp_path / "killed", finished=False).folder)
+    damaged = make_run(tmp_path / "damaged").folder
+    content = bytearray((damaged / "log.mcap").read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 2000] = bytes(2000)
+    (damaged / "log.mcap").write_bytes(content)
+    with pytest.raises(SegslamError, match=rf"log\.mcap: damaged, \d+ of its {NUM_SCANS} steps are left"):
+        read_run(damaged)
     made = make_run(tmp_path / "run")
     (made.folder / "metrics.json").write_text("{")
     with pytest.raises(SegslamError, match=r"metrics\.json: cannot read"):

@@ -20,6 +20,7 @@ from speed.latency import latency
 from speed.start import start
 from speed.throughput import throughput
 
+from segslam import keep_freed_memory
 from segslam.experiments.provenance import commit, machine
 
 PACKAGES = ("segslam", "kiss-icp", "numpy", "numba", "gtsam", "small-gicp", "mcap")
@@ -73,6 +74,7 @@ def main() -> None:
     parser.add_argument("--against", type=Path, metavar="JSON")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
+    keep_freed_memory()  # as the commands do
     parts = measures(options)
     if unknown := set(options.only or ()) - set(parts):
         parser.error(f"no part {', '.join(sorted(unknown))}; known: {', '.join(parts)}")

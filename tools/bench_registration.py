@@ -23,6 +23,7 @@ from registration.simulated import scan_of, simulated
 from registration.speed import many_correspondences, sizes, stages
 from registration.trials import Row
 
+from segslam import keep_freed_memory
 from segslam.config import Config, load_config
 from segslam.experiments.provenance import commit, machine
 
@@ -122,6 +123,7 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     options = arguments()
+    keep_freed_memory()  # as the commands do
     config = load_config(overrides=options.set)
     parts = {
         "real": real_part,

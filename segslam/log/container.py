@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
@@ -38,12 +39,19 @@ class Stored(NamedTuple):
     data: bytes
 
 
-def messages(path: Path) -> Iterator[Stored]:
-    """Each message in the order of the file. Raises CutError at a cut, after what is whole before it."""
+def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
+    """Each message in the order of the file. Raises CutError at a cut, after what is whole before it.
+
+    Of a file with an index, those before the last chunk that holds a message of the topic `since_last` are left out.
+    """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
+    start = 0
     with path.open("rb") as stream:
-        for offset, opcode, body in _records(stream):
+        if since_last is not None and (summary := _summary(stream)) is not None:
+            schemas, channels = dict(summary.schemas), dict(summary.channels)
+            start = _last_chunk_with(since_last, summary)
+        for offset, opcode, body in _records(stream, start):
             for record in _records_of_chunk(offset, body) if opcode == Opcode.CHUNK else ():
                 if isinstance(record, Schema):
                     schemas[record.id] = record
@@ -81,8 +89,8 @@ def metadata(path: Path) -> dict[str, dict[str, str]]:
 
 def count(path: Path, topic: str) -> int:
     """How many messages a topic has: by the index where the file has one, or else by reading."""
-    with path.open("rb") as stream, suppress(*_DAMAGE):
-        summary = make_reader(stream).get_summary()
+    with path.open("rb") as stream:
+        summary = _summary(stream)
         if summary is not None and summary.statistics is not None:
             counts = summary.statistics.channel_message_counts
             return sum(counts.get(channel.id, 0) for channel in summary.channels.values() if channel.topic == topic)
@@ -93,13 +101,29 @@ def count(path: Path, topic: str) -> int:
     return number
 
 
-def _records(stream: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
-    """Offset, opcode and body of each record from the start of a file to the end of its data.
+def _summary(stream: IO[bytes]) -> Summary | None:
+    """The index at the end of a file; None where there is none, or it is damaged."""
+    with suppress(*_DAMAGE):
+        return make_reader(stream).get_summary()
+    return None
+
+
+def _last_chunk_with(topic: str, summary: Summary) -> int:
+    """Offset of the last chunk that holds a message of a topic; 0 if none does."""
+    ids = {channel.id for channel in summary.channels.values() if channel.topic == topic}
+    holding = (chunk for chunk in summary.chunk_indexes if ids & chunk.message_index_offsets.keys())
+    return max((chunk.chunk_start_offset for chunk in holding), default=0)
+
+
+def _records(stream: IO[bytes], start: int = 0) -> Iterator[tuple[int, int, bytes]]:
+    """Offset, opcode and body of each record of a file, from that at `start` on, to the end of its data.
 
     Raises CutError for a record that is not whole, and for a file that is not MCAP.
     """
+    stream.seek(0)
     if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise CutError(0)
+    stream.seek(max(start, len(MCAP0_MAGIC)))
     while True:
         offset, head = stream.tell(), stream.read(_RECORD_HEAD.size)
         if len(head) < _RECORD_HEAD.size:

@@ -29,6 +29,7 @@ _POINT_FIELDS = [
     PackedElementField(name="z", offset=8, type=PackedElementField.FLOAT32),
     PackedElementField(name="label", offset=12, type=PackedElementField.UINT8),
 ]
+_IDENTITY = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 
 
 def frame_transform(T_parent_child: Transform, *, parent: str, child: str, stamp_ns: int) -> FrameTransform:
@@ -50,7 +51,7 @@ def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) ->
     return PointCloud(
         timestamp=_timestamp(stamp_ns),
         frame_id=frame,
-        pose=_pose(np.eye(4)),
+        pose=_IDENTITY,
         point_stride=_POINT.itemsize,
         fields=_POINT_FIELDS,
         data=rows.tobytes(),
@@ -79,7 +80,7 @@ def line(points: Sequence[Vector], colors: Sequence[str], *, width_px: float = 2
         type=LinePrimitive.LINE_LIST,
         thickness=width_px,
         scale_invariant=True,
-        pose=_pose(np.eye(4)),
+        pose=_IDENTITY,
         points=[Point3(x=x, y=y, z=z) for x, y, z in np.asarray(points).tolist()],
         colors=[_color(color) for color in colors for _ in range(2)],
     )

@@ -120,6 +120,7 @@ def _result(log: RunLog) -> SlamResult:
         if step.keyframe is not None:
             keyframe_rows.append(row)
     if len(T_odom_lidar) < len(trajectory):
-        raise SegslamError(f"{log.path}: damaged, {len(T_odom_lidar)} of its {len(trajectory)} steps are left; replay it")
+        left = f"{len(T_odom_lidar)} of its {len(trajectory)} steps are left"
+        raise SegslamError(f"{log.path}: damaged, {left}; replay it, or map the data again")
     odometry = Trajectory(trajectory.scan_index, trajectory.stamp_ns, np.array(T_odom_lidar))
     return SlamResult(trajectory, odometry, estimate, np.array(keyframe_rows), tuple(attempts))

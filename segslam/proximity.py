@@ -2,7 +2,7 @@
 
 Odometry drifts with the way travelled, so two keyframes can be as wrong about each other as the shortest chain between
 them is long, and an accepted loop is a short cut. The search radius grows with that chain, target by target: the bound
-that a covariance would give, at the price of one Dijkstra run.
+that a covariance would give, at the price of one Dijkstra run over the ends of loops.
 """
 
 import numpy as np
@@ -14,17 +14,25 @@ from segslam import geometry
 from segslam.config import ProximityConfig
 from segslam.types import IndexPairs, Indices, LoopCandidate, LoopClosure, Vector
 
+NO_CLOSURES: IndexPairs = np.empty((0, 2), dtype=np.int64)
+
 
 class ProximityDetector:
-    """Proposes loops, and remembers those accepted."""
+    """Proposes loops, and remembers those accepted. What a proposal costs does not grow with the drive, but for
+    a comparison of each keyframe's place with the new one's."""
 
     def __init__(self, config: ProximityConfig) -> None:
         self._config = config
-        self._closures = np.empty((0, 2), dtype=np.int64)
+        self._closures = NO_CLOSURES
+        self._chains = Chains(NO_CLOSURES)
 
     def note_closure(self, closure: LoopClosure) -> None:
-        """From now on this loop ties its two ends together, and its surroundings are not searched again."""
+        """From now on the surroundings of this loop are not searched again."""
         self._closures = np.vstack([self._closures, [[closure.source_id, closure.target_id]]])
+
+    def note_estimate(self) -> None:
+        """From now on poses are such that all closures noted so far tie their two ends together."""
+        self._chains = Chains(self._closures)
 
     def candidates(
         self, source_id: int, T_world_keyframes: Float[np.ndarray, "n 4 4"], travel_m: Float[np.ndarray, " n"]
@@ -36,55 +44,91 @@ class ProximityDetector:
         differ by `height_factor` radii.
         """
         config = self._config
-        radius_m = search_radius_m(source_id, travel_m, self._closures, config=config)
-        offset = T_world_keyframes[:, :3, 3] - T_world_keyframes[source_id, :3, 3]
+        within_reach = self._within_reach(source_id, T_world_keyframes, travel_m)
+        chain_m = self._chains.lengths_m(source_id, within_reach, travel_m)
+        radius_m = search_radius_m(chain_m, config=config)
+        offset = T_world_keyframes[within_reach, :3, 3] - T_world_keyframes[source_id, :3, 3]
         distance_m = np.hypot(offset[:, 0], offset[:, 1])
         eligible = (
-            (np.arange(len(travel_m)) < source_id)
-            & (travel_m[source_id] - travel_m >= config.min_travel_m)
-            & (distance_m <= radius_m)
+            (distance_m <= radius_m)
             & (np.abs(offset[:, 2]) <= config.height_factor * radius_m)
-            & ~self._is_closed(source_id, travel_m, radius_m)
+            & ~self._is_closed(source_id, within_reach, travel_m, radius_m)
         )
         nearest_first = np.flatnonzero(eligible)[np.argsort(distance_m[eligible], kind="stable")]
-        targets = _spread_out(nearest_first, travel_m, config.spread_m, config.max_candidates)
+        rows = _spread_out(nearest_first, travel_m[within_reach], config.spread_m, config.max_candidates)
         T_source_world = geometry.inverse(T_world_keyframes[source_id])
         return tuple(
             LoopCandidate(
                 source_id=source_id,
-                target_id=target_id,
-                T_target_source_prior=geometry.inverse(T_source_world @ T_world_keyframes[target_id]),
-                distance_m=float(np.linalg.norm(offset[target_id])),
-                search_radius_m=float(radius_m[target_id]),
+                target_id=int(within_reach[row]),
+                T_target_source_prior=geometry.inverse(T_source_world @ T_world_keyframes[within_reach[row]]),
+                distance_m=float(np.linalg.norm(offset[row])),
+                search_radius_m=float(radius_m[row]),
             )
-            for target_id in targets
+            for row in rows
         )
 
-    def _is_closed(self, source_id: int, travel_m: Vector, radius_m: Vector) -> Bool[np.ndarray, " n"]:
+    def _within_reach(self, source_id: int, T_world_keyframes: np.ndarray, travel_m: Vector) -> Indices:
+        """Older keyframes far enough in travel and, whatever their radius, near enough; travel grows with the id."""
+        config = self._config
+        num_far = np.searchsorted(travel_m, travel_m[source_id] - config.min_travel_m, side="right")
+        x, y = T_world_keyframes[: min(num_far, source_id), :2, 3].T - T_world_keyframes[source_id, :2, 3, None]
+        return np.flatnonzero(np.hypot(x, y) <= config.max_radius_m)
+
+    def _is_closed(self, source_id: int, ids: Indices, travel_m: Vector, radius_m: Vector) -> Bool[np.ndarray, " k"]:
         """Which targets lie where a loop has just been closed: within `min_gap_m` of it on the side of the source, and
         on that of the target not so much farther that another place could be meant."""
         sources, targets = self._closures.T
         recent = targets[np.abs(travel_m[sources] - travel_m[source_id]) < self._config.min_gap_m]
-        apart_m = np.abs(travel_m[:, None] - travel_m[recent])
+        apart_m = np.abs(travel_m[ids, None] - travel_m[recent])
         return (apart_m < self._config.min_gap_m + radius_m[:, None]).any(axis=1)
 
 
-def search_radius_m(source_id: int, travel_m: Vector, closures: IndexPairs, *, config: ProximityConfig) -> Vector:
-    """How far the estimate of each keyframe may be off as seen from one, in metres.
+class Chains:
+    """The shortest ways between keyframes along odometry, which is as long as it is, and closures, of no length.
 
-    `closures` holds (source id, target id); the chain to a keyframe is the shortest along odometry and closures.
+    They turn off at ends of closures only, so the graph that is searched has no other vertices.
     """
-    chain_m = dijkstra(_chains(travel_m, closures), directed=False, indices=np.array(source_id))
+
+    def __init__(self, closures: IndexPairs) -> None:
+        """`closures` (k, 2): the two keyframes of each."""
+        self._pairs = np.unique(closures, axis=0)  # the sparse format would add up what stands there twice
+        self._ends = np.unique(self._pairs)
+        self._found: dict[int, Vector] = {}
+
+    def lengths_m(self, source_id: int, ids: Indices, travel_m: Vector) -> Vector:
+        """(k,) from one keyframe to each of some others."""
+        straight_m = np.abs(travel_m[ids] - travel_m[source_id])
+        if not len(self._ends):
+            return straight_m
+        ends_m = travel_m[self._ends]
+        source_ends = [int(end[0]) for end in self._beside(np.array([source_id]))]
+        turning_m = np.min(
+            [self._from(end, ends_m) + abs(ends_m[end] - travel_m[source_id]) for end in source_ends], axis=0
+        )
+        by_ends_m = [turning_m[end] + np.abs(ends_m[end] - travel_m[ids]) for end in self._beside(ids)]
+        return np.minimum(straight_m, np.min(by_ends_m, axis=0))
+
+    def _beside(self, ids: Indices) -> tuple[Indices, Indices]:
+        """Rows of the ends next to some keyframes, before and after them in travel; twice the same at the margins."""
+        after = np.searchsorted(self._ends, ids)
+        return np.maximum(after - 1, 0), np.minimum(after, len(self._ends) - 1)
+
+    def _from(self, end: int, ends_m: Vector) -> Vector:
+        """From one end to all ends; kept, for a new keyframe mostly asks from where the last one did."""
+        if end not in self._found:
+            rows = np.arange(len(self._ends) - 1)
+            sources, targets = np.searchsorted(self._ends, self._pairs).T
+            lengths = np.concatenate([np.diff(ends_m), np.zeros(len(self._pairs))])
+            places = np.concatenate([rows, sources]), np.concatenate([rows + 1, targets])
+            graph = coo_array((lengths, places), shape=(len(self._ends), len(self._ends)))
+            self._found[end] = dijkstra(graph, directed=False, indices=np.array(end))
+        return self._found[end]
+
+
+def search_radius_m(chain_m: Vector, *, config: ProximityConfig) -> Vector:
+    """How far the estimate of each keyframe may be off as seen from one, in metres, by the chain to it."""
     return np.minimum(config.base_radius_m + config.drift_ratio * chain_m, config.max_radius_m)
-
-
-def _chains(travel_m: Vector, closures: IndexPairs) -> coo_array:
-    """The graph whose edges are odometry, as long as the way, and closures, of no length."""
-    ids = np.arange(len(travel_m) - 1)
-    pairs = np.unique(closures, axis=0)  # the sparse format would add up what stands there twice
-    lengths = np.concatenate([np.diff(travel_m), np.zeros(len(pairs))])
-    rows, columns = np.concatenate([ids, pairs[:, 0]]), np.concatenate([ids + 1, pairs[:, 1]])
-    return coo_array((lengths, (rows, columns)), shape=(len(travel_m), len(travel_m)))
 
 
 def _spread_out(ranked: Indices, travel_m: Vector, spread_m: float, most: int) -> list[int]:

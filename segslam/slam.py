@@ -153,9 +153,10 @@ class Slam:
             self.graph.add_keyframe(keyframe.id, keyframe.T_odom_keyframe, keyframe.travel_m)
             attempts = self._attempt_loops(keyframe.id, watch)
             self._attempts += attempts
-            if any(isinstance(attempt.outcome, LoopClosure) for attempt in attempts):
+            if self.graph.is_due:
                 with watch("optimize"):
                     estimate = self.graph.optimize()
+                self._detector.note_estimate()
         return Step(scan_index, stamp_ns, T_odom_lidar, keyframe, attempts, estimate, watch.seconds)
 
     def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:

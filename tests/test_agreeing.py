@@ -8,7 +8,7 @@ import numpy as np
 from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph.agreeing import believe_agreeing
-from segslam.pose_graph.consistency import agreements, largest_agreeing, neighbours
+from segslam.pose_graph.consistency import agreements, ends_m, largest_agreeing, neighbours
 from segslam.pose_graph.edges import Edge, factor_graph
 from segslam.pose_graph.gnc import TruncatedProblem, settle, settle_from
 from segslam.pose_graph.noise import first_pose, inlier_bound, odometry_information
@@ -45,7 +45,7 @@ def problem_of(closures: list[Edge]) -> tuple[TruncatedProblem, gtsam.Values, np
     values = gtsam.Values()
     for i, T_world in enumerate(TRUTH):
         values.insert(i, gtsam.Pose3(T_world))
-    near = neighbours(closures, 6.0 * np.arange(len(TRUTH)), 60.0)
+    near = neighbours(ends_m(closures, 6.0 * np.arange(len(TRUTH))), 59.0)
     says = np.minimum(1.0, 2.0 / near.sum(axis=1))
     agree = agreements(odometry, closures, BOUND)
     return TruncatedProblem(trusted, closures, BOUND, says=says), values, agree, near

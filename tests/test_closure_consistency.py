@@ -9,7 +9,15 @@ from scipy.stats import chi2, kstest
 
 from segslam import geometry
 from segslam.config import GraphConfig
-from segslam.pose_graph.consistency import adjoints, agreements, largest_agreeing, neighbours, pairwise_chi2
+from segslam.pose_graph.consistency import (
+    adjoints,
+    agreements,
+    ends_m,
+    largest_agreeing,
+    neighbours,
+    num_near,
+    pairwise_chi2,
+)
 from segslam.pose_graph.edges import Edge, factor_graph
 from segslam.pose_graph.noise import inlier_bound, odometry_information
 from segslam.pose_graph.solver import search
@@ -171,5 +179,9 @@ def test_closures_are_neighbours_where_both_ends_are_near() -> None:
     edges = [Edge(a, b, np.eye(4), np.eye(6)) for a, b in ends]
     expected = np.eye(4, dtype=bool)
     expected[0, 1] = expected[1, 0] = True
-    np.testing.assert_array_equal(neighbours(edges, travel_m, 30.0), expected)
-    assert neighbours([], travel_m, 30.0).shape == (0, 0)
+    places_m = ends_m(edges, travel_m)
+    np.testing.assert_array_equal(neighbours(places_m, 30.0), expected)
+    np.testing.assert_array_equal(num_near(places_m, 30.0), expected.sum(axis=1))
+    nowhere_m = ends_m([], travel_m)
+    assert neighbours(nowhere_m, 30.0).shape == (0, 0)
+    assert num_near(nowhere_m, 30.0).shape == (0,)

@@ -1,6 +1,8 @@
 """Loops of known truth, with known drift and known lies."""
 
 import itertools
+import subprocess
+import sys
 from pathlib import Path
 
 import gtsam
@@ -126,8 +128,12 @@ def test_a_closure_told_from_the_other_end_is_its_inverse() -> None:
     np.testing.assert_allclose(first.T_world_keyframes, second.T_world_keyframes, atol=0.02)
 
 
+@pytest.mark.parametrize("most_paired", [0, 1_000])
 @pytest.mark.parametrize("final", ["gnc", "consistent"])
-def test_the_end_switches_lies_off_and_keeps_the_truth(final: str) -> None:
+def test_the_end_switches_lies_off_and_keeps_the_truth(
+    final: str, most_paired: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("segslam.pose_graph.graph.MOST_PAIRED", most_paired)
     graph = graph_of(DRIFT, TRUE_LOOPS + LIES, GraphConfig(final=final))
     graph.optimize()
     estimate = graph.finish()
@@ -203,6 +209,56 @@ def test_a_keyframe_after_an_optimisation_follows_it_by_odometry() -> None:
     expected = T_world_118 @ geometry.inverse(DRIFT[118]) @ DRIFT[119]
     np.testing.assert_allclose(graph.T_world_keyframe(119), expected, atol=1e-9)
     np.testing.assert_allclose(graph.T_world_keyframes[119], expected, atol=1e-9)
+
+
+def test_poses_given_out_are_not_touched_by_what_follows() -> None:
+    graph = graph_of(DRIFT[:100], TRUE_LOOPS[:2])
+    given = [graph.T_world_keyframes, graph.travel_m]
+    copies = [array.copy() for array in given]
+    for i in range(100, 120):
+        graph.add_keyframe(i, DRIFT[i], float(travel_m(DRIFT)[i]))
+    graph.optimize()
+    for array, copy in zip(given, copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
+
+
+def test_the_longer_the_drive_the_more_closures_wait_for_an_optimisation(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = graph_of(DRIFT, [])
+    assert not graph.is_due
+    graph.add_closure(TRUE_LOOPS[0])
+    assert graph.is_due
+    monkeypatch.setattr("segslam.pose_graph.graph.KEYFRAMES_PER_CLOSURE", 60)  # of 120
+    due = []
+    for loop in TRUE_LOOPS[1:4]:
+        due.append(graph.is_due)
+        graph.add_closure(loop)
+    assert [*due, graph.is_due] == [False, False, True, True]
+    graph.optimize()
+    assert not graph.is_due
+
+
+LONG_DRIVE = """
+import numpy as np
+from segslam.pose_graph import G2oGraph, optimize_graph
+from segslam.pose_graph.edges import Edge
+ahead = np.eye(4)
+ahead[0, 3] = 1.0
+poses = {i: np.eye(4) for i in range(12_000)}
+for i in poses:
+    poses[i][0, 3] = 1.001 * i
+found = optimize_graph(G2oGraph(poses, [Edge(i, i + 1, ahead, np.eye(6)) for i in range(len(poses) - 1)]))
+print(found.graph.T_world_vertex[11_999][0, 3])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="ulimit")
+def test_a_long_drive_does_not_exhaust_the_stack() -> None:
+    """GTSAM calls itself along the drive: on a small stack 12,000 poses crash it as 100,000 do on the usual one."""
+    command = ["bash", "-c", 'ulimit -s 192; exec "$0" -c "$1"', sys.executable, LONG_DRIVE]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert float(done.stdout) == pytest.approx(11_999.0, abs=0.01)
 
 
 def test_moving_the_odometry_moves_the_world() -> None:

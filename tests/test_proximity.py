@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from segslam import geometry
 from segslam.config import ProximityConfig
-from segslam.proximity import ProximityDetector, search_radius_m
+from segslam.proximity import NO_CLOSURES, Chains, ProximityDetector, search_radius_m
 from segslam.types import Alignment, LoopClosure, Registration
 
 CONFIG = ProximityConfig(
@@ -38,6 +38,10 @@ def closure(source_id: int, target_id: int) -> LoopClosure:
     registration = Registration(np.eye(4), 0, 0, 0.0, np.eye(6))
     alignment = Alignment(registration, registration, 1.0, 0.0, 0.0)
     return LoopClosure(source_id, target_id, np.eye(4), np.eye(6), alignment)
+
+
+def radius_m(source_id: int, travel: np.ndarray, closures: np.ndarray) -> np.ndarray:
+    return search_radius_m(Chains(closures).lengths_m(source_id, np.arange(len(travel)), travel), config=CONFIG)
 
 
 def test_the_same_place_a_round_ago_is_proposed_first() -> None:
@@ -94,16 +98,14 @@ def test_height_counts_less_than_the_way_along_the_road() -> None:
 
 def test_the_radius_grows_with_the_way_and_no_farther_than_its_limit() -> None:
     travel = np.array([0.0, 100.0, 300.0, 2000.0])
-    radius = search_radius_m(3, travel, np.empty((0, 2), dtype=np.int64), config=CONFIG)
-    np.testing.assert_allclose(radius, [20.0, 20.0, 20.0, 6.0])
-    radius = search_radius_m(2, travel, np.empty((0, 2), dtype=np.int64), config=CONFIG)
-    np.testing.assert_allclose(radius, [9.0, 8.0, 6.0, 20.0])
+    np.testing.assert_allclose(radius_m(3, travel, NO_CLOSURES), [20.0, 20.0, 20.0, 6.0])
+    np.testing.assert_allclose(radius_m(2, travel, NO_CLOSURES), [9.0, 8.0, 6.0, 20.0])
 
 
 def test_a_closure_shrinks_the_radius_around_both_its_ends() -> None:
     travel = np.array([0.0, 50.0, 500.0, 600.0, 650.0])
     closures = np.array([[3, 1], [3, 1]])
-    radius = search_radius_m(4, travel, closures, config=CONFIG)
+    radius = radius_m(4, travel, closures)
     np.testing.assert_allclose(radius, [6.0 + 1.0, 6.5, 6.0 + 1.5, 6.5, 6.0])
 
 
@@ -121,8 +123,9 @@ def test_the_chain_is_the_shortest_of_all_chains(seed: int, num_closures: int) -
         length[source, target] = length[target, source] = 0.0
     for via in range(num):
         length = np.minimum(length, length[:, [via]] + length[[via], :])
-    radius = search_radius_m(num - 1, travel, closures, config=CONFIG)
-    np.testing.assert_allclose(radius, np.minimum(6.0 + 0.01 * length[num - 1], 20.0), rtol=1e-12)
+    chains = Chains(closures)
+    for source in range(num):
+        np.testing.assert_allclose(chains.lengths_m(source, np.arange(num), travel), length[source], rtol=1e-12)
 
 
 def test_where_a_loop_was_just_closed_no_other_is_searched() -> None:
@@ -140,6 +143,17 @@ def test_a_loop_just_closed_with_one_visit_does_not_stop_the_search_of_another()
     targets = [candidate.target_id for candidate in detector.candidates(2 * ROUND + 13, poses, travel)]
     assert targets[0] == 13
     assert all(target < ROUND - 3 for target in targets), targets
+
+
+def test_a_loop_narrows_the_search_once_the_poses_are_such() -> None:
+    poses, travel = square(ROUND + 40)
+    poses[ROUND:, 1, 3] += 7.5  # beyond the radius without any drift, and all keyframes as far from their place
+    detector = ProximityDetector(CONFIG)
+    detector.note_closure(closure(ROUND + 12, 12))
+    (found, *_) = detector.candidates(ROUND + 20, poses, travel)
+    assert found.search_radius_m == pytest.approx(6.0 + 0.01 * 200.0)
+    detector.note_estimate()
+    assert detector.candidates(ROUND + 20, poses, travel) == ()
 
 
 def test_an_old_keyframe_may_be_searched_again_among_those_before_it() -> None:

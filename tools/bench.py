@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from speed.growth import curves, optimisation
+from speed.growth import curves, drives, optimisation
 from speed.latency import latency
 from speed.start import start
 from speed.throughput import throughput
@@ -24,6 +24,7 @@ from segslam import keep_freed_memory
 from segslam.experiments.provenance import commit, machine
 
 PACKAGES = ("segslam", "kiss-icp", "numpy", "numba", "gtsam", "small-gicp", "mcap")
+DRIVE_SIZES = (1_000, 2_000, 5_000, 10_000, 20_000)
 GRAPH_SIZES = (1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
 LARGE_GRAPH = {"num_poses": 100_000, "num_closures": 20_000, "false_share": 0.2}
 
@@ -38,7 +39,7 @@ def measures(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
         ),
         "latency": lambda: latency(*scans, labels=options.labels),
         "start": start,
-        "growth": lambda: curves(GRAPH_SIZES),
+        "growth": lambda: curves(GRAPH_SIZES) | {"drive": drives(DRIVE_SIZES)},
         "large_graph": lambda: optimisation(**LARGE_GRAPH),
     }
 

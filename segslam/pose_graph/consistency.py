@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
+from scipy.spatial import KDTree
 
 from segslam.cliques import maximum_cliques, pack_rows
 from segslam.pose_graph.edges import Edge, Transforms
@@ -88,11 +89,20 @@ def pairwise_chi2(
     return chi2
 
 
-def neighbours(closures: Sequence[Edge], travel_m: Vector, within_m: float) -> Agreements:
+def ends_m(closures: Sequence[Edge], travel_m: Vector) -> Float[np.ndarray, "_ 2"]:
+    """(k, 2) m of travel to the two ends of each closure."""
+    return travel_m[np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64).reshape(-1, 2)]
+
+
+def neighbours(ends_m: Float[np.ndarray, "k 2"], within_m: float) -> Agreements:
     """(k, k) which two closures join the same two places: both ends within so much travel, as are its own."""
-    ends_m = travel_m[np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64).reshape(-1, 2)]
     apart_m = np.abs(ends_m[:, None] - ends_m)
-    return (apart_m < within_m).all(axis=2)
+    return (apart_m <= within_m).all(axis=2)
+
+
+def num_near(ends_m: Float[np.ndarray, "k 2"], within_m: float) -> Indices:
+    """(k,) how many closures join the same two places as each, itself among them: the row sums of `neighbours`."""
+    return KDTree(ends_m).query_ball_point(ends_m, within_m, p=np.inf, return_length=True)
 
 
 def adjoints(T_a_b: Transforms) -> Matrices:

@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 
 from segslam.pose_graph.edges import Edge, factor_graph, squared_errors
-from segslam.pose_graph.solver import Search, search
+from segslam.pose_graph.solver import Search, search, step
 from segslam.types import Mask, Vector
 
 CONTROL_FACTOR = 1.4  # growth of mu in the paper
@@ -119,8 +119,7 @@ def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Val
         weights = tls_weights(problem.squared_errors(values), control, problem.inlier_bound)
         if np.minimum(weights, 1.0 - weights).max() < NEGLIGIBLE_WEIGHT:
             break
-        graph = problem.weighted(weights)
-        values = values.retract(graph.linearize(values).optimize())
+        values = step(problem.weighted(weights), values)
         iterations += 1
         control *= CONTROL_FACTOR
     return values, iterations

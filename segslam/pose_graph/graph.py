@@ -1,7 +1,8 @@
 """The factor graph of keyframes: odometry between neighbours, closures between visits, one estimate for all.
 
 The graph is small, for it holds keyframes and not scans, so each optimisation is a full one that starts from the last
-estimate: 2,271 keyframes with 396 closures take some 15 ms an iteration, and two or three iterations.
+estimate: 2,271 keyframes with 396 closures take some 15 ms an iteration, and two or three iterations. On a drive so
+long that this adds up, some closures wait for each other.
 """
 
 from collections.abc import Iterable
@@ -14,16 +15,22 @@ from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import gnc, noise
 from segslam.pose_graph.agreeing import believe_agreeing
-from segslam.pose_graph.consistency import agreements, neighbours
+from segslam.pose_graph.consistency import agreements, ends_m, neighbours, num_near
 from segslam.pose_graph.drift import pitch_per_m, straightened
 from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
+from segslam.pose_graph.rows import Rows
 from segslam.pose_graph.solver import search
 from segslam.types import AngleSamples, GraphEstimate, LoopClosure, SegslamError, Transform, Vector
 
 RUNNING_TOLERANCE = 1e-3
 """Where an optimisation ends while running. Chosen: the same trajectories to a centimetre, a third fewer iterations."""
 FINAL_TOLERANCE = 1e-5
+KEYFRAMES_PER_CLOSURE = 2_500
+"""Chosen: so many more keyframes, and one closure more waits for the next optimisation; the time for all of them then
+grows with the drive and not with its square."""
+MOST_PAIRED = 5_000
+"""Closures of which every two are compared, in 20 s and 500 MB; of more than that, graduated non-convexity decides."""
 PLACE_M = 30.0
 """Closures whose ends are this near in travel see the same things, and are wrong together. Chosen."""
 VOICES_OF_A_PLACE = 2.0
@@ -52,8 +59,11 @@ class PoseGraph:
         self._inlier_bound = noise.inlier_bound(config.inlier_probability, error_allowance=config.error_allowance)
         self._kernel = noise.kernel(config.robust, self._inlier_bound)
         self._values = gtsam.Values()
+        self._T_world = Rows(np.empty((0, 4, 4)))
+        """The poses of the values."""
+        self._num_closures_in_estimate = 0
         self._T_odom_last = np.eye(4)
-        self._travel_m: list[float] = []
+        self._travel_m = Rows(np.empty(0))
 
     @property
     def num_keyframes(self) -> int:
@@ -63,12 +73,18 @@ class PoseGraph:
     @property
     def travel_m(self) -> Vector:
         """(n,) travel of each keyframe, by id."""
-        return np.array(self._travel_m)
+        return self._travel_m.all()
 
     @property
     def T_world_keyframes(self) -> Transforms:  # noqa: N802
         """(n, 4, 4) by id: the last estimate, and odometry from there for keyframes that are newer."""
-        return poses_by_id(self._values)
+        return self._T_world.all()
+
+    @property
+    def is_due(self) -> bool:
+        """Whether closures enough wait for an optimisation: one, but for drives of many thousand keyframes."""
+        waiting = len(self._closures) - self._num_closures_in_estimate
+        return waiting > self.num_keyframes // KEYFRAMES_PER_CLOSURE
 
     def T_world_keyframe(self, keyframe_id: int) -> Transform:  # noqa: N802
         """The present estimate of one pose. Raises SegslamError for an id that the graph does not hold."""
@@ -85,14 +101,17 @@ class PoseGraph:
         if keyframe_id == 0:
             first = gtsam.Pose3(_exact(T_odom_keyframe))
             self._trusted.add(gtsam.PriorFactorPose3(0, first, noise.first_pose()))
-            self._values.insert(0, first)
+            pose = first
         else:
             T_last_new = _exact(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
-            information = noise.odometry_information(travel_m - self._travel_m[-1], T_last_new, self._config)
+            way_m = travel_m - self.travel_m[-1]
+            information = noise.odometry_information(way_m, T_last_new, self._config)
             edge = Edge(keyframe_id - 1, keyframe_id, T_last_new, information)
             self._odometry.append(edge)
             self._trusted.add(edge.factor())
-            self._values.insert(keyframe_id, self._values.atPose3(keyframe_id - 1).compose(gtsam.Pose3(T_last_new)))
+            pose = self._values.atPose3(keyframe_id - 1).compose(gtsam.Pose3(T_last_new))
+        self._values.insert(keyframe_id, pose)
+        self._T_world.append(pose.matrix())
         self._T_odom_last = T_odom_keyframe
         self._travel_m.append(travel_m)
 
@@ -136,15 +155,16 @@ class PoseGraph:
         robust = self._optimize(FINAL_TOLERANCE)
         if self._config.final == "none":
             return robust
-        near = neighbours(self._closures, self.travel_m, PLACE_M)
-        says = np.minimum(1.0, VOICES_OF_A_PLACE / near.sum(axis=1))
+        places_m = ends_m(self._closures, self.travel_m)
+        says = np.minimum(1.0, VOICES_OF_A_PLACE / num_near(places_m, PLACE_M))
         problem = gnc.TruncatedProblem(self._trusted, self._closures, self._inlier_bound, says=says)
-        if self._config.final == "gnc":
+        if self._config.final == "gnc" or len(self._closures) > MOST_PAIRED:
             solution = gnc.solve(problem, self._values)
         else:
+            near = neighbours(places_m, PLACE_M)
             agree = agreements(self._odometry, self._closures, self._inlier_bound)
             solution = believe_agreeing(problem, self._values, agree, near)
-        self._values = solution.search.values
+        self._take(solution.search.values)
         return self._estimate(solution.search.error, solution.weights)
 
     def write_g2o(self, path: Path) -> None:
@@ -154,10 +174,16 @@ class PoseGraph:
 
     def _optimize(self, tolerance: float) -> GraphEstimate:
         found = search(joined(self._trusted, self._robust), self._values, tolerance=tolerance)
-        self._values = found.values
+        self._take(found.values)
         errors = np.sqrt(squared_errors(self._doubted, self._values))
         weights = [1.0 if self._kernel is None else self._kernel.weight(float(error)) for error in errors]
         return self._estimate(found.error, weights)
+
+    def _take(self, values: gtsam.Values) -> None:
+        """Values that all closures so far were part of."""
+        self._values = values
+        self._T_world = Rows(poses_by_id(values))
+        self._num_closures_in_estimate = len(self._closures)
 
     def _estimate(self, error: float, weights: Iterable[float]) -> GraphEstimate:
         pairs = [(closure.b, closure.a) for closure in self._closures]

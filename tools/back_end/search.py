@@ -80,6 +80,7 @@ def search(drive: Drive, rng: np.random.Generator) -> tuple[list[LoopClosure], d
         if looking.look(keyframe_id):
             started = time.perf_counter()
             looking.graph.optimize()
+            looking.detector.note_estimate()
             seconds.append(time.perf_counter() - started)
     last = np.array(seconds[-max(1, len(seconds) // 10) :] or [np.nan])
     looking.graph.finish()

@@ -1,23 +1,44 @@
-"""How cost grows with the length of a drive: graphs and proposals as long as no simulation is."""
+"""How cost grows with the length of a drive: graphs, proposals and whole drives as long as no simulation is."""
 
 import resource
+import tempfile
 import time
 from collections.abc import Callable
+from itertools import accumulate, pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from segslam import geometry
+from segslam.alignment import Stopwatch
 from segslam.config import Config
+from segslam.log import LogWriter
 from segslam.log.drawing import Drawing
+from segslam.odometry import GivenOdometry
 from segslam.pose_graph import G2oGraph, optimize_graph
 from segslam.pose_graph.edges import Edge
 from segslam.proximity import ProximityDetector
-from segslam.types import GraphEstimate, LoopClosure
+from segslam.slam import Slam
+from segslam.types import (
+    Alignment,
+    GraphEstimate,
+    Keyframe,
+    LoopAttempt,
+    LoopCandidate,
+    LoopClosure,
+    Registration,
+    Step,
+    Trajectory,
+)
 
 STEP_M = 2.0
 LAP = 500
 """Keyframes of a round of a town block; every later round closes loops with the one before."""
+ROUNDS = 4
+"""Of one block, before a drive goes on to the next."""
+AWAY = 100
+"""Keyframes from a block to the next."""
 SIGMA_RAD, SIGMA_M = 0.002, 0.02
 
 
@@ -54,6 +75,65 @@ def optimisation(num_poses: int, num_closures: int, *, false_share: float) -> di
     }
 
 
+class Drive(Slam):
+    """Where the loops that are tried come from the truth, give or take some noise: no scan is aligned."""
+
+    def __init__(self, T_world_true: np.ndarray) -> None:
+        config = Config.model_validate({"graph": {"systematic_drift": "never"}})  # there are no scans to ask
+        super().__init__(config, odometry=GivenOdometry(_no_scans(), config.odometry))
+        self._true = T_world_true
+        self._rng = np.random.default_rng(0)
+        self._information = np.diag(geometry.tangent(rotation_rad=SIGMA_RAD, translation_m=SIGMA_M) ** -2.0)
+
+    def _attempt(self, candidate: LoopCandidate, watch: Stopwatch) -> LoopAttempt:
+        edge = _edge(self._rng, self._true, candidate.target_id, candidate.source_id, self._information)
+        found = Registration(edge.T_a_b, 30, 30, 0.05, self._information)
+        alignment = Alignment(found, found, 0.8, 0.05, 0.0)
+        ids = candidate.source_id, candidate.target_id
+        return LoopAttempt(candidate, LoopClosure(*ids, edge.T_a_b, self._information, alignment), {})
+
+
+def drive(num_keyframes: int) -> dict[str, float]:
+    """Seconds that all but the alignment of scans takes, from the keyframe to the log and the final optimum."""
+    true = _town(num_keyframes)
+    config = Config().graph
+    sigmas = geometry.tangent(
+        rotation_rad=np.radians(config.odometry_sigma_deg), translation_m=config.odometry_sigma_m
+    ) * np.sqrt(STEP_M)
+    rng = np.random.default_rng(1)
+    motions = [geometry.inverse(a) @ b @ geometry.exp(rng.normal(size=6) * sigmas) for a, b in pairwise(true)]
+    slam, num_closures = Drive(true), 0
+    with tempfile.TemporaryDirectory() as folder, LogWriter(Path(folder) / "log.mcap", config=slam.config) as log:
+        slam.keep_clouds_in(log)
+        started = time.perf_counter()
+        for i, T_odom_lidar in enumerate(accumulate(motions, np.matmul, initial=np.eye(4))):
+            points, labels = np.zeros((10, 3), np.float32), np.zeros(10, np.uint8)
+            keyframe = Keyframe(i, i, i * 10**8, T_odom_lidar, STEP_M * i, points, labels)
+            step = slam.repeat(Step(i, i * 10**8, T_odom_lidar, keyframe, (), None, {}))
+            log.write(step)
+            num_closures += len(step.attempts)
+        driven_s = time.perf_counter() - started
+        result = slam.finish()
+        log.write_result(result.estimate, result.trajectory)
+        seconds = time.perf_counter() - started
+    errors_m = np.linalg.norm(result.trajectory.T_world_lidar[:, :3, 3] - true[:, :3, 3], axis=1)
+    return {
+        "seconds": seconds,
+        "finish_seconds": seconds - driven_s,
+        "num_closures": num_closures,
+        "worst_m": float(errors_m.max()),
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+
+
+def drives(sizes: tuple[int, ...]) -> dict[str, Any]:
+    """`drive` by number of keyframes, and the exponent of its time."""
+    rows = [drive(size) for size in sizes]
+    return {"size": list(sizes), "exponent": exponent(sizes, [row["seconds"] for row in rows])} | {
+        name: [row[name] for row in rows] for name in rows[0]
+    }
+
+
 def curves(sizes: tuple[int, ...]) -> dict[str, Any]:
     """Seconds by size, and the exponent of the power law through the larger half of them."""
     measured = {
@@ -77,6 +157,7 @@ def _propose_seconds(num_keyframes: int) -> float:
     detector, poses = ProximityDetector(Config().proximity), _rounds(num_keyframes)
     for source in range(LAP, num_keyframes, 5):
         detector.note_closure(_closure(source, source - LAP))
+    detector.note_estimate()
     travel_m = STEP_M * np.arange(num_keyframes)
     return _timed(lambda: detector.candidates(num_keyframes - 1, poses, travel_m))
 
@@ -96,6 +177,18 @@ def _timed(work: Callable[[], object]) -> float:
         work()
         times.append(time.perf_counter() - started)
     return min(times)
+
+
+def _town(num_poses: int) -> np.ndarray:
+    """Some rounds of a block, on straight ahead, rounds of the next block, and so on."""
+    place = np.arange(num_poses - 1) % (ROUNDS * LAP + AWAY)
+    turns = np.where(place < ROUNDS * LAP, 2.0 * np.pi / LAP, 0.0)
+    steps = (geometry.transform(geometry.yaw(turn), [STEP_M, 0.0, 0.0]) for turn in turns)
+    return np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
+
+
+def _no_scans() -> Trajectory:
+    return Trajectory(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4, 4)))
 
 
 def _rounds(num_poses: int) -> np.ndarray:

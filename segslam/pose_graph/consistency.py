@@ -96,8 +96,8 @@ def ends_m(closures: Sequence[Edge], travel_m: Vector) -> Float[np.ndarray, "_ 2
 
 def neighbours(ends_m: Float[np.ndarray, "k 2"], within_m: float) -> Agreements:
     """(k, k) which two closures join the same two places: both ends within so much travel, as are its own."""
-    apart_m = np.abs(ends_m[:, None] - ends_m)
-    return (apart_m <= within_m).all(axis=2)
+    first, second = (np.abs(column[:, None] - column) <= within_m for column in ends_m.T)
+    return first & second
 
 
 def num_near(ends_m: Float[np.ndarray, "k 2"], within_m: float) -> Indices:

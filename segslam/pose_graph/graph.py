@@ -30,7 +30,7 @@ KEYFRAMES_PER_CLOSURE = 2_500
 """Chosen: so many more keyframes, and one closure more waits for the next optimisation; the time for all of them then
 grows with the drive and not with its square."""
 MOST_PAIRED = 5_000
-"""Closures of which every two are compared, in 20 s and 500 MB; of more than that, graduated non-convexity decides."""
+"""Closures of which every two are compared, in 8 s and 450 MB; of more than that, graduated non-convexity decides."""
 PLACE_M = 30.0
 """Closures whose ends are this near in travel see the same things, and are wrong together. Chosen."""
 VOICES_OF_A_PLACE = 2.0

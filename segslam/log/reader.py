@@ -54,7 +54,7 @@ class RunLog:
     def steps(self, *, clouds: bool = True) -> Iterator[Step]:
         """The steps in the order in which they were made, read as they are asked for.
 
-        Without `clouds`, in half the time, keyframes come with no points.
+        Without `clouds`, in a quarter of the time, keyframes come with no points.
         A cut or damaged log gives its complete steps up to there, and a warning that says how many.
         Raises SegslamError where the file does not hold what this version writes.
         """

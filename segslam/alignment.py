@@ -1,12 +1,12 @@
 """Two scans, from points to a verified pose: describe and prepare each once, then match, refine and verify a pair."""
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
 from segslam import geometry, refine, segregator, verify
+from segslam.beside import both
 from segslam.config import Config, VerifyConfig
 from segslam.semantics import geometric_labels
 from segslam.types import Alignment, Description, Labels, Points, Registration, Rejected, RejectReason
@@ -60,8 +60,7 @@ def register(
     def prepared(points: Points, labels: Labels | None) -> PreparedScan:
         return prepare_scan(points, shape_labels(points, config=config) if labels is None else labels, config=config)
 
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        source, target = pool.map(prepared, (source_points, target_points), (source_labels, target_labels))
+    source, target = both(prepared, (source_points, source_labels), (target_points, target_labels))
     return align(source, target, config=config)
 
 

@@ -1,12 +1,19 @@
-"""Work that need not be waited for, in a thread beside."""
+"""Work in threads beside: what need not be waited for, and two things at once."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Done = TypeVar("Done")
+
+
+def both(work: Callable[..., Done], first: tuple[Any, ...], second: tuple[Any, ...]) -> tuple[Done, Done]:
+    """What `work` makes of two sets of arguments, at the same time."""
+    with ThreadPoolExecutor(1) as thread:
+        other = thread.submit(work, *second)
+        return work(*first), other.result()
 
 
 def beside(items: Iterable[Item], work: Callable[[Item], Done], *, most_waiting: int) -> Iterator[Done]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from segslam import geometry, refine
 from segslam.alignment import Labeller, PreparedScan, Stopwatch, align, prepare_scan, shape_labels
+from segslam.beside import both
 from segslam.config import Config
 from segslam.keyframes import Clouds, CloudStore, KeyframeSelector, thin
 from segslam.odometry import KissOdometry, Odometry, OdometryResult
@@ -209,7 +210,7 @@ class Slam:
     def _attempt(self, candidate: LoopCandidate, watch: Stopwatch) -> LoopAttempt:
         own = Stopwatch()
         with own("prepare"):
-            source, target = self._prepared(candidate.source_id), self._prepared(candidate.target_id)
+            source, target = both(self._prepared, (candidate.source_id,), (candidate.target_id,))
         outcome = align(
             source,
             target,

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from segslam.beside import beside
+from segslam.beside import beside, both
 
 
 @pytest.mark.parametrize("most_waiting", [1, 8])
@@ -94,3 +94,21 @@ def test_an_early_end_stops_the_work() -> None:
     num_worked = len(worked)
     time.sleep(0.02)
     assert len(worked) == num_worked <= 5
+
+
+def test_both_are_done_at_the_same_time_and_given_in_their_order() -> None:
+    meeting = threading.Barrier(2, timeout=5.0)
+
+    def work(first: int, second: int) -> int:
+        meeting.wait()
+        return first - second
+
+    assert both(work, (5, 1), (2, 7)) == (4, -5)
+
+
+@pytest.mark.parametrize("zero", [0, 1])
+def test_what_raises_in_either_raises(zero: int) -> None:
+    arguments = [(1, 1), (1, 1)]
+    arguments[zero] = (1, 0)
+    with pytest.raises(ZeroDivisionError):
+        both(lambda a, b: a / b, *arguments)

@@ -24,7 +24,7 @@ from segslam import keep_freed_memory
 from segslam.experiments.provenance import commit, machine
 
 PACKAGES = ("segslam", "kiss-icp", "numpy", "numba", "gtsam", "small-gicp", "mcap")
-DRIVE_SIZES = (1_000, 2_000, 5_000, 10_000, 20_000)
+DRIVE_SIZES = (1_000, 2_000, 5_000, 10_000)
 GRAPH_SIZES = (1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
 LARGE_GRAPH = {"num_poses": 100_000, "num_closures": 20_000, "false_share": 0.2}
 

@@ -3,6 +3,7 @@
 import multiprocessing
 import signal
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ class _AlignerApart:
     def __init__(self, config: OdometryConfig) -> None:
         context = multiprocessing.get_context("spawn")  # a fork would take along the locks of other threads
         self._pipe, theirs = context.Pipe()
-        shared = context.RawArray("d", 3 * MOST_SHARED)
+        shared = _room_for_points(context)
         self._shared = _as_points(shared)
         self._process = context.Process(target=_serve, args=(theirs, shared, config), name="odometry", daemon=True)
         self._process.start()
@@ -61,7 +62,7 @@ class _AlignerApart:
     def _asked(self, T_odom_lidar: Transform | None, points: Points | None) -> Transform:
         """The pose of the sweep: the one given or, where it is None, the one it is found at."""
         sent: Points | int | None = points
-        if points is not None and len(points) <= MOST_SHARED:
+        if points is not None and len(points) <= len(self._shared):
             self._shared[: len(points)] = points
             sent = len(points)
         try:
@@ -84,9 +85,17 @@ class _AlignerApart:
         )
 
 
+def _room_for_points(context: SpawnContext) -> Any:
+    """Memory that two processes share; none where the system grants none, as where files may not be that large."""
+    try:
+        return context.RawArray("d", 3 * MOST_SHARED)
+    except OSError:
+        return None
+
+
 def _as_points(shared: Any) -> Points:
-    """The shared memory as rows of float64 coordinates."""
-    return np.frombuffer(shared).reshape(-1, 3)
+    """The shared memory as rows of float64 coordinates; no row where there is none."""
+    return np.empty((0, 3)) if shared is None else np.frombuffer(shared).reshape(-1, 3)
 
 
 def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:

@@ -224,19 +224,16 @@ def test_poses_given_out_are_not_touched_by_what_follows() -> None:
             array[0] = 0.0
 
 
-def test_the_longer_the_drive_the_more_closures_wait_for_an_optimisation(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = graph_of(DRIFT, [])
-    assert not graph.is_due
-    graph.add_closure(TRUE_LOOPS[0])
-    assert graph.is_due
-    monkeypatch.setattr("segslam.pose_graph.graph.KEYFRAMES_PER_CLOSURE", 60)  # of 120
-    due = []
-    for loop in TRUE_LOOPS[1:4]:
-        due.append(graph.is_due)
+def test_the_more_closures_there_are_the_more_wait_for_an_optimisation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("segslam.pose_graph.graph.CLOSURES_PER_WAITING", 2)
+    graph, waited = graph_of(DRIFT, []), []
+    for number, loop in enumerate(TRUE_LOOPS):
+        assert not graph.is_due
         graph.add_closure(loop)
-    assert [*due, graph.is_due] == [False, False, True, True]
-    graph.optimize()
-    assert not graph.is_due
+        if graph.is_due:
+            graph.optimize()
+            waited.append(number)
+    assert waited == [0, 1, 3, 6], "after 1, 1, 2, 3 and next 4 closures"
 
 
 LONG_DRIVE = """

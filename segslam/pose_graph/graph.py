@@ -2,7 +2,7 @@
 
 The graph is small, for it holds keyframes and not scans, so each optimisation is a full one that starts from the last
 estimate: 2,271 keyframes with 396 closures take some 15 ms an iteration, and two or three iterations. On a drive so
-long that this adds up, some closures wait for each other.
+long that this adds up, closures wait for each other.
 """
 
 from collections.abc import Iterable
@@ -26,9 +26,9 @@ from segslam.types import AngleSamples, GraphEstimate, LoopClosure, SegslamError
 RUNNING_TOLERANCE = 1e-3
 """Where an optimisation ends while running. Chosen: the same trajectories to a centimetre, a third fewer iterations."""
 FINAL_TOLERANCE = 1e-5
-KEYFRAMES_PER_CLOSURE = 2_500
-"""Chosen: so many more keyframes, and one closure more waits for the next optimisation. Far beyond this number the time
-for all of them grows with the drive; below, with its square: 72 s at 5,000 keyframes in rounds of a block."""
+CLOSURES_PER_WAITING = 200
+"""Chosen: of so many closures in the estimate, one more waits for the next optimisation: it tells less, and the time of
+all optimisations would grow with the square of the drive. No KITTI sequence has so many."""
 MOST_PAIRED = 5_000
 """Closures of which every two are compared, in 8 s and 450 MB; of more than that, graduated non-convexity decides."""
 PLACE_M = 30.0
@@ -82,9 +82,9 @@ class PoseGraph:
 
     @property
     def is_due(self) -> bool:
-        """Whether closures enough wait for an optimisation: one, but for drives of many thousand keyframes."""
+        """Whether closures enough wait for an optimisation: one, or more where the estimate has hundreds already."""
         waiting = len(self._closures) - self._num_closures_in_estimate
-        return waiting > self.num_keyframes // KEYFRAMES_PER_CLOSURE
+        return waiting > self._num_closures_in_estimate // CLOSURES_PER_WAITING
 
     def T_world_keyframe(self, keyframe_id: int) -> Transform:  # noqa: N802
         """The present estimate of one pose. Raises SegslamError for an id that the graph does not hold."""

@@ -18,8 +18,10 @@ NO_CLOSURES: IndexPairs = np.empty((0, 2), dtype=np.int64)
 
 
 class ProximityDetector:
-    """Proposes loops, and remembers those accepted. What a proposal costs does not grow with the drive, but for
-    a comparison of each keyframe's place with the new one's."""
+    """Proposes loops, and remembers those accepted.
+
+    A proposal compares the place of each keyframe with the new one's; all else that it costs is for those near.
+    """
 
     def __init__(self, config: ProximityConfig) -> None:
         self._config = config

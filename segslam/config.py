@@ -273,7 +273,7 @@ class GraphConfig(Section):
         description="of errors this many times as large as claimed: not every odometry is as good as KISS-ICP's",
     )
     systematic_drift: Literal["auto", "never"] = Field(
-        "auto", description="turn back what a leftover vertical angle bent, where held-out scans show it"
+        "auto", description="turn back what leftover angles of the sensor bent, where held-out scans show it"
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from segslam import geometry, refine
 from segslam.alignment import Labeller, PreparedScan, Stopwatch, align, prepare_scan, shape_labels
+from segslam.beam_angles import sample_angles
 from segslam.beside import both
 from segslam.config import Config
 from segslam.keyframes import Clouds, CloudStore, KeyframeSelector, thin
@@ -32,7 +33,6 @@ from segslam.types import (
     Trajectory,
     Transform,
 )
-from segslam.vertical_angle import sample_angles
 
 NUM_PREPARED = 64
 """Keyframes ready for alignment in memory, some 2 MB each; others are made ready again, in some 40 ms."""
@@ -181,7 +181,7 @@ class Slam:
         )
 
     def _straighten(self) -> DriftEvidence:
-        """Turn back what a leftover vertical angle bent, if held-out scans show that it did."""
+        """Turn back what leftover angles bent, if held-out scans show that it did."""
         T_odom_keyframes = np.stack([self._steps[row][2] for row in self._keyframe_rows])
         samples = sample_angles(self._surface, T_odom_keyframes, self.graph.travel_m)
         evidence = judge(samples)

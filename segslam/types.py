@@ -221,33 +221,34 @@ class GraphEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngleSamples:
-    """What pairs of scans along a drive tell of a leftover vertical angle, a row a pair."""
+    """What pairs of scans along a drive tell of leftover angles, a row a pair. Columns: vertical, of azimuth."""
 
     travel_m: Vector
     """Of the middle between the two scans."""
-    angle_rad: Vector
-    """By which all points lie too low."""
-    excess_rad_per_m: Vector
-    """How much too far down the odometry turned."""
-
-    def rows(self, rows: Indices) -> "AngleSamples":
-        """Some of the pairs."""
-        return AngleSamples(self.travel_m[rows], self.angle_rad[rows], self.excess_rad_per_m[rows])
+    angle_rad: Float[np.ndarray, "n 2"]
+    """By which all points lie too low; by which a point ahead lies too far left, and one behind too far right."""
+    excess_rad_per_m: Float[np.ndarray, "n 2"]
+    """How much too far down the odometry turned, and how much too far left."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriftEvidence:
-    """Whether a leftover vertical angle bent the odometry, and what speaks for it. None: too few scans to say."""
+    """Whether leftover angles bent the odometry, and what speaks for it. None: too few scans to say."""
 
     chosen: bool
     reason: str
     num_pairs: int
-    angle_deg: float | None = None
+    vertical_deg: float | None = None
     """Median over the drive; positive where points lie too low."""
+    azimuth_deg: float | None = None
+    """The same of azimuth; positive where a point ahead lies too far left."""
+    vertical_change_deg: float | None = None
+    """Sigma of the slow change around the mean."""
+    azimuth_change_deg: float | None = None
     chi2_before: float | None = None
-    """Of the odometry's excess pitch in stretches held out of the fit, as it is."""
+    """Of the odometry's excess turns in stretches held out of the fit, as they are."""
     chi2_after: float | None = None
-    """The same, less what the angles of the other stretches predict."""
+    """The same, less what the angles around the stretches predict."""
     t_value: float | None = None
     """Of the agreement between prediction and excess, over stretches."""
     t_needed: float | None = None

@@ -13,7 +13,7 @@ LAYERS = (  # top first; a room is a module or a folder
     {"slam", "log", "run_files", "map", "evaluation"},
     {"alignment"},
     {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "simulation",
-     "vertical_angle"},
+     "beam_angles"},
     {"semantics"},  # below datasets, whose scans come with labels
     {"trajectory"},
     {"geometry", "points", "beside", "interrupts", "cliques"},

@@ -79,8 +79,11 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
 
 def drift_summary(drift: dict[str, Any]) -> str:
     """What was found of a systematic drift, and what was done."""
-    if drift["angle_deg"] is None:
-        return f"no word on a leftover vertical angle: {drift['reason']}"
+    if drift["vertical_deg"] is None:
+        return f"no word on leftover angles: {drift['reason']}"
     done = "turned back" if drift["chosen"] else "left alone"
     held_out = f"held-out chi-square {drift['chi2_before']:.0f} -> {drift['chi2_after']:.0f}"
-    return f"leftover vertical angle {drift['angle_deg']:.2f} degrees, {done}: {drift['reason']} ({held_out})"
+    angles = ", ".join(
+        f"{name} {drift[f'{name}_deg']:.2f} +- {drift[f'{name}_change_deg']:.2f}" for name in ("vertical", "azimuth")
+    )
+    return f"leftover angles (degrees) {angles}, {done}: {drift['reason']} ({held_out})"

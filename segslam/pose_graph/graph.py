@@ -16,7 +16,7 @@ from segslam.config import GraphConfig
 from segslam.pose_graph import gnc, noise
 from segslam.pose_graph.agreeing import believe_agreeing
 from segslam.pose_graph.consistency import agreements, ends_m, neighbours, num_near
-from segslam.pose_graph.drift import pitch_per_m, straightened
+from segslam.pose_graph.drift import straightened, turns_per_m
 from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
 from segslam.pose_graph.rows import Rows
@@ -46,9 +46,10 @@ class PoseGraph:
 
     def __init__(self, config: GraphConfig) -> None:
         self._config = config
+        self._measured: list[Edge] = []
+        """Odometry as it came."""
         self._odometry: list[Edge] = []
-        self._turned_rad = np.zeros(0)
-        """By how much the first of these motions have been turned up."""
+        """The same, straightened if it was."""
         self._closures: list[Edge] = []
         self._trusted = gtsam.NonlinearFactorGraph()
         """The prior of the first pose and the factors of odometry: never doubted."""
@@ -107,6 +108,7 @@ class PoseGraph:
             way_m = travel_m - self.travel_m[-1]
             information = noise.odometry_information(way_m, T_last_new, self._config)
             edge = Edge(keyframe_id - 1, keyframe_id, T_last_new, information)
+            self._measured.append(edge)
             self._odometry.append(edge)
             self._trusted.add(edge.factor())
             pose = self._values.atPose3(keyframe_id - 1).compose(gtsam.Pose3(T_last_new))
@@ -129,15 +131,13 @@ class PoseGraph:
         self._robust.add(edge.factor(kernel=self._kernel))
 
     def straighten(self, samples: AngleSamples) -> None:
-        """Turn back in the odometry what a leftover vertical angle bent; it takes effect with the next optimisation.
+        """Turn back in the odometry what leftover angles bent; it takes effect with the next optimisation.
 
-        What an earlier call turned back is put in place again first.
+        What an earlier call turned back is put in place again first; keyframes added later are as they come.
         """
         travel_m = self.travel_m
-        turned_rad = pitch_per_m(samples, (travel_m[:-1] + travel_m[1:]) / 2) * np.diff(travel_m)
-        earlier = np.pad(self._turned_rad, (0, len(turned_rad) - len(self._turned_rad)))
-        self._odometry = straightened(self._odometry, turned_rad - earlier)
-        self._turned_rad = turned_rad
+        turned_rad = turns_per_m(samples, (travel_m[:-1] + travel_m[1:]) / 2) * np.diff(travel_m)[:, None]
+        self._odometry = straightened(self._measured, turned_rad)
         prior = self._trusted.at(0)
         self._trusted = gtsam.NonlinearFactorGraph()
         self._trusted.add(prior)

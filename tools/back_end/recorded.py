@@ -7,11 +7,11 @@ import numpy as np
 
 from back_end.drives import Drive, exact_closure
 from segslam import geometry, refine
+from segslam.beam_angles import sample_angles
 from segslam.config import RefineConfig
 from segslam.evaluation import loop_metrics
 from segslam.log import read_log
 from segslam.types import AngleSamples, Keyframe, LoopClosure, SegslamError
-from segslam.vertical_angle import sample_angles
 
 REACH_M = 6.0
 SPACING_M = 6.0
@@ -26,7 +26,7 @@ class Recorded(Drive):
     closures: list[LoopClosure]
 
     def angle_samples(self, config: RefineConfig) -> AngleSamples:
-        """What pairs of its scans tell of a leftover vertical angle."""
+        """What pairs of its scans tell of leftover angles."""
 
         def surface(keyframe_id: int) -> refine.Surface:
             return refine.prepare(refine.thin(self.keyframes[keyframe_id].points, config=config), config=config)

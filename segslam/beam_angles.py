@@ -131,6 +131,11 @@ def swinging(points: Points) -> Points:
     return np.column_stack([ahead * y, -ahead * x, np.zeros_like(x)])
 
 
+def corrected(points: Points, angle_rad: Float[np.ndarray, "2"]) -> Points:
+    """(n, 3) points that lie too low and, ahead, too far left by these angles, put right."""
+    return points + np.tensordot(angle_rad, _corrections(points), axes=1)
+
+
 def _corrections(points: Points) -> Float[np.ndarray, "2 n 3"]:
     """m per radian of either angle."""
     return np.stack([raising(points), swinging(points)])
@@ -147,14 +152,14 @@ def _step(
 ) -> Float[np.ndarray, "8"]:
     """One Gauss-Newton step of matched points: a tangent of the pose, and changes of the angles."""
     by_angle_source, by_angle_target = _corrections(source), _corrections(target)
-    corrected = source + np.tensordot(angle_rad, by_angle_source, axes=1)
-    moved = geometry.apply(T_target_source, corrected)
+    right = source + np.tensordot(angle_rad, by_angle_source, axes=1)
+    moved = geometry.apply(T_target_source, right)
     residual_m = np.einsum("ij,ij->i", normals, moved - target - np.tensordot(angle_rad, by_angle_target, axes=1))
     normals_source = normals @ T_target_source[:3, :3]
     by_angle = np.einsum("ij,kij->ik", normals_source, by_angle_source) - np.einsum(
         "ij,kij->ik", normals, by_angle_target
     )
-    jacobian = np.hstack([np.cross(corrected, normals_source), normals_source, by_angle])
+    jacobian = np.hstack([np.cross(right, normals_source), normals_source, by_angle])
     weight = (1.0 + (residual_m / RESIDUAL_M) ** 2) ** -2
     weighted = jacobian * weight[:, None]
     return -np.linalg.lstsq(weighted.T @ jacobian, weighted.T @ residual_m)[0]

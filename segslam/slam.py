@@ -6,15 +6,15 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from segslam import geometry, refine
+from segslam import geometry
 from segslam.alignment import Labeller, PreparedScan, Stopwatch, align, prepare_scan, shape_labels
-from segslam.beam_angles import sample_angles
 from segslam.beside import both
 from segslam.config import Config
 from segslam.keyframes import Clouds, CloudStore, KeyframeSelector, thin
 from segslam.odometry import KissOdometry, Odometry, OdometryResult
-from segslam.pose_graph import PoseGraph, judge
+from segslam.pose_graph import PoseGraph
 from segslam.proximity import ProximityDetector
+from segslam.straightening import straighten
 from segslam.trajectory import corrected_poses
 from segslam.types import (
     Alignment,
@@ -25,6 +25,7 @@ from segslam.types import (
     LoopAttempt,
     LoopCandidate,
     LoopClosure,
+    Points,
     Registration,
     Rejected,
     RejectReason,
@@ -181,17 +182,13 @@ class Slam:
         )
 
     def _straighten(self) -> DriftEvidence:
-        """Turn back what leftover angles bent, if held-out scans show that it did."""
+        """Turn back what leftover angles bent, if it did."""
         T_odom_keyframes = np.stack([self._steps[row][2] for row in self._keyframe_rows])
-        samples = sample_angles(self._surface, T_odom_keyframes, self.graph.travel_m)
-        evidence = judge(samples)
-        if evidence.chosen:
-            self.graph.straighten(samples)
-        return evidence
+        closures = [attempt.outcome for attempt in self._attempts if isinstance(attempt.outcome, LoopClosure)]
+        return straighten(self.graph, closures, self._points, T_odom_keyframes, config=self.config.refine)
 
-    def _surface(self, keyframe_id: int) -> refine.Surface:
-        points, _ = self._clouds.cloud(keyframe_id)
-        return refine.prepare(refine.thin(points, config=self.config.refine), config=self.config.refine)
+    def _points(self, keyframe_id: int) -> Points:
+        return self._clouds.cloud(keyframe_id)[0]
 
     def _prepare(self, keyframe_id: int) -> PreparedScan:
         points, labels = self._clouds.cloud(keyframe_id)

@@ -11,7 +11,7 @@ LAYERS = (  # top first; a room is a module or a folder
     {"experiments", "report"},
     {"runs", "results", "viewer"},
     {"slam", "log", "run_files", "map", "evaluation"},
-    {"alignment"},
+    {"alignment", "straightening"},
     {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "simulation",
      "beam_angles"},
     {"semantics"},  # below datasets, whose scans come with labels

@@ -23,7 +23,8 @@ from back_end.worth import closure_worth, odometry_worth
 
 from segslam.evaluation import trajectory_metrics
 from segslam.experiments.provenance import commit, machine
-from segslam.pose_graph import PoseGraph, judge
+from segslam.pose_graph import PoseGraph, angles_along, judge
+from segslam.straightening import sample, sharpened
 from segslam.types import AngleSamples, LoopClosure
 
 FIGURES = ("ate_m", "height_m", "kitti_translation_percent")
@@ -55,26 +56,33 @@ def row_of(run: Path) -> dict[str, Any]:
     """All figures of one run."""
     drive = read_recorded(run)
     started = time.perf_counter()
-    samples = drive.angle_samples(CONFIG.refine)
+    samples = sample(drive.points_of, drive.odometry, drive.travel_m, config=CONFIG.refine)
     evidence = judge(samples)
+    angles_rad = angles_along(samples, drive.travel_m)
+    sharp = list(sharpened(drive.closures, drive.points_of, angles_rad, config=CONFIG.refine))
     row: dict[str, Any] = {
         "run": f"{run.parent.name}/{run.name}",
         "keyframes": len(drive.keyframes),
         "travel_m": float(drive.travel_m[-1]),
         "odometry": errors(drive.odometry, drive),
         "loops": drive.loops(),
-        "worth": {**odometry_worth(drive), "closures": closure_worth(drive, drive.closures)},
+        "worth": {
+            **odometry_worth(drive),
+            "closures": closure_worth(drive, drive.closures),
+            "sharpened": closure_worth(drive, sharp),
+        },
         "evidence": asdict(evidence),
         "excess_mdeg_per_m": (1e3 * np.degrees(np.median(samples.excess_rad_per_m, axis=0))).tolist(),
         "sampling_s": time.perf_counter() - started,
     }
-    kinds = {
-        "found": drive.closures,
-        "exact": exact(drive.closures, drive.truth),
-        "exact_everywhere": exact_everywhere(drive),
+    exact_ones, everywhere = exact(drive.closures, drive.truth), exact_everywhere(drive)
+    kinds = {  # as they are, and on a straightened drive
+        "found": (drive.closures, sharp),
+        "exact": (exact_ones, exact_ones),
+        "exact_everywhere": (everywhere, everywhere),
     }
-    for name, closures in kinds.items():
-        plain, forced = finished(drive, closures, None), finished(drive, closures, samples)
+    for name, (closures, straight) in kinds.items():
+        plain, forced = finished(drive, closures, None), finished(drive, straight, samples)
         decided = forced if evidence.chosen else plain
         row[name] = {"closures": len(closures), "plain": plain, "forced": forced, "decided": decided}
     row["ate_by_exact"] = row["found"]["decided"]["ate_m"] / row["exact"]["decided"]["ate_m"]

@@ -1,7 +1,7 @@
 """The pose graph: the only room that knows GTSAM."""
 
 from segslam.pose_graph.batch import Optimized, Robust, optimize_graph
-from segslam.pose_graph.drift import judge
+from segslam.pose_graph.drift import angles_along, judge
 from segslam.pose_graph.g2o import G2oGraph, read_g2o, write_g2o
 from segslam.pose_graph.graph import PoseGraph
 
@@ -10,6 +10,7 @@ __all__ = [
     "Optimized",
     "PoseGraph",
     "Robust",
+    "angles_along",
     "judge",
     "optimize_graph",
     "read_g2o",

@@ -122,7 +122,12 @@ def judge(samples: AngleSamples) -> DriftEvidence:
 
 def turns_per_m(samples: AngleSamples, travel_m: Vector) -> Float[np.ndarray, "n 2"]:
     """How much too far down, and too far left, the odometry turns at these places, in rad/m."""
-    return np.column_stack([angle.at(travel_m) for angle in fitted(samples)]) / BEND_M
+    return angles_along(samples, travel_m) / BEND_M
+
+
+def angles_along(samples: AngleSamples, travel_m: Vector) -> Float[np.ndarray, "n 2"]:
+    """The vertical angle and that of azimuth to be expected at these places, in rad."""
+    return np.column_stack([angle.at(travel_m) for angle in fitted(samples)])
 
 
 def straightened(odometry: list[Edge], turned_rad: Float[np.ndarray, "n 2"]) -> list[Edge]:

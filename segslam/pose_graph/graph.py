@@ -130,6 +130,13 @@ class PoseGraph:
         self._doubted.add(edge.factor())
         self._robust.add(edge.factor(kernel=self._kernel))
 
+    def replace_closures(self, closures: Iterable[LoopClosure]) -> None:
+        """The same loops in the same order, measured better; they take effect with the next optimisation."""
+        self._closures = []
+        self._doubted, self._robust = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+        for closure in closures:
+            self.add_closure(closure)
+
     def straighten(self, samples: AngleSamples) -> None:
         """Turn back in the odometry what leftover angles bent; it takes effect with the next optimisation.
 

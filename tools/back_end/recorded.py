@@ -6,12 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from back_end.drives import Drive, exact_closure
-from segslam import geometry, refine
-from segslam.beam_angles import sample_angles
-from segslam.config import RefineConfig
+from segslam import geometry
 from segslam.evaluation import loop_metrics
 from segslam.log import read_log
-from segslam.types import AngleSamples, Keyframe, LoopClosure, SegslamError
+from segslam.types import Keyframe, LoopClosure, Points, SegslamError
 
 REACH_M = 6.0
 SPACING_M = 6.0
@@ -25,13 +23,9 @@ class Recorded(Drive):
     keyframes: list[Keyframe]
     closures: list[LoopClosure]
 
-    def angle_samples(self, config: RefineConfig) -> AngleSamples:
-        """What pairs of its scans tell of leftover angles."""
-
-        def surface(keyframe_id: int) -> refine.Surface:
-            return refine.prepare(refine.thin(self.keyframes[keyframe_id].points, config=config), config=config)
-
-        return sample_angles(surface, self.odometry, self.travel_m)
+    def points_of(self, keyframe_id: int) -> Points:
+        """Of a keyframe, in its frame."""
+        return self.keyframes[keyframe_id].points
 
     def loops(self) -> dict[str, float]:
         """False closures, and the recall of revisits."""

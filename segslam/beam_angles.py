@@ -33,8 +33,8 @@ MOST_TURN_RAD = math.radians(45.0)
 MOST_POINTS = 4000  # chosen: of the source; all others would find the same
 REACH_M = (1.0, 0.8, 0.6, *[0.5] * 17)
 """Search distance of each step, at most. Chosen: odometry is off by less than the first."""
-SETTLED = 3e-4
-"""A step smaller than this (rad, m) is the last. Chosen: a third of what the angles of one pair can be known to."""
+SETTLED = 1e-3
+"""A step smaller than this (rad, m) is the last. Chosen: what the angles of one pair can be known to."""
 RESIDUAL_M = 0.05
 """Where a point has lost three quarters of its weight. Chosen: above the noise of ranges, below what has moved."""
 LEVEL_NORMAL_Z, STANDING_NORMAL_Z = 0.95, 0.15

@@ -31,6 +31,7 @@ def finish(
     from segslam.run_files import LOG, write_metrics
     from segslam.runs import accuracy, peak_rss_mb
 
+    say("all scans are in; one more look at them, and the last optimisation", quiet=quiet)
     result, metrics = run.finish()
     if reference is not None:
         metrics |= accuracy(result, reference)

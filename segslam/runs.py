@@ -22,6 +22,7 @@ from segslam.run_files import LOG, UNFINISHED, room_for, write_loops, write_pose
 from segslam.slam import Slam, SlamResult, Tracked
 from segslam.trajectory import Poses, rows_of_same_scan
 from segslam.types import (
+    AngleSamples,
     BadScan,
     IndexPairs,
     LoopClosure,
@@ -124,12 +125,15 @@ class Run:
         """Do again, from the keyframe on, what a log holds; it is read here, while the rest is done beside."""
         return beside(steps, lambda recorded: self._logged(self._slam.repeat(recorded)), most_waiting=MOST_WAITING)
 
-    def finish(self) -> tuple[SlamResult, dict[str, Any]]:
-        """Optimise once more and write all results; the figures of `metrics.json` that need no reference."""
+    def finish(self, angles: AngleSamples | None = None) -> tuple[SlamResult, dict[str, Any]]:
+        """Optimise once more and write all results; the figures of `metrics.json` that need no reference.
+
+        `angles` as in `Slam.finish`.
+        """
         started = perf_counter()
-        result = self._slam.finish()
+        result = self._slam.finish(angles)
         self._note_ms("finish", perf_counter() - started)
-        self._log.write_result(result.estimate, result.trajectory)
+        self._log.write_result(result.estimate, result.trajectory, result.angles)
         self._log.close()
         seconds = perf_counter() - self._started
         with room_for(self.folder):

@@ -14,10 +14,11 @@ from segslam.keyframes import Clouds, CloudStore, KeyframeSelector, thin
 from segslam.odometry import KissOdometry, Odometry, OdometryResult
 from segslam.pose_graph import PoseGraph
 from segslam.proximity import ProximityDetector
-from segslam.straightening import straighten
+from segslam.straightening import sample, straighten
 from segslam.trajectory import corrected_poses
 from segslam.types import (
     Alignment,
+    AngleSamples,
     DriftEvidence,
     GraphEstimate,
     Indices,
@@ -51,6 +52,8 @@ class SlamResult:
     attempts: tuple[LoopAttempt, ...]
     drift: DriftEvidence | None = None
     """None where nobody asked, or the run was read from its log."""
+    angles: AngleSamples | None = None
+    """What led to that."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,11 +130,18 @@ class Slam:
         if self._steps:
             self._odometry.restore(np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]), scan_of)
 
-    def finish(self) -> SlamResult:
-        """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan."""
+    def finish(self, angles: AngleSamples | None = None) -> SlamResult:
+        """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan.
+
+        `angles`: what these scans told an earlier run with the same settings of `refine` of leftover angles; they are
+        not asked again.
+        """
         if not self._steps:
             raise ValueError("no scan was processed")
-        drift = self._straighten() if self.config.graph.systematic_drift == "auto" else None
+        drift = None
+        if self.config.graph.systematic_drift == "auto":
+            angles = self._sample_angles() if angles is None else angles
+            drift = self._straighten(angles)
         estimate = self.graph.finish()
         odometry = Trajectory(
             scan_index=np.array([index for index, _, _ in self._steps]),
@@ -141,7 +151,7 @@ class Slam:
         rows = np.array(self._keyframe_rows)
         T_world_lidar = corrected_poses(odometry.T_world_lidar, rows, self.graph.T_world_keyframes)
         trajectory = replace(odometry, T_world_lidar=T_world_lidar)
-        return SlamResult(trajectory, odometry, estimate, rows, tuple(self._attempts), drift)
+        return SlamResult(trajectory, odometry, estimate, rows, tuple(self._attempts), drift, angles if drift else None)
 
     def _advance(
         self, scan_index: int, stamp_ns: int, T_odom_lidar: Transform, keyframe: Keyframe | None, watch: Stopwatch
@@ -181,11 +191,13 @@ class Slam:
             intensities=None if registered.intensities is None else registered.intensities[rows],
         )
 
-    def _straighten(self) -> DriftEvidence:
-        """Turn back what leftover angles bent, if it did."""
+    def _sample_angles(self) -> AngleSamples:
         T_odom_keyframes = np.stack([self._steps[row][2] for row in self._keyframe_rows])
+        return sample(self._points, T_odom_keyframes, self.graph.travel_m, config=self.config.refine)
+
+    def _straighten(self, angles: AngleSamples) -> DriftEvidence:
         closures = [attempt.outcome for attempt in self._attempts if isinstance(attempt.outcome, LoopClosure)]
-        return straighten(self.graph, closures, self._points, T_odom_keyframes, config=self.config.refine)
+        return straighten(self.graph, closures, angles, self._points, config=self.config.refine)
 
     def _points(self, keyframe_id: int) -> Points:
         return self._clouds.cloud(keyframe_id)[0]

@@ -24,8 +24,8 @@ PointsOf = Callable[[int], Points]
 def straighten(
     graph: PoseGraph,
     closures: Iterable[LoopClosure],
+    samples: AngleSamples,
     points_of: PointsOf,
-    T_odom_keyframes: Float[np.ndarray, "n 4 4"],
     *,
     config: RefineConfig,
 ) -> DriftEvidence:
@@ -33,7 +33,6 @@ def straighten(
 
     `closures` are those of the graph. It takes effect with the next optimisation.
     """
-    samples = sample(points_of, T_odom_keyframes, graph.travel_m, config=config)
     evidence = judge(samples)
     if evidence.chosen:
         graph.straighten(samples)
@@ -66,9 +65,10 @@ def sharpened(
         thinned = refine.thin(points_of(keyframe_id), config=config)
         return refine.prepare(corrected(thinned, angles_rad[keyframe_id]), config=config)
 
+    last_stage = config.model_copy(update={"correspondence_m": config.correspondence_m[-1:]})
     for closure in closures:
         source, target = both(surface, (closure.source_id,), (closure.target_id,))
-        found = refine.refine(source, target, closure.T_target_source, config=config)
+        found = refine.refine(source, target, closure.T_target_source, config=last_stage)
         if isinstance(found, Rejected):
             yield closure
         else:

@@ -8,6 +8,7 @@ import yaml
 from drives import drifting, round_drive
 
 from segslam import cli
+from segslam import slam as slam_module
 from segslam.config import load_config
 from segslam.log import LogWriter, read_log
 from segslam.odometry import GivenOdometry
@@ -34,7 +35,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for scan in scans:
             log.write(slam.process(scan))
         result = slam.finish()
-        log.write_result(result.estimate, result.trajectory)
+        log.write_result(result.estimate, result.trajectory, result.angles)
     return path
 
 
@@ -65,6 +66,26 @@ def test_a_replay_with_the_same_settings_repeats_the_run(
     poses_before, poses_after = (read_log(path).result()[1] for path in (log, out / "log.mcap"))
     np.testing.assert_array_equal(poses_before.scan_index, poses_after.scan_index)
     np.testing.assert_allclose(poses_before.T_world_lidar, poses_after.T_world_lidar, rtol=0, atol=1e-9)
+
+
+def _count_samplings(monkeypatch: pytest.MonkeyPatch) -> list[None]:
+    counted: list[None] = []
+    sample = slam_module.sample
+    monkeypatch.setattr(
+        slam_module, "sample", lambda *given, **named: (counted.append(None), sample(*given, **named))[1]
+    )
+    return counted
+
+
+def test_scans_are_asked_again_for_angles_only_where_they_are_aligned_otherwise(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = _count_samplings(monkeypatch)
+    assert run("replay", log, "--out", tmp_path / "same", "--quiet") == 0
+    assert not counted
+    assert read_log(tmp_path / "same" / "log.mcap").angles() is not None
+    assert run("replay", log, "--out", tmp_path / "other", "--quiet", "--set", "refine.voxel_m=0.6") == 0
+    assert len(counted) == 1
 
 
 def test_other_settings_change_the_loops_and_the_change_is_told(

@@ -15,7 +15,7 @@ from mcap.stream_reader import StreamReader
 from segslam.config import Config
 from segslam.log import LogWriter, read_log, schema
 from segslam.log.cloud import intensities, keyframe_points, points_and_labels
-from segslam.types import Keyframe, Step
+from segslam.types import AngleSamples, Keyframe, Step
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,18 @@ def test_result_read_again_is_that_written(steps: list[Step], tmp_path: Path) ->
         log.write_result(estimate, trajectory)
     log = read_log(tmp_path / "log.mcap")
     assert_same((estimate, trajectory), log.result())
+    assert log.angles() is None
     assert len(list(log.steps())) == len(steps)
+
+
+@pytest.mark.parametrize("num", [0, 3])
+def test_what_scans_told_of_leftover_angles_is_read_again(steps: list[Step], tmp_path: Path, num: int) -> None:
+    angles = AngleSamples(np.arange(float(num)), np.random.default_rng(0).normal(size=(num, 2)), np.ones((num, 2)))
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
+        for step in steps:
+            log.write(step)
+        log.write_result(*made_result(steps), angles)
+    assert_same(angles, read_log(tmp_path / "log.mcap").angles())
 
 
 @pytest.mark.parametrize("chunk_bytes", [100, 4_000_000])

@@ -17,7 +17,7 @@ from segslam import geometry
 from segslam.log import LogWriter, schema
 from segslam.log.drawing import REJECTED_COLORS, weight_color
 from segslam.log.records import BULK, codec
-from segslam.types import Rejected, RejectReason, Step
+from segslam.types import AngleSamples, Rejected, RejectReason, Step
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +35,14 @@ def test_own_messages_agree_with_the_json_schemas_in_the_file(steps: list[Step],
     with LogWriter(tmp_path / "log.mcap", config=CONFIG, reference=trajectory) as log:
         for step in steps:
             log.write(step)
-        log.write_result(estimate, trajectory)
+        log.write_result(estimate, trajectory, AngleSamples(np.arange(3.0), np.ones((3, 2)), np.ones((3, 2))))
     topics = set()
     with (tmp_path / "log.mcap").open("rb") as stream:
         for found, channel, message in make_reader(stream).iter_messages():
             if found.encoding == "jsonschema":
                 jsonschema.validate(json.loads(message.data), json.loads(found.data))
                 topics.add(channel.topic)
-    assert topics == {schema.STEP, schema.ESTIMATE, schema.RESULT, schema.REFERENCE, schema.MEMORY}
+    assert topics == {schema.STEP, schema.ESTIMATE, schema.ANGLES, schema.RESULT, schema.REFERENCE, schema.MEMORY}
 
 
 def test_fields_left_out_of_the_json_exist() -> None:

@@ -10,13 +10,14 @@ from segslam.cli.export import map_summary, write_maps
 
 if TYPE_CHECKING:
     from segslam.runs import Run
-    from segslam.types import Trajectory
+    from segslam.types import AngleSamples, Trajectory
 
 
 def finish(
     run: "Run",
     reference: "Trajectory | None",
     *,
+    angles: "AngleSamples | None" = None,
     map_files: Sequence[Path] = (),
     json: bool,
     quiet: bool,
@@ -24,7 +25,7 @@ def finish(
 ) -> dict[str, Any]:
     """End a run: write its results, with a map where files for it are named, and show its figures.
 
-    `more` is among the figures, which are returned.
+    `angles` as in `Slam.finish`; `more` is among the figures, which are returned.
     """
     from segslam.log import read_log
     from segslam.report import write_report
@@ -32,7 +33,7 @@ def finish(
     from segslam.runs import accuracy, peak_rss_mb
 
     say("all scans are in; one more look at them, and the last optimisation", quiet=quiet)
-    result, metrics = run.finish()
+    result, metrics = run.finish(angles)
     if reference is not None:
         metrics |= accuracy(result, reference)
     metrics |= more

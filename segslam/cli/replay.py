@@ -51,7 +51,10 @@ def replay(
         reference=reference,
     ) as run:
         changes, interrupted = _repeat(run, recorded, quiet=quiet)
-        finish(run, reference, json=json, quiet=quiet, more=changes | _recorded_accuracy(recorded, reference))
+        asked_alike = not interrupted and settings_now.refine == recorded.config.refine
+        more = changes | _recorded_accuracy(recorded, reference)
+        angles = recorded.angles() if asked_alike else None
+        finish(run, reference, angles=angles, json=json, quiet=quiet, more=more)
     if interrupted:
         raise typer.Exit(130)
 

@@ -18,7 +18,7 @@ from segslam.log.cloud import KeyframePoints, intensities, points_and_labels
 from segslam.log.container import CutError
 from segslam.log.foxglove import transforms
 from segslam.log.records import codec
-from segslam.types import GraphEstimate, Keyframe, SegslamError, Step, Trajectory, Transform
+from segslam.types import AngleSamples, GraphEstimate, Keyframe, SegslamError, Step, Trajectory, Transform
 
 logger = logging.getLogger(__name__)
 
@@ -87,13 +87,23 @@ class RunLog:
 
     def result(self) -> tuple[GraphEstimate, Trajectory] | None:
         """The last estimate and the trajectory of every scan; None if the run did not get there."""
+        parts = self._ending()
+        return (self._decoded(_estimate, parts), self._decoded(_trajectory, parts[schema.RESULT])) if parts else None
+
+    def angles(self) -> AngleSamples | None:
+        """What its scans told of leftover angles; None if they were not asked, or the run did not get there."""
+        parts = self._ending()
+        return self._decoded(_angles, parts[schema.ANGLES]) if schema.ANGLES in parts else None
+
+    def _ending(self) -> Parts:
+        """The messages of the result; empty if the run did not get there."""
         parts: dict[str, bytes] = {}
         with suppress(CutError):
             for topic, data in self._messages(since_last=schema.TRAJECTORY):
                 parts[topic] = data
                 if topic == schema.RESULT:
-                    return self._decoded(_estimate, parts), self._decoded(_trajectory, data)
-        return None
+                    return parts
+        return {}
 
     def _messages(self, *, since_last: str | None = None) -> Iterator[tuple[str, bytes]]:
         """Topic and data, as `container.messages`.
@@ -155,6 +165,10 @@ def _estimate(parts: Parts) -> GraphEstimate:
     poses = transforms(PosesInFrame.FromString(parts[schema.TRAJECTORY]))
     T_world_keyframe = dict(zip(values["keyframe_ids"], poses, strict=True))
     return codec(GraphEstimate).decode(values, {GraphEstimate: {"T_world_keyframe": T_world_keyframe}})
+
+
+def _angles(data: bytes) -> AngleSamples:
+    return codec(AngleSamples).decode(json.loads(data), {})
 
 
 def _trajectory(data: bytes) -> Trajectory:

@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 from segslam.log.records import codec
-from segslam.types import GraphEstimate, Step, Trajectory
+from segslam.types import AngleSamples, GraphEstimate, Step, Trajectory
 
 VERSION = 1
 """Raised whenever a reader of the version before would misread a log."""
@@ -18,6 +18,8 @@ MEMORY = "/memory"
 """segslam.Memory (JSON): `rss_mb`, what the process held at each step, where the system tells it."""
 RESULT = "/result"
 """segslam.Result (JSON): the trajectory of every scan, once, after the last step and the last estimate."""
+ANGLES = "/angles"
+"""segslam.Angles (JSON): what pairs of scans told of leftover angles, between the last estimate and the result."""
 REFERENCE = "/reference"
 """segslam.Reference (JSON): the true poses of the scans, where they are known, before the first step."""
 TRANSFORMS = "/tf"
@@ -61,6 +63,7 @@ def json_schemas() -> dict[str, dict[str, Any]]:
         ESTIMATE: estimate | {"title": "segslam.Estimate"},
         MEMORY: {"title": "segslam.Memory", "type": "object", "properties": {"rss_mb": {"type": "number"}}},
         RESULT: codec(Trajectory).schema | {"title": "segslam.Result"},
+        ANGLES: codec(AngleSamples).schema | {"title": "segslam.Angles"},
         REFERENCE: codec(Trajectory).schema | {"title": "segslam.Reference"},
     }
 

@@ -25,6 +25,7 @@ from segslam.log.origin import metadata
 from segslam.log.output import Output
 from segslam.log.records import codec
 from segslam.types import (
+    AngleSamples,
     GraphEstimate,
     Keyframe,
     Labels,
@@ -123,11 +124,16 @@ class LogWriter:
                 return points_and_labels(KeyframePoints.FromString(data))
         raise SegslamError(f"{self._path}: keyframe {keyframe_id} has gone from the log; leave the file alone")
 
-    def write_result(self, estimate: GraphEstimate, trajectory: Trajectory) -> None:
-        """Add what the last optimisation gave, and the pose of every scan that follows from it."""
+    def write_result(self, estimate: GraphEstimate, trajectory: Trajectory, angles: AngleSamples | None = None) -> None:
+        """Add what the last optimisation gave, and the pose of every scan that follows from it.
+
+        `angles`: what scans told of leftover angles, if they were asked.
+        """
         drawn = self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns)
-        messages = [*_serialised(drawn), _estimate_message(estimate), (schema.RESULT, _json(Trajectory, trajectory))]
-        self._write(messages, stamp_ns=self._stamp_ns)
+        messages = [*_serialised(drawn), _estimate_message(estimate)]
+        if angles is not None:
+            messages.append((schema.ANGLES, _json(AngleSamples, angles)))
+        self._write([*messages, (schema.RESULT, _json(Trajectory, trajectory))], stamp_ns=self._stamp_ns)
 
     def move(self, path: Path) -> None:
         """Take the place of the file `path`, which is there until all that was written here is safely on the disk."""

@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float
 
 from segslam import geometry
-from segslam.beside import beside
 from segslam.types import AngleSamples, Mask, Points, Transform, Vector
 
 APART_M = 20.0
@@ -72,15 +71,11 @@ def sample_angles(
     Row i of the arrays is keyframe i; `surface_of` gives its scan. Pairs of scans that tell nothing are left out.
     """
     surface_of = lru_cache(6)(surface_of)  # a pair begins where the last but one ended
-    pairs = [
-        (target, source, geometry.inverse(T_odom_keyframes[target]) @ T_odom_keyframes[source])
-        for target, source in _pairs(T_odom_keyframes, travel_m)
-    ]
-    made_ready = ((surface_of(source), surface_of(target), T_prior) for target, source, T_prior in pairs)
     rows, angles, excesses = [], [], []
-    for pair, found in zip(pairs, beside(made_ready, lambda ready: register(*ready), most_waiting=4), strict=True):
+    for target, source in _pairs(T_odom_keyframes, travel_m):
+        T_prior = geometry.inverse(T_odom_keyframes[target]) @ T_odom_keyframes[source]
+        found = register(surface_of(source), surface_of(target), T_prior)
         if found is not None:
-            target, source, T_prior = pair
             T_target_source, angle_rad = found
             excess_rad = geometry.log(geometry.inverse(T_target_source) @ T_prior)[1:3]
             rows.append((travel_m[source] + travel_m[target]) / 2)

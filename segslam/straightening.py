@@ -1,6 +1,6 @@
 """The end of a drive whose scans have angles left over: odometry turned back, closures found again on corrected scans.
 
-Closures err by those angles too: on simulated 05, 06 and 08 their heights by 3 to 5 cm, which corrected scans leave at
+Closures err by those angles too: on simulated 05, 06 and 08 their heights by 2 to 5 cm, which corrected scans leave at
 one.
 """
 

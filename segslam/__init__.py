@@ -1,24 +1,72 @@
-"""LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs."""
+"""LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs.
+
+    run = segslam.map_folder("scans", "runs/first")         # map a folder of scans, or a recording
+    found = segslam.register(source_points, target_points)  # the pose of one scan in another, no initial guess
+
+`Slam` maps scan by scan; `open_dataset` and `Scan` are where scans come from, `read_run` reads the folder of a run.
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from segslam.alignment import register
-    from segslam.allocator import keep_freed_memory
     from segslam.config import Config, load_config
     from segslam.datasets import open_dataset
+    from segslam.registration import register
+    from segslam.retrieval import Places
+    from segslam.run.finished import read_run
+    from segslam.run.locator import Located, Locator, locate
+    from segslam.run.map_folder import map_folder
+    from segslam.sessions.localise import localise
+    from segslam.sessions.merge import merge
     from segslam.slam import Slam
+    from segslam.system.memory import keep_freed_memory
+    from segslam.types import Alignment, BadScan, Rejected, Scan, SegslamError
 
-__all__ = ["Config", "Slam", "keep_freed_memory", "load_config", "open_dataset", "register"]
+    __version__: str
+
+__all__ = [
+    "Alignment",
+    "BadScan",
+    "Config",
+    "Located",
+    "Locator",
+    "Places",
+    "Rejected",
+    "Scan",
+    "SegslamError",
+    "Slam",
+    "keep_freed_memory",
+    "load_config",
+    "localise",
+    "locate",
+    "map_folder",
+    "merge",
+    "open_dataset",
+    "read_run",
+    "register",
+]
 
 _HOMES = {
+    "Alignment": "types",
+    "BadScan": "errors",
     "Config": "config",
+    "Located": "run.locator",
+    "Locator": "run.locator",
+    "Places": "retrieval",
+    "Rejected": "types",
+    "Scan": "types",
+    "SegslamError": "errors",
     "Slam": "slam",
-    "keep_freed_memory": "allocator",
+    "keep_freed_memory": "system.memory",
     "load_config": "config",
+    "locate": "run.locator",
+    "localise": "sessions.localise",
+    "map_folder": "run.map_folder",
+    "merge": "sessions.merge",
     "open_dataset": "datasets",
-    "register": "alignment",
+    "read_run": "run.finished",
+    "register": "registration",
 }
 
 
@@ -26,4 +74,13 @@ def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for: `segslam --help` needs none of them."""
     if name in _HOMES:
         return getattr(import_module(f"segslam.{_HOMES[name]}"), name)
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("segslam")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """What `help` and completion show."""
+    return [*__all__, "__version__", "__doc__", "__all__", "__name__", "__file__", "__path__"]

@@ -1,5 +1,15 @@
-"""`python -m segslam`."""
+"""`python -m segslam`, and the command `segslam`."""
 
-from segslam.cli import main
 
-main()
+def main() -> None:
+    """Handle Ctrl-C before anything else is imported, then run the command."""
+    from segslam.system.interrupts import ctrl_c_in_order
+
+    with ctrl_c_in_order():
+        from segslam import cli
+
+        cli.main()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,6 +1,7 @@
-"""Every parameter, with unit, range and source. Unknown keys are refused with their path; the defaults are complete.
+"""Every parameter, with unit, range and, in square brackets, the source of its default. Unknown keys are refused.
 
-P marks a value of the Segregator paper (Yin et al., ICRA 2023), A one of its authors' program.
+Most users need `USER_SETTINGS` only. Sources: the Segregator paper (Yin et al., ICRA 2023), its authors' program, the
+library that uses the value, measured (on what), or chosen (on what, where data decided).
 """
 
 import logging
@@ -23,6 +24,29 @@ from pydantic import (
 from segslam.types import Label, SegslamError
 
 logger = logging.getLogger(__name__)
+
+USER_SETTINGS = (
+    "sensor.vertical_angle_deg",
+    "odometry.max_range_m",
+    "odometry.min_range_m",
+    "odometry.voxel_size_m",
+    "odometry.deskew",
+    "health.check",
+    "keyframes.distance_m",
+    "keyframes.voxel_m",
+    "proximity.min_travel_m",
+    "proximity.max_radius_m",
+    "verify.min_overlap",
+    "verify.max_residual_ratio",
+    "graph.final",
+    "graph.error_allowance",
+    "map.voxel_m",
+    "map.color",
+)
+"""The settings that most users need, the first of their sections. All others are for experts."""
+
+REMOVED = ("graph.systematic_drift",)
+"""Settings of older versions that are dropped with a warning, also from files and `--set`."""
 
 
 def _label_from_name(value: object) -> object:
@@ -48,44 +72,178 @@ StaticLabel = Annotated[LabelName, AfterValidator(_check_static)]
 
 
 class Section(BaseModel):
-    """What all sections share: they cannot be changed, and refuse unknown keys."""
+    """Base of all sections: immutable; unknown keys, infinities and NaN are refused."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
+
+
+class SensorCalibrationConfig(Section):
+    """Calibration of the LiDAR, applied when its scans are read."""
+
+    vertical_angle_deg: float | None = Field(
+        None,
+        ge=-5,
+        le=5,
+        description="elevation added to all points of a scan; positive if the sensor measures points too low; `null`: "
+        "0.205 for data in KITTI's layout, 0 for all other data (degrees) [KISS-ICP, for KITTI]",
+    )
 
 
 class OdometryConfig(Section):
-    """KISS-ICP's own parameters, under its own names."""
+    """Parameters of KISS-ICP, under its own names."""
 
-    max_range_m: float = Field(100.0, gt=0, description="points farther away are dropped (m)")
-    min_range_m: float = Field(3.0, ge=0, description="points nearer than this are dropped: the car's own roof (m)")
-    voxel_size_m: float = Field(1.0, gt=0, description="edge of the local map's voxels (m)")
-    deskew: bool = Field(True, description="compensate the motion within a sweep, where points carry times")
-    max_num_threads: int = Field(
-        0, ge=0, description="of KISS-ICP, for the process; 0: all, poses repeat to 1e-9 m; 1: to the bit"
+    max_range_m: float = Field(100.0, gt=0, description="points farther away are dropped (m) [KISS-ICP]")
+    min_range_m: float = Field(
+        3.0,
+        ge=0,
+        description="points nearer than this are dropped: returns from the vehicle itself (m) [chosen for KITTI's car]",
     )
-    stamp_tolerance_s: float = Field(0.01, ge=0, description="a given pose this near in time is the scan's (s)")
+    voxel_size_m: float = Field(1.0, gt=0, description="voxel size of KISS-ICP's local map (m) [KISS-ICP]")
+    deskew: bool = Field(True, description="compensate the motion within a sweep, if the points have times [KISS-ICP]")
+    max_num_threads: int = Field(
+        0,
+        ge=0,
+        description="threads of KISS-ICP; 0: all cores, poses repeat to 1e-9 m; 1: poses repeat exactly [KISS-ICP]",
+    )
+    stamp_tolerance_s: float = Field(
+        0.01, ge=0, description="largest time difference between a scan and its pose in a given trajectory (s) [chosen]"
+    )
+
+    @model_validator(mode="after")
+    def _has_a_range(self) -> "OdometryConfig":
+        if self.max_range_m <= self.min_range_m:
+            raise ValueError(f"max_range_m {self.max_range_m:g} must be above min_range_m {self.min_range_m:g}")
+        return self
+
+
+class HealthConfig(Section):
+    """Check of each odometry motion against the scans, and its repair."""
+
+    check: bool = Field(
+        True, description="check the motions of the odometry, and repair those that the scans contradict [chosen]"
+    )
+    tolerance_m: float = Field(
+        0.15,
+        gt=0,
+        description="a motion is replaced if its translation is off by more than this (m) "
+        "[chosen on KITTI 00 and courtyard]",
+    )
+    tolerance_deg: float = Field(
+        0.6,
+        gt=0,
+        description="a motion is replaced if its rotation is off by more than this (degrees) "
+        "[chosen on KITTI 00 and courtyard]",
+    )
+    watch_scans: int = Field(
+        20,
+        ge=1,
+        description="after a repair every scan is registered, until this many in a row agree with odometry [chosen]",
+    )
+    map_scans: int = Field(10, ge=1, description="number of scans in the local map of the check [chosen]")
+    map_spacing_m: float = Field(
+        0.2, ge=0, description="smallest distance between two scans of the local map (m) [chosen]"
+    )
+    map_spacing_deg: float = Field(
+        4.0,
+        ge=0,
+        description="smallest rotation between two scans of the local map that are nearer than that (degrees) [chosen]",
+    )
+    correspondence_m: tuple[float, ...] = Field(
+        (2.0, 0.7), min_length=1, description="search distances of the registration with the local map (m) [chosen]"
+    )
+    inlier_m: float = Field(
+        0.5, gt=0, description="distance to the local map within which a point overlaps it (m) [chosen]"
+    )
+    min_overlap: float = Field(
+        0.6,
+        ge=0,
+        le=1,
+        description="smallest overlap of a registered scan, relative to the drive's median [chosen on NCLT]",
+    )
+    max_rms: float = Field(
+        2.0, ge=1, description="largest residual of a registered scan, relative to the drive's median [chosen on NCLT]"
+    )
 
 
 class KeyframeConfig(Section):
-    """When a keyframe is cut, and how much of it is kept."""
+    """Selection of keyframes, and their resolution."""
 
-    distance_m: float = Field(2.0, gt=0, description="cut a keyframe this far from the last (m)")
-    angle_deg: float = Field(20.0, gt=0, le=180, description="or after this turn (degrees)")
-    voxel_m: float = Field(0.2, gt=0, description="thinning of a keyframe, cluster classes excepted (m)")
-    resolution_m: float = Field(0.004, gt=0, description="rounding of a keyframe: 16 bits must log it (m)")
+    distance_m: float = Field(2.0, gt=0, description="distance between keyframes (m) [chosen]")
+    voxel_m: float = Field(
+        0.2,
+        gt=0,
+        description="voxel size to which keyframes are downsampled, except for the classes that form clusters (m) "
+        "[chosen]",
+    )
+    angle_deg: float = Field(
+        20.0,
+        gt=0,
+        le=180,
+        description="rotation after which a keyframe is made before that distance is reached (degrees) [chosen]",
+    )
+    dense_voxels: int = Field(
+        3000,
+        ge=0,
+        description="a keyframe with fewer voxels (refine.voxel_m) is matched together with its neighbours' points "
+        "[chosen on KITTI, courtyard, NCLT]",
+    )
+    max_gathered: int = Field(
+        10, ge=0, description="largest number of neighbouring keyframes whose points are gathered [chosen]"
+    )
+    resolution_m: float = Field(
+        0.004, gt=0, description="grid to which the coordinates of keyframes are rounded (m) [chosen]"
+    )
 
 
 class ProximityConfig(Section):
-    """Where loops are looked for."""
+    """Search for loop candidates near the estimated position."""
 
-    min_travel_m: float = Field(50.0, ge=0, description="travel between the two ends of a loop (m)")
-    base_radius_m: float = Field(6.0, gt=0, description="search radius without any drift (m)")
-    drift_ratio: float = Field(0.015, ge=0, description="growth of the radius per metre of chain between the two")
-    max_radius_m: float = Field(20.0, gt=0, description="the radius never exceeds this (m)")
-    height_factor: float = Field(2.0, gt=0, description="greatest difference of heights, in search radii")
-    max_candidates: int = Field(2, ge=1, description="candidates proposed per keyframe")
-    spread_m: float = Field(8.0, ge=0, description="travel between two candidates of one keyframe (m)")
-    min_gap_m: float = Field(8.0, ge=0, description="no new search within this travel of an accepted loop (m)")
+    min_travel_m: float = Field(
+        50.0, ge=0, description="smallest distance travelled between the two keyframes of a loop (m) [chosen]"
+    )
+    max_radius_m: float = Field(20.0, gt=0, description="largest search radius (m) [chosen on simulated drives]")
+    base_radius_m: float = Field(6.0, gt=0, description="search radius without drift (m) [chosen on simulated drives]")
+    drift_ratio: float = Field(
+        0.015,
+        ge=0,
+        description="increase of the search radius per metre travelled between the two keyframes "
+        "[chosen on KISS-ICP's drift in simulated drives]",
+    )
+    break_radius_m: float = Field(60.0, gt=0, description="search radius across a break of the odometry (m) [chosen]")
+    base_height_m: float = Field(
+        1.0,
+        gt=0,
+        description="largest height difference of two visits without drift (m) [chosen: storeys are 3 m apart]",
+    )
+    height_ratio: float = Field(
+        0.008,
+        ge=0,
+        description="increase of that height difference per metre travelled between the two keyframes "
+        "[chosen: ramps of 100 to 150 m]",
+    )
+    base_turn_deg: float = Field(
+        15.0, gt=0, le=180, description="largest rotation between a loop and its prior without drift (degrees) [chosen]"
+    )
+    turn_ratio_deg: float = Field(
+        0.02,
+        ge=0,
+        description="increase of that rotation per metre travelled between the two keyframes (degrees) [chosen]",
+    )
+    max_candidates: int = Field(2, ge=1, description="number of candidates per keyframe [chosen]")
+    spread_m: float = Field(
+        8.0, ge=0, description="smallest distance travelled between two candidates of one keyframe (m) [chosen]"
+    )
+    min_gap_m: float = Field(
+        8.0, ge=0, description="distance travelled after an accepted loop before the next search (m) [chosen]"
+    )
+
+
+class RetrievalConfig(Section):
+    """Loops with places that look alike, wherever odometry expects them."""
+
+    enabled: bool = Field(
+        True, description="look for loops outside the search radius of proximity, among places that look alike [chosen]"
+    )
 
 
 def _check_rising(bounds: tuple[float, float]) -> tuple[float, float]:
@@ -98,26 +256,40 @@ Bounds = Annotated[tuple[float, float], AfterValidator(_check_rising)]
 
 
 class GeometricLabelsConfig(Section):
-    """Labelling by shape alone. Heights are above the ground."""
+    """Labels from shape alone. Heights are above the ground."""
 
-    max_range_m: float = Field(70.0, gt=0, le=200, description="points farther away stay unlabelled (m)")
-    ground_cell_m: float = Field(1.0, ge=0.2, description="edge of the cells of the ground's surface (m)")
-    max_slope: float = Field(0.2, gt=0, description="steepest that the ground rises between cells")
-    ground_height_m: float = Field(0.15, gt=0, description="points lower than this are ground (m)")
-    band_m: Bounds = Field((0.4, 2.6), description="where poles and small solids are looked for (m)")
-    min_points: int = Field(4, ge=1, description="fewest points of a pole, small solid or car within the band")
-    max_things: int = Field(30, ge=1, description="of each of these classes, those with most points")
-    pole_core_m: float = Field(0.4, gt=0, description="a pole lies within this radius (m)")
-    pole_clear_m: float = Field(0.8, gt=0, description="and nothing else within this one (m)")
-    pole_min_m: float = Field(1.0, gt=0, description="least height of a pole within the band (m)")
-    pole_min_share: float = Field(0.7, gt=0, le=1, description="share of its occupied heights that stand clear")
-    trunk_max_m: float = Field(1.6, gt=0, description="longest small solid: young trees, bushes, signs (m)")
-    trunk_min_m: float = Field(1.6, gt=0, description="lowest top of a small solid (m)")
-    car_top_m: Bounds = Field((1.0, 2.1), description="lowest and highest top of a car (m)")
-    car_length_m: Bounds = Field((1.0, 6.0), description="shortest and longest side seen of a car (m)")
-    car_max_width_m: float = Field(2.4, gt=0, description="widest car (m)")
-    wall_thickness_m: float = Field(0.16, gt=0, description="standard deviation of a wall's points across it (m)")
-    wall_min_top_m: float = Field(1.8, gt=0, description="lowest top of a wall: hedges are lower (m)")
+    max_range_m: float = Field(70.0, gt=0, le=200, description="points farther away stay unlabelled (m) [chosen]")
+    ground_cell_m: float = Field(1.0, ge=0.2, description="cell size of the ground surface (m) [chosen]")
+    max_slope: float = Field(0.2, gt=0, description="largest slope of the ground between cells [chosen]")
+    ground_height_m: float = Field(0.15, gt=0, description="points lower than this are ground (m) [chosen]")
+    band_m: Bounds = Field(
+        (0.4, 2.6), description="lowest and highest height in which poles and small solids are searched (m) [chosen]"
+    )
+    min_points: int = Field(
+        4, ge=1, description="smallest number of points of a pole, small solid or car within the band [chosen]"
+    )
+    max_things: int = Field(
+        30, ge=1, description="largest number of objects per class; those with most points are kept [chosen]"
+    )
+    pole_core_m: float = Field(0.4, gt=0, description="largest radius of a pole (m) [chosen]")
+    pole_clear_m: float = Field(0.8, gt=0, description="radius around a pole without other points (m) [chosen]")
+    pole_min_m: float = Field(1.0, gt=0, description="smallest height of a pole within the band (m) [chosen]")
+    pole_min_share: float = Field(
+        0.7, gt=0, le=1, description="smallest share of the heights of a pole without other points nearby [chosen]"
+    )
+    trunk_max_m: float = Field(
+        1.6, gt=0, description="largest length of a small solid: young trees, bushes, signs (m) [chosen]"
+    )
+    trunk_min_m: float = Field(1.6, gt=0, description="smallest height of the top of a small solid (m) [chosen]")
+    car_top_m: Bounds = Field((1.0, 2.1), description="lowest and highest top of a car (m) [chosen]")
+    car_length_m: Bounds = Field((1.0, 6.0), description="shortest and longest visible side of a car (m) [chosen]")
+    car_max_width_m: float = Field(2.4, gt=0, description="largest width of a car (m) [chosen]")
+    wall_thickness_m: float = Field(
+        0.16, gt=0, description="standard deviation of a wall's points across it (m) [chosen]"
+    )
+    wall_min_top_m: float = Field(
+        1.8, gt=0, description="smallest height of the top of a wall; hedges are lower (m) [chosen]"
+    )
 
 
 class SegregatorConfig(Section):
@@ -132,77 +304,126 @@ class SegregatorConfig(Section):
             Label.POLE: 4,
             Label.TRAFFIC_SIGN: 3,
         },
-        description="class -> fewest points of a cluster; these classes give clusters (P: L_SC; A: car 30, trunk 15)",
+        description="classes that form clusters, and the smallest number of points of a cluster "
+        "[paper: L_SC; authors: car 30, trunk 15; chosen]",
     )
     max_clusters_per_class: int = Field(
-        24, ge=3, description="of a class, those with the largest surface seen; bounds the time of matching"
+        24,
+        ge=3,
+        description="largest number of clusters per class; those with the largest visible surface are kept [chosen]",
     )
     foot_classes: tuple[StaticLabel, ...] = Field(
         (Label.TRUNK, Label.POLE, Label.TRAFFIC_SIGN),
-        description="upright things: their clusters are placed on the ground beneath, not at their centre",
+        description="classes of upright objects: the position of their clusters is the foot on the ground [chosen]",
     )
-    foot_max_distance_m: float = Field(10.0, gt=0, description="the ground is looked for as far as this (m)")
-    dcvc_start_radius_m: float = Field(0.35, ge=0.01, description="first radial bin of DCVC (A) (m)")
-    dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (A) (m)")
+    foot_max_distance_m: float = Field(
+        10.0, gt=0, description="largest distance to the ground patch below such a cluster (m) [chosen]"
+    )
+    dcvc_start_radius_m: float = Field(0.35, ge=0.01, description="first radial bin of DCVC (m) [authors]")
+    dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (m) [authors]")
     dcvc_pitch_deg: float = Field(
-        2.0, ge=0.1, le=90, description="pitch bin of DCVC, no narrower than beams are apart (A: 1.2) (degrees)"
+        2.0,
+        ge=0.1,
+        le=90,
+        description="pitch bin of DCVC, at least the spacing of the beams (degrees) [authors: 1.2; chosen]",
     )
-    dcvc_azimuth_deg: float = Field(1.2, ge=0.1, le=90, description="azimuth bin of DCVC (A) (degrees)")
-    min_range_m: float = Field(0.5, ge=0, description="nearest point clustered (A) (m)")
-    max_range_m: float = Field(120.0, gt=0, le=1000, description="farthest point clustered (A) (m)")
+    dcvc_azimuth_deg: float = Field(1.2, ge=0.1, le=90, description="azimuth bin of DCVC (degrees) [authors]")
+    min_range_m: float = Field(0.5, ge=0, description="nearest point clustered (m) [authors]")
+    max_range_m: float = Field(120.0, gt=0, le=1000, description="farthest point clustered (m) [authors]")
     feature_classes: tuple[StaticLabel, ...] = Field(
-        (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points (P: L_F)"
+        (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points [paper: L_F]"
     )
-    feature_voxel_m: float = Field(0.35, ge=0.01, description="voxel of the class clouds (A: 0.5) (m)")
+    feature_voxel_m: float = Field(
+        0.35, ge=0.01, description="voxel size of the class clouds (m) [authors: 0.5; chosen]"
+    )
     normal_radius_m: float = Field(
-        0.7, gt=0, description="of the patch that gives a point's normal and Gaussian (A: 1.0) (m)"
+        0.7,
+        gt=0,
+        description="radius of the patch from which the normal and the Gaussian of a point are computed (m) "
+        "[authors: 1.0; chosen]",
     )
-    feature_radius_m: float = Field(2.0, gt=0, description="neighbourhood of FPFH (A: 2.5) (m)")
+    feature_radius_m: float = Field(2.0, gt=0, description="neighbourhood of FPFH (m) [authors: 2.5; chosen]")
     max_features_per_class: int = Field(
-        750, ge=1, description="key points of a class: those with most neighbours; 1,500 in all take 175 kB"
+        750,
+        ge=1,
+        description="largest number of key points per class; those with most neighbours are kept; 1,500 take 175 kB "
+        "[chosen]",
     )
-    tuple_similarity: float = Field(0.95, gt=0, lt=1, description="edge ratio of the tuple test (A)")
-    tuple_trials_per_pair: int = Field(100, ge=1, description="random triples drawn for each mutual pair (A)")
-    tuple_seed: int = Field(0, ge=0, description="of the random triples")
+    tuple_similarity: float = Field(0.95, gt=0, lt=1, description="edge ratio of the tuple test [authors]")
+    tuple_trials_per_pair: int = Field(100, ge=1, description="random triples drawn for each mutual pair [authors]")
+    tuple_seed: int = Field(0, ge=0, description="random seed of these triples [chosen]")
     features: Literal["always", "when_few_clusters", "never"] = Field(
-        "when_few_clusters", description="when a scan is given FPFH key points"
+        "when_few_clusters", description="when FPFH key points are computed for a scan [chosen]"
     )
-    few_clusters: int = Field(24, ge=0, description="fewer clusters than this are few")
+    few_clusters: int = Field(
+        24, ge=0, description="number of clusters below which a scan has few clusters [chosen on simulated 00 and 08]"
+    )
     gate: Literal["published", "invariant", "lengths"] = Field(
-        "invariant", description="G-TRIM as published, with eigenvalues (rotation-invariant), or lengths only (Segator)"
+        "invariant",
+        description="G-TRIM: published; invariant: with eigenvalues, invariant under rotation; lengths: lengths only "
+        "[paper; chosen; Segator]",
     )
     noise_bounds_m: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         (0.2, 0.4),
         min_length=1,
-        description="bounds of one measurement (P, A: 0.2), the next tried if the pose is uncertain; lengths differ by "
-        "twice as much at most (m)",
+        description="noise bounds of a position, tried in order until the pose is certain; two lengths may differ by "
+        "twice the bound (m) [paper and authors: 0.2; chosen: 0.4]",
     )
-    shape_bound_m2: float = Field(0.3, gt=0, description="G-TRIM: greatest squared Wasserstein shape distance (m^2)")
-    min_clique: int = Field(3, ge=3, description="smallest inlier clique accepted")
-    clique_max_nodes: int = Field(200_000, ge=1, description="search nodes after which the best so far is kept")
-    max_cliques: int = Field(8, ge=1, description="maximum cliques tried at each bound until a pose is certain")
-    certain_inliers: int = Field(12, ge=1, description="inliers that make a pose certain: nothing else is tried then")
+    shape_bound_m2: float = Field(
+        0.3, gt=0, description="G-TRIM: largest squared Wasserstein distance between two shapes (m^2) [chosen]"
+    )
+    min_clique: int = Field(
+        3, ge=3, description="size of the smallest clique of inliers that is accepted [chosen on simulated 00 and 08]"
+    )
+    clique_max_nodes: int = Field(
+        200_000, ge=1, description="search nodes after which the search stops with the best clique found [chosen]"
+    )
+    max_cliques: int = Field(8, ge=1, description="largest number of maximum cliques tried at each bound [chosen]")
+    certain_inliers: int = Field(
+        12,
+        ge=1,
+        description="number of inliers above which a pose is certain and no other is tried "
+        "[chosen on simulated 00 and 08]",
+    )
     solver: Literal["gaussians", "joint", "decoupled"] = Field(
         "gaussians",
-        description="joint: rotation and translation together; decoupled: one after the other (A); gaussians: joint, "
-        "then clusters and ground laid on each other with their own covariances",
+        description="joint: rotation and translation together; decoupled: one after the other; gaussians: joint, then "
+        "refined by aligning clusters and ground, weighted by their covariances [authors: decoupled; chosen]",
     )
-    rotation: Literal["full", "yaw"] = Field("full", description="degrees of freedom of the rotation (yaw: Quatro)")
-    centroid_noise_m: float = Field(0.07, gt=0, description="a centroid's noise in each direction (m)")
+    rotation: Literal["full", "yaw"] = Field(
+        "full", description="degrees of freedom of the rotation (yaw: Quatro) [chosen]"
+    )
+    centroid_noise_m: float = Field(
+        0.07, gt=0, description="noise of a centroid in each direction (m) [measured: simulated truth]"
+    )
     centroid_noise_share: float = Field(
-        0.35, ge=0, description="and as a share of its cluster's standard deviation in that direction"
+        0.35,
+        ge=0,
+        description="additional noise of a centroid, as a share of its cluster's standard deviation "
+        "[measured: simulated truth]",
     )
     shared_noise_m: float = Field(
-        0.045, ge=0, description="noise that all share, being seen from one side; in the information alone (m)"
+        0.045,
+        ge=0,
+        description="noise common to all centroids, in the information matrix only (m) [measured: simulated truth]",
     )
     shared_noise_deg: float = Field(
-        0.05, ge=0, description="the same of the rotation, as of a sensor's bent rays (degrees)"
+        0.05,
+        ge=0,
+        description="rotation noise common to all centroids, for example from sensor calibration (degrees) "
+        "[measured: simulated truth]",
     )
-    ground_noise_m: float = Field(0.1, gt=0, description="noise of the distance of two patches of the ground (m)")
-    ground_weight: float = Field(0.3, ge=0, description="weight of such a distance: neighbours err alike")
-    gnc_factor: float = Field(1.4, gt=1, description="growth of GNC's control parameter (A)")
-    gnc_max_iterations: int = Field(100, ge=1, description="(A)")
-    gnc_cost_tolerance: float = Field(1e-6, gt=0, description="stop at this change of cost (A)")
+    ground_noise_m: float = Field(
+        0.1, gt=0, description="noise of the distance between two ground patches (m) [chosen]"
+    )
+    ground_weight: float = Field(
+        0.3,
+        ge=0,
+        description="weight of such a distance; below 1 because the errors of neighbours are correlated [chosen]",
+    )
+    gnc_factor: float = Field(1.4, gt=1, description="growth of GNC's control parameter [authors]")
+    gnc_max_iterations: int = Field(100, ge=1, description="largest number of iterations of GNC [authors]")
+    gnc_cost_tolerance: float = Field(1e-6, gt=0, description="change of cost at which GNC stops [authors]")
 
     @model_validator(mode="after")
     def _radial_bins_reach_the_range(self) -> "SegregatorConfig":
@@ -217,97 +438,212 @@ class SegregatorConfig(Section):
 class RefineConfig(Section):
     """Coarse-to-fine GICP."""
 
-    voxel_m: float = Field(0.5, gt=0, description="voxel of the clouds that are aligned (m)")
-    correspondence_m: tuple[float, ...] = Field((1.0, 0.5), description="search distance, stage by stage (m)")
-    max_iterations: int = Field(20, ge=1, description="in each stage")
-    max_range_m: float = Field(60.0, gt=0, description="points farther away are left out (m)")
-    min_points: int = Field(100, ge=10, description="fewest points, and fewest pairs, that can be aligned")
+    voxel_m: float = Field(0.5, gt=0, description="voxel size of the registered clouds (m) [chosen on KITTI 00]")
+    correspondence_m: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        (1.0, 0.5), min_length=1, description="search distance of each stage (m) [chosen on KITTI 00]"
+    )
+    max_iterations: int = Field(20, ge=1, description="largest number of iterations in each stage [small_gicp]")
+    max_range_m: float = Field(60.0, gt=0, description="points farther away are dropped (m) [chosen]")
+    min_points: int = Field(
+        100, ge=10, description="smallest number of points, and of point pairs, for a registration [chosen on KITTI 00]"
+    )
     information_scale: float = Field(
-        0.05, gt=0, description="Hessian to information, for neighbours err alike: calibrated on simulated truth"
+        0.05,
+        gt=0,
+        description="factor from the Hessian to the information matrix; below 1: errors of neighbours are correlated "
+        "[measured: simulated truth]",
     )
     shared_noise_m: float = Field(
-        0.026, ge=0, description="noise of the translation that all points share: a sensor's bent rays (m)"
+        0.026,
+        ge=0,
+        description="translation noise common to all points, for example from sensor calibration (m) "
+        "[measured: simulated truth]",
     )
-    shared_noise_deg: float = Field(0.067, ge=0, description="the same of the rotation (degrees)")
+    shared_noise_deg: float = Field(
+        0.067, ge=0, description="rotation noise common to all points (degrees) [measured: simulated truth]"
+    )
 
 
 class VerifyConfig(Section):
-    """When an alignment is believed."""
+    """Conditions under which a registered pose is accepted."""
 
-    max_hypotheses: int = Field(3, ge=1, description="coarse poses tried, the best first")
-    max_plan_hypotheses: int = Field(
-        2, ge=0, description="after these, poses tried that lay the floor plans on one another"
+    min_overlap: float = Field(
+        0.2,
+        ge=0,
+        le=1,
+        description="smallest overlap: the share of points above the ground within reach that lie on the other scan "
+        "[chosen on simulated 00 and 08]",
     )
-    min_inliers: int = Field(3, ge=0, description="clique members that agree with a coarse pose worth refining")
-    min_overlap: float = Field(0.2, ge=0, le=1, description="share of standing points that meet the other surface")
-    inlier_m: float = Field(0.5, gt=0, description="a point this near the other surface meets it (m)")
-    max_range_m: float = Field(50.0, gt=0, description="points farther from the other sensor are out of its reach (m)")
-    max_rms_m: float = Field(0.165, gt=0, description="of the points that meet, to the other surface's planes (m)")
-    max_free_space_violation: float = Field(0.035, ge=0, le=1, description="share of points in space seen empty")
-    free_space_margin_m: float = Field(1.0, gt=0, description="a point this far before a return violates it (m)")
-    free_space_margin_ratio: float = Field(0.02, ge=0, description="and this much more per metre of range")
-    max_coarse_fine_m: float = Field(2.0, gt=0, description="farthest that refinement may move (m)")
-    prior_gate: float = Field(1.5, gt=0, description="distance from the prior, in search radii")
+    max_residual_ratio: float = Field(
+        1.5,
+        gt=0,
+        description="largest residual of these points, relative to neighbouring keyframes "
+        "[chosen on KITTI 00, courtyard, NCLT]",
+    )
+    max_hypotheses: int = Field(3, ge=1, description="number of coarse poses tried, the best first [chosen]")
+    max_plan_hypotheses: int = Field(
+        2, ge=0, description="number of poses tried after these, from aligning the two floor plans [chosen]"
+    )
+    min_inliers: int = Field(
+        3, ge=0, description="smallest number of clique members consistent with a coarse pose [chosen]"
+    )
+    inlier_m: float = Field(
+        0.5,
+        gt=0,
+        description="distance to the other scan within which a point overlaps it (m) [chosen: refine.voxel_m]",
+    )
+    max_range_m: float = Field(
+        50.0,
+        gt=0,
+        description="points farther from the other sensor are out of its reach (m) [chosen on simulated 00 and 08]",
+    )
+    max_free_space_violation: float = Field(
+        0.035,
+        ge=0,
+        le=1,
+        description="largest share of points in space that the other scan saw empty [chosen on simulated 00 and 08]",
+    )
+    max_violation_ratio: float = Field(
+        5.0,
+        ge=0,
+        description="the same limit relative to neighbouring keyframes; the larger of the two limits holds [chosen]",
+    )
+    free_space_margin_m: float = Field(
+        1.0,
+        gt=0,
+        description="distance before a return at which a point violates free space; less in narrow places (m) "
+        "[chosen for KITTI's streets]",
+    )
+    free_space_margin_ratio: float = Field(
+        0.02, ge=0, description="increase of that distance per metre of range [chosen]"
+    )
+    max_coarse_fine_m: float = Field(
+        2.0, gt=0, description="largest correction of a coarse pose by refinement (m) [chosen]"
+    )
+    well_observed: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="a pose is compared with rivals if the ratio of the smallest to the largest variance of its "
+        "translation is below this [chosen on KITTI 00]",
+    )
+    max_rivals: int = Field(
+        6,
+        ge=0,
+        description="number of floor-plan poses tried as rivals, besides shifts along the weak direction [chosen]",
+    )
+    rival_ratio: float = Field(
+        1.2,
+        ge=1,
+        description="a pose is ambiguous if a rival has less than this many times its mismatch "
+        "[chosen on a simulated corridor and tunnel]",
+    )
+    prior_gate: float = Field(
+        1.5, gt=0, description="largest horizontal distance from the prior, in search radii [chosen]"
+    )
 
 
 class GraphConfig(Section):
-    """What odometry and closures are believed to err by, and how their graph is solved."""
+    """Noise of odometry and closures, and the optimisation of the pose graph."""
 
-    odometry_sigma_m: float = Field(0.01, gt=0, description="odometry's translation noise per metre^0.5 travelled")
-    odometry_sigma_deg: float = Field(0.02, gt=0, description="odometry's rotation noise per metre^0.5 travelled")
-    turn_m: float = Field(5.0, ge=0, description="a turn of one radian adds as much noise as this travel (m)")
-    closure_sigma_m: float = Field(0.04, gt=0, description="least translation noise of a closure (m)")
-    closure_sigma_deg: float = Field(0.08, gt=0, description="least rotation noise of a closure (degrees)")
-    robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = Field(
-        "cauchy", description="kernel of the closures while running"
-    )
     final: Literal["none", "gnc", "consistent"] = Field(
-        "consistent", description="last optimisation: as before, or truncated; by GNC, or from closures that agree"
-    )
-    inlier_probability: float = Field(
-        0.99, gt=0, lt=1, description="the truncated ones keep closures within this chi-square quantile"
+        "consistent",
+        description="final optimisation: `none` keeps the robust kernel, `gnc` uses graduated non-convexity, "
+        "`consistent` starts from the largest pairwise-consistent set of closures [chosen on simulated drives]",
     )
     error_allowance: float = Field(
         3.0,
         ge=1,
-        description="of errors this many times as large as claimed: not every odometry is as good as KISS-ICP's",
+        description="tolerated ratio of real to modelled errors in the final optimisation; raise it for an odometry "
+        "that is worse than KISS-ICP [chosen]",
     )
-    systematic_drift: Literal["auto", "never"] = Field(
-        "auto", description="turn back what leftover angles of the sensor bent, where held-out scans show it"
+    odometry_sigma_m: float = Field(
+        0.01,
+        gt=0,
+        description="translation noise of the odometry per square root of a metre travelled "
+        "[measured: simulated streets]",
+    )
+    odometry_sigma_deg: float = Field(
+        0.02,
+        gt=0,
+        description="rotation noise of the odometry per square root of a metre travelled [measured: simulated streets]",
+    )
+    turn_m: float = Field(
+        5.0,
+        ge=0,
+        description="distance whose noise equals that of a rotation by one radian (m) [measured: simulated streets]",
+    )
+    closure_sigma_m: float = Field(
+        0.04, gt=0, description="smallest translation noise of a closure (m) [measured: simulated 06]"
+    )
+    closure_sigma_deg: float = Field(
+        0.08, gt=0, description="smallest rotation noise of a closure (degrees) [measured: simulated 06]"
+    )
+    robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = Field(
+        "cauchy", description="robust kernel of the closures before the final optimisation [chosen]"
+    )
+    inlier_probability: float = Field(
+        0.99,
+        gt=0,
+        lt=1,
+        description="a closure is an inlier if its squared error is below this quantile of the chi-square distribution "
+        "(6 degrees of freedom) [statistics]",
     )
 
 
 class LogConfig(Section):
-    """How the log is written."""
+    """Format of the log."""
 
-    view_every: int = Field(8, ge=1, description="every n-th point of a keyframe is drawn; all are kept for replay")
-    compression: Literal["none", "lz4", "zstd"] = Field("zstd", description="of the chunks of the log")
+    view_every: int = Field(
+        8, ge=1, description="viewers get every n-th point of a keyframe; replay uses all points [chosen]"
+    )
+    compression: Literal["none", "lz4", "zstd"] = Field("zstd", description="compression of the log [chosen]")
 
 
 class MapConfig(Section):
     """The map that `--map` and `segslam export` make of a run."""
 
-    voxel_m: float = Field(0.2, ge=0.02, le=5, description="edge of the voxels, a point each (m)")
-    max_range_m: float = Field(50.0, gt=0, le=300, description="points farther from their keyframe are left out (m)")
+    voxel_m: float = Field(0.2, ge=0.02, le=5, description="voxel size; the map has one point per voxel (m) [chosen]")
     color: Literal["class", "height", "intensity"] = Field(
-        "class", description="what the colours of the cloud say; a run keeps intensities only if mapped with it"
+        "class",
+        description="meaning of the colours; intensities are stored only in runs mapped with `intensity` [chosen]",
     )
-    view_range_m: float = Field(30.0, ge=0, description="keyframes nearer than this are asked; 0: none (m)")
-    view_margin_m: float = Field(0.3, gt=0, description="a return this far behind a voxel saw through it (m)")
-    view_margin_ratio: float = Field(0.01, ge=0, description="and this much more per metre of range")
-    min_views: int = Field(3, ge=1, description="fewest keyframes that saw through what is removed")
-    moved_radius_m: float = Field(0.8, ge=0, description="what has mostly removed voxels this near goes with them (m)")
-    cell_m: float = Field(0.2, ge=0.05, le=4, description="edge of the cells of the occupancy grid (m)")
-    obstacle_m: Bounds = Field((0.3, 2.0), description="heights above the ground where a voxel is an obstacle (m)")
-    min_obstacle_voxels: int = Field(2, ge=1, description="fewest of them in an occupied cell")
+    max_range_m: float = Field(
+        50.0, gt=0, le=300, description="points farther from their keyframe are dropped (m) [chosen]"
+    )
+    view_range_m: float = Field(
+        30.0,
+        ge=0,
+        description="distance within which a keyframe can vote a voxel away; 0: no voxel is removed (m) [chosen]",
+    )
+    view_margin_m: float = Field(
+        0.3,
+        gt=0,
+        description="distance by which a return must lie behind a voxel to have passed through it (m) [chosen]",
+    )
+    view_margin_ratio: float = Field(0.01, ge=0, description="increase of that distance per metre of range [chosen]")
+    min_views: int = Field(
+        3, ge=1, description="smallest number of keyframes that see through a removed voxel [chosen]"
+    )
+    moved_radius_m: float = Field(
+        0.8, ge=0, description="voxels with mostly removed neighbours within this radius are removed too (m) [chosen]"
+    )
+    cell_m: float = Field(0.2, ge=0.05, le=4, description="cell size of the occupancy grid (m) [chosen]")
+    obstacle_m: Bounds = Field(
+        (0.3, 2.0), description="heights above the ground where a voxel is an obstacle (m) [chosen]"
+    )
+    min_obstacle_voxels: int = Field(2, ge=1, description="smallest number of such voxels in an occupied cell [chosen]")
 
 
 class Config(Section):
     """All sections."""
 
+    sensor: SensorCalibrationConfig = SensorCalibrationConfig()
     odometry: OdometryConfig = OdometryConfig()
+    health: HealthConfig = HealthConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     proximity: ProximityConfig = ProximityConfig()
+    retrieval: RetrievalConfig = RetrievalConfig()
     geometric: GeometricLabelsConfig = GeometricLabelsConfig()
     segregator: SegregatorConfig = SegregatorConfig()
     refine: RefineConfig = RefineConfig()
@@ -336,7 +672,8 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base
         except yaml.YAMLError as error:
             raise SegslamError(f"--set {text}: the value is no valid YAML ({_one_line(error)})") from error
     source = str(path) if path is not None else "--set"
-    return _validate(values, source if not (path and overrides) else f"{path} and --set")
+    source = source if not (path and overrides) else f"{path} and --set"
+    return _validate(_without_removed(values, source), source)
 
 
 def config_to_yaml(config: Config) -> str:
@@ -353,6 +690,16 @@ def config_from_yaml(text: str, source: str) -> Config:
     if gone:
         logger.warning("%s: left out what this version does not have: %s", source, ", ".join(gone))
     return _validate(known, source)
+
+
+def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
+    """The values without settings that older versions had and this one no longer needs."""
+    for key in REMOVED:
+        section, _, name = key.partition(".")
+        if isinstance(values.get(section), dict) and name in values[section]:
+            logger.warning("%s: %s no longer exists and is ignored", source, key)
+            values = values | {section: {k: v for k, v in values[section].items() if k != name}}
+    return values
 
 
 def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -389,9 +736,23 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return _parse_yaml(text, str(path))
 
 
+class _EachKeyOnce(yaml.SafeLoader):
+    """Refuses a key that is given twice, of which YAML's own loader takes the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As of the loader. Raises ConstructorError with the line of the second."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
+            if isinstance(key, yaml.ScalarNode):
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(text)
+        values = yaml.load(text, _EachKeyOnce)
     except yaml.YAMLError as error:
         raise SegslamError(f"{source}: no valid YAML ({_one_line(error)})") from error
     if values is None:
@@ -409,7 +770,9 @@ def _validate(values: dict[str, Any], source: str) -> Config:
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             raise SegslamError(f"{source}: unknown key {key}; {_known_keys(first['loc'])}") from error
-        raise SegslamError(f"{source}: {key}: {first['msg']}, got {first['input']!r}") from error
+        message = first["msg"].removeprefix("Value error, ")
+        got = "" if isinstance(first["input"], dict) else f", got {first['input']!r}"
+        raise SegslamError(f"{source}: {key}: {message}{got}") from error
 
 
 def _known_keys(location: tuple[int | str, ...]) -> str:

@@ -1,4 +1,8 @@
-"""What goes wrong, by whose fault. Apart from the records, so that the command line starts without NumPy."""
+"""Exceptions. Separate from the records, so that the command line starts without NumPy."""
+
+import errno
+import os
+import re
 
 
 class SegslamError(Exception):
@@ -6,8 +10,15 @@ class SegslamError(Exception):
 
 
 class WorkFailed(SegslamError):
-    """What was asked for was right and could not be done, as with a full disk."""
+    """A valid request that failed, for example because of a full disk."""
 
 
 class BadScan(SegslamError):
-    """One scan that cannot be used, the others are unaffected: report it, skip it, count it."""
+    """A scan that cannot be used; other scans are not affected. Report it, skip it, count it."""
+
+
+def reason(error: OSError) -> str:
+    """Why, in a few words; NumPy's errors have no `strerror`, and count items where the disk is full."""
+    if error.strerror is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):
+        return os.strerror(errno.ENOSPC)
+    return error.strerror or str(error) or type(error).__name__

@@ -1,6 +1,6 @@
-"""How far an estimate is from the truth. Rows of the two belong together; both are poses of the same body.
+"""Errors of an estimate against ground truth, matched row by row; both are poses of the same body.
 
-Absolute errors are what remains after the rigid motion, without scale, that best lays the estimate on the truth.
+Absolute errors are the residuals after the best rigid alignment, without scale.
 """
 
 from dataclasses import dataclass
@@ -22,39 +22,40 @@ CAMERA_UP = (0.0, -1.0, 0.0)
 """Upwards in KITTI's camera frames, x right, y down, z ahead."""
 MIN_POSES = 3  # fewer are aligned without error, whatever they are
 LINE_TOLERANCE = 1e-6  # share of the spread along a line; rounding has less across it
+LINE_TURN_DEG = 5.0  # chosen: a turn about the line of the positions that is known worse than this makes no are_deg
 
 SEGMENT_LENGTHS_M = tuple(range(100, 801, 100))
 SEGMENT_STEP = 10
 """Scans between the starts of KITTI's segments."""
 
-FALSE_LOOP_M = 2.0
-FALSE_LOOP_DEG = 5.0
+SUCCESS_M, SUCCESS_DEG = 2.0, 5.0
+"""Largest errors of a correct registration or loop, those of the Segregator paper."""
 REVISIT_M = 4.0
-"""A keyframe this near to an older one sees what that one saw."""
+"""A keyframe within this distance of an older one revisits its place (m)."""
 REVISIT_MIN_TRAVEL_M = 50.0
 FOUND_WITHIN_M = 10.0  # chosen: a closure corrects the drift of the revisit around it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseErrors:
-    """Of each row: metres and degrees."""
+    """Errors of each row (m, degrees)."""
 
     translation_m: Vector
     rotation_deg: Vector
 
 
 def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, float, float] = Z_UP) -> dict[str, float]:
-    """The figures of `metrics.json` that two trajectories give, those that can be known.
+    """The error figures of `metrics.json` that can be computed from two trajectories.
 
     ate_m, are_deg, height_m: root mean squares after alignment; the last along `up` of the reference's frame.
     rpe_m, rpe_deg: root mean squares of the motion from each row to the next. kitti_translation_percent,
     kitti_rotation_deg_per_100m: means over KITTI's segments, left out if the drive is shorter than 100 m.
-    Nothing at all for fewer than 3 rows; no are_deg and height_m for positions that leave one line by no more than the
-    error is, for the turn about it is then anyone's.
+    Nothing at all for fewer than 3 rows; no height_m for positions that leave one line by no more than the error, and
+    no are_deg for those that leave it by less than 11 times that: the turn about the line is not known to 5 degrees.
     """
     if len(reference) < MIN_POSES:
         return {}
-    T_reference_estimate = align(estimate[:, :3, 3], reference[:, :3, 3])
+    T_reference_estimate = align_positions(estimate[:, :3, 3], reference[:, :3, 3])
     aligned = T_reference_estimate @ estimate
     absolute = pose_errors(aligned, reference)
     relative = relative_errors(estimate, reference)
@@ -64,8 +65,10 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
         "rpe_m": _rms(relative.translation_m),
         "rpe_deg": _rms(relative.rotation_deg),
     }
-    if not _on_a_line(reference[:, :3, 3], ate_m):
+    turn_deg = _turn_about_line_deg(reference[:, :3, 3], ate_m)
+    if turn_deg < LINE_TURN_DEG:
         metrics["are_deg"] = _rms(absolute.rotation_deg)
+    if turn_deg < np.degrees(1.0):
         metrics["height_m"] = _rms((aligned - reference)[:, :3, 3] @ np.array(up))
     segments = segment_errors(estimate, reference)
     if len(segments.translation_m):
@@ -74,18 +77,15 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
     return metrics
 
 
-def align(source: Points, target: Points) -> Transform:
-    """T_target_source that brings matched points together in least squares (Umeyama, PAMI 1991, with scale 1).
+def align_positions(source: Points, target: Points) -> Transform:
+    """T_target_source that aligns matched points in the least-squares sense (Umeyama, PAMI 1991, with scale 1).
 
-    For points on a line the turn about it is arbitrary. Raises ValueError for no points, or another number of them.
+    For points on a line the rotation about it is arbitrary. Raises ValueError for no points or unequal numbers.
     """
     if len(source) == 0 or source.shape != target.shape:
         raise ValueError(f"cannot align {len(source)} points with {len(target)}")
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    covariance = (target - target_mean).T @ (source - source_mean) / len(source)  # Eq. (38)
-    u, _, vt = np.linalg.svd(covariance)
-    keep_handedness = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # Eq. (43)
-    rotation = u @ keep_handedness @ vt  # Eq. (40)
+    rotation = geometry.nearest_rotation((target - target_mean).T @ (source - source_mean))  # Eq. (38), (40), (43)
     return geometry.transform(rotation, target_mean - rotation @ source_mean)  # Eq. (41)
 
 
@@ -117,15 +117,16 @@ def segment_errors(estimate: Poses, reference: Poses) -> PoseErrors:
 
 
 def loop_metrics(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> dict[str, float]:
-    """How many accepted loops are false, and how many revisits have a true one.
+    """Number of false loops among the accepted ones, and share of the revisits with a correct loop.
 
     `reference` has a row a keyframe, in order of time; `rows` names the (source, target) of each closure in it.
-    loop_precision is left out without closures; loop_recall, the share of revisiting keyframes with a true closure at
-    most 10 m of travel away, without revisits.
+    num_loops_false and loop_precision are left out where there is no closure to judge; loop_recall, the share of
+    revisiting keyframes with a true closure at most 10 m of travel away, without revisits.
     """
     false = false_loops(T_target_source, rows, reference)
-    metrics: dict[str, float] = {"num_loops_false": int(false.sum())}
+    metrics: dict[str, float] = {}
     if len(rows):
+        metrics["num_loops_false"] = int(false.sum())
         metrics["loop_precision"] = float(1 - false.mean())
     revisiting = np.flatnonzero(revisits(reference))
     if len(revisiting):
@@ -137,14 +138,14 @@ def loop_metrics(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> 
 
 
 def false_loops(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> Flags:
-    """Which closures are off by more than 2 m or 5 degrees; `rows` are the (source, target) of each in `reference`."""
+    """True for closures with errors above 2 m or 5 degrees; `rows`: (source, target) of each in `reference`."""
     truth = np.linalg.inv(reference[rows[:, 1]]) @ reference[rows[:, 0]]
     errors = pose_errors(T_target_source, truth)
-    return (errors.translation_m > FALSE_LOOP_M) | (errors.rotation_deg > FALSE_LOOP_DEG)
+    return (errors.translation_m > SUCCESS_M) | (errors.rotation_deg > SUCCESS_DEG)
 
 
 def revisits(reference: Poses) -> Flags:
-    """Which poses lie within 4 m of one that was left at least 50 m of travel before."""
+    """True for poses within 4 m of an earlier pose that is at least 50 m of travel back."""
     travel_m = travelled_m(reference)
     near = cKDTree(reference[:, :3, 3]).query_pairs(REVISIT_M, output_type="ndarray")  # the older row first
     far_in_travel = travel_m[near[:, 1]] - travel_m[near[:, 0]] >= REVISIT_MIN_TRAVEL_M
@@ -153,9 +154,10 @@ def revisits(reference: Poses) -> Flags:
     return result
 
 
-def _on_a_line(positions: Points, error_m: float) -> bool:
+def _turn_about_line_deg(positions: Points, error_m: float) -> float:
+    """Rotation by which errors of the positions can turn the line fitted to them about itself."""
     along, across, _ = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
-    return bool(across <= max(error_m, LINE_TOLERANCE * along))
+    return float(np.degrees(error_m / across)) if across > LINE_TOLERANCE * along else np.inf
 
 
 def _angles_deg(T_a_b: Poses) -> Vector:

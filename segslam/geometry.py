@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.types import Information, Points, Rotation, Tangent, Transform
+from segslam.types import Direction, Information, Points, Rotation, Tangent, Transform
 
 Triple = float | Sequence[float] | np.ndarray
 """Three numbers, or one for all three."""
@@ -40,8 +40,16 @@ def yaw(angle_rad: float) -> Rotation:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def level(up: Direction) -> Rotation:
+    """The smallest rotation that maps the unit vector `up` to +z; about x if `up` is -z."""
+    axis = np.array([up[1], -up[0], 0.0])  # up x z
+    sine = float(np.linalg.norm(axis))
+    axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+    return ScipyRotation.from_rotvec(axis * math.atan2(sine, up[2])).as_matrix()
+
+
 def tangent(*, rotation_rad: Triple, translation_m: Triple) -> Tangent:
-    """A tangent from its named halves; scalars spread over the three axes. Also serves for standard deviations."""
+    """A tangent from its named halves; a scalar is used for all three axes. Also for standard deviations."""
     return np.concatenate([np.broadcast_to(np.asarray(half, dtype=float), 3) for half in (rotation_rad, translation_m)])
 
 
@@ -57,13 +65,18 @@ def log(T_a_b: Transform) -> Tangent:
     return np.concatenate([phi, np.linalg.solve(_left_jacobian(phi), T_a_b[:3, 3])])
 
 
+def scaled(T_a_b: Transform, factor: float) -> Transform:
+    """The motion at the same twist over `factor` times the time; as it is, to the bit, for a factor of 1."""
+    return T_a_b if factor == 1.0 else exp(factor * log(T_a_b))
+
+
 def angle(T_a_b: Transform) -> float:
-    """Size of the rotation, in radians, 0 to pi: arccos((tr R - 1) / 2), computed without loss near 0."""
+    """Angle of the rotation (rad), 0 to pi: arccos((tr R - 1) / 2), exact near 0."""
     return float(ScipyRotation.from_matrix(T_a_b[:3, :3]).magnitude())
 
 
 def distance(T_a_b: Transform) -> float:
-    """Size of the translation, in metres."""
+    """Length of the translation (m)."""
     return float(np.linalg.norm(T_a_b[:3, 3]))
 
 
@@ -73,11 +86,15 @@ def interpolate(T_w_a: Transform, T_w_b: Transform, fraction: float) -> Transfor
 
 
 def with_noise(information: Information, *, rotation_rad: Triple, translation_m: Triple) -> Information:
-    """The information of a tangent that is also off by independent noise of these standard deviations.
+    """The information of a tangent after adding independent noise with these standard deviations.
 
-    Inverse(inverse(I) + S), written so that I may be singular: what was unknown stays so.
+    Inverse(inverse(I) + S), computed so that I may be singular: unknown directions stay unknown.
     """
-    noise = np.diag(tangent(rotation_rad=rotation_rad, translation_m=translation_m) ** 2)
+    return with_covariance(information, np.diag(tangent(rotation_rad=rotation_rad, translation_m=translation_m) ** 2))
+
+
+def with_covariance(information: Information, noise: Information) -> Information:
+    """The information of a tangent after adding independent noise of this covariance; as `with_noise`."""
     total = np.linalg.solve(np.eye(6) + information @ noise, information)
     return (total + total.T) / 2
 
@@ -97,3 +114,24 @@ def _left_jacobian(phi: np.ndarray) -> Rotation:
     a = (1.0 - math.cos(theta)) / theta**2
     b = (theta - math.sin(theta)) / theta**3
     return np.eye(3) + a * cross + b * cross @ cross
+
+
+def raise_beams(points: Points, angle_deg: float) -> Points:
+    """The points at the same range and azimuth, their elevation raised by `angle_deg`; of the same dtype.
+
+    A positive angle corrects a sensor that measures points too low. Zero returns the points themselves.
+    """
+    if angle_deg == 0.0:
+        return points
+    cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    x, y, z = np.ascontiguousarray(points.T)
+    horizontal = np.maximum(np.hypot(x, y), np.finfo(x.dtype).tiny)  # a point straight above has no azimuth to keep
+    stretch = cosine - sine * z / horizontal
+    return np.stack([x * stretch, y * stretch, sine * horizontal + cosine * z], axis=1)
+
+
+def raising(points: Points) -> Points:
+    """(n, 3) m per radian: the derivative of `raise_beams` at zero, for each point."""
+    horizontal = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
+    x, y, z = points.T
+    return np.column_stack([-z * x / horizontal, -z * y / horizontal, horizontal])

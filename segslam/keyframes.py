@@ -1,4 +1,4 @@
-"""When a scan becomes a keyframe, and which of its points are kept."""
+"""Selection of keyframes, and the points that a keyframe keeps."""
 
 import math
 from collections.abc import Collection
@@ -13,7 +13,7 @@ from segslam.types import Indices, Keyframe, Label, Labels, Points, Transform
 
 
 class KeyframeSelector:
-    """Cuts a keyframe where the last one is far enough away, or the sensor has turned enough since."""
+    """Selects a scan as keyframe if distance or rotation from the last keyframe are large enough."""
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._config = config
@@ -22,16 +22,20 @@ class KeyframeSelector:
         self.travel_m = 0.0
         """Length of the path through all scans so far."""
 
-    def update(self, T_odom_lidar: Transform) -> bool:
-        """Whether the next scan is a keyframe; the first is.
+    def update(self, T_odom_lidar: Transform, *, break_m: float = 0.0) -> bool:
+        """Whether the next scan is a keyframe; the first scan is, and the first after a break (`break_m` of travel).
 
-        Far means the straight distance from the last keyframe: a standing sensor's jitter adds to the path, not to it.
+        The distance is the straight one from the last keyframe, so that jitter of a standing sensor makes no keyframes.
         """
-        if self._T_odom_last is not None:
+        if break_m:
+            self.travel_m += break_m
+        elif self._T_odom_last is not None:
             self.travel_m += geometry.distance(geometry.inverse(self._T_odom_last) @ T_odom_lidar)
         self._T_odom_last = T_odom_lidar
-        is_keyframe = self._T_odom_keyframe is None or self._is_far(
-            geometry.inverse(self._T_odom_keyframe) @ T_odom_lidar
+        is_keyframe = (
+            break_m > 0
+            or self._T_odom_keyframe is None
+            or self._is_far(geometry.inverse(self._T_odom_keyframe) @ T_odom_lidar)
         )
         if is_keyframe:
             self._T_odom_keyframe = T_odom_lidar
@@ -42,12 +46,12 @@ class KeyframeSelector:
         return distance_m >= self._config.distance_m or angle_rad >= math.radians(self._config.angle_deg)
 
 
-def thin(
+def downsample_keyframe(
     points: Points, labels: Labels, *, config: KeyframeConfig, whole_classes: Collection[Label]
 ) -> tuple[Points, Labels, Indices]:
-    """What a keyframe keeps of a scan: all points of `whole_classes`, one a voxel of the others; float32, rounded.
+    """The points of a keyframe: all points of `whole_classes`, one per voxel of the others; float32, rounded.
 
-    Their labels and rows come with them.
+    Also returns their labels and rows.
     Every later stage works on these points and the log holds exactly these, so that a replay repeats the run.
     """
     is_kept = np.isin(labels, np.array([int(label) for label in whole_classes], dtype=np.uint8))
@@ -60,10 +64,10 @@ def thin(
 
 @runtime_checkable
 class Clouds(Protocol):
-    """Where the points of keyframes are, until a loop asks for them."""
+    """Storage of the points of keyframes."""
 
     def keep(self, keyframe: Keyframe) -> None:
-        """Take note of the newest keyframe."""
+        """Store the points of the newest keyframe."""
         ...
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
@@ -79,7 +83,7 @@ class CloudStore:
         self._kept: dict[int, tuple[np.ndarray, Labels]] = {}
 
     def keep(self, keyframe: Keyframe) -> None:
-        """Take note of the newest keyframe."""
+        """Store the points of the newest keyframe."""
         steps = np.rint(keyframe.points.astype(np.float64) / self._resolution_m)
         fits = np.abs(steps).max(initial=0.0) <= np.iinfo(np.int16).max
         self._kept[keyframe.id] = (steps.astype(np.int16 if fits else np.int32), keyframe.labels)

@@ -1,17 +1,17 @@
-"""Point clouds as arrays: in and out, no state."""
+"""Functions on point clouds as arrays."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from segslam.system.kernels import kernel
 from segslam.types import Covariances, Indices, Points
 
 EMPTY = -1
-"""Of a slot in a hash table, and the row of a key that is not in it."""
+"""Value of an empty slot of a hash table, and row of a key that is not in the table."""
 MAX_CELLS = 2**62
-"""What an int64 can number."""
+"""Largest number of voxels that int64 keys can count."""
 
 
 class Neighbours(NamedTuple):
@@ -29,7 +29,7 @@ def within_range(points: Points, min_m: float, max_m: float) -> np.ndarray:
 
 
 def squared_ranges(points: Points) -> np.ndarray:
-    """(n,) m^2: how far each point is from the origin, squared; not finite where a coordinate is not."""
+    """(n,) squared distances from the origin (m^2); not finite if a coordinate is not."""
     with np.errstate(over="ignore"):
         x, y, z = (points * points).T  # column by column: sums along rows of three take five times as long
     return x + y + z
@@ -42,7 +42,7 @@ def is_finite(points: Points) -> np.ndarray:
 
 
 def canonical_order(points: Points) -> Indices:
-    """Indices that sort points along a skew direction: the same sequence of points whatever order they come in."""
+    """Indices that sort points along a skew direction; the sorted sequence does not depend on the input order."""
     x, y, z = points.T.astype(np.float64)
     return np.argsort(x + math.sqrt(2.0) * y + math.sqrt(3.0) * z)
 
@@ -92,9 +92,9 @@ def patch_covariances(points: Points, neighbours: Neighbours) -> Covariances:
 
 
 def normals(points: Points, covariances: Covariances) -> Points:
-    """The direction in which the surroundings of each point vary least, turned towards the sensor at the origin.
+    """Normal of each point: the direction of least variance around it, towards the sensor at the origin.
 
-    Zero where no single direction is least: duplicates, points on a line along an axis.
+    Zero if that direction is not unique: duplicates, points on a line along an axis.
     """
     directions = _least_directions(covariances)
     away = np.einsum("ij,ij->i", directions, points) > 0
@@ -120,12 +120,12 @@ def _cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]
     return (x * extent[1] + y) * extent[2] + z, (extent[1] * extent[2], extent[2])
 
 
-@njit("int64(int64, int64)", cache=True, nogil=True, inline="always")
+@kernel("int64(int64, int64)")
 def _home(key, size):
     return (key * 0x9E3779B97F4A7C1 >> 20) & (size - 1)
 
 
-@njit("Tuple((int64[:], int64[:]))(int64[:])", cache=True, nogil=True)
+@kernel("Tuple((int64[:], int64[:]))(int64[:])")
 def hash_keys(keys):
     """An open-addressing table for `find_key`, and for each row the first row with the same key.
 
@@ -146,7 +146,7 @@ def hash_keys(keys):
     return table, first
 
 
-@njit("int64(int64[:], int64[:], int64)", cache=True, nogil=True)
+@kernel("int64(int64[:], int64[:], int64)")
 def find_key(table, keys, key):
     """The first row of `keys` that equals `key`, or EMPTY; `table` is that of `hash_keys(keys)`."""
     slot = _home(key, len(table))
@@ -155,7 +155,7 @@ def find_key(table, keys, key):
     return table[slot]
 
 
-@njit("int64[:, :](int64[:], int64, int64, int64)", cache=True, nogil=True)
+@kernel("int64[:, :](int64[:], int64, int64, int64)")
 def _nearby_columns(keys, key, stride_x, stride_y):
     """(9, 2) first and last + 1 row, in sorted keys, of the cells around a cell; three of them lie above each other."""
     bounds = np.empty((9, 2), np.int64)
@@ -166,11 +166,7 @@ def _nearby_columns(keys, key, stride_x, stride_y):
     return bounds
 
 
-@njit(
-    "Tuple((int64[:], int64[:], int32[:]))(float64[:, :], int64[:], int64, int64, int64[:], float64)",
-    cache=True,
-    nogil=True,
-)
+@kernel("Tuple((int64[:], int64[:], int32[:]))(float64[:, :], int64[:], int64, int64, int64[:], float64)")
 def _neighbours(points, keys, stride_x, stride_y, row_of, squared_radius):
     """Points and keys are sorted by key; `row_of` gives the row that each had before."""
     starts, ends = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
@@ -194,7 +190,7 @@ def _neighbours(points, keys, stride_x, stride_y, row_of, squared_radius):
     return starts, ends, rows[:count].copy()
 
 
-@njit("float64[:, :, :](float64[:, :], int64[:], int64[:], int32[:])", cache=True, nogil=True)
+@kernel("float64[:, :, :](float64[:, :], int64[:], int64[:], int32[:])")
 def _patch_covariances(points, starts, ends, rows):
     covariances = np.empty((len(points), 3, 3))
     for row in range(len(points)):
@@ -217,7 +213,7 @@ def _patch_covariances(points, starts, ends, rows):
     return covariances
 
 
-@njit("float64(float64[:, :])", cache=True, nogil=True)
+@kernel("float64(float64[:, :])")
 def _least_eigenvalue(a):
     """Of a symmetric matrix, in closed form (Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961)."""
     mean = (a[0, 0] + a[1, 1] + a[2, 2]) / 3.0
@@ -237,7 +233,7 @@ def _least_eigenvalue(a):
     return mean + 2.0 * scale * math.cos((math.acos(cosine) + math.tau) / 3.0)
 
 
-@njit("float64[:, :](float64[:, :, :])", cache=True, nogil=True)
+@kernel("float64[:, :](float64[:, :, :])")
 def _least_directions(matrices):
     """Unit eigenvector of the least eigenvalue of each symmetric matrix, the sign as it comes; zero if it is not one.
 

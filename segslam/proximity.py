@@ -1,9 +1,11 @@
-"""Which old keyframes may show what the new one sees: near in space by the graph's estimate, far in travel.
+"""Loop candidates by distance: older keyframes near the newest one by the graph's estimate, but far in travel.
 
-Odometry drifts with the way travelled, so two keyframes can be as wrong about each other as the shortest chain between
-them is long, and an accepted loop is a short cut. The search radius grows with that chain, target by target: the bound
-that a covariance would give, at the price of one Dijkstra run over the ends of loops.
+Odometry drifts with the distance travelled, so the error between two keyframes is bounded by the length of the shortest
+chain of odometry and loops between them. The search radius of each target grows with that chain. This approximates the
+bound by a covariance, and costs one run of Dijkstra's algorithm over the keyframes with loops.
 """
+
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,48 +14,64 @@ from scipy.sparse.csgraph import dijkstra
 
 from segslam import geometry
 from segslam.config import ProximityConfig
-from segslam.types import IndexPairs, Indices, LoopCandidate, LoopClosure, Vector
+from segslam.types import REJECTED_WEIGHT, IndexPairs, Indices, LoopCandidate, LoopClosure, Vector
+from segslam.verification.prior import height_bounds_m
 
+BREAK_TRAVEL_M = 1e5
+"""Travel that a break of the odometry counts: the relative pose across it is unknown."""
 NO_CLOSURES: IndexPairs = np.empty((0, 2), dtype=np.int64)
 
 
 class ProximityDetector:
-    """Proposes loops, and remembers those accepted.
+    """Proposes loop candidates, and stores the accepted loops.
 
-    A proposal compares the place of each keyframe with the new one's; all else that it costs is for those near.
+    A search compares the position of each keyframe with the new one; all other costs arise for near keyframes only.
     """
 
     def __init__(self, config: ProximityConfig) -> None:
         self._config = config
         self._closures = NO_CLOSURES
+        self._kept = np.empty(0, dtype=bool)
         self._chains = Chains(NO_CLOSURES)
 
     def note_closure(self, closure: LoopClosure) -> None:
-        """From now on the surroundings of this loop are not searched again."""
+        """Exclude the surroundings of this loop from the following searches."""
         self._closures = np.vstack([self._closures, [[closure.source_id, closure.target_id]]])
+        self._kept = np.append(self._kept, True)
 
-    def note_estimate(self) -> None:
-        """From now on poses are such that all closures noted so far tie their two ends together."""
-        self._chains = Chains(self._closures)
+    def note_estimate(self, closure_weights: Mapping[tuple[int, int], float]) -> None:
+        """Use the closures noted so far in the chains, with the weights of a `GraphEstimate`.
+
+        A closure that the optimiser rejected shortens no chain, and its surroundings are searched again.
+        """
+        weights = [closure_weights.get((source, target), 1.0) for source, target in self._closures.tolist()]
+        self._kept = np.array(weights) >= REJECTED_WEIGHT
+        self._chains = Chains(self._closures[self._kept])
 
     def candidates(
-        self, source_id: int, T_world_keyframes: Float[np.ndarray, "n 4 4"], travel_m: Float[np.ndarray, " n"]
+        self,
+        source_id: int,
+        T_world_keyframes: Float[np.ndarray, "n 4 4"],
+        travel_m: Float[np.ndarray, " n"],
+        *,
+        below: int | None = None,
     ) -> tuple[LoopCandidate, ...]:
-        """At most `max_candidates` older keyframes for one, the nearest first, `spread_m` of travel apart.
+        """At most `max_candidates` older keyframes near one, sorted by distance, `spread_m` of travel apart.
 
-        Row i of the arrays is the keyframe of id i, as the graph estimates it now. Distance is horizontal, for the
-        height of LiDAR odometry drifts most and a road's height differs little between two passes; the heights may
-        differ by `height_factor` radii.
+        Row i of the arrays is keyframe i, by the current estimate. Distances are horizontal, because the height of
+        LiDAR odometry drifts most. Heights may differ by `prior.height_bounds_m`, which separates the storeys of a
+        building. If `below` is given, only smaller ids are proposed.
         """
         config = self._config
         within_reach = self._within_reach(source_id, T_world_keyframes, travel_m)
+        within_reach = within_reach if below is None else within_reach[within_reach < below]
         chain_m = self._chains.lengths_m(source_id, within_reach, travel_m)
         radius_m = search_radius_m(chain_m, config=config)
         offset = T_world_keyframes[within_reach, :3, 3] - T_world_keyframes[source_id, :3, 3]
         distance_m = np.hypot(offset[:, 0], offset[:, 1])
         eligible = (
             (distance_m <= radius_m)
-            & (np.abs(offset[:, 2]) <= config.height_factor * radius_m)
+            & (np.abs(offset[:, 2]) <= height_bounds_m(chain_m, config=config))
             & ~self._is_closed(source_id, within_reach, travel_m, radius_m)
         )
         nearest_first = np.flatnonzero(eligible)[np.argsort(distance_m[eligible], kind="stable")]
@@ -66,30 +84,32 @@ class ProximityDetector:
                 T_target_source_prior=geometry.inverse(T_source_world @ T_world_keyframes[within_reach[row]]),
                 distance_m=float(np.linalg.norm(offset[row])),
                 search_radius_m=float(radius_m[row]),
+                chain_m=float(chain_m[row]),
             )
             for row in rows
         )
 
     def _within_reach(self, source_id: int, T_world_keyframes: np.ndarray, travel_m: Vector) -> Indices:
-        """Older keyframes far enough in travel and, whatever their radius, near enough; travel grows with the id."""
+        """Older keyframes far enough in travel and within the largest radius."""
         config = self._config
         num_far = np.searchsorted(travel_m, travel_m[source_id] - config.min_travel_m, side="right")
         x, y = T_world_keyframes[: min(num_far, source_id), :2, 3].T - T_world_keyframes[source_id, :2, 3, None]
-        return np.flatnonzero(np.hypot(x, y) <= config.max_radius_m)
+        largest_m = max(config.max_radius_m, config.break_radius_m) if _has_break(travel_m) else config.max_radius_m
+        return np.flatnonzero(np.hypot(x, y) <= largest_m)
 
     def _is_closed(self, source_id: int, ids: Indices, travel_m: Vector, radius_m: Vector) -> Bool[np.ndarray, " k"]:
-        """Which targets lie where a loop has just been closed: within `min_gap_m` of it on the side of the source, and
-        on that of the target not so much farther that another place could be meant."""
-        sources, targets = self._closures.T
+        """True for targets near a loop closed within the last `min_gap_m`: closer to its target, in travel, than
+        `min_gap_m` plus the search radius."""
+        sources, targets = self._closures[self._kept].T
         recent = targets[np.abs(travel_m[sources] - travel_m[source_id]) < self._config.min_gap_m]
         apart_m = np.abs(travel_m[ids, None] - travel_m[recent])
         return (apart_m < self._config.min_gap_m + radius_m[:, None]).any(axis=1)
 
 
 class Chains:
-    """The shortest ways between keyframes along odometry, which is as long as it is, and closures, of no length.
+    """Shortest chains between keyframes along odometry, with its length, and closures, with length 0.
 
-    They turn off at ends of closures only, so the graph that is searched has no other vertices.
+    Chains branch at the ends of closures only, so the searched graph has no other vertices.
     """
 
     def __init__(self, closures: IndexPairs) -> None:
@@ -99,7 +119,7 @@ class Chains:
         self._found: dict[int, Vector] = {}
 
     def lengths_m(self, source_id: int, ids: Indices, travel_m: Vector) -> Vector:
-        """(k,) from one keyframe to each of some others."""
+        """(k,) lengths of the chains from one keyframe to others."""
         straight_m = np.abs(travel_m[ids] - travel_m[source_id])
         if not len(self._ends):
             return straight_m
@@ -112,12 +132,12 @@ class Chains:
         return np.minimum(straight_m, np.min(by_ends_m, axis=0))
 
     def _beside(self, ids: Indices) -> tuple[Indices, Indices]:
-        """Rows of the ends next to some keyframes, before and after them in travel; twice the same at the margins."""
+        """Rows of the closure ends before and after each keyframe in travel; the same row twice at the margins."""
         after = np.searchsorted(self._ends, ids)
         return np.maximum(after - 1, 0), np.minimum(after, len(self._ends) - 1)
 
     def _from(self, end: int, ends_m: Vector) -> Vector:
-        """From one end to all ends; kept, for a new keyframe mostly asks from where the last one did."""
+        """Lengths from one end to all ends, cached: successive keyframes mostly start at the same end."""
         if end not in self._found:
             rows = np.arange(len(self._ends) - 1)
             sources, targets = np.searchsorted(self._ends, self._pairs).T
@@ -129,12 +149,20 @@ class Chains:
 
 
 def search_radius_m(chain_m: Vector, *, config: ProximityConfig) -> Vector:
-    """How far the estimate of each keyframe may be off as seen from one, in metres, by the chain to it."""
-    return np.minimum(config.base_radius_m + config.drift_ratio * chain_m, config.max_radius_m)
+    """Largest error of each keyframe's position relative to another, from the length of the chain between them (m).
+
+    A chain across a break of the odometry is longer than any drive (`BREAK_TRAVEL_M`).
+    """
+    radius_m = np.minimum(config.base_radius_m + config.drift_ratio * chain_m, config.max_radius_m)
+    return np.where(chain_m >= BREAK_TRAVEL_M, max(config.break_radius_m, config.max_radius_m), radius_m)
+
+
+def _has_break(travel_m: Vector) -> bool:
+    return len(travel_m) > 0 and bool(travel_m[-1] - travel_m[0] >= BREAK_TRAVEL_M)
 
 
 def _spread_out(ranked: Indices, travel_m: Vector, spread_m: float, most: int) -> list[int]:
-    """The best ranked, without those nearer in travel than `spread_m` to a better one; at most `most`."""
+    """At most `most` rows by rank, skipping rows within `spread_m` of travel of a better one."""
     chosen: list[int] = []
     for keyframe_id in ranked:
         if len(chosen) == most:

@@ -1,72 +1,37 @@
-"""The whole pipeline, one call a scan. It knows no file and no viewer: whoever wants to see consumes the Steps."""
+"""The whole pipeline, one call per scan. It knows no file and no viewer; these consume the Steps that it returns."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from segslam import geometry
-from segslam.alignment import Labeller, PreparedScan, Stopwatch, align, prepare_scan, shape_labels
-from segslam.beside import both
 from segslam.config import Config
-from segslam.keyframes import Clouds, CloudStore, KeyframeSelector, thin
-from segslam.odometry import KissOdometry, Odometry, OdometryResult
-from segslam.pose_graph import PoseGraph
-from segslam.proximity import ProximityDetector
-from segslam.straightening import sample, straighten
+from segslam.health import least_informed
+from segslam.keyframes import Clouds, CloudStore, downsample_keyframe
+from segslam.loops import ROUNDS, LoopCloser
+from segslam.odometry import Odometry, OdometryResult
+from segslam.pose_graph import Graph, PoseGraph
+from segslam.registration import Labeller, Stopwatch, shape_labels
+from segslam.semantics.late import made
+from segslam.slam_result import SlamResult as SlamResult
+from segslam.tracker import Tracked as Tracked
+from segslam.tracker import Tracker
 from segslam.trajectory import corrected_poses
 from segslam.types import (
-    Alignment,
-    AngleSamples,
-    DriftEvidence,
     GraphEstimate,
     Indices,
     Keyframe,
     LoopAttempt,
-    LoopCandidate,
     LoopClosure,
-    Points,
-    Registration,
-    Rejected,
-    RejectReason,
+    Motion,
+    MotionState,
     Scan,
+    SegslamError,
     Step,
     Trajectory,
     Transform,
 )
-
-NUM_PREPARED = 64
-"""Keyframes ready for alignment in memory, some 2 MB each; others are made ready again, in some 40 ms."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SlamResult:
-    """The end of a run: the pose of every scan before and after loop closing, and how it came about."""
-
-    trajectory: Trajectory
-    odometry: Trajectory
-    estimate: GraphEstimate
-    keyframe_rows: Indices
-    """Row of each keyframe, by id, in the two trajectories."""
-    attempts: tuple[LoopAttempt, ...]
-    drift: DriftEvidence | None = None
-    """None where nobody asked, or the run was read from its log."""
-    angles: AngleSamples | None = None
-    """What led to that."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
-    """A scan that odometry has placed. What follows, `Slam.close_loops`, may be done while the next is tracked."""
-
-    scan_index: int
-    stamp_ns: int
-    registered: OdometryResult | None
-    """What a keyframe is cut from; None where none is to be cut."""
-    T_odom_lidar: Transform
-    travel_m: float
-    watch: Stopwatch
 
 
 class Slam:
@@ -81,105 +46,183 @@ class Slam:
     ) -> None:
         """`odometry` replaces KISS-ICP; `labeller` replaces the geometric labels given to scans without any."""
         self.config = config or Config()
-        self._odometry = odometry or KissOdometry(self.config.odometry)
-        self._labeller = labeller or partial(shape_labels, config=self.config)
-        self._selector = KeyframeSelector(self.config.keyframes)
-        self._detector = ProximityDetector(self.config.proximity)
-        self.graph = PoseGraph(self.config.graph)
+        by_shape = partial(shape_labels, config=self.config)
+        self._tracker = Tracker(self.config, odometry=odometry)
+        self._labeller = labeller or by_shape
+        self._labels_by_shape = labeller is None
+        self.graph = self._new_graph()
         self._clouds: Clouds = CloudStore(self.config.keyframes.resolution_m)
-        self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self._prepare)
+        self._loops = LoopCloser(self.config, self.graph, lambda: self._clouds, by_shape)
         self._steps: list[tuple[int, int, Transform]] = []
+        self._motions: list[Motion] = []
+        self._since_keyframe: list[Motion] = []
         self._keyframe_rows: list[int] = []
         self._attempts: list[LoopAttempt] = []
+        self._is_finished = False
+
+    def _new_graph(self) -> Graph:
+        return PoseGraph(self.config.graph)
 
     def keep_clouds_in(self, clouds: Clouds) -> None:
-        """Have the points of keyframes in another place than in memory; before the first scan."""
+        """Store the points of keyframes elsewhere than in memory. Call it before the first scan."""
         self._clouds = clouds
 
     def process(self, scan: Scan) -> Step:
-        """All that this scan causes. Raises BadScan, and forgets the scan, if it cannot be used."""
+        """Process one scan: a Step with everything that it caused.
+
+        Raises BadScan, and forgets the scan, if it cannot be used or is not later than the one before. Raises
+        SegslamError after `finish`.
+        """
         return self.close_loops(self.track(scan))
 
     def track(self, scan: Scan) -> Tracked:
         """Where the scan was taken, and whether it becomes a keyframe. Raises BadScan as `process` does."""
-        watch = Stopwatch()
-        with watch("odometry"):
-            registered = self._odometry.register(scan)
-        T_odom_lidar = registered.T_odom_lidar
-        is_keyframe = self._selector.update(T_odom_lidar)
-        kept = registered if is_keyframe else None
-        return Tracked(scan.index, scan.stamp_ns, kept, T_odom_lidar, self._selector.travel_m, watch)
+        if self._is_finished:
+            raise SegslamError(f"scan {scan.index}: the run is finished; map further scans with a new Slam")
+        return self._tracker.track(scan)
 
-    def close_loops(self, tracked: Tracked) -> Step:
-        """What follows from a scan that was tracked."""
+    def close_loops(self, tracked: Tracked, *, tries_loops: bool = True) -> Step:
+        """What follows from a scan that was tracked. Loops not tried now may be in the search that `finish` does."""
         keyframe = None
         if tracked.registered is not None:
-            with tracked.watch("keyframe"):
-                keyframe = self._cut(tracked, tracked.registered)
-        return self._advance(tracked.scan_index, tracked.stamp_ns, tracked.T_odom_lidar, keyframe, tracked.watch)
+            keyframe = self._cut(tracked, tracked.registered)
+        return self._advance(
+            tracked.scan_index,
+            tracked.stamp_ns,
+            tracked.T_odom_lidar,
+            tracked.motion,
+            keyframe,
+            tracked.watch,
+            tries_loops=tries_loops,
+        )
 
     def repeat(self, recorded: Step) -> Step:
         """As `process`, from a Step that was made before: all from the keyframe on is done again."""
-        self._selector.update(recorded.T_odom_lidar)
+        motion = recorded.motion or Motion(MotionState.UNCHECKED)
+        self._tracker.note(recorded)
         return self._advance(
-            recorded.scan_index, recorded.stamp_ns, recorded.T_odom_lidar, recorded.keyframe, Stopwatch()
+            recorded.scan_index, recorded.stamp_ns, recorded.T_odom_lidar, motion, recorded.keyframe, Stopwatch()
+        )
+
+    def take(self, recorded: Step, *, below: int = 0, optimize: bool = False) -> Step:
+        """As `repeat`, with the loops of the Step as they were; more are searched among keyframes of ids under `below`.
+
+        The graph is optimised only where it is asked for.
+        """
+
+        def attempts(keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+            self._loops.take(recorded.attempts)
+            return (*recorded.attempts, *(self._loops.attempt(keyframe_id, watch, below=below) if below else ()))
+
+        return self._advance(
+            recorded.scan_index,
+            recorded.stamp_ns,
+            recorded.T_odom_lidar,
+            recorded.motion or Motion(MotionState.UNCHECKED),
+            recorded.keyframe,
+            Stopwatch(),
+            attempts_of=attempts,
+            is_due=lambda: optimize,
         )
 
     def go_on(self, scan_of: Callable[[int], Scan]) -> None:
         """Let `process` follow on `repeat`. `scan_of` reads the scan of a step, counted from 0, where it is needed."""
         if self._steps:
-            self._odometry.restore(np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]), scan_of)
+            T_odom_lidar = np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps])
+            self._tracker.restore(T_odom_lidar, self._motions, self._stamps(), scan_of)
 
-    def finish(self, angles: AngleSamples | None = None) -> SlamResult:
-        """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan.
-
-        `angles`: what these scans told an earlier run with the same settings of `refine` of leftover angles; they are
-        not asked again.
-        """
+    def finish(self) -> SlamResult:
+        """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan."""
         if not self._steps:
             raise ValueError("no scan was processed")
-        drift = None
-        if self.config.graph.systematic_drift == "auto":
-            angles = self._sample_angles() if angles is None else angles
-            drift = self._straighten(angles)
-        estimate = self.graph.finish()
+        self._is_finished = True
+        estimate, late = self._settle()
         odometry = Trajectory(
             scan_index=np.array([index for index, _, _ in self._steps]),
-            stamp_ns=np.array([stamp_ns for _, stamp_ns, _ in self._steps]),
+            stamp_ns=self._stamps(),
             T_world_lidar=np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]),
         )
         rows = np.array(self._keyframe_rows)
-        T_world_lidar = corrected_poses(odometry.T_world_lidar, rows, self.graph.T_world_keyframes)
+        T_world_lidar = corrected_poses(
+            odometry.T_world_lidar,
+            rows,
+            self.graph.T_world_keyframes,
+            after_break=np.array([self._motions[row].is_break for row in self._keyframe_rows]),
+        )
         trajectory = replace(odometry, T_world_lidar=T_world_lidar)
-        return SlamResult(trajectory, odometry, estimate, rows, tuple(self._attempts), drift, angles if drift else None)
+        attempts = (*self._attempts, *late)
+        return SlamResult(trajectory, odometry, estimate, rows, attempts, tuple(self._motions), len(late))
+
+    def _settle(self) -> tuple[GraphEstimate, list[LoopAttempt]]:
+        """The final estimate, after loops were searched again with better poses; and the attempts of that search."""
+        late: list[LoopAttempt] = []
+        estimate = self.graph.finish()
+        for _ in range(ROUNDS):
+            self._loops.note_estimate(estimate.closure_weights)
+            found = list(self._loops.look_again(Stopwatch()))
+            late += found
+            if not any(isinstance(attempt.outcome, LoopClosure) for attempt in found):
+                break
+            estimate = self.graph.finish()
+        return estimate, late
+
+    def _stamps(self) -> Indices:
+        return np.array([stamp_ns for _, stamp_ns, _ in self._steps])
 
     def _advance(
-        self, scan_index: int, stamp_ns: int, T_odom_lidar: Transform, keyframe: Keyframe | None, watch: Stopwatch
+        self,
+        scan_index: int,
+        stamp_ns: int,
+        T_odom_lidar: Transform,
+        motion: Motion,
+        keyframe: Keyframe | None,
+        watch: Stopwatch,
+        *,
+        tries_loops: bool = True,
+        attempts_of: Callable[[int, Stopwatch], tuple[LoopAttempt, ...]] | None = None,
+        is_due: Callable[[], bool] | None = None,
     ) -> Step:
         self._steps.append((scan_index, stamp_ns, T_odom_lidar))
+        self._motions.append(motion)
+        self._since_keyframe.append(motion)
         attempts: tuple[LoopAttempt, ...] = ()
         estimate = None
         if keyframe is not None:
             self._clouds.keep(keyframe)
             self._keyframe_rows.append(len(self._steps) - 1)
-            self.graph.add_keyframe(keyframe.id, keyframe.T_odom_keyframe, keyframe.travel_m)
-            attempts = self._attempt_loops(keyframe.id, watch)
-            self._attempts += attempts
-            if self.graph.is_due:
+            self.graph.add_keyframe(
+                keyframe.id,
+                keyframe.T_odom_keyframe,
+                keyframe.travel_m,
+                information=least_informed(self._since_keyframe),
+            )
+            self._since_keyframe = []
+            with watch("recognise"):
+                place = self._loops.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
+            keyframe = replace(keyframe, place=None if place is None else place.to_bytes())
+            if tries_loops:
+                attempts = (attempts_of or self._loops.attempt)(keyframe.id, watch)
+                self._attempts += attempts
+            if is_due() if is_due else self.graph.is_due:
                 with watch("optimize"):
                     estimate = self.graph.optimize()
-                self._detector.note_estimate()
-        return Step(scan_index, stamp_ns, T_odom_lidar, keyframe, attempts, estimate, watch.seconds)
+                self._loops.note_estimate(estimate.closure_weights)
+        return Step(scan_index, stamp_ns, T_odom_lidar, keyframe, attempts, estimate, watch.seconds, motion)
 
     def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:
-        """A keyframe of this scan, labelled by shape if it came without labels, and thinned to what is kept."""
-        labels = registered.labels if registered.labels.any() else self._labeller(registered.points)
-        points, labels, rows = thin(
-            registered.points,
-            labels,
-            config=self.config.keyframes,
-            whole_classes=tuple(self.config.segregator.cluster_min_points),
-        )
+        """A keyframe of this scan, labelled by shape if it has no labels, and downsampled."""
+        with tracked.watch("label"):
+            labels = made(registered.labels)
+            is_unlabelled = not labels.any()
+            if is_unlabelled:
+                labels = self._labeller(registered.points)
+        with tracked.watch("keyframe"):
+            points, labels, rows = downsample_keyframe(
+                registered.points,
+                labels,
+                config=self.config.keyframes,
+                whole_classes=tuple(self.config.segregator.cluster_min_points),
+            )
         return Keyframe(
             id=self.graph.num_keyframes,
             scan_index=tracked.scan_index,
@@ -189,61 +232,5 @@ class Slam:
             points=points,
             labels=labels,
             intensities=None if registered.intensities is None else registered.intensities[rows],
+            labelled_by_shape=True if is_unlabelled and self._labels_by_shape else None,
         )
-
-    def _sample_angles(self) -> AngleSamples:
-        T_odom_keyframes = np.stack([self._steps[row][2] for row in self._keyframe_rows])
-        return sample(self._points, T_odom_keyframes, self.graph.travel_m, config=self.config.refine)
-
-    def _straighten(self, angles: AngleSamples) -> DriftEvidence:
-        closures = [attempt.outcome for attempt in self._attempts if isinstance(attempt.outcome, LoopClosure)]
-        return straighten(self.graph, closures, angles, self._points, config=self.config.refine)
-
-    def _points(self, keyframe_id: int) -> Points:
-        return self._clouds.cloud(keyframe_id)[0]
-
-    def _prepare(self, keyframe_id: int) -> PreparedScan:
-        points, labels = self._clouds.cloud(keyframe_id)
-        return prepare_scan(points, labels, config=self.config)
-
-    def _attempt_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        with watch("propose"):
-            candidates = self._detector.candidates(keyframe_id, self.graph.T_world_keyframes, self.graph.travel_m)
-        attempts = tuple(self._attempt(candidate, watch) for candidate in candidates)
-        for attempt in attempts:
-            if isinstance(attempt.outcome, LoopClosure):
-                self.graph.add_closure(attempt.outcome)
-                self._detector.note_closure(attempt.outcome)
-        return attempts
-
-    def _attempt(self, candidate: LoopCandidate, watch: Stopwatch) -> LoopAttempt:
-        own = Stopwatch()
-        with own("prepare"):
-            source, target = both(self._prepared, (candidate.source_id,), (candidate.target_id,))
-        outcome = align(
-            source,
-            target,
-            config=self.config,
-            gate=lambda coarse: _far_from_prior(coarse, candidate, self.config.verify.prior_gate),
-            watch=own,
-        )
-        for stage, seconds in own.seconds.items():
-            watch.add(stage, seconds)
-        return LoopAttempt(candidate, _closure(candidate, outcome), own.seconds)
-
-
-def _far_from_prior(coarse: Registration, candidate: LoopCandidate, gate: float) -> Rejected | None:
-    """A coarse pose that puts the source farther from where the graph has it than drift can explain."""
-    T_prior_coarse = geometry.inverse(candidate.T_target_source_prior) @ coarse.T_target_source
-    apart_m = geometry.distance(T_prior_coarse)
-    allowed_m = gate * candidate.search_radius_m
-    if apart_m > allowed_m:
-        return Rejected(RejectReason.FAR_FROM_PRIOR, f"{apart_m:.1f} m > {allowed_m:.1f} m")
-    return None
-
-
-def _closure(candidate: LoopCandidate, outcome: Alignment | Rejected) -> LoopClosure | Rejected:
-    if isinstance(outcome, Rejected):
-        return outcome
-    fine = outcome.fine
-    return LoopClosure(candidate.source_id, candidate.target_id, fine.T_target_source, fine.information, outcome)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam import geometry
-from segslam.types import IndexPairs, Indices, SegslamError, Transform
+from segslam.types import IndexPairs, Indices, Mask, SegslamError, Transform
 
 Poses = Float[np.ndarray, "_ 4 4"]
 """Rigid transforms T_a_b, one a row."""
@@ -40,7 +40,7 @@ class PoseFile:
 
 
 def read_poses(path: Path, *, format: PoseFormat | None = None) -> PoseFile:
-    """The poses of a KITTI or TUM file, rotations made exact; the format is told by the columns unless given.
+    """The poses of a KITTI or TUM file with exact rotations; the format is detected from the columns unless given.
 
     Empty lines are skipped, and lines from a # on. Raises SegslamError that names the file, and the line if one is
     broken: another number of columns, no finite number, or a matrix or quaternion that is no rotation.
@@ -114,12 +114,15 @@ def travelled_m(T_a_b: Poses) -> np.ndarray:
     return np.concatenate([np.zeros(min(1, len(T_a_b))), np.cumsum(steps)])
 
 
-def corrected_poses(T_odom_lidar: Poses, keyframe_rows: Indices, T_world_keyframe: Poses) -> Poses:
+def corrected_poses(
+    T_odom_lidar: Poses, keyframe_rows: Indices, T_world_keyframe: Poses, *, after_break: Mask | None = None
+) -> Poses:
     """T_world_lidar of every scan, from the odometry of every scan and the corrected poses of the keyframes among them.
 
     Each of the two keyframes around a scan predicts its pose by the odometry between them; the two predictions are
     blended on SE(3) by the share of the way travelled. Before the first and after the last keyframe the nearest one
-    predicts alone. `keyframe_rows` ascend. Raises ValueError if there is no keyframe, or not a pose for each.
+    predicts alone, and before a keyframe that follows a break (`after_break`, one a keyframe) the one before it.
+    `keyframe_rows` ascend. Raises ValueError if there is no keyframe, or not a pose for each.
     """
     if len(keyframe_rows) == 0 or len(keyframe_rows) != len(T_world_keyframe):
         raise ValueError(f"{len(keyframe_rows)} keyframes and {len(T_world_keyframe)} poses of keyframes")
@@ -128,6 +131,8 @@ def corrected_poses(T_odom_lidar: Poses, keyframe_rows: Indices, T_world_keyfram
         for row, T_world_k in zip(keyframe_rows, T_world_keyframe, strict=True)
     ]
     before, after, share = _surroundings(keyframe_rows, travelled_m(T_odom_lidar))
+    if after_break is not None:
+        share = np.where(after_break[after], 0.0, share)
     poses = [
         geometry.interpolate(corrections[k] @ T_odom_s, corrections[m] @ T_odom_s, fraction)
         for T_odom_s, k, m, fraction in zip(T_odom_lidar, before, after, share, strict=True)
@@ -184,11 +189,13 @@ def _format_of(path: Path, number: int, fields: list[str]) -> PoseFormat:
 
 def _numbers(path: Path, number: int, fields: list[str], format: PoseFormat) -> list[float]:
     if len(fields) != COLUMNS[format]:
-        raise SegslamError(f"{path}:{number}: found {len(fields)} numbers; {LAYOUT[format]}: mend or remove the line")
+        raise SegslamError(
+            f"{path}:{number}: found {len(fields)} numbers; {LAYOUT[format]}: correct or remove the line"
+        )
     try:
         values = [float(field) for field in fields]
     except ValueError as error:
-        raise SegslamError(f"{path}:{number}: {error}; {LAYOUT[format]}: mend or remove the line") from error
+        raise SegslamError(f"{path}:{number}: {error}; {LAYOUT[format]}: correct or remove the line") from error
     if not np.isfinite(values).all():
         raise SegslamError(f"{path}:{number}: holds {' '.join(fields)}; every number must be finite")
     return values
@@ -200,7 +207,7 @@ def _stamps(path: Path, lines: list[tuple[int, list[str]]]) -> Indices:
         try:
             stamps.append(nanoseconds(fields[0]))
         except ValueError as error:
-            raise SegslamError(f"{path}:{number}: {error}; mend or remove the line") from error
+            raise SegslamError(f"{path}:{number}: {error}; correct or remove the line") from error
     return np.array(stamps, dtype=np.int64)
 
 
@@ -229,5 +236,5 @@ def _require_rotations(path: Path, numbers: list[int], rows: np.ndarray, poses: 
     if off[worst] > ROTATION_TOLERANCE:
         what = "3x3 part" if format == "kitti" else "quaternion"
         raise SegslamError(
-            f"{path}:{numbers[worst]}: the {what} is no rotation, it is off by {off[worst]:.3g}; mend the line"
+            f"{path}:{numbers[worst]}: the {what} is no rotation, it is off by {off[worst]:.3g}; correct the line"
         )

@@ -6,32 +6,53 @@ Stamps are integer nanoseconds. Labels are SemanticKITTI learning ids.
 Shapes are checked under pytest only.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numpy.typing import ArrayLike
 
 from segslam.errors import BadScan as BadScan
 from segslam.errors import SegslamError as SegslamError
 from segslam.errors import WorkFailed as WorkFailed
+from segslam.system.short_repr import Record
 
 Points = Float[np.ndarray, "_ 3"]
 """Points, a row each, in metres."""
 Labels = UInt8[np.ndarray, "_"]
 """SemanticKITTI learning ids, one a point."""
+ScanLabels = Labels | Callable[[], Labels]
+"""The labels of a scan, or a function that computes them, as for a network."""
 Transform = Float[np.ndarray, "4 4"]
 """A rigid transform T_a_b."""
 Rotation = Float[np.ndarray, "3 3"]
 Tangent = Float[np.ndarray, "6"]
 """[rotation rad; translation m], right perturbation."""
 Covariances = Float[np.ndarray, "_ 3 3"]
+Direction = Float[np.ndarray, "3"]
 Information = Float[np.ndarray, "6 6"]
 """Inverse covariance of a tangent, in the same order."""
 Indices = Int[np.ndarray, "_"]
 IndexPairs = Int[np.ndarray, "_ 2"]
 Vector = Float[np.ndarray, "_"]
 Mask = Bool[np.ndarray, "_"]
+
+
+def as_points(points: ArrayLike) -> Points:
+    """The first three columns of an array-like object; float32 stays float32, all else becomes float64.
+
+    Raises SegslamError for another shape, or if it holds no numbers.
+    """
+    try:
+        array = np.asarray(points)
+        array = array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise SegslamError(f"points: not an array of numbers ({error}); give rows of x, y, z") from error
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise SegslamError(f"points: an array of shape {array.shape}; give rows of x, y, z, as of shape (n, 3)")
+    return array[:, :3]
 
 
 class Label(IntEnum):
@@ -69,7 +90,7 @@ GROUND_LABELS = (Label.ROAD, Label.PARKING, Label.SIDEWALK, Label.OTHER_GROUND, 
 
 
 class RejectReason(StrEnum):
-    """Why there is no registration or no loop, in the order of the pipeline."""
+    """Reason of a rejected registration or loop, in the order of the pipeline."""
 
     TOO_FEW_POINTS = "too_few_points"
     TOO_FEW_CORRESPONDENCES = "too_few_correspondences"
@@ -81,49 +102,126 @@ class RejectReason(StrEnum):
     LOW_OVERLAP = "low_overlap"
     HIGH_RESIDUAL = "high_residual"
     FREE_SPACE_VIOLATED = "free_space_violated"
-    INCONSISTENT = "inconsistent"
+    AMBIGUOUS = "ambiguous"
+    NO_PLACE = "no_place"
+    UNCONFIRMED = "unconfirmed"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scan:
-    """One sweep. `points` (n, 3) in the LiDAR frame; `labels` (n,) has a row for each, all UNLABELLED if unknown."""
+@dataclass(frozen=True, slots=True, eq=False, repr=False, init=False)
+class Scan(Record):
+    """One sweep: points in the LiDAR frame (x ahead, y left, z up; m) and the stamp are enough.
 
-    index: int
-    stamp_ns: int
+    A network labels a scan when it becomes a keyframe; until then `labels` is a function without arguments that
+    returns the labels.
+    """
+
     points: Points
-    labels: Labels
-    times: Vector = field(default_factory=lambda: np.empty(0))
+    stamp_ns: int
+    index: int | None
+    """Number of the scan in the drive; if None, `Slam` counts."""
+    labels: ScanLabels
+    """A row for each point, all UNLABELLED if unknown."""
+    times: Vector
     """Per point, 0 at the sweep's start to 1 at its end; empty if unknown or already motion-compensated."""
-    intensities: Vector | None = None
+    intensities: Vector | None
     """Per point, in the sensor's own unit; None if unknown or not asked for."""
+    kept: Mask | None
+    """Rows of the file that the points were read from; None for all rows."""
+
+    def __init__(
+        self,
+        points: ArrayLike,
+        stamp_ns: int,
+        index: int | None = None,
+        labels: ScanLabels | None = None,
+        times: Vector | None = None,
+        intensities: Vector | None = None,
+        kept: Mask | None = None,
+    ) -> None:
+        """`points`: array-like with at least 3 columns; the first 3 are used."""
+        xyz = as_points(points)
+        values = {
+            "points": xyz,
+            "stamp_ns": stamp_ns,
+            "index": index,
+            "labels": np.zeros(len(xyz), np.uint8) if labels is None else labels,
+            "times": np.empty(0) if times is None else times,
+            "intensities": intensities,
+            "kept": kept,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Keyframe:
-    """A scan kept for loop closing. It has no world pose: the graph alone owns those."""
+class MotionState(StrEnum):
+    """Result of checking a motion against the scans."""
+
+    UNCHECKED = "unchecked"
+    """Not checked: too little motion since the last check."""
+    CONFIRMED = "confirmed"
+    """The motion of the odometry, consistent with the scans."""
+    REFINED = "refined"
+    """Registered again; the motion of the odometry was within the tolerance."""
+    REPAIRED = "repaired"
+    """Replaced by a registration: the motion of the odometry was off by more than the tolerance."""
+    REJOINED = "rejoined"
+    """Registered with the scans before a break, which joins the trajectory again."""
+    BROKEN = "broken"
+    """A break: the motion is a guess that no scan supports."""
+    BEGUN = "begun"
+    """First scan of another session of a merged run: its motion from the scan before is unknown."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Motion(Record):
+    """The check of a scan's motion since the last checked scan."""
+
+    state: MotionState
+    moved_m: float | None = None
+    """Distance from the odometry's pose to the registered one; None if there was no registration."""
+    moved_deg: float | None = None
+    overlap: float | None = None
+    """Share of the scan that lies on earlier scans, at the registered pose."""
+    rms_m: float | None = None
+    information: Information | None = None
+    """Information of the motion; None if the noise model of the odometry holds."""
+
+    @property
+    def is_break(self) -> bool:
+        """True if the pose is a guess that no scan supports."""
+        return self.state is MotionState.BEGUN or (self.state is MotionState.BROKEN and self.overlap is None)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Keyframe(Record):
+    """A scan kept for loop closing. It has no world pose: the pose graph owns all world poses."""
 
     id: int
     scan_index: int
     stamp_ns: int
     T_odom_keyframe: Transform
     travel_m: float
-    """Length of the odometry's path from the first scan to here."""
+    """Length of the odometry's path from the first scan."""
     points: Points
     """Motion-compensated, in the keyframe's frame, float32."""
     labels: Labels
     intensities: Vector | None = None
-    """Per point, as its scan has them; None if it has none."""
+    """Intensities of the scan, per point; None if unknown."""
+    labelled_by_shape: bool | None = None
+    """True if the labels were computed from the points alone; None if unknown."""
+    place: bytes | None = None
+    """Signature by which its place is recognised (`segslam.retrieval`); None where none was made."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Description:
-    """What matching needs of one scan, in the scan's frame: clusters (k rows) and point features (m rows).
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Description(Record):
+    """Features of one scan for matching, in the scan's frame: clusters (k rows) and key points (m rows).
 
-    Each is a Gaussian with a class. Small enough to keep thousands of them.
+    Each is a Gaussian with a class. Thousands of descriptions fit in memory.
     """
 
     means: Points
-    """Centres; of upright things, where the ground is seen, the point of the ground beneath."""
+    """Centres; for upright objects above observed ground, the point on the ground below."""
     covariances: Covariances
     classes: Labels
     sizes: Indices
@@ -136,23 +234,25 @@ class Description:
     ground_points: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
     """Centres of flat patches of the ground, a row each."""
     ground_normals: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
-    """Their unit normals, towards the side of the sensor."""
+    """Unit normals of the patches, towards the sensor."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopCandidate:
-    """A proposal: the new keyframe `source_id` may see what the old `target_id` saw. The prior only gates."""
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopCandidate(Record):
+    """A possible loop: the new keyframe `source_id` and the older `target_id`. The prior is used by gates only."""
 
     source_id: int
     target_id: int
     T_target_source_prior: Transform
     distance_m: float
-    """Between the two positions, by the present estimate."""
+    """Distance between the two positions, by the current estimate."""
     search_radius_m: float
+    chain_m: float = 0.0
+    """Length of the shortest chain of odometry and closures between the two."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Registration:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Registration(Record):
     """The pose of the source in the target: `p_target = T_target_source @ p_source`."""
 
     T_target_source: Transform
@@ -162,34 +262,54 @@ class Registration:
     """Root mean square distance of the inliers."""
     information: Information
     num_edges: int = 0
-    """Edges of the consistency graph (0 where the method has none)."""
+    """Edges of the consistency graph (0 if the method has none)."""
+
+    @property
+    def ok(self) -> bool:
+        """True; False for `Rejected`."""
+        return True
 
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A registration that failed, or a loop that is none. There is no pose to misuse."""
+    """A failed registration or rejected loop. It has no pose; its truth value is False."""
 
     reason: RejectReason
     detail: str = ""
 
+    def __bool__(self) -> bool:
+        return False
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Alignment:
-    """A registration that was refined and verified; `fine.T_target_source` is the pose."""
+    @property
+    def ok(self) -> bool:
+        """False; True for a registration, alignment or closure."""
+        return False
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Alignment(Record):
+    """A refined and verified registration; `fine.T_target_source` is the pose."""
 
     coarse: Registration
     fine: Registration
     overlap: float
-    """Share of the standing points within reach of the other scan that lie on it; of the two ways, the smaller."""
+    """Share of the standing points within reach of the other scan that lie on it; the smaller of both directions."""
     rms_m: float
-    """Of those points, to the planes of the other surface."""
+    """Root mean square distance of these points to the planes of the other scan (m)."""
     free_space_violation: float
-    """Share of the points that stand where the other scan saw empty space."""
+    """Share of the points in space that the other scan observed empty."""
+    observability: float = 1.0
+    """Smallest divided by largest variance of the translation, 0 to 1: small along a corridor."""
+
+    @property
+    def ok(self) -> bool:
+        """True; False for `Rejected`."""
+        return True
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopClosure:
-    """A verified loop, one between-factor to be. `information` is that of `T_target_source`, right perturbation."""
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopClosure(Record):
+    """A verified loop, a between-factor of the graph. `information`: of `T_target_source`, right perturbation."""
 
     source_id: int
     target_id: int
@@ -197,66 +317,63 @@ class LoopClosure:
     information: Information
     alignment: Alignment
 
+    @property
+    def ok(self) -> bool:
+        """True; False for `Rejected`."""
+        return True
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopAttempt:
-    """A candidate and what came of it."""
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopAttempt(Record):
+    """A candidate and its outcome."""
 
     candidate: LoopCandidate
     outcome: LoopClosure | Rejected
     seconds: dict[str, float]
-    """By stage: describe_source, describe_target, match, refine, verify; only those that ran."""
+    """Seconds by stage (prepare, match, refine, verify); only stages that ran."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GraphEstimate:
-    """What one optimisation gave."""
+REJECTED_WEIGHT = 0.5
+"""Closures with a smaller weight count as rejected by the optimiser."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Placement(Record):
+    """The verified pose of a keyframe in an old map, one prior factor to be. `information` is that of the pose."""
+
+    keyframe_id: int
+    map_keyframe_id: int
+    """The map's keyframe that it was registered with."""
+    T_world_keyframe: Transform
+    """In the map's world."""
+    information: Information
+    alignment: Alignment
+    """With the map's keyframe."""
+    is_found: bool
+    """Found with no initial guess, or else tracked: registered from a predicted pose."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class GraphEstimate(Record):
+    """The result of one optimisation."""
 
     T_world_keyframe: dict[int, Transform]
     error: float
-    """GTSAM's: half the chi-square, robust kernels included."""
+    """Minimised cost as GTSAM defines it: half the chi-square, under robust kernels before the final optimisation."""
     closure_weights: dict[tuple[int, int], float]
-    """(source_id, target_id) -> 0 (switched off) to 1 (fully trusted)."""
+    """(source_id, target_id) -> 0 (rejected) to 1 (full weight)."""
+    motion_weights: dict[tuple[int, int], float] = field(default_factory=dict)
+    """(keyframe_id, next keyframe_id) -> 0 for rejected motions of the odometry. All other motions have weight 1."""
+
+    @property
+    def rejected(self) -> set[tuple[int, int]]:
+        """The closures (source_id, target_id) that the optimiser rejected."""
+        return {pair for pair, weight in self.closure_weights.items() if weight < REJECTED_WEIGHT}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AngleSamples:
-    """What pairs of scans along a drive tell of leftover angles, a row a pair. Columns: vertical, of azimuth."""
-
-    travel_m: Vector
-    """Of the middle between the two scans."""
-    angle_rad: Float[np.ndarray, "n 2"]
-    """By which all points lie too low; by which a point ahead lies too far left, and one behind too far right."""
-    excess_rad_per_m: Float[np.ndarray, "n 2"]
-    """How much too far down the odometry turned, and how much too far left."""
-
-
-@dataclass(frozen=True, slots=True)
-class DriftEvidence:
-    """Whether leftover angles bent the odometry, and what speaks for it. None: too few scans to say."""
-
-    chosen: bool
-    reason: str
-    num_pairs: int
-    vertical_deg: float | None = None
-    """Median over the drive; positive where points lie too low."""
-    azimuth_deg: float | None = None
-    """The same of azimuth; positive where a point ahead lies too far left."""
-    vertical_change_deg: float | None = None
-    """Sigma of the slow change around the mean."""
-    azimuth_change_deg: float | None = None
-    chi2_before: float | None = None
-    """Of the odometry's excess turns in stretches held out of the fit, as they are."""
-    chi2_after: float | None = None
-    """The same, less what the angles around the stretches predict."""
-    t_value: float | None = None
-    """Of the agreement between prediction and excess, over stretches."""
-    t_needed: float | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Step:
-    """All that one scan caused."""
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Step(Record):
+    """Everything that one scan caused."""
 
     scan_index: int
     stamp_ns: int
@@ -266,11 +383,24 @@ class Step:
     estimate: GraphEstimate | None
     """Present only if this step optimised the graph."""
     stage_seconds: dict[str, float]
+    motion: Motion | None = None
+    """Check of the scan's motion; None if it was not checked."""
+    placements: tuple[Placement, ...] = ()
+    """Keyframes placed in an old map: the keyframe of this step, and earlier ones that it confirms."""
+    not_placed: Rejected | None = None
+    """Why the keyframe of this step has no place in the old map; None if it has one, or there is no map."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Stamped poses, a row a scan. `T_world_lidar` (n, 4, 4); `scan_index` says which scans they are."""
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LateLoops(Record):
+    """Loops tried after the last scan."""
+
+    attempts: tuple[LoopAttempt, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Trajectory(Record):
+    """Stamped poses, one row per scan. `T_world_lidar` (n, 4, 4); `scan_index`: numbers of the scans."""
 
     scan_index: Indices
     stamp_ns: Indices

@@ -2,10 +2,17 @@
 
 import json
 import os
+import signal
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # as many processes as cores: their threads only wait for each other
+    for library in ("OMP", "OPENBLAS", "NUMBA"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+import helpers.checker  # noqa: F401  (named below)
 import hypothesis
 import numpy as np
 import pytest
@@ -20,11 +27,11 @@ def _modules_checked() -> list[str]:
     return [
         ".".join(file.relative_to(ROOT).with_suffix("").parts)
         for file in sorted((ROOT / "segslam").rglob("*.py"))
-        if file.name != "__init__.py" and "njit" not in file.read_text()
+        if file.name != "__init__.py" and "import kernel\n" not in file.read_text()
     ]
 
 
-install_import_hook(_modules_checked(), "checker.check")
+install_import_hook(_modules_checked(), "helpers.checker.check")
 hypothesis.settings.register_profile("steady", deadline=None)  # a slow machine is no failure
 hypothesis.settings.load_profile("steady")
 
@@ -36,6 +43,22 @@ def data_dir() -> Path:
     if not (folder / "kitti").is_dir():
         pytest.skip(f"no real data at {folder}; set SEGSLAM_DATA")
     return folder
+
+
+@pytest.fixture
+def ctrl_c_works() -> Iterator[None]:
+    """Ctrl-C interrupts the test and the processes that it starts, though a script's job and xdist ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="module")
+def blank_reports() -> Iterator[None]:
+    """Runs end with a report that is a blank page: drawing takes longer than mapping a few scans."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("segslam.run.report.write_report", lambda folder: (folder / "report.html").write_text(""))
+        yield
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
+import re
 from pathlib import Path
 
 import pytest
 
-from segslam.config import Config, config_from_yaml, config_to_yaml, load_config
+from segslam.config import USER_SETTINGS, Config, config_from_yaml, config_to_yaml, load_config
 from segslam.types import Label, SegslamError
 
 
@@ -21,6 +22,18 @@ def test_settings_of_an_older_version_are_read_without_those_that_have_gone(capl
     ]
     with pytest.raises(SegslamError, match=r"log\.mcap: keyframes\.distance_m: .* got -1"):
         config_from_yaml("keyframes: {distance_m: -1}", "log.mcap")
+
+
+def test_a_setting_that_was_removed_is_dropped_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("graph: {systematic_drift: never, turn_m: 4.0}\n")
+    config = load_config(file)
+    assert config == load_config(None, ["graph.turn_m=4.0"])
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{file}: graph.systematic_drift no longer exists and is ignored"
+    ]
+    assert load_config(None, ["graph.systematic_drift=auto"]) == Config()
+    assert config_from_yaml(file.read_text(), "log.mcap") == config
 
 
 def test_a_file_holds_differences_and_set_wins_over_it(tmp_path: Path) -> None:
@@ -42,7 +55,12 @@ def test_shipped_configurations_load(file: Path) -> None:
         ("keyframes.distance=1", "keyframes.distance"),
         ("keyframe.distance_m=1", "keyframe"),
         ("keyframes.distance_m=-1", "keyframes.distance_m"),
+        ("keyframes.distance_m=.inf", "keyframes.distance_m"),
+        ("keyframes.distance_m=.nan", "keyframes.distance_m"),
+        ("odometry.max_range_m=1", "odometry: max_range_m 1 must be above min_range_m 3"),
         ("keyframes.distance_m=[", "--set keyframes.distance_m"),
+        ("refine.correspondence_m=[]", "refine.correspondence_m"),
+        ("refine.correspondence_m=[1.0, -0.5]", "refine.correspondence_m.1"),
         ("segregator.feature_classes=[hovercraft]", "feature_classes"),
         ("distance_m=1", "section.key=value"),
         ("keyframes.distance_m", "section.key=value"),
@@ -51,6 +69,16 @@ def test_shipped_configurations_load(file: Path) -> None:
 def test_a_wrong_setting_is_refused_by_name(text: str, named: str) -> None:
     with pytest.raises(SegslamError, match=named.replace(".", r"\.").replace("[", r"\[")):
         load_config(None, [text])
+
+
+@pytest.mark.parametrize(
+    "text", ["keyframes: {distance_m: 1, distance_m: 5}", "graph: {}\nkeyframes: {}\nkeyframes: {}\n"]
+)
+def test_a_key_given_twice_is_refused_with_its_line(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "twice.yaml"
+    file.write_text(text)
+    with pytest.raises(SegslamError, match=r"twice\.yaml: .* is given twice .*line \d"):
+        load_config(file)
 
 
 @pytest.mark.parametrize("content", [b"keyframes: [", b"- a\n- b\n", b"keyframes: 3\n", b"\xff\xfe\x00", None])
@@ -65,3 +93,14 @@ def test_a_file_that_holds_no_settings_is_refused_by_name(tmp_path: Path, conten
 def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
     (tmp_path / "empty.yaml").write_text("")
     assert load_config(tmp_path / "empty.yaml") == Config()
+
+
+def test_settings_that_users_need_are_the_first_of_their_sections_and_every_default_has_a_source() -> None:
+    wanted = [tuple(key.split(".")) for key in USER_SETTINGS]
+    for section, field in Config.model_fields.items():
+        fields = type(field.default).model_fields
+        first = [key for name, key in wanted if name == section]
+        assert list(fields)[: len(first)] == first, section
+        for key, setting in fields.items():
+            assert re.search(r"\[[^\]]+\]$", setting.description or ""), f"{section}.{key}"
+    assert len(wanted) <= 16

@@ -1,23 +1,34 @@
 """The documents say what the code does: examples run, the options page is the code's, commands explain themselves."""
 
+import json
 import re
 import runpy
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from drives import round_drive, write_kitti_sequence
-from finished_run import make_run
+from helpers.commands import all_commands
+from helpers.drives import round_drive, write_kitti_sequence
+from helpers.finished_run import make_run
 from typer.main import get_command
 
+import segslam
 from segslam import cli
 from segslam.cli import commands
 from segslam.trajectory import read_poses
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
+GENERATED = {"commands.md", "api.md"}
+PAGES = [
+    *("README.md", "CONTRIBUTING.md", "CHANGELOG.md"),
+    *(f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md") if file.name not in GENERATED),
+]
 
 
 def _run_example(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: Path) -> None:
@@ -66,6 +77,36 @@ def test_the_example_that_scores_agrees_with_the_known_error(
     assert float(ate) == pytest.approx(1.30, abs=0.005)  # as the data's description has it
 
 
+def test_the_notebook_maps_and_registers_simulated_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    matplotlib.use("Agg")
+    names: dict[str, Any] = {}
+    for cell in json.loads((ROOT / "docs" / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), cell["id"], "exec"), names)  # as a kernel does
+    plt.close("all")
+    assert names["errors"]["ate_m"] < 0.3
+    assert names["found"]
+    assert names["off_m"] < 0.3
+
+
+def test_the_site_has_a_page_for_every_command_and_public_name() -> None:
+    pages = runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))
+    page = pages["commands_page"]()
+    for name, command in all_commands(get_command(cli.app)):
+        assert f"## segslam {name}\n" in page
+        assert all(f"`{option}`" in page for parameter in command.params for option in parameter.opts if "-" in option)
+    assert all(f"## {name}\n" in pages["api_page"]() for name in segslam.__all__ if callable(getattr(segslam, name)))
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_warnings(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", str(ROOT / "docs"), str(tmp_path / "site")]
+    done = subprocess.run(build, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "site" / "tutorial.html").is_file()
+
+
 def test_every_example_is_run_by_a_test_here() -> None:
     tests = Path(__file__).read_text()
     assert all(f'"{example.name}"' in tests for example in EXAMPLES.glob("*.py"))
@@ -78,7 +119,7 @@ def test_the_page_of_options_is_that_of_the_configuration() -> None:
 
 def test_every_command_has_an_example_and_every_option_is_explained() -> None:
     commands.add_all(cli.app)
-    for name, command in _all_commands(get_command(cli.app)):
+    for name, command in all_commands(get_command(cli.app)):
         assert "Example" in (command.help or ""), f"segslam {name}"
         for parameter in command.params:
             assert getattr(parameter, "help", None), f"segslam {name}: {parameter.name}"
@@ -95,11 +136,11 @@ def test_help_starts_without_the_heavy_packages() -> None:
     assert done.stdout.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize("page", ["README.md", *(f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md"))])
+@pytest.mark.parametrize("page", PAGES)
 def test_the_commands_and_options_that_a_page_names_exist(page: str) -> None:
     commands.add_all(cli.app)
-    known = dict(_all_commands(get_command(cli.app)))
-    for line in re.findall(r"(?m)^(?:    |\$ )?segslam .*$|`segslam [^`]*`", (ROOT / page).read_text()):
+    known = dict(all_commands(get_command(cli.app)))
+    for line in re.findall(r"(?m)^(?:    |\$ )segslam .*$|`segslam [^`]*`", (ROOT / page).read_text()):
         words = line.strip(" `$").split("#")[0].split()
         name = " ".join(words[1:3]) if " ".join(words[1:3]) in known else words[1] if len(words) > 1 else ""
         if name.startswith("-") or not name:
@@ -111,15 +152,7 @@ def test_the_commands_and_options_that_a_page_names_exist(page: str) -> None:
                 assert word.split("=")[0] in options | {"--help"}, f"{page}: {line}"
 
 
-@pytest.mark.parametrize("page", ["README.md", *(f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md"))])
+@pytest.mark.parametrize("page", PAGES)
 def test_the_files_that_a_page_links_to_exist(page: str) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text()):
         assert target.startswith("http") or ((ROOT / page).parent / target).exists(), f"{page}: {target}"
-
-
-def _all_commands(command: object, name: str = "") -> list[tuple[str, object]]:
-    """Each command by its words."""
-    children = getattr(command, "commands", {})
-    if not children:
-        return [(name, command)]
-    return [found for key, child in children.items() for found in _all_commands(child, f"{name} {key}".strip())]

@@ -14,7 +14,7 @@ from kiss_icp.metrics import sequence_error
 from segslam import geometry
 from segslam.evaluation import (
     CAMERA_UP,
-    align,
+    align_positions,
     loop_metrics,
     pose_errors,
     relative_errors,
@@ -112,19 +112,21 @@ def test_noisy_estimate_is_scored_as_evo_scores_it() -> None:
 def test_alignment_finds_any_rigid_motion(seed: int) -> None:
     points = np.random.default_rng(seed).normal(size=(10, 3))
     T_target_source = _motion(seed)
-    np.testing.assert_allclose(align(points, geometry.apply(T_target_source, points)), T_target_source, atol=1e-12)
+    np.testing.assert_allclose(
+        align_positions(points, geometry.apply(T_target_source, points)), T_target_source, atol=1e-12
+    )
 
 
 def test_alignment_is_a_rotation_even_where_a_mirror_fits_better() -> None:
     points = np.random.default_rng(3).normal(size=(30, 3))
-    assert np.linalg.det(align(points, points * [1, 1, -1])[:3, :3]) == pytest.approx(1.0)
+    assert np.linalg.det(align_positions(points, points * [1, 1, -1])[:3, :3]) == pytest.approx(1.0)
 
 
 def test_no_other_rigid_motion_aligns_better() -> None:
     rng = np.random.default_rng(4)
     source = rng.normal(size=(40, 3))
     target = source + 0.3 * rng.normal(size=(40, 3))
-    T_target_source = align(source, target)
+    T_target_source = align_positions(source, target)
 
     def cost(T: np.ndarray) -> float:
         return float(np.square(geometry.apply(T, source) - target).sum())
@@ -138,9 +140,9 @@ def test_no_other_rigid_motion_aligns_better() -> None:
 
 def test_alignment_needs_as_many_points_on_both_sides() -> None:
     with pytest.raises(ValueError, match="cannot align 2 points with 3"):
-        align(np.zeros((2, 3)), np.zeros((3, 3)))
+        align_positions(np.zeros((2, 3)), np.zeros((3, 3)))
     with pytest.raises(ValueError, match="cannot align 0 points"):
-        align(np.zeros((0, 3)), np.zeros((0, 3)))
+        align_positions(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def test_moving_the_whole_estimate_changes_no_figure() -> None:
@@ -257,5 +259,21 @@ def test_recall_counts_revisits_near_a_true_closure() -> None:
 
 def test_without_closures_or_revisits_there_is_no_precision_or_recall() -> None:
     none = np.empty((0, 4, 4)), np.empty((0, 2), dtype=int)
-    assert loop_metrics(*none, _round_trip()) == {"num_loops_false": 0, "loop_recall": 0.0}
-    assert loop_metrics(*none, _round_trip()[:20]) == {"num_loops_false": 0}
+    assert loop_metrics(*none, _round_trip()) == {"loop_recall": 0.0}
+    assert loop_metrics(*none, _round_trip()[:20]) == {}
+
+
+def test_no_rotation_error_is_given_where_the_turn_about_a_line_is_not_known() -> None:
+    """A street that leaves a straight line by 4 cm, in an estimate that is 1 cm off."""
+    rng = np.random.default_rng(0)
+    truth = np.tile(np.eye(4), (50, 1, 1))
+    truth[:, 0, 3] = np.arange(50)
+    truth[:, 1, 3] = 0.06 * np.sin(np.arange(50) / 5)
+    estimate = truth.copy()
+    estimate[:, :3, 3] += 0.006 * rng.normal(size=(50, 3))
+    assert "are_deg" not in trajectory_metrics(estimate, truth)
+    assert "height_m" in trajectory_metrics(estimate, truth)
+    truth[:, 1, 3] *= 100
+    estimate[:, 1, 3] *= 100
+    estimate[:, 1, 3] = truth[:, 1, 3] + 0.006 * rng.normal(size=50)
+    assert trajectory_metrics(estimate, truth)["are_deg"] < 0.1

@@ -3,7 +3,7 @@ import pytest
 
 from segslam import geometry
 from segslam.config import KeyframeConfig
-from segslam.keyframes import CloudStore, KeyframeSelector, thin
+from segslam.keyframes import CloudStore, KeyframeSelector, downsample_keyframe
 from segslam.types import Keyframe, Label
 
 CONFIG = KeyframeConfig(distance_m=2.0, angle_deg=20.0)
@@ -48,7 +48,7 @@ def test_a_standing_sensor_that_jitters_cuts_no_keyframe() -> None:
 def test_a_cloud_is_given_as_it_was_kept(reach_m: float) -> None:
     rng = np.random.default_rng(0)
     labels = rng.integers(0, 20, 5_000).astype(np.uint8)
-    points, labels, _ = thin(
+    points, labels, _ = downsample_keyframe(
         rng.uniform(-reach_m, reach_m, (5_000, 3)), labels, config=CONFIG, whole_classes=(Label.CAR, Label.TRUNK)
     )
     store = CloudStore(CONFIG.resolution_m)

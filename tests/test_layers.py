@@ -1,36 +1,39 @@
-"""A module imports from lower layers only, and siblings do not import each other."""
+"""The imports and files of the package are those of docs/architecture.md."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "segslam"
-LAYERS = (  # top first; a room is a module or a folder
-    {"cli"},
-    {"experiments", "report"},
-    {"runs", "results", "viewer"},
-    {"slam", "log", "run_files", "map", "evaluation"},
-    {"alignment", "straightening"},
-    {"odometry", "keyframes", "proximity", "segregator", "refine", "verify", "pose_graph", "datasets", "simulation",
-     "beam_angles"},
-    {"semantics"},  # below datasets, whose scans come with labels
-    {"trajectory"},
-    {"geometry", "points", "beside", "interrupts", "cliques"},
-    {"types", "config"},
-    {"errors", "allocator"},
-)  # fmt: skip
-BOTTOM = {"types", "config"}  # config names the classes of types
-FOREIGN = {
-    "gtsam": {"pose_graph"},
-    "mcap": {"log", "datasets"},
-    "rerun": {"viewer", "cli"},
-    "small_gicp": {"refine", "experiments"},
-}
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "segslam"
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+FILES = sorted(PACKAGE.rglob("*.py"))
+SAME_LAYER = {("config", "types")}
+"""Importer and imported: the settings name the classes of `types`."""
+LINES_TOLERANCE = 0.25
 
 
-def _room(parts: tuple[str, ...]) -> str:
-    return parts[0].removesuffix(".py")
+def _layers() -> list[list[str]]:
+    """The names of each layer, top first: words separated by two spaces, then a description after four or more."""
+    figure = PAGE.split("```")[1].strip("\n")
+    return [re.split(r" {2,3}", re.split(r" {4,}", line)[0].strip()) for line in figure.splitlines()]
+
+
+def _table(heading: str) -> list[list[str]]:
+    section = PAGE.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows[2:]]
+
+
+LEVEL = {name.rstrip("/"): level for level, names in enumerate(_layers()) for name in names}
+LIBRARIES = {library: set(packages.split(", ")) for library, packages in _table("Libraries")}
+
+
+def _part(file: Path) -> str:
+    """The module or folder at the top of the package that a file belongs to."""
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
 def _imports(file: Path) -> list[str]:
@@ -43,19 +46,33 @@ def _imports(file: Path) -> list[str]:
     return names
 
 
-def _level(room: str) -> int:
-    return next(level for level, rooms in enumerate(LAYERS) if room in rooms)
+def test_the_figure_names_every_module_and_folder() -> None:
+    there = {_part(file) for file in FILES} - {"__init__", "__main__"}
+    assert there == set(LEVEL)
 
 
-@pytest.mark.parametrize("file", sorted(PACKAGE.rglob("*.py")), ids=lambda file: str(file.relative_to(PACKAGE)))
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
 def test_module_imports_from_lower_layers_only(file: Path) -> None:
-    room = _room(file.relative_to(PACKAGE).parts)
+    part = _part(file)
     for name in _imports(file):
         top, _, rest = name.partition(".")
-        if top in FOREIGN:
-            assert room in FOREIGN[top], f"{top} belongs to {FOREIGN[top]}, not to {room}"
-        if top != "segslam" or room in ("__init__", "__main__") or not rest:
+        if top != "segslam" or part in ("__init__", "__main__") or not rest:
             continue
         other = rest.split(".")[0]
-        if other != room and not {room, other} <= BOTTOM:
-            assert _level(room) < _level(other), f"{room} imports {name}"
+        if other != part and (part, other) not in SAME_LAYER:
+            assert LEVEL[part] < LEVEL[other], f"{part} imports {name}"
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_library_is_imported_where_the_page_says(library: str) -> None:
+    importers = {_part(file) for file in FILES if any(name.split(".")[0] == library for name in _imports(file))}
+    assert importers == LIBRARIES[library]
+
+
+@pytest.mark.parametrize(("step", "code", "lines"), _table("One scan, from file to map"))
+def test_walk_names_functions_and_lengths_as_they_are(step: str, code: str, lines: str) -> None:
+    name, function = code.strip("`").split(": ")
+    text = (PACKAGE / name).read_text()
+    assert re.search(rf"^ *def {function}\(", text, re.MULTILINE), f"{step}: no {function} in {name}"
+    length = text.count("\n")
+    assert abs(length - int(lines)) <= LINES_TOLERANCE * length, f"{name} has {length} lines now"

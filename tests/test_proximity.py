@@ -13,7 +13,8 @@ CONFIG = ProximityConfig(
     base_radius_m=6.0,
     drift_ratio=0.01,
     max_radius_m=20.0,
-    height_factor=2.0,
+    base_height_m=1.0,
+    height_ratio=0.008,
     max_candidates=3,
     spread_m=6.0,
     min_gap_m=4.0,
@@ -89,11 +90,17 @@ def test_the_prior_is_the_source_in_the_target() -> None:
     assert found[0].distance_m == pytest.approx(geometry.distance(expected))
 
 
-def test_height_counts_less_than_the_way_along_the_road() -> None:
-    for height, is_proposed in ((15.9, True), (16.4, False)):
+def test_another_storey_is_not_proposed() -> None:
+    """Chains are of 200 m and up to 208: the height may drift by 1 m and 0.8 % of that, a storey is 3 m."""
+    for height, is_proposed in ((2.55, True), (2.7, False), (3.0, False)):
         poses, travel = square(ROUND + 13)
         poses[:ROUND, 2, 3] += height
-        assert bool(ProximityDetector(CONFIG).candidates(ROUND + 12, poses, travel)) is is_proposed
+        assert bool(ProximityDetector(CONFIG).candidates(ROUND + 12, poses, travel)) is is_proposed, height
+
+
+def test_a_candidate_carries_the_chain_that_its_bounds_follow_from() -> None:
+    poses, travel = square(ROUND + 13)
+    assert ProximityDetector(CONFIG).candidates(ROUND + 12, poses, travel)[0].chain_m == pytest.approx(200.0)
 
 
 def test_the_radius_grows_with_the_way_and_no_farther_than_its_limit() -> None:
@@ -152,8 +159,23 @@ def test_a_loop_narrows_the_search_once_the_poses_are_such() -> None:
     detector.note_closure(closure(ROUND + 12, 12))
     (found, *_) = detector.candidates(ROUND + 20, poses, travel)
     assert found.search_radius_m == pytest.approx(6.0 + 0.01 * 200.0)
-    detector.note_estimate()
+    detector.note_estimate({(ROUND + 12, 12): 1.0})
     assert detector.candidates(ROUND + 20, poses, travel) == ()
+
+
+def test_a_closure_that_the_optimiser_rejected_narrows_and_blocks_nothing() -> None:
+    poses, travel = square(ROUND + 40)
+    poses[ROUND:, 1, 3] += 7.5  # beyond the radius that a closure of length 0 would leave
+    detector = ProximityDetector(CONFIG)
+    unaware = detector.candidates(ROUND + 13, poses, travel)
+    detector.note_closure(closure(ROUND + 12, 12))
+    assert detector.candidates(ROUND + 13, poses, travel) == (), "just closed"
+    detector.note_estimate({(ROUND + 12, 12): 0.01})
+    again = detector.candidates(ROUND + 13, poses, travel)
+    assert [found.target_id for found in again] == [found.target_id for found in unaware]
+    assert [found.search_radius_m for found in again] == [found.search_radius_m for found in unaware]
+    detector.note_estimate({(ROUND + 12, 12): 0.9})
+    assert detector.candidates(ROUND + 13, poses, travel) == (), "accepted by a later optimisation"
 
 
 def test_an_old_keyframe_may_be_searched_again_among_those_before_it() -> None:

@@ -1,88 +1,101 @@
-"""Whole registrations: the same bits on any number of threads, and an answer or a clear refusal for any cloud."""
-
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-from drives import round_drive
+from helpers.drives import round_drive
 
-from segslam.alignment import register
-from segslam.types import Alignment, Label, Rejected
+from segslam import geometry
+from segslam.config import Config
+from segslam.registration import PreparedScan, Stopwatch, prepare_scan, register, register_prepared
+from segslam.types import Alignment, Label, Rejected, RejectReason
+from segslam.verification.free_space import observe_free_space
 
-DIGEST = """
-import hashlib, sys
-import numpy as np
-from segslam.alignment import align, prepare_scan
-from segslam.config import Config, SegregatorConfig
-config = Config(segregator=SegregatorConfig(features="always"))
-stored = np.load(sys.argv[1])
-source, target = (prepare_scan(stored[f"points{k}"], stored[f"labels{k}"], config=config) for k in range(2))
-found = align(source, target, config=config)
-parts = [getattr(source.description, name) for name in source.description.__slots__]
-parts += [source.surface.points, source.view.nearest_m]
-for registration in (found.coarse, found.fine):
-    parts += [registration.T_target_source, registration.information]
-print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())
-"""
+CONFIG = Config()
 
 
-def _digest(scans: Path, num_threads: int) -> str:
-    names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    done = subprocess.run(
-        [sys.executable, "-c", DIGEST, str(scans)],
-        env=os.environ | dict.fromkeys(names, str(num_threads)),
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+def _error(T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
+    T = geometry.inverse(T_a) @ T_b
+    return geometry.distance(T), float(np.degrees(geometry.angle(T)))
 
 
-def test_one_thread_and_two_give_the_same_bits(tmp_path: Path) -> None:
-    scans, _ = round_drive()
-    arrays = {f"{name}{k}": getattr(scans[i], name) for k, i in enumerate((3, 0)) for name in ("points", "labels")}
-    np.savez(tmp_path / "scans.npz", **arrays)
-    assert _digest(tmp_path / "scans.npz", 1) == _digest(tmp_path / "scans.npz", 2)
+def _round_pair() -> tuple[PreparedScan, PreparedScan, np.ndarray]:
+    scans, truth = round_drive()
+    source, target = (prepare_scan(scans[i].points, scans[i].labels, config=CONFIG) for i in (3, 0))
+    return source, target, geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[3]
 
 
-def test_two_million_points_are_registered() -> None:
-    """Each point of two scans, many times over with noise."""
-    scans, _ = round_drive()
-    rng = np.random.default_rng(0)
-    clouds = []
-    for scan in (scans[3], scans[0]):
-        rows = rng.integers(len(scan.points), size=2_000_000)
-        clouds.append((scan.points[rows] + rng.normal(scale=0.01, size=(len(rows), 3)), scan.labels[rows]))
-    (source, source_labels), (target, target_labels) = clouds
-    found = register(source, target, source_labels=source_labels, target_labels=target_labels)
-    assert isinstance(found, Alignment)
-
-
-@pytest.mark.parametrize("label", [Label.CAR, Label.POLE, Label.ROAD, Label.BUILDING, Label.UNLABELLED])
-def test_scans_of_a_single_class_are_registered_or_rejected(label: Label) -> None:
-    scans, _ = round_drive()
-    source, target = scans[3].points, scans[0].points
+@pytest.mark.parametrize("turn_deg", [0, 90, 180])
+def test_two_scans_of_a_place_are_aligned_from_any_yaw(turn_deg: float) -> None:
+    scans, truth = round_drive()
+    T_turned_source = geometry.transform(geometry.yaw(np.radians(turn_deg)), [0.0, 0.0, 0.0])
+    source, target = scans[3], scans[0]
     found = register(
-        source,
-        target,
-        source_labels=np.full(len(source), label, np.uint8),
-        target_labels=np.full(len(target), label, np.uint8),
+        geometry.apply(T_turned_source, source.points),
+        target.points,
+        source_labels=source.labels,
+        target_labels=target.labels,
     )
-    assert isinstance(found, (Alignment, Rejected))
-
-
-def test_points_of_no_number_change_nothing() -> None:
-    scans, _ = round_drive()
-    points, labels = scans[3].points, scans[3].labels
-    broken = np.concatenate([points, np.full((100, 3), np.nan), np.full((1, 3), np.inf)])
-    labelled = np.concatenate([labels, np.full(101, Label.CAR, np.uint8)])
-    target = {"target_points": scans[0].points, "target_labels": scans[0].labels}
-    whole = register(points, source_labels=labels, **target)
-    found = register(broken, source_labels=labelled, **target)
-    assert isinstance(whole, Alignment)
+    T_target_source = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[3]
     assert isinstance(found, Alignment)
-    np.testing.assert_array_equal(found.fine.T_target_source, whole.fine.T_target_source)
+    metres, degrees = _error(T_target_source @ geometry.inverse(T_turned_source), found.fine.T_target_source)
+    assert metres < 0.05
+    assert degrees < 0.2
+
+
+def test_a_gate_rejects_a_coarse_pose_before_it_is_refined() -> None:
+    source, target, _ = _round_pair()
+    watch = Stopwatch()
+    no = Rejected(RejectReason.FAR_FROM_PRIOR)
+    assert register_prepared(source, target, config=CONFIG, gate=lambda pose, *, slack_m: no, watch=watch) is no
+    assert set(watch.seconds) == {"match"}
+
+
+def test_a_gate_sees_the_refined_pose_too_which_moves_no_farther() -> None:
+    source, target, T_target_source = _round_pair()
+    seen: list[tuple[float, float]] = []
+
+    def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
+        seen.append((slack_m, _error(T_target_source, pose)[0]))
+        return Rejected(RejectReason.FAR_FROM_PRIOR, "refined") if slack_m == 0.0 else None
+
+    found = register_prepared(source, target, config=CONFIG, gate=gate)
+    assert isinstance(found, Rejected)
+    assert found.detail == "refined"
+    assert [slack_m for slack_m, _ in seen[:2]] == [CONFIG.verify.max_coarse_fine_m, 0.0]
+    assert seen[1][1] < 0.05
+
+
+def test_what_moves_is_in_neither_surface_nor_view() -> None:
+    points = round_drive()[0][0].points
+    labels = np.full(len(points), Label.BUILDING, dtype=np.uint8)
+    ahead = points[:, 0] > 0.0
+    moving = prepare_scan(points, np.where(ahead, np.uint8(Label.MOVING_CAR), labels), config=CONFIG)
+    without = prepare_scan(points[~ahead], labels[~ahead], config=CONFIG)
+    assert moving.surface.points[:, 0].max() < 0.5
+    np.testing.assert_array_equal(moving.surface.points, without.surface.points)
+    np.testing.assert_array_equal(moving.free_space.nearest_m, without.free_space.nearest_m)
+
+
+def test_the_view_of_gathered_points_is_that_of_the_scan_in_their_middle() -> None:
+    scans, _ = round_drive()
+    gathered = np.concatenate([scans[0].points, scans[3].points])
+    labels = np.full(len(gathered), Label.BUILDING, dtype=np.uint8)
+    prepared = prepare_scan(gathered, labels, config=CONFIG, seen_from_here=scans[0].points)
+    np.testing.assert_array_equal(prepared.free_space.nearest_m, observe_free_space(scans[0].points).nearest_m)
+    assert len(prepared.surface) > len(prepare_scan(scans[0].points, scans[0].labels, config=CONFIG).surface)
+
+
+@pytest.mark.parametrize(
+    "points", [np.empty((0, 3)), np.zeros((50, 3)), np.column_stack([np.linspace(5, 50, 500), np.zeros((500, 2))])]
+)
+def test_scans_that_say_nothing_are_rejected(points: np.ndarray) -> None:
+    labels = np.ones(len(points), dtype=np.uint8)
+    assert isinstance(register(points, points, source_labels=labels, target_labels=labels), Rejected)
+    assert isinstance(register(points, points), Rejected)
+
+
+@pytest.mark.data
+def test_real_scans_of_different_places_are_rejected(real_pairs) -> None:
+    outcomes = [
+        register(real_pairs.points(source), real_pairs.points(target))
+        for source, target in ((94, 0), (198, 4413), (95, 199), (30, 198))
+    ]
+    assert all(isinstance(outcome, Rejected) for outcome in outcomes), outcomes

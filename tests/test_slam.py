@@ -3,26 +3,19 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from drives import drifting, round_drive
+from helpers.drives import SLAM_CONFIG, drifting_slam, round_drive
 
-from segslam.beside import beside
 from segslam.config import load_config
 from segslam.evaluation import trajectory_metrics
-from segslam.odometry import GivenOdometry
-from segslam.runs import accuracy
+from segslam.run.accuracy import accuracy
 from segslam.slam import Slam, SlamResult, Tracked
-from segslam.types import BadScan, LoopAttempt, LoopClosure, Rejected, Scan, Step
-
-CONFIG = load_config(None, ["proximity.min_travel_m=60"])
-
-
-def _slam() -> Slam:
-    return Slam(CONFIG, odometry=GivenOdometry(drifting(round_drive()[1]), CONFIG.odometry))
+from segslam.system.threads import in_other_thread
+from segslam.types import BadScan, LoopAttempt, LoopClosure, Rejected, Scan, SegslamError, Step
 
 
 @pytest.fixture(scope="module")
 def run() -> tuple[list[Step], SlamResult]:
-    slam = _slam()
+    slam = drifting_slam()
     steps = [slam.process(scan) for scan in round_drive()[0]]
     return steps, slam.finish()
 
@@ -53,7 +46,7 @@ def test_a_step_holds_an_estimate_exactly_when_a_loop_was_accepted(run: tuple[li
 
 def test_repeating_the_steps_gives_the_same_attempts_and_poses(run: tuple[list[Step], SlamResult]) -> None:
     steps, result = run
-    slam = Slam(CONFIG)
+    slam = Slam(SLAM_CONFIG)
     again = [slam.repeat(step) for step in steps]
     repeated = slam.finish()
     np.testing.assert_allclose(repeated.trajectory.T_world_lidar, result.trajectory.T_world_lidar, atol=1e-9)
@@ -66,7 +59,7 @@ def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
     run: tuple[list[Step], SlamResult], most_waiting: int, slow: str
 ) -> None:
     steps, result = run
-    slam = _slam()
+    slam = drifting_slam()
 
     def tracked() -> Iterator[Tracked]:
         for scan in round_drive()[0]:
@@ -77,7 +70,7 @@ def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
         time.sleep(0.02 * (slow == "closing"))
         return slam.close_loops(scan)
 
-    for step, expected in zip(beside(tracked(), closed, most_waiting=most_waiting), steps, strict=True):
+    for step, expected in zip(in_other_thread(tracked(), closed, most_waiting=most_waiting), steps, strict=True):
         assert step.scan_index == expected.scan_index
         np.testing.assert_array_equal(step.T_odom_lidar, expected.T_odom_lidar)
         assert (step.keyframe is None) == (expected.keyframe is None)
@@ -101,9 +94,9 @@ def test_other_gates_on_the_same_steps_reject_what_was_accepted(run: tuple[list[
 
 def test_a_bad_scan_is_forgotten() -> None:
     scans, _ = round_drive()
-    slam = _slam()
+    slam = drifting_slam()
     slam.process(scans[0])
-    empty = Scan(1, scans[1].stamp_ns, np.empty((0, 3), np.float32), np.empty(0, np.uint8))
+    empty = Scan(np.empty((0, 3), np.float32), scans[1].stamp_ns)
     with pytest.raises(BadScan):
         slam.process(empty)
     slam.process(scans[2])
@@ -112,7 +105,7 @@ def test_a_bad_scan_is_forgotten() -> None:
 
 def test_there_is_no_end_without_a_beginning() -> None:
     with pytest.raises(ValueError, match="no scan"):
-        Slam(CONFIG).finish()
+        Slam(SLAM_CONFIG).finish()
 
 
 def _exactly(attempt: LoopAttempt) -> tuple[object, ...]:
@@ -126,3 +119,23 @@ def _told(outcome: LoopClosure | Rejected) -> str:
     if isinstance(outcome, Rejected):
         return f"{outcome.reason} {outcome.detail}"
     return np.array2string(outcome.T_target_source, precision=10)
+
+
+def test_a_scan_that_is_not_later_than_the_last_is_refused_and_forgotten() -> None:
+    scans = round_drive()[0][:3]
+    slam = drifting_slam()
+    slam.process(scans[1])
+    for older in (scans[1], scans[0]):
+        with pytest.raises(BadScan, match=rf"scan {older.index}: its stamp .* is not later than {scans[1].stamp_ns}"):
+            slam.process(older)
+    slam.process(scans[2])
+    assert slam.finish().trajectory.scan_index.tolist() == [1, 2]
+
+
+def test_no_scan_is_taken_after_the_end() -> None:
+    scans = round_drive()[0][:2]
+    slam = drifting_slam()
+    slam.process(scans[0])
+    slam.finish()
+    with pytest.raises(SegslamError, match="scan 1: the run is finished"):
+        slam.process(scans[1])

@@ -11,13 +11,13 @@ from time import monotonic
 
 import numpy as np
 import pytest
-from drives import round_drive
+from helpers.drives import round_drive
 
 from segslam.config import load_config
 from segslam.log import read_log, schema
 from segslam.log.container import messages
 from segslam.odometry import GivenOdometry
-from segslam.runs import Run
+from segslam.run.run import Run
 from segslam.semantics.label_files import open_labels
 from segslam.slam import Slam
 from segslam.types import Scan, Step, Trajectory

@@ -1,7 +1,7 @@
-"""The back end alone, on the shape of real drives: proposals, graph, lies among the closures, time. No scan is needed.
+"""The back end alone, on the shape of real drives: proposals, graph, outliers, time. No scan is needed.
 
 Where two keyframes lie within reach of each other in the (levelled) truth, a closure is the truth with noise; elsewhere
-none is found. Lies are a share of all closures. Beside each drive stands what exact closures at the same places give.
+none is found. Outliers are a share of all closures. Beside each drive stands the result of exact closures there.
 
     python tools/bench_back_end.py ../shared/data --out back_end.json --sequence 00 --sequence 08 --seeds 3
 """
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from back_end.drives import CONFIG, exact, read_drive
-from back_end.lies import KINDS, believe, lies
+from back_end.outliers import KINDS, draw_outliers, finished
 from back_end.search import search
 
 from segslam.experiments.provenance import commit, machine
@@ -26,16 +26,16 @@ def measure(data: Path, sequence: str, odometry: str, seed: int, shares: list[fl
     drive = read_drive(data, sequence, odometry, np.random.default_rng([seed, 0]))
     true, found = search(drive, np.random.default_rng([seed, 1]))
     row = {"sequence": sequence, "odometry": odometry, "seed": seed, "keyframes": len(drive.truth), "search": found}
-    row["without_lies"] = believe(drive, true, [])
-    row["exact_closures"] = believe(drive, exact(true, drive.truth), [])
-    row["ate_by_exact"] = row["without_lies"]["ate_m"] / row["exact_closures"]["ate_m"]
-    row["lies"] = []
+    row["without_outliers"] = finished(drive, true, [])
+    row["exact_closures"] = finished(drive, exact(true, drive.truth), [])
+    row["ate_by_exact"] = row["without_outliers"]["ate_m"] / row["exact_closures"]["ate_m"]
+    row["outliers"] = []
     for kind in KINDS if true else ():
         for share in shares:
             rng = np.random.default_rng([seed, 2, round(100 * share)])
-            result = believe(drive, true, lies(drive, kind, round(len(true) * share / (1.0 - share)), rng))
-            ratio = result["ate_m"] / row["without_lies"]["ate_m"]
-            row["lies"].append({"kind": kind, "share": share, "ate_ratio": ratio, **result})
+            result = finished(drive, true, draw_outliers(drive, kind, round(len(true) * share / (1.0 - share)), rng))
+            ratio = result["ate_m"] / row["without_outliers"]["ate_m"]
+            row["outliers"].append({"kind": kind, "share": share, "ate_ratio": ratio, **result})
     return row
 
 
@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--sequence", action="append", help="may be repeated; default 00, 05, 06, 08, 09")
     parser.add_argument("--odometry", default="calibrated", choices=["measured", "drifting", "calibrated", "allowed"])
-    parser.add_argument("--share", type=float, action="append", help=f"of lies; may be repeated; default {SHARES}")
+    parser.add_argument("--share", type=float, action="append", help=f"of outliers; may be repeated; default {SHARES}")
     parser.add_argument("--seeds", type=int, default=1)
     options = parser.parse_args()
     rows = []

@@ -1,8 +1,7 @@
 """What the back end makes of whole drives: errors, closures, what exact closures would give, what edges claim.
 
-Odometry, scans and closures come from each run's log, so one run of `segslam map` serves any number of settings. Beside
-the closures that were found stand exact ones: at the same places, and wherever two keyframes lie within 6 m. Each is
-solved as it is, and with the bend of leftover angles turned back; `decided` is what a run would do.
+Odometry and closures come from each run's log, so one run of `segslam map` serves any number of settings. Beside the
+closures that were found stand exact ones: at the same places, and wherever two keyframes lie within 6 m.
 
     segslam simulate D --sequence 06 --poses 06.txt --seed 11 --set sensor.vertical_angle_error_deg=0.35
     segslam map D --sequence 06 --out runs/06
@@ -12,34 +11,30 @@ solved as it is, and with the bend of leftover angles turned back; `decided` is 
 import argparse
 import json
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from back_end.calibration import closure_calibration, odometry_calibration
 from back_end.drives import CONFIG, exact
 from back_end.recorded import Recorded, exact_everywhere, read_recorded
-from back_end.worth import closure_worth, odometry_worth
 
 from segslam.evaluation import trajectory_metrics
 from segslam.experiments.provenance import commit, machine
-from segslam.pose_graph import PoseGraph, angles_along, judge
-from segslam.straightening import sample, sharpened
-from segslam.types import AngleSamples, LoopClosure
+from segslam.pose_graph import PoseGraph
+from segslam.types import LoopClosure
 
 FIGURES = ("ate_m", "height_m", "kitti_translation_percent")
 
 
-def finished(drive: Recorded, closures: list[LoopClosure], samples: AngleSamples | None) -> dict[str, Any]:
-    """Errors at the end with these closures, straightened by the samples if there are any."""
+def finished(drive: Recorded, closures: list[LoopClosure]) -> dict[str, Any]:
+    """Errors after the final optimisation with these closures."""
     graph = PoseGraph(CONFIG.graph)
     for keyframe in drive.keyframes:
         graph.add_keyframe(keyframe.id, keyframe.T_odom_keyframe, keyframe.travel_m)
     for closure in closures:
         graph.add_closure(closure)
     started = time.perf_counter()
-    if samples is not None:
-        graph.straighten(samples)
     weights = graph.finish().closure_weights.values()
     seconds = time.perf_counter() - started
     switched_off = sum(weight < 0.5 for weight in weights)
@@ -55,37 +50,22 @@ def errors(poses: np.ndarray, drive: Recorded) -> dict[str, float]:
 def row_of(run: Path) -> dict[str, Any]:
     """All figures of one run."""
     drive = read_recorded(run)
-    started = time.perf_counter()
-    samples = sample(drive.points_of, drive.odometry, drive.travel_m, config=CONFIG.refine)
-    evidence = judge(samples)
-    angles_rad = angles_along(samples, drive.travel_m)
-    sharp = list(sharpened(drive.closures, drive.points_of, angles_rad, config=CONFIG.refine))
     row: dict[str, Any] = {
         "run": f"{run.parent.name}/{run.name}",
         "keyframes": len(drive.keyframes),
         "travel_m": float(drive.travel_m[-1]),
         "odometry": errors(drive.odometry, drive),
         "loops": drive.loops(),
-        "worth": {
-            **odometry_worth(drive),
-            "closures": closure_worth(drive, drive.closures),
-            "sharpened": closure_worth(drive, sharp),
-        },
-        "evidence": asdict(evidence),
-        "excess_mdeg_per_m": (1e3 * np.degrees(np.median(samples.excess_rad_per_m, axis=0))).tolist(),
-        "sampling_s": time.perf_counter() - started,
+        "worth": {**odometry_calibration(drive), "closures": closure_calibration(drive, drive.closures)},
     }
-    exact_ones, everywhere = exact(drive.closures, drive.truth), exact_everywhere(drive)
-    kinds = {  # as they are, and on a straightened drive
-        "found": (drive.closures, sharp),
-        "exact": (exact_ones, exact_ones),
-        "exact_everywhere": (everywhere, everywhere),
+    kinds = {
+        "found": drive.closures,
+        "exact": exact(drive.closures, drive.truth),
+        "exact_everywhere": exact_everywhere(drive),
     }
-    for name, (closures, straight) in kinds.items():
-        plain, forced = finished(drive, closures, None), finished(drive, straight, samples)
-        decided = forced if evidence.chosen else plain
-        row[name] = {"closures": len(closures), "plain": plain, "forced": forced, "decided": decided}
-    row["ate_by_exact"] = row["found"]["decided"]["ate_m"] / row["exact"]["decided"]["ate_m"]
+    for name, closures in kinds.items():
+        row[name] = {"closures": len(closures), **finished(drive, closures)}
+    row["ate_by_exact"] = row["found"]["ate_m"] / row["exact"]["ate_m"]
     return row
 
 
@@ -93,12 +73,11 @@ def table(rows: list[dict[str, Any]]) -> str:
     """The rows for a reader, ATE in metres of keyframes."""
     lines = [
         "| run | odometry | ATE | height | KITTI % | closures, false, off | recall | exact, same places | ratio "
-        "| exact, all within 6 m | never straightened | leftover vertical and azimuth (deg), believed, t "
-        "| chi2 of chains 1, 10, 100; closures |",
-        "|" + "---|" * 13,
+        "| exact, all within 6 m | chi2 of chains 1, 10, 100; closures |",
+        "|" + "---|" * 11,
     ]
     for row in rows:
-        found, loops, worth, evidence = row["found"]["decided"], row["loops"], row["worth"], row["evidence"]
+        found, loops, worth = row["found"], row["loops"], row["worth"]
         cells = [
             row["run"],
             _number(row["odometry"]["ate_m"]),
@@ -107,18 +86,9 @@ def table(rows: list[dict[str, Any]]) -> str:
             _number(found.get("kitti_translation_percent")),
             f"{loops['closures']}, {loops['num_loops_false']}, {found['switched_off']}",
             _number(loops.get("loop_recall")),
-            _number(row["exact"]["decided"]["ate_m"]),
+            _number(row["exact"]["ate_m"]),
             _number(row["ate_by_exact"]),
-            f"{_number(row['exact_everywhere']['decided']['ate_m'])} ({row['exact_everywhere']['closures']})",
-            _number(row["found"]["plain"]["ate_m"]),
-            ", ".join(
-                [
-                    _number(evidence["vertical_deg"]),
-                    _number(evidence["azimuth_deg"]),
-                    "yes" if evidence["chosen"] else "no",
-                    _number(evidence["t_value"]),
-                ]
-            ),
+            f"{_number(row['exact_everywhere']['ate_m'])} ({row['exact_everywhere']['closures']})",
             f"{', '.join(_number(worth[f'chain_{k}']) for k in (1, 10, 100))}; {_number(worth['closures'])}",
         ]
         lines.append("| " + " | ".join(cells) + " |")

@@ -12,7 +12,7 @@ import yaml
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic.fields import FieldInfo
 
-from segslam.config import Config, Section
+from segslam.config import USER_SETTINGS, Config, Section
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "options.md"
 INTRODUCTION = """# Every setting
@@ -30,8 +30,19 @@ keyframes:
   distance_m: 1.5
 ```
 
-P in a meaning marks a value of the Segregator paper, A one of its authors' program.
+The source of a default is the paper (Yin et al., ICRA 2023), its authors' program, a library that uses the same value,
+a measurement, or a choice, with the data that decided it. [What decides a loop](decisions.md) has the numbers.
 """
+USERS = """
+## Settings that most users need
+
+| setting | default | unit | allowed | meaning |
+|---|---|---|---|---|
+"""
+EXPERTS = """
+# All settings, for experts
+"""
+SOURCE = re.compile(r" \[([^\]]+)\]$")
 SIGNS = {Ge: ("at least", "ge"), Gt: ("above", "gt"), Le: ("at most", "le"), Lt: ("below", "lt")}
 TRAILING_UNITS = re.compile(r" \((m|s|degrees|m\^2|m per m)\)$")
 
@@ -45,19 +56,27 @@ def main() -> None:
 def page() -> str:
     """The page's text."""
     default = Config()
-    return INTRODUCTION + "".join(_section(name, getattr(default, name)) for name in Config.model_fields)
+    users = "".join(_user_row(default, *key.split(".")) for key in USER_SETTINGS)
+    sections = "".join(_section(name, getattr(default, name)) for name in Config.model_fields)
+    return INTRODUCTION + USERS + users + EXPERTS + sections
+
+
+def _user_row(config: Config, name: str, key: str) -> str:
+    section = getattr(config, name)
+    return _row(f"{name}.{key}", section.model_dump(mode="json")[key], type(section).model_fields[key])
 
 
 def _section(name: str, section: Section) -> str:
     values = section.model_dump(mode="json")
-    rows = [_row(key, values[key], field) for key, field in type(section).model_fields.items()]
+    rows = [_row(key, values[key], field, source=True) for key, field in type(section).model_fields.items()]
     about = f"{type(section).__doc__}\n\n" if type(section).__doc__ != Section.__doc__ and type(section).__doc__ else ""
-    head = "| setting | default | unit | allowed | meaning |\n|---|---|---|---|---|\n"
+    head = "| setting | default | unit | allowed | meaning | source |\n|---|---|---|---|---|---|\n"
     return f"\n## {name}\n\n{about}{head}{''.join(rows)}"
 
 
-def _row(key: str, value: Any, field: FieldInfo) -> str:
-    meaning = field.description or ""
+def _row(key: str, value: Any, field: FieldInfo, *, source: bool = False) -> str:
+    found = SOURCE.search(field.description or "")
+    meaning = SOURCE.sub("", field.description or "")
     unit = TRAILING_UNITS.search(meaning)
     cells = (
         f"`{key}`",
@@ -65,6 +84,7 @@ def _row(key: str, value: Any, field: FieldInfo) -> str:
         unit[1] if unit else "",
         _allowed(field),
         TRAILING_UNITS.sub("", meaning).replace("|", "\\|"),
+        *([found[1] if found else ""] if source else []),
     )
     return f"| {' | '.join(cells)} |\n"
 

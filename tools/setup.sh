@@ -8,10 +8,22 @@ extra=$1
 
 install_packages() {
     local sudo=
-    [ "$(id -u)" = 0 ] || sudo=sudo
+    if [ "$(id -u)" != 0 ]; then
+        command -v sudo >/dev/null || { echo "setup: as root, run: apt-get install $*" >&2; return 1; }
+        sudo=sudo
+    fi
     echo "installing system packages: $*" >&2
     $sudo apt-get update -qq >&2 || return
-    DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "$@" >&2
+    $sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@" >&2
+}
+
+# Sets `python` to the first interpreter that segslam runs on and that can make a virtual environment.
+find_python() {
+    for python in python3 python3.13 python3.12 python3.11; do
+        "$python" -c 'import sys, ensurepip, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
+            2>/dev/null && return
+    done
+    return 1
 }
 
 system_packages() {
@@ -20,7 +32,7 @@ system_packages() {
     for pair in libusb-1.0.so.0=libusb-1.0-0 libGL.so.1=libgl1 libEGL.so.1=libegl1 libgomp.so.1=libgomp1; do
         ldconfig -p | grep -q "${pair%%=*}" || missing+=("${pair##*=}")
     done
-    python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3 python3-venv)
+    find_python || python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3 python3-venv)
     if [ ${#missing[@]} -gt 0 ]; then
         command -v apt-get >/dev/null || { echo "setup: install by hand: ${missing[*]}" >&2; return 1; }
         install_packages "${missing[@]}" || return
@@ -31,13 +43,15 @@ python_packages() {
     local wanted stamp="$venv/.segslam-installed"
     wanted=$(cat "$root/pyproject.toml" <(printf '%s\n%s\n' "$root" "$extra") | sha256sum)
     grep -qsxF "$wanted" "$stamp" && return
-    python3 -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || {
-        echo "setup: segslam runs on Python 3.11 to 3.13, python3 is $(python3 --version)" >&2
+    find_python || {
+        echo "setup: needs Python 3.11 to 3.13 with its venv module, $(python3 --version 2>&1) is what there is (kiss-icp" \
+            "has no wheel for 3.14). Install python3.13 and python3.13-venv, or: uv python install 3.13" >&2
         return 1
     }
-    [ -x "$venv/bin/python" ] || python3 -m venv "$venv" || return
+    [ -x "$venv/bin/python" ] || "$python" -m venv "$venv" || return
     echo "installing Python packages into $venv" >&2
     "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$root${extra:+[$extra]}" >&2 || return
+    "$venv/bin/python" -m segslam warm-up >&2 || return
     echo "$wanted" >> "$stamp"
 }
 

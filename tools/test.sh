@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Runs the tests, after setting up what they need. Options go to pytest: `bash tools/test.sh -m slow` runs the long ones.
+# Runs the tests in a process a core, after setting up what they need. Options go to pytest: `bash tools/test.sh -m slow`
+# runs the long ones, `-n 0` runs all in one process.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . tools/setup.sh dev
-exec "$PYTHON" -m pytest "$@"
+exec "$PYTHON" -m pytest -n "$(nproc)" --maxprocesses 4 --dist worksteal "$@"

@@ -11,6 +11,9 @@ from segslam import geometry
 from segslam.log import read_log
 from segslam.types import Rejected
 
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
+
 log = read_log(Path(sys.argv[1]) / "log.mcap")
 outcomes = Counter[str]()
 keyframes = []

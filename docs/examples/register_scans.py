@@ -1,4 +1,4 @@
-"""Find the pose of one scan in another with no initial guess, from two (n, 3) arrays in files of NumPy.
+"""Find the pose of one scan in another with no initial guess, from two arrays of x, y, z (and more) in files of NumPy.
 
 python docs/examples/register_scans.py source.npy target.npy
 """
@@ -9,6 +9,9 @@ import numpy as np
 
 import segslam
 from segslam.types import Rejected
+
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 
 source_points, target_points = (np.load(file) for file in sys.argv[1:])
 found = segslam.register(source_points, target_points)

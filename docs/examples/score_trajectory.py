@@ -9,6 +9,9 @@ from pathlib import Path
 from segslam.evaluation import trajectory_metrics
 from segslam.trajectory import read_poses
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
+
 estimate, reference = (read_poses(Path(file), format="kitti") for file in sys.argv[1:])
 figures = trajectory_metrics(estimate.T_a_b, reference.T_a_b, up=(0.0, -1.0, 0.0))  # the camera's y points down
 for name, value in figures.items():

@@ -1,33 +1,58 @@
 """The command line: one file a command, the only place that prints. Heavy imports wait inside the commands."""
 
+import errno
 import logging
+import os
 import sys
+from typing import Annotated
 
 import typer
 
-from segslam.allocator import keep_freed_memory
 from segslam.cli.warn import FirstOfEachKind
-from segslam.errors import SegslamError, WorkFailed
+from segslam.errors import SegslamError, reason
+from segslam.system.interrupts import EXIT_STATUS, ctrl_c_in_order, stop_line
+from segslam.system.memory import keep_freed_memory
+
+BAD_INPUT = 2
 
 app = typer.Typer(
     name="segslam",
     help="LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs.",
     no_args_is_help=True,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,  # rich takes half of the time until help is shown
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     pretty_exceptions_enable=False,
 )
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"segslam {version('segslam')}")
+        raise typer.Exit
+
+
 @app.callback()
-def _segslam() -> None:
-    """Map, evaluate, replay and register LiDAR scans."""
+def _segslam(
+    _: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Map LiDAR scans, score the result, repeat a run with other settings, register pairs of scans."""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a command, that of the command line unless given, and exit.
 
-    Exit status: 0 done, 1 the work failed, 2 bad usage or bad input, 130 interrupted.
+    Exit status: 0 done, 1 no pose was found, 2 bad usage, bad input or a full disk, 130 stopped by Ctrl-C.
     """
+    with ctrl_c_in_order():
+        sys.exit(_status(arguments))
+
+
+def _status(arguments: list[str] | None) -> int:
+    """The exit status of a command. A failure prints one line."""
     from segslam.cli import commands
 
     keep_freed_memory()
@@ -35,9 +60,35 @@ def main(arguments: list[str] | None = None) -> None:
     logging.basicConfig(level=logging.WARNING, handlers=[warnings])
     commands.add_all(app)
     try:
-        app(arguments)
+        app(arguments, prog_name="segslam")
+    except SystemExit as ended:
+        status = ended.code if isinstance(ended.code, int) else 0
+        if status == EXIT_STATUS:
+            print(stop_line(), file=sys.stderr)
+        return _flushed(status)
     except SegslamError as error:
         print(f"segslam: {error}", file=sys.stderr)
-        sys.exit(1 if isinstance(error, WorkFailed) else 2)
+    except OSError as error:
+        print(f"segslam: {_of_file(error)}", file=sys.stderr)
     finally:
-        warnings.tell_counts()
+        warnings.print_counts()
+    return _flushed(BAD_INPUT)
+
+
+def _of_file(error: OSError) -> str:
+    """Which file cannot be used, and why; what help and figures are printed to has no name."""
+    if error.filename is None and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO):
+        return f"standard output: cannot be written ({reason(error)}); send it elsewhere"
+    return f"{error.filename or 'output'}: cannot be read or written ({reason(error)})"
+
+
+def _flushed(status: int) -> int:
+    """The status, or BAD_INPUT if standard output cannot be written; a failure has been reported before."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again as it ends
+        if status == 0 and not isinstance(error, BrokenPipeError):
+            print(f"segslam: {_of_file(error)}", file=sys.stderr)
+        return BAD_INPUT
+    return status

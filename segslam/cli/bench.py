@@ -15,7 +15,7 @@ from segslam.cli.bench_options import (
     run_trials,
     with_options,
 )
-from segslam.cli.console import print_json, say
+from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
 
 if TYPE_CHECKING:
     from segslam.experiments.job import Job
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from segslam.experiments.rows import Row
     from segslam.experiments.trials import Trial
 
-app = typer.Typer(help="The paper's experiments, each method on the same scans.", no_args_is_help=True)
+app = typer.Typer(
+    help="Repeat the experiments of the Segregator paper; every method gets the same scans.", no_args_is_help=True
+)
 
 LOST_PERCENT = [10.0, 30.0, 50.0, 70.0, 90.0]
 
@@ -31,7 +33,7 @@ LOST_PERCENT = [10.0, 30.0, 50.0, 70.0, 90.0]
 @app.command()
 @with_options
 def pairs(data: DataArgument, options: Options) -> None:
-    """Success rates over lists of pairs.
+    """Measure the success rate over lists of pairs.
 
     Example: segslam bench pairs kitti --sequence 06 --pairs kitti06_3to5.txt --sample 100 --workers 4 --out bench06
     """
@@ -41,7 +43,7 @@ def pairs(data: DataArgument, options: Options) -> None:
 @app.command()
 @with_options
 def timing(data: DataArgument, options: Options) -> None:
-    """Time of each stage, errors and edges of the graph, all lists together; the paper's is that of 06.
+    """Measure the time of each stage, the errors and the graph size, all lists together (paper: sequence 06).
 
     Example: segslam bench timing kitti --sequence 06 --pairs kitti06_3to5.txt --pairs kitti06_8to10.txt --sample 50
     """
@@ -53,9 +55,11 @@ def timing(data: DataArgument, options: Options) -> None:
 def yaw(
     data: DataArgument,
     options: Options,
-    step_deg: Annotated[float, typer.Option("--step-deg", min=1, max=180, help="Between two angles (deg).")] = 15.0,
+    step_deg: Annotated[
+        float, typer.Option("--step-deg", min=1, max=180, help="Step between two yaw angles (degrees).")
+    ] = 15.0,
 ) -> None:
-    """The source turned through the circle: error against angle. Scans 0 and 10 unless pairs are given.
+    """Measure the error against the yaw of the source, over the full circle. Default pair: scans 0 and 10.
 
     Example: segslam bench yaw kitti --sequence 05 --step-deg 5 --out yaw05
     """
@@ -74,27 +78,67 @@ def deterioration(
     data: DataArgument,
     options: Options,
     lost_percent: Annotated[
-        list[float], typer.Option("--lost", min=0, max=100, help="Percent of labels lost; repeatable.")
+        list[float], typer.Option("--lost", min=0, max=100, help="Percentage of labels to remove; may be repeated.")
     ] = LOST_PERCENT,
     clouds: Annotated[
-        Literal["one", "both"], typer.Option(help="Lost in the source alone, or in both scans.")
+        Literal["one", "both"], typer.Option(help="Remove labels from the source only, or from both scans.")
     ] = "both",
-    draws: Annotated[int, typer.Option("--draws", min=1, help="Random draws at each percentage.")] = 10,
+    draws: Annotated[int, typer.Option("--draws", min=1, help="Number of random draws at each percentage.")] = 10,
 ) -> None:
-    """Labels taken away at random. Scans 0 and 10 unless pairs are given.
+    """Measure the success while labels are removed at random. Default pair: scans 0 and 10.
 
     Example: segslam bench deterioration kitti --sequence 05 --labels predictions --clouds one --out lost05
     """
-    from segslam.experiments.variations import PAPER_PAIR, robbed_trials
+    from segslam.experiments.variations import PAPER_PAIR, unlabelled_trials
 
     job = make_job(data, options)
     reference = reference_of(job)
     lists = read_lists(options, reference, default=PAPER_PAIR)
-    robbed = partial(
-        robbed_trials, lost_percent=lost_percent, num_draws=draws, seed=options.seed, both=clouds == "both"
+    reduced = partial(
+        unlabelled_trials, lost_percent=lost_percent, num_draws=draws, seed=options.seed, both=clouds == "both"
     )
-    trials = [trial for one in lists for trial in robbed(one, reference)]
+    trials = [trial for one in lists for trial in reduced(one, reference)]
     _run("deterioration", job, lists, trials, options, by="lost_percent", clouds=clouds, draws=draws)
+
+
+@app.command()
+def places(
+    file: Annotated[
+        Path, typer.Argument(help="Places: a .npz with `columns` (n, size, size) uint8 and `poses` (n, 3, 4).")
+    ],
+    database: Annotated[str, typer.Option("--database", help="Rows of the database: A:B, B not included.")],
+    queries: Annotated[str, typer.Option("--queries", help="Rows of the queries: C:D.")],
+    turned: Annotated[bool, typer.Option("--turned", help="Turn each query by a random yaw.")] = False,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --turned.")] = 0,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Measure how often a place is recognised, with no labels. A hit is within 5 m; queries without one are left out.
+
+    Example: segslam bench places kitti_00.npz --database 0:3000 --queries 3200:
+    """
+    from segslam.experiments.places import PlacesBench, parse_range, read_places
+
+    announce(f"bench places: reading {file}", quiet=quiet)
+    seen = read_places(file)
+    bench = PlacesBench(
+        seen,
+        parse_range(database, "--database", len(seen)),
+        parse_range(queries, "--queries", len(seen)),
+        turned_seed=seed if turned else None,
+    )
+    for _ in progress(bench.run(), total=bench.num_steps, title="bench places", quiet=quiet):
+        pass
+    figures = bench.figures()
+    if json:
+        print_json(figures)
+        return
+    say(
+        f"{figures['num_queries']} queries of {figures['num_places']} places: recall@1 {figures['recall_at_1']:.3f}, "
+        f"recall@20 {figures['recall_at_20']:.3f}; {figures['query_ms']:.1f} ms a query, "
+        f"{figures['index_bytes']} bytes a place",
+        quiet=quiet,
+    )
 
 
 def _run_pairs(experiment: str, data: Path, options: Options) -> None:
@@ -117,11 +161,11 @@ def _run(
     by: str,
     **settings: Any,
 ) -> None:
-    """Register, say what came out, and write the report where a folder is given."""
+    """Register the pairs, print the results, and write the report if a folder is given."""
     from segslam.experiments.paper import beside_paper
     from segslam.experiments.provenance import account
+    from segslam.experiments.report_tables import overall, plain
     from segslam.experiments.summary import results
-    from segslam.report.bench_tables import overall, plain
 
     rows = run_trials(job, trials, options)
     found = beside_paper(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
@@ -138,11 +182,12 @@ def _run(
 
 def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes], *, quiet: bool) -> None:
     """The report and, beside it, the pictures as files."""
-    from segslam.report.bench import write_bench_report
+    from segslam.experiments.report import write_bench_report
+    from segslam.system.whole_files import write_whole
 
     write_bench_report(out, report, pictures=pictures)
     for number, png in enumerate(pictures.values()):
-        (out / f"failure_{number:02d}.png").write_bytes(png)
+        write_whole(out / f"failure_{number:02d}.png", png)
     say(f"{out / 'report.html'}, report.md, report.json, details.csv", quiet=quiet)
 
 
@@ -150,7 +195,7 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
     """The worst failures, drawn, by caption."""
     from segslam.experiments.job import BAD_SCAN, points_of
     from segslam.experiments.summary import worst_failures
-    from segslam.report.bench_figures import draw_registration
+    from segslam.run.report.pairs import draw_pair
 
     trial_of = {trial.key: trial for trial in trials}
     pictures = {}
@@ -158,13 +203,9 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
         trial = trial_of[row.key[:3]]
         outcome = f"{row.error_m:.1f} m, {row.error_deg:.1f} deg off" if row.accepted else row.reason.replace("_", " ")
         caption = f"{row.method}, {row.pairs}: {row.source} to {row.target}{_changes(row)}, {outcome}"
-        pictures[caption] = draw_registration(
-            points_of(job.source, trial.source),
-            points_of(job.source, trial.target),
-            T_true=trial.T_target_source,
-            T_estimate=row.estimate,
-            title=caption,
-        )
+        poses = {"truth": trial.T_target_source} | ({} if row.estimate is None else {"estimate": row.estimate})
+        source, target = points_of(job.source, trial.source), points_of(job.source, trial.target)
+        pictures[caption] = draw_pair(source, target, poses=poses, title=caption)
     return pictures
 
 

@@ -1,4 +1,4 @@
-"""What all commands of `segslam bench` take, and what they do alike: open, run, report."""
+"""Options and steps common to all commands of `segslam bench`: open, run, report."""
 
 import inspect
 import os
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from segslam.cli.compiling import compile_kernels
 from segslam.cli.console import (
     ConfigOption,
     DatasetOption,
@@ -19,11 +20,14 @@ from segslam.cli.console import (
     QuietOption,
     SequenceOption,
     SetOption,
+    announce,
     progress,
     say,
 )
 from segslam.errors import SegslamError
-from segslam.experiments.settings import METHOD_NAMES
+from segslam.experiments.method_settings import METHOD_NAMES
+from segslam.system.interrupts import EXIT_STATUS, when_stopped
+from segslam.system.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.experiments.job import Job
@@ -34,7 +38,7 @@ if TYPE_CHECKING:
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
-DataArgument = Annotated[Path, typer.Argument(help="KITTI's folder, of real or simulated scans.")]
+DataArgument = Annotated[Path, typer.Argument(help="KITTI's folder, with real or simulated scans.")]
 
 
 @dataclass(frozen=True)
@@ -43,44 +47,62 @@ class Options:
 
     pairs: Annotated[
         list[Path] | None,
-        typer.Option("--pairs", help="List of pairs, `source target` a line, or JSON with their poses; repeatable."),
+        typer.Option(
+            "--pairs", help="List of pairs: one `source target` per line, or JSON with their poses; may be repeated."
+        ),
     ] = None
-    min_m: Annotated[float | None, typer.Option("--min-m", min=0, help="Cut a list from true poses: from (m)")] = None
-    max_m: Annotated[float | None, typer.Option("--max-m", min=0, help="to this distance (m),")] = None
-    min_gap: Annotated[int, typer.Option("--min-gap", min=1, help="at least so many scans apart.")] = 50
-    sample: Annotated[int | None, typer.Option("--sample", min=1, help="Draw so many pairs of each list.")] = None
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of what is drawn.")] = 0
+    min_m: Annotated[
+        float | None,
+        typer.Option("--min-m", min=0, help="Make a list from the true poses: smallest distance of a pair (m)."),
+    ] = None
+    max_m: Annotated[float | None, typer.Option("--max-m", min=0, help="Largest distance of such a pair (m).")] = None
+    min_gap: Annotated[
+        int, typer.Option("--min-gap", min=1, help="Smallest number of scans between the two of such a pair.")
+    ] = 50
+    sample: Annotated[
+        int | None, typer.Option("--sample", min=1, help="Use only N pairs of each list, drawn at random.")
+    ] = None
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --sample.")] = 0
     sequence: SequenceOption = "00"
     method: Annotated[
         list[str] | None,
-        typer.Option("--method", help=f"Repeatable; all unless given: {', '.join(METHOD_NAMES)}."),
+        typer.Option("--method", help=f"Method, may be repeated; default: all of {', '.join(METHOD_NAMES)}."),
     ] = None
     dataset: DatasetOption = None
     labels: LabelsOption = "auto"
     encoding: EncodingOption = None
     config: ConfigOption = None
     settings: SetOption = None
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes on this machine (extra `cluster`).")] = 1
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, help="Number of processes on this machine (extra `cluster`).")
+    ] = 1
     scheduler: Annotated[
         str | None, typer.Option("--scheduler", help="Address of a Dask cluster that sees DATA (extra `cluster`).")
     ] = None
     out: Annotated[
-        Path | None, typer.Option("--out", help="Folder of report and rows; the same command again goes on there.")
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Folder for the report and the rows; the same command continues an interrupted benchmark there.",
+        ),
     ] = None
-    details: Annotated[Path | None, typer.Option("--details", help="Write a CSV file, a row a registration.")] = None
-    draw: Annotated[int, typer.Option("--draw", min=0, help="Draw so many of the worst failures; needs --out.")] = 0
+    details: Annotated[Path | None, typer.Option("--details", help="CSV file to write, one row per registration.")] = (
+        None
+    )
+    draw: Annotated[int, typer.Option("--draw", min=0, help="Draw the N worst failures; needs --out.")] = 0
     json: JsonOption = False
     quiet: QuietOption = False
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, taking the fields of `Options` as options of its own; its parameter `options` gets them all."""
+    """The command with the fields of `Options` as its own options; they are passed as its parameter `options`."""
     own = inspect.signature(command, eval_str=True)
     shared = {field.name: (field.type, field.default) for field in fields(Options)}
 
     @wraps(command)
     def typed(**values: Any) -> None:
         options = Options(**{name: values.pop(name) for name in shared})
+        announce(f"bench: opening {values.get('data', 'its data')}", quiet=options.quiet)
         command(**values, options=options)
 
     parameters = [parameter for name, parameter in own.parameters.items() if name != "options"]
@@ -95,12 +117,14 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def make_job(data: Path, options: Options) -> "Job":
-    """What the options ask for. Methods that are not named and not installed are left out, with a line each."""
+    """The job that the options describe. Methods not named and not installed are left out, with a message each."""
     _one_thread_each()
     from segslam.config import load_config
     from segslam.experiments.job import DataSource, Job
     from segslam.experiments.methods import find_method
 
+    if options.details is not None:
+        check_target(options.details)
     if options.draw and options.out is None:
         raise SegslamError("--draw: the pictures need a folder; give --out DIR")
     chosen = []
@@ -110,13 +134,19 @@ def make_job(data: Path, options: Options) -> "Job":
         except SegslamError as error:
             if options.method:
                 raise
-            say(f"left out: {error}", quiet=options.quiet)
+            say(f"method skipped: {error}", quiet=options.quiet)
         else:
             chosen.append(name)
+    config = load_config(options.config, options.settings or ())
     source = DataSource(
-        data.expanduser().absolute(), options.sequence, options.dataset, options.labels, options.encoding
+        data.expanduser().absolute(),
+        options.sequence,
+        options.dataset,
+        options.labels,
+        options.encoding,
+        config.sensor.vertical_angle_deg,
     )
-    return Job(source, tuple(chosen), load_config(options.config, options.settings or ()))
+    return Job(source, tuple(chosen), config)
 
 
 def reference_of(job: "Job") -> "Trajectory | None":
@@ -135,7 +165,7 @@ def read_lists(
 
     cuts = options.min_m is not None or options.max_m is not None
     if options.pairs and cuts:
-        raise SegslamError("--pairs, --min-m: give lists by files, or cut one by --min-m and --max-m, not both")
+        raise SegslamError("--pairs, --min-m: give lists of pairs, or make one with --min-m and --max-m, not both")
     if options.pairs:
         lists = [read_pairs(file) for file in options.pairs]
     elif cuts:
@@ -143,7 +173,7 @@ def read_lists(
     elif default is not None:
         lists = [default]
     else:
-        raise SegslamError("--pairs: give a list of pairs, or cut one from the true poses by --min-m and --max-m")
+        raise SegslamError("--pairs: give a list of pairs, or make one from the true poses with --min-m and --max-m")
     if options.sample is None:
         return lists
     return [sample_pairs(one, num_pairs=options.sample, seed=options.seed) for one in lists]
@@ -154,6 +184,7 @@ def run_trials(job: "Job", trials: list["Trial"], options: Options) -> list["Row
     from segslam.experiments.benchmark import Pool, in_order, run
     from segslam.experiments.rows import write_rows
 
+    compile_kernels(quiet=options.quiet)
     rows: list[Row] = []
     pool = Pool(options.workers, options.scheduler)
     work = run(job, trials, pool=pool, folder=options.out)
@@ -161,9 +192,9 @@ def run_trials(job: "Job", trials: list["Trial"], options: Options) -> list["Row
         for some in progress(work, total=len(trials), title="bench", quiet=options.quiet):
             rows += some
     except KeyboardInterrupt:
-        kept = f"; the same command goes on from {options.out}" if options.out else ""
-        say(f"stopped after {len(rows)} registrations{kept}", quiet=options.quiet)
-        raise typer.Exit(130) from None
+        kept = f"are kept, the same command goes on from {options.out}" if options.out else "are lost; --out keeps them"
+        when_stopped(f"{len(rows)} registrations {kept}")
+        raise typer.Exit(EXIT_STATUS) from None
     rows = in_order(rows, job, trials)
     if options.details is not None:
         write_rows(options.details, rows)
@@ -172,18 +203,18 @@ def run_trials(job: "Job", trials: list["Trial"], options: Options) -> list["Row
 
 def _bounds(options: Options) -> dict[str, Any]:
     if options.min_m is None or options.max_m is None or not options.min_m < options.max_m:
-        raise SegslamError(f"--min-m {options.min_m} --max-m {options.max_m}: give both, the lesser first")
+        raise SegslamError(f"--min-m {options.min_m} --max-m {options.max_m}: give both, the smaller one first")
     name = f"cut_{options.min_m:g}to{options.max_m:g}"
     return {"name": name, "min_m": options.min_m, "max_m": options.max_m, "min_gap": options.min_gap}
 
 
 def _posed(reference: "Trajectory | None") -> "Trajectory":
     if reference is None:
-        raise SegslamError("--min-m: the data has no true poses to cut a list from; give --pairs FILE")
+        raise SegslamError("--min-m: the data has no true poses to make a list from; give --pairs FILE")
     return reference
 
 
 def _one_thread_each() -> None:
-    """Keep Open3D and others from taking all cores, before they are loaded: methods are timed on one core each."""
+    """Limit Open3D and other libraries to one thread before they are loaded, because times are per core."""
     for variable in THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")

@@ -1,9 +1,11 @@
-"""What data, and a run that was begun, allow: how they can be mapped, resumed or replayed."""
+"""Checks before a run is mapped, resumed or replayed."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from segslam.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.config import Config
@@ -11,37 +13,40 @@ if TYPE_CHECKING:
     from segslam.log import RunLog
 
 
+def check_exists(path: Path, hint: str) -> None:
+    """Raises SegslamError with the hint if there is no such file or folder; before anything slow is imported."""
+    if not path.expanduser().exists():
+        raise SegslamError(f"{path}: no such file or folder; {hint}")
+
+
 def check_intensities(scans: "Dataset") -> None:
     """Raises SegslamError if the first scan that can be read has no intensities."""
-    from segslam.types import BadScan, SegslamError
+    from segslam.errors import BadScan
 
     for row in range(len(scans)):
         with suppress(BadScan):
             if scans[row].intensities is None:
-                raise SegslamError(
-                    f"map.color=intensity: {scans.name} has no intensities that are known; take class or height"
-                )
+                raise SegslamError(f"map.color=intensity: {scans.name} has no intensities; use class or height")
             return
 
 
 def log_to_resume(folder: Path) -> "RunLog":
     """The log of the run in a folder. Raises SegslamError if there is none, or the run is still going on."""
     from segslam.log import is_being_written, read_log
-    from segslam.run_files import LOG
-    from segslam.types import SegslamError
+    from segslam.run.folder import LOG
 
     log = folder / LOG
     if not log.is_file():
-        raise SegslamError(f"{folder}: no {LOG} there, so no run to resume; map without --resume into a new folder")
+        raise SegslamError(
+            f"{folder}: it has no {LOG}, so there is no run to resume; map into a new folder without --resume"
+        )
     if is_being_written(log):
-        raise SegslamError(f"{log}: the run is still going on; end it before it is resumed")
+        raise SegslamError(f"{log}: the run is still in progress; stop it before you resume it")
     return read_log(log)
 
 
 def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options: Mapping[str, str]) -> None:
-    """Raises SegslamError where a run would be resumed otherwise than it began."""
-    from segslam.types import SegslamError
-
+    """Raises SegslamError if a run would be resumed with other data, settings or options."""
     for key, before, now in changed_settings(recorded.config, settings):
         raise SegslamError(
             f"{key}: {now} now, but {recorded.path} began with {before}; a resumed run keeps its settings"

@@ -1,4 +1,4 @@
-"""What all commands share: options, progress on standard error, one JSON object on standard output."""
+"""Common parts of all commands: options, progress on standard error, one JSON object on standard output."""
 
 import json
 import logging
@@ -11,59 +11,90 @@ from typing import Annotated, Any, Literal, TypeVar
 import typer
 
 from segslam.cli.warn import FirstOfEachKind
+from segslam.errors import WorkFailed, reason
 
 Item = TypeVar("Item")
 
 
 def _without_warnings(quiet: bool) -> bool:
-    """What `--quiet` says; if it does, no warning is told from now on."""
+    """Callback of `--quiet`: if it is set, warnings are no longer printed."""
     for handler in logging.getLogger().handlers:
         if quiet and isinstance(handler, FirstOfEachKind):
             handler.setLevel(logging.ERROR)
     return quiet
 
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")]
+JsonOption = Annotated[
+    bool,
+    typer.Option("--json", help="Print the figures as one JSON object on standard output, and nothing else there."),
+]
 QuietOption = Annotated[
     bool,
     typer.Option(
-        "--quiet", "-q", callback=_without_warnings, help="Nothing on standard error but what ends the command."
+        "--quiet",
+        "-q",
+        callback=_without_warnings,
+        help="Print no progress and no warnings; only the error that ends the command.",
     ),
 ]
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="YAML file with the settings that differ.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="YAML file with the settings that differ from the defaults.")
+]
 SetOption = Annotated[
-    list[str] | None, typer.Option("--set", help="One setting, as section.key=value; may be repeated.")
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change one setting: section.key=value; may be repeated."),
 ]
 DatasetOption = Annotated[
-    str | None, typer.Option("--dataset", help="Kind of data: kitti, or a reader of kiss-icp; else found from DATA.")
+    str | None,
+    typer.Option("--dataset", help="Kind of data: kitti, or a reader of kiss-icp; detected from DATA by default."),
 ]
-SequenceOption = Annotated[str, typer.Option("--sequence", help="Which sequence of the data set.")]
-FramesOption = Annotated[str | None, typer.Option("--frames", help="Scans A:B by number, B not included.")]
+SequenceOption = Annotated[str, typer.Option("--sequence", help="Sequence of the data set.")]
+FramesOption = Annotated[str | None, typer.Option("--frames", help="Use scans A to B by number, B not included: A:B.")]
 LabelsOption = Annotated[
     str,
     typer.Option(
-        "--labels", help="auto (labels/ if there, else geometric), none, geometric, network:MODEL.onnx, or a folder."
+        "--labels",
+        help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder.",
     ),
 ]
 EncodingOption = Annotated[
     Literal["raw", "learning", "learning-0"] | None,
-    typer.Option("--encoding", help="Of label files whose ids cannot tell: raw, learning (0-19), learning-0 (0-18)."),
+    typer.Option(
+        "--encoding",
+        help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18).",
+    ),
 ]
 
 
 def print_json(values: dict[str, Any]) -> None:
-    """One JSON object on standard output. Raises ValueError for NaN: a figure that is unknown is left out instead."""
-    print(json.dumps(values, allow_nan=False))
+    """Print one JSON object on standard output. Raises ValueError for NaN: unknown figures must be left out."""
+    print_out(json.dumps(values, allow_nan=False))
+
+
+def print_out(text: str) -> None:
+    """Print lines on standard output. Raises WorkFailed if that fails, for example on a full disk."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise WorkFailed(f"standard output: cannot be written ({reason(error)}); send it elsewhere") from error
 
 
 def say(text: str, *, quiet: bool = False) -> None:
-    """A line for the person, on standard error so that standard output stays machine-readable."""
+    """Print a message on standard error; standard output stays machine-readable."""
     if not quiet:
         print(text, file=sys.stderr)
 
 
+def announce(text: str, *, quiet: bool) -> None:
+    """Print a first message on a terminal, before libraries are loaded and data are opened."""
+    if sys.stderr.isatty():
+        say(text, quiet=quiet)
+
+
 def progress(items: Iterable[Item], *, total: int, title: str, quiet: bool = False) -> Iterator[Item]:
-    """The items, with a bar on a terminal, a line every ten seconds elsewhere, and nothing under `quiet`."""
+    """Yield the items, with a progress bar on a terminal, a line every ten seconds elsewhere, nothing if `quiet`."""
     if quiet:
         yield from items
     elif sys.stderr.isatty():
@@ -74,15 +105,24 @@ def progress(items: Iterable[Item], *, total: int, title: str, quiet: bool = Fal
 
 def _bar(items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn(title),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.speed:.1f}/s"),
-        TimeRemainingColumn(),
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
     )
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        """Items per second; rich has no estimate before the second item."""
+
+        def render(self, task: Task) -> Text:
+            return Text("" if task.speed is None else f"{task.speed:.1f}/s")
+
+    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), Rate(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as bars:
         task = bars.add_task(title, total=total)
         for item in items:

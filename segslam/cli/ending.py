@@ -1,42 +1,43 @@
-"""How a run ends, mapped or replayed: its results, its report, its figures."""
+"""End of a mapped or replayed run: results, report, figures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from segslam.cli.console import print_json, say
 from segslam.cli.export import map_summary, write_maps
 
 if TYPE_CHECKING:
-    from segslam.runs import Run
-    from segslam.types import AngleSamples, Trajectory
+    from segslam.run.run import Run
+    from segslam.slam_result import SlamResult
+    from segslam.types import Trajectory
 
 
 def finish(
     run: "Run",
     reference: "Trajectory | None",
     *,
-    angles: "AngleSamples | None" = None,
     map_files: Sequence[Path] = (),
     json: bool,
     quiet: bool,
-    more: Mapping[str, Any] = MappingProxyType({}),
+    more: Callable[["SlamResult"], Mapping[str, Any]] = lambda result: {},
 ) -> dict[str, Any]:
     """End a run: write its results, with a map where files for it are named, and show its figures.
 
-    `angles` as in `Slam.finish`; `more` is among the figures, which are returned.
+    What `more` makes of the result is among the figures, which are returned.
     """
+    from segslam.calibration import vertical_angle_advice
     from segslam.log import read_log
-    from segslam.report import write_report
-    from segslam.run_files import LOG, write_metrics
-    from segslam.runs import accuracy, peak_rss_mb
+    from segslam.run.accuracy import accuracy
+    from segslam.run.folder import LOG, write_metrics
+    from segslam.run.report import write_report
+    from segslam.run.run import peak_rss_mb
 
-    say("all scans are in; one more look at them, and the last optimisation", quiet=quiet)
-    result, metrics = run.finish(angles)
+    say("all scans read; final optimisation ...", quiet=quiet)
+    result, metrics = run.finish()
     if reference is not None:
         metrics |= accuracy(result, reference)
-    metrics |= more
+    metrics |= more(result)
     write_metrics(run.folder, metrics)
     try:
         if map_files:
@@ -50,42 +51,47 @@ def finish(
         print_json(metrics)
     else:
         say(summary(metrics, run.folder), quiet=quiet)
+        if advice := vertical_angle_advice(metrics, run.config.sensor):
+            say(advice, quiet=quiet)
         if map_files:
             say(map_summary(metrics, map_files), quiet=quiet)
     return metrics
 
 
 def summary(metrics: dict[str, Any], folder: Path) -> str:
-    """What a person wants to know of a run at a glance."""
+    """The summary of a run that is printed at its end."""
     lines = [
         f"{metrics['num_scans']} scans in {metrics['seconds_total']:.1f} s ({metrics['scans_per_second']:.1f}/s), "
         f"{metrics['num_keyframes']} keyframes, {metrics['num_loops_accepted']} loops of "
         f"{metrics['num_candidates']} candidates"
     ]
     if skipped := metrics["num_scans_skipped"]:
-        lines.append(f"{skipped} bad scans were skipped")
+        lines.append(f"{skipped} scan{'s' * (skipped != 1)} skipped (unreadable or empty); see the warning above")
+    if repaired := metrics.get("num_motions_repaired"):
+        lines.append(
+            f"odometry: {repaired} motion{'s' * (repaired != 1)} repaired by registration with the scans before"
+        )
+    if broken := metrics.get("num_motions_broken"):
+        lines.append(
+            f"odometry: {broken} break{'s' * (broken != 1)}: motions that the scans do not support; see the report"
+        )
     if "ate_m" in metrics:
         lines.append(
-            f"error after alignment: {metrics['ate_m']:.3f} m, odometry alone {metrics['odometry_ate_m']:.3f} m; "
-            f"false loops: {metrics['num_loops_false']}"
+            f"error after alignment: {metrics['ate_m']:.3f} m, odometry only: {metrics['odometry_ate_m']:.3f} m"
+            + (f"; false loops: {metrics['num_loops_false']}" if "num_loops_false" in metrics else "")
         )
-    if drift := metrics.get("systematic_drift"):
-        lines.append(drift_summary(drift))
+    if "localised_percent" in metrics:
+        lines.append(f"localised in the old map: {metrics['localised_percent']:.1f} % of the scans; see localised.csv")
+    if "num_loops_between" in metrics:
+        rejected = metrics["num_loops_between_switched_off"]
+        lines.append(f"loops between sessions: {metrics['num_loops_between']}, {rejected} rejected by the optimiser")
     if "num_scans_resumed" in metrics:
-        lines.append(f"of these scans, {metrics['num_scans_resumed']} are from the log")
+        lines.append(
+            f"{metrics['num_scans_resumed']} of these scans were resumed from the log; the rate is that of the others"
+        )
     if "num_loops_won" in metrics:
-        before = f", error {metrics['recorded_ate_m']:.3f} m before" if "recorded_ate_m" in metrics else ""
-        lines.append(f"replayed: {metrics['num_loops_won']} loops won, {metrics['num_loops_lost']} lost{before}")
+        before = f"; error of the logged run: {metrics['recorded_ate_m']:.3f} m" if "recorded_ate_m" in metrics else ""
+        lines.append(
+            f"against the logged run: {metrics['num_loops_won']} loops more, {metrics['num_loops_lost']} fewer{before}"
+        )
     return "\n".join([*lines, f"results in {folder}"])
-
-
-def drift_summary(drift: dict[str, Any]) -> str:
-    """What was found of a systematic drift, and what was done."""
-    if drift["vertical_deg"] is None:
-        return f"no word on leftover angles: {drift['reason']}"
-    done = "turned back" if drift["chosen"] else "left alone"
-    held_out = f"held-out chi-square {drift['chi2_before']:.0f} -> {drift['chi2_after']:.0f}"
-    angles = ", ".join(
-        f"{name} {drift[f'{name}_deg']:.2f} +- {drift[f'{name}_change_deg']:.2f}" for name in ("vertical", "azimuth")
-    )
-    return f"leftover angles (degrees) {angles}, {done}: {drift['reason']} ({held_out})"

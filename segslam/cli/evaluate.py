@@ -5,68 +5,102 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from segslam.cli.console import JsonOption, QuietOption, print_json, say
+from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
 
 if TYPE_CHECKING:
-    from segslam.trajectory import PoseFile
+    from segslam.trajectory import PoseFile, Poses
     from segslam.types import IndexPairs
 
 UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
 
 
 def evaluate(
-    run: Annotated[Path | None, typer.Argument(help="Run folder; its metrics.json takes the new figures up.")] = None,
-    reference: Annotated[Path | None, typer.Option(help="True poses, KITTI or TUM format.")] = None,
-    estimate: Annotated[Path | None, typer.Option(help="Estimated poses, in place of a run.")] = None,
+    run: Annotated[
+        Path | None, typer.Argument(help="Run folder; the new figures are written to its metrics.json.")
+    ] = None,
+    reference: Annotated[Path | None, typer.Option(help="Ground-truth poses, KITTI or TUM format.")] = None,
+    estimate: Annotated[Path | None, typer.Option(help="Estimated poses, instead of a run folder.")] = None,
     format: Annotated[
-        Literal["kitti", "tum"] | None, typer.Option(help="Of both files; else told by the columns.")
+        Literal["kitti", "tum"] | None,
+        typer.Option(help="Format of both files; detected from the number of columns by default."),
     ] = None,
     up: Annotated[
         Literal["z", "-y"] | None,
-        typer.Option(help="Upwards in the reference's frame; else -y (camera) in KITTI's format and z in TUM's."),
+        typer.Option(help="Upward axis of the reference frame; default: -y (camera) for KITTI format, z for TUM."),
     ] = None,
-    max_difference: Annotated[float, typer.Option(help="Farthest that stamps of one pose are apart (s).")] = 0.01,
+    max_difference: Annotated[
+        float, typer.Option(help="Largest time difference between a pose and its reference (s).")
+    ] = 0.01,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw both trajectories and the error into this file: .png, .svg or .pdf.")
+    ] = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Score a run, or a trajectory, against the truth.
+    """Measure the error of a run, or of a trajectory, against ground truth.
 
     Example: segslam eval runs/00; or segslam eval --estimate poses_kitti.txt --reference kitti/poses/00.txt
     """
+    if run is not None or estimate is not None:
+        announce(f"eval: reading {run or estimate}", quiet=quiet)
     from segslam.types import SegslamError
 
     if run is not None and estimate is None:
-        figures = _score_run(run, reference)
+        figures = _score_run(run, reference, plot, quiet=quiet)
     elif run is None and estimate is not None and reference is not None:
-        figures = _score_files(estimate, reference, format, up, max_difference, quiet=quiet)
+        figures = _score_files(estimate, reference, format, up, max_difference, plot, quiet=quiet)
     else:
-        raise SegslamError("name either a run folder, or two files by --estimate and --reference")
+        raise SegslamError("give either a run folder, or two files with --estimate and --reference")
     if json:
         print_json(figures)
     elif not quiet:
-        print(table(figures))
+        print_out(table(figures))
+    if plot is not None and not json:
+        say(f"picture in {plot}", quiet=quiet)
 
 
 def table(figures: dict[str, Any]) -> str:
     """The figures with what they mean, a line each."""
-    from segslam.results import FIGURES
+    from segslam.run.finished import FIGURES
 
     return "\n".join(f"{figures[key]:10.4g}  {meaning}" for key, meaning in FIGURES.items() if key in figures)
 
 
-def _score_run(folder: Path, reference_file: Path | None) -> dict[str, Any]:
-    from segslam.results import read_run, true_poses
-    from segslam.run_files import write_metrics
-    from segslam.runs import accuracy
+def _score_run(folder: Path, reference_file: Path | None, plot: Path | None, *, quiet: bool) -> dict[str, Any]:
+    from segslam.run.accuracy import accuracy
+    from segslam.run.finished import ACCURACY, read_run, true_poses
+    from segslam.run.folder import folder_of, write_metrics
+    from segslam.trajectory import rows_of_same_scan
     from segslam.types import SegslamError
 
+    folder = folder_of(folder)
     run = read_run(folder)
     reference = run.reference if reference_file is None else true_poses(reference_file, run)
     if reference is None:
-        raise SegslamError(f"{folder}: its data had no true poses; name a file of them by --reference")
-    metrics = run.metrics | accuracy(run.result, reference)
+        raise SegslamError(f"{folder}: the data had no ground-truth poses; give a file with --reference")
+    figures = accuracy(run.result, reference)
+    num_scans = len(run.result.trajectory)
+    if "ate_m" not in figures:
+        raise SegslamError(
+            f"{reference_file or folder}: only {len(reference)} of {num_scans} scans have a pose, three are needed"
+        )
+    if len(reference) < num_scans:
+        say(f"scored {len(reference)} scans that have a reference pose, of {num_scans}", quiet=quiet)
+    metrics = {key: value for key, value in run.metrics.items() if key.removeprefix("odometry_") not in ACCURACY}
+    metrics |= figures
     write_metrics(folder, metrics)
+    if plot is not None:
+        trajectory = run.result.trajectory
+        rows = rows_of_same_scan(trajectory.scan_index, reference.scan_index)
+        _draw(plot, trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]])
     return metrics
+
+
+def _draw(file: Path, estimate: "Poses", reference: "Poses") -> None:
+    from segslam.run.report.comparison import check_picture, draw_scored
+
+    check_picture(file)
+    draw_scored(file, estimate, reference)
 
 
 def _score_files(
@@ -75,6 +109,7 @@ def _score_files(
     format: Literal["kitti", "tum"] | None,
     up: str | None,
     max_difference_s: float,
+    plot: Path | None,
     *,
     quiet: bool,
 ) -> dict[str, Any]:
@@ -84,17 +119,26 @@ def _score_files(
 
     estimate, reference = (read_poses(file, format=format) for file in (estimate_file, reference_file))
     if (estimate.stamp_ns is None) != (reference.stamp_ns is None):
-        raise SegslamError(f"{estimate_file}: not of the format of {reference_file}; rows cannot be told from stamps")
+        raise SegslamError(
+            f"{estimate_file}: not the format of {reference_file} (KITTI rows against TUM stamps); convert one of them"
+        )
+    if estimate.stamp_ns is None and len(estimate) != len(reference):
+        raise SegslamError(
+            f"{estimate_file}: {len(estimate)} poses, but {reference_file} has {len(reference)}; in KITTI's format "
+            "line n + 1 is of scan n in both. Score the run folder in its place, or use TUM's format, matched by stamp"
+        )
     rows = _matching_rows(estimate, reference, round(max_difference_s * 1e9))
     direction = up or ("-y" if estimate.stamp_ns is None else "z")
     figures = trajectory_metrics(estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]], up=UP[direction])
     if not figures:
         raise SegslamError(
-            f"{estimate_file}: {len(rows)} of its {len(estimate)} poses are among the {len(reference)} of "
-            f"{reference_file}; three are needed. Check the files, or --max-difference for stamps"
+            f"{estimate_file}: only {len(rows)} of its {len(estimate)} poses match one of the {len(reference)} "
+            f"poses of {reference_file}; at least three are needed. Check the files, or raise --max-difference"
         )
+    if plot is not None:
+        _draw(plot, estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]])
     if not len(rows) == len(estimate) == len(reference):
-        say(f"scored {len(rows)} poses of {len(estimate)} estimated and {len(reference)} true ones", quiet=quiet)
+        say(f"scored {len(rows)} poses; the estimate has {len(estimate)}, the reference {len(reference)}", quiet=quiet)
     return figures | {"num_poses": len(rows)}
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, print_json, progress, say
+from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, print_json, progress, say
 
 if TYPE_CHECKING:
     from segslam.config import MapConfig
@@ -19,25 +19,28 @@ WITH_MAP = ("map.ply", "map.png")
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Run folder, finished.")],
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
     files: Annotated[
         list[Path],
-        typer.Argument(help="What to write: .ply, .pcd, .las, .laz the cloud; .png from above; .yaml occupancy grid."),
+        typer.Argument(
+            help="Files to write: .ply .pcd .las .laz (cloud), .png (from above), .yaml (grid), or before_after.png."
+        ),
     ],
     config: ConfigOption = None,
     settings: SetOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Write the map of a finished run: one clean cloud, a picture from above, an occupancy grid for map_server.
+    """Write the map of a finished run: a point cloud, a picture from above, an occupancy grid for map_server.
 
     Example: segslam export runs/00 map.laz map.png grid.yaml --set map.color=height
     """
+    announce(f"export: reading {run}", quiet=quiet)
     from segslam.config import load_config
     from segslam.log import read_log
-    from segslam.run_files import LOG
+    from segslam.run.folder import log_of
 
-    log = read_log(run / LOG)
+    log = read_log(log_of(run))
     figures = write_maps(log, files, config=load_config(config, settings or (), base=log.config).map, quiet=quiet)
     if json:
         print_json(figures)
@@ -46,18 +49,27 @@ def export(
 
 
 def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", quiet: bool) -> dict[str, Any]:
-    """Make the map of a finished run and write it to each of the files; the figures that tell what it was made of.
+    """Write the map of a finished run to each of the files. Returns figures of the map.
 
     Raises SegslamError if the run did not finish or a name is no map's, and WorkFailed where the disk is full.
     """
     from time import perf_counter
 
     from segslam.map import write_map
-    from segslam.run_files import room_for
+    from segslam.run.report import BEFORE_AFTER, write_before_after
+    from segslam.system.whole_files import cannot_write
 
     started = perf_counter()
-    with room_for(files[0].parent):
-        made = write_map(_placed(log, quiet=quiet), files, config=config, show=partial(_shown, quiet=quiet))
+    of_map = [file for file in files if file.name != BEFORE_AFTER]
+    for file in files:
+        if file not in of_map:
+            write_before_after(log.path.parent, file)
+    if not of_map:
+        return {"map_seconds": perf_counter() - started}
+    try:
+        made = write_map(_placed(log, quiet=quiet), of_map, config=config, show=partial(_shown, quiet=quiet))
+    except OSError as error:
+        raise cannot_write(of_map[0], error) from error
     return {
         "num_map_points": made.num_points,
         "num_map_moving_points": made.num_moving_points,
@@ -68,11 +80,14 @@ def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", qui
 
 def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
     """What a person wants to know of a map at a glance."""
+    written = f"map in {', '.join(str(file) for file in files)}"
+    if "num_map_points" not in figures:
+        return written
     removed = figures["num_map_moving_points"], figures["num_map_voxels_seen_through"]
     return (
-        f"map of {figures['num_map_points']} points in {figures['map_seconds']:.1f} s; left out as moving: "
-        f"{removed[0]} points by class, {removed[1]} voxels that others saw through\n"
-        f"map in {', '.join(str(file) for file in files)}"
+        f"map of {figures['num_map_points']} points in {figures['map_seconds']:.1f} s; removed as moving: "
+        f"{removed[0]} points by class, {removed[1]} voxels that later scans see through\n"
+        f"{written}"
     )
 
 
@@ -82,7 +97,9 @@ def _placed(log: "RunLog", *, quiet: bool) -> "Iterator[tuple[Keyframe, Transfor
 
     result = log.result()
     if result is None:
-        raise SegslamError(f"{log.path}: the run did not finish; `segslam replay` it, or go on with --resume")
+        raise SegslamError(
+            f"{log.path}: the run did not finish; run `segslam replay` on its log, or resume it with --resume"
+        )
     estimate, _ = result
     for step in progress(log.steps(), total=log.num_steps(), title="gather", quiet=quiet):
         if step.keyframe is not None:

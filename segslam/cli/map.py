@@ -1,14 +1,17 @@
 """`segslam map`."""
 
+import json as json_text
+import shlex
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from segslam.cli.checks import check_intensities, check_same, is_finished, log_to_resume
+from segslam.cli.checks import check_exists, check_intensities, check_same, is_finished, log_to_resume
+from segslam.cli.compiling import compile_kernels
 from segslam.cli.console import (
     ConfigOption,
     DatasetOption,
@@ -19,62 +22,89 @@ from segslam.cli.console import (
     QuietOption,
     SequenceOption,
     SetOption,
+    announce,
     print_json,
+    print_out,
     progress,
     say,
 )
 from segslam.cli.ending import finish
-from segslam.cli.export import WITH_MAP, map_summary, write_maps
-from segslam.cli.view import open_scene
+from segslam.cli.export import map_summary, write_maps
+from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
+from segslam.cli.given_odometry import given_odometry
+from segslam.cli.in_map import pipeline
+from segslam.cli.run_options import (
+    DataArgument,
+    DryRunOption,
+    MapFileOption,
+    OdometryOption,
+    PresetOption,
+    ResumeOption,
+    TopicOption,
+    ViewOption,
+    WithMapOption,
+    chosen_maps,
+)
+from segslam.cli.view import check_display, close_scene, open_scene
+from segslam.errors import SegslamError
+from segslam.system.interrupts import EXIT_STATUS, when_stopped
 
 if TYPE_CHECKING:
-    from segslam.alignment import Labeller
-    from segslam.config import Config, MapConfig, OdometryConfig
+    from segslam.config import Config, MapConfig
     from segslam.datasets import Dataset
-    from segslam.log import RunLog
+    from segslam.log import Mirror, RunLog
     from segslam.odometry import Odometry
-    from segslam.runs import Run
+    from segslam.presets import Preset
+    from segslam.run.map_folder import SlamOf
+    from segslam.run.run import Run
     from segslam.types import BadScan, Step
 
 
 def map_command(
-    data: Annotated[Path, typer.Argument(help="KITTI's folder (with sequences/), a folder of scans, or a recording.")],
-    out: Annotated[Path, typer.Option(help="New folder for the run; that of the run for --resume.")],
+    data: DataArgument,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder for the run; with --resume the folder of the run.  [required]")
+    ] = None,
     dataset: DatasetOption = None,
     sequence: SequenceOption = "00",
     frames: FramesOption = None,
-    topic: Annotated[str, typer.Option(help="Of the points, in a recording that has several (rosbag, mcap).")] = "",
+    topic: TopicOption = "",
     labels: LabelsOption = "auto",
     encoding: EncodingOption = None,
-    odometry: Annotated[
-        Path | None, typer.Option(help="Use this trajectory (KITTI or TUM format, LiDAR frame) in place of KISS-ICP.")
-    ] = None,
+    odometry: OdometryOption = None,
     config: ConfigOption = None,
     settings: SetOption = None,
-    with_map: Annotated[bool, typer.Option("--map", help="Write one clean cloud, map.ply, and map.png too.")] = False,
-    map_file: Annotated[
-        list[Path] | None,
-        typer.Option(help="Write the map as this file of the run: .ply .pcd .las .laz .png .yaml; may be repeated."),
-    ] = None,
-    view: Annotated[
-        bool, typer.Option("--view", help="Watch it in Rerun's viewer, as `segslam view` shows it.")
-    ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, killed or stopped.")] = False,
+    preset: PresetOption = "auto",
+    with_map: WithMapOption = False,
+    map_file: MapFileOption = None,
+    view: ViewOption = False,
+    foxglove: FoxgloveOption = None,
+    resume: ResumeOption = False,
+    dry_run: DryRunOption = False,
+    in_map: Annotated[Path | None, typer.Option(help="Localise in the map of this run: `segslam localise`.")] = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Map a sequence: corrected trajectory, log, loops and, where there is ground truth, the error.
+    """Map scans: write the corrected trajectory, the loops, a log, a report and, with ground truth, the error.
 
     Example: segslam map kitti --sequence 00 --frames 0:1000 --out runs/00
     """
+    if view:
+        check_display()
     from segslam.config import load_config
-    from segslam.datasets import open_dataset
-    from segslam.map import check_names
 
-    map_files = [out / name for name in (*(WITH_MAP if with_map else ()), *(map_file or ()))]
-    check_names(map_files)
-    recorded = log_to_resume(out) if resume else None
+    if out is None and not dry_run:
+        raise SegslamError("--out: name a new folder for the run, as in --out runs/00 (or look first: --dry-run)")
+    check_exists(data, "name the folder with sequences/ or with the scans")
+    recorded = log_to_resume(out) if resume and out else None
+    check_preset(preset, resumes=recorded is not None)
     settings_now = load_config(config, settings or (), base=recorded.config if recorded else None)
+    announce(f"map: opening {data}" if in_map is None else f"localise: reading the map of {in_map}", quiet=quiet)
+    slam_of = pipeline(in_map)
+    from segslam.datasets import open_dataset
+
+    folder = out or Path()
+    map_names, map_files = chosen_maps(folder, with_map=with_map, map_file=map_file)
     by_intensity = settings_now.map.color == "intensity"
     scans = open_dataset(
         data,
@@ -85,45 +115,92 @@ def map_command(
         frames=frames,
         topic=topic,
         intensities=by_intensity,
+        vertical_angle_deg=settings_now.sensor.vertical_angle_deg,
     )
     if by_intensity:
         check_intensities(scans)
-    options = {
+    options = ({"in_map": str(in_map.expanduser().resolve())} if in_map else {}) | {
         "frames": frames or "",
         "topic": topic,
         "labels": labels,
         "encoding": encoding or "",
-        "odometry": str(odometry or ""),
+        "odometry": str(odometry.resolve()) if odometry else "",
     }
-    given = _given_odometry(odometry, scans, settings_now.odometry) if odometry else None
+    source = {"data": str(data.expanduser().resolve()), "dataset": dataset or "", "sequence": sequence}
+    given = given_odometry(odometry, scans, settings_now.odometry) if odometry else None
+    if recorded is None:
+        settings_now = load_config(config, settings or (), base=preset_config(preset, scans, quiet=quiet))
+    if dry_run:
+        _show_dry_run(scans, settings_now, json=json, quiet=quiet)
+        return
     if recorded is not None:
         check_same(recorded, settings_now, dataset=scans.name, options=options)
         if is_finished(recorded, scans):
             _complete(recorded, map_files, config=settings_now.map, json=json, quiet=quiet)
             raise typer.Exit(0)
     scene = open_scene(None, view_every=settings_now.log.view_every) if view else None
-    map_scans(
-        scans,
-        out,
-        settings=settings_now,
-        odometry=given,
-        options=options,
-        recorded=recorded,
-        map_files=map_files,
-        watch=scene.add if scene else _nobody,
-        json=json,
-        quiet=quiet,
-    )
+    with ExitStack() as stack:
+        server = serve_foxglove(foxglove, stack, quiet=quiet)
+        map_scans(
+            scans,
+            folder,
+            settings=settings_now,
+            odometry=given,
+            options=options | source | {"map_files": json_text.dumps([str(name) for name in map_names])},
+            recorded=recorded,
+            map_files=map_files,
+            watch=scene.add if scene else _nobody,
+            go_on=f"go on with: segslam resume {shlex.quote(str(folder))}",
+            slam_of=slam_of,
+            mirror=server.send if server else None,
+            json=json,
+            quiet=quiet,
+        )
     if scene:
-        scene.end()
+        close_scene(scene, None)
+
+
+def check_preset(name: str, *, resumes: bool) -> None:
+    """Raises SegslamError for a preset that does not exist, and for any if a run is resumed."""
+    if name == "auto":
+        return
+    from segslam.presets import SETTINGS
+
+    if name not in SETTINGS:
+        raise SegslamError(f"--preset {name}: no such preset; known: auto, {', '.join(SETTINGS)}")
+    if resumes:
+        raise SegslamError(f"--preset {name}: a resumed run keeps its settings; leave the option out")
+
+
+def preset_config(name: str, scans: "Dataset", *, quiet: bool) -> "Config":
+    """The settings of a preset that exists; of the one that fits the scans if it is `auto`, with a message."""
+    from segslam.presets import extent_m, preset, preset_for
+
+    if name != "auto":
+        return preset(cast("Preset", name))
+    extent = extent_m(scans)
+    chosen = preset_for(extent)
+    if chosen != "driving":
+        say(f"surfaces are near (median {extent:.0f} m): settings of --preset {chosen}", quiet=quiet)
+    return preset(chosen)
+
+
+def _show_dry_run(scans: "Dataset", settings: "Config", *, json: bool, quiet: bool) -> None:
+    from segslam.cli.dry_run import found_in, lines
+
+    found = found_in(scans, settings)
+    if json:
+        print_json(found)
+    elif not quiet:
+        print_out(lines(found))
 
 
 def _complete(recorded: "RunLog", map_files: Sequence[Path], *, config: "MapConfig", json: bool, quiet: bool) -> None:
-    """Give a finished run the maps that it lacks, and show its figures."""
-    from segslam.results import read_metrics
+    """Write the missing maps of a finished run, and show its figures."""
+    from segslam.run.finished import read_metrics
 
     folder = recorded.path.parent
-    say(f"{folder}: finished already, with all scans; nothing is left to resume", quiet=quiet)
+    say(f"{folder}: the run is already complete; there is nothing to resume", quiet=quiet)
     if missing := [file for file in map_files if not file.exists()]:
         made = write_maps(recorded, missing, config=config, quiet=quiet)
         say(map_summary(made, missing), quiet=quiet)
@@ -132,7 +209,7 @@ def _complete(recorded: "RunLog", map_files: Sequence[Path], *, config: "MapConf
 
 
 def _nobody(_: "Step | BadScan") -> None:
-    """Watches."""
+    """Default observer of steps: does nothing."""
 
 
 def map_scans(
@@ -145,38 +222,59 @@ def map_scans(
     recorded: "RunLog | None" = None,
     map_files: Sequence[Path] = (),
     watch: "Callable[[Step | BadScan], None]" = _nobody,
+    mirror: "Mirror | None" = None,
+    slam_of: "SlamOf | None" = None,
+    go_on: str,
     json: bool,
     quiet: bool,
 ) -> None:
     """Map a data set into a new folder, or go on with the run `recorded` there, and show the figures.
 
-    `watch` is given each step. Raises typer.Exit(130) if Ctrl-C ended it early.
+    The run keeps the vertical angle that the data set was opened with.
+    `watch` is given each step, `mirror` each message of the log; `slam_of` makes another pipeline than `Slam`. Raises
+    typer.Exit(130) if Ctrl-C ended it early; `go_on` is the advice that is printed then.
     """
     from segslam.odometry import OdometryApart
-    from segslam.run_files import new_folder
-    from segslam.runs import Run
+    from segslam.run.folder import new_folder
+    from segslam.run.map_folder import in_effect, labeller_of
+    from segslam.run.run import Run
     from segslam.slam import Slam
 
+    settings = in_effect(settings, scans)
     folder = out if recorded else new_folder(out)
+    compile_kernels(quiet=quiet)
+    for file in map_files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    when_stopped(f"the log in {folder} is kept; {go_on}")
     apart = OdometryApart(settings.odometry) if odometry is None else None
-    with Run(
-        folder,
-        Slam(settings, odometry=odometry or apart, labeller=_labeller(scans)),
-        dataset=scans.name,
-        T_camera_lidar=scans.T_camera_lidar,
-        reference=scans.reference,
-        options=options,
-        resumes=recorded is not None,
-    ) as run:
+    with (
+        apart or nullcontext(),
+        Run(
+            folder,
+            (slam_of or Slam)(settings, odometry=odometry or apart, labeller=labeller_of(scans)),
+            dataset=scans.name,
+            T_camera_lidar=scans.T_camera_lidar,
+            reference=scans.reference,
+            options=options,
+            resumes=recorded is not None,
+            mirror=mirror,
+        ) as run,
+    ):
         with apart or nullcontext():
             if recorded is not None:
                 _take_over(run, recorded, scans, watch, quiet=quiet)
             interrupted = _process(run, scans, watch, quiet=quiet)
+        if interrupted and run.num_steps == 0:
+            when_stopped("no scan was mapped, nothing was written")
+            raise typer.Exit(EXIT_STATUS)
         resumed = {} if recorded is None else {"num_scans_resumed": run.num_scans_resumed}
-        metrics = finish(run, scans.reference, map_files=map_files, json=json, quiet=quiet, more=resumed)
+        metrics = finish(run, scans.reference, map_files=map_files, json=json, quiet=quiet, more=lambda _: resumed)
     if interrupted:
-        say(f"stopped: {metrics['num_scans']} of {len(scans)} scans are mapped", quiet=quiet)
-        raise typer.Exit(130)
+        when_stopped(f"{metrics['num_scans']} of {len(scans)} scans are mapped; {go_on}")
+        raise typer.Exit(EXIT_STATUS)
+    if metrics.get("localised_percent") == 0.0:
+        say(f"segslam: {scans.name}: no scan was found in the old map; {folder} has the odometry alone")
+        raise typer.Exit(1)
 
 
 def _take_over(
@@ -187,7 +285,7 @@ def _take_over(
         for step in progress(run.resume(recorded, scans), total=recorded.num_steps(), title="resume", quiet=quiet):
             watch(step)
     except KeyboardInterrupt as interrupt:
-        raise typer.Exit(130) from interrupt
+        raise typer.Exit(EXIT_STATUS) from interrupt
 
 
 def _process(run: "Run", scans: "Dataset", watch: "Callable[[Step | BadScan], None]", *, quiet: bool) -> bool:
@@ -198,29 +296,3 @@ def _process(run: "Run", scans: "Dataset", watch: "Callable[[Step | BadScan], No
             watch(step)
         return False
     return True
-
-
-def _given_odometry(file: Path, scans: "Dataset", config: "OdometryConfig") -> "Odometry":
-    """TUM rows are found by stamp; KITTI rows by the scan's number, or by its place if there is a row for each scan."""
-    import numpy as np
-
-    from segslam.odometry import GivenOdometry
-    from segslam.trajectory import read_poses
-    from segslam.types import SegslamError, Trajectory
-
-    poses = read_poses(file)
-    if poses.stamp_ns is not None:
-        trajectory = Trajectory(np.arange(len(poses)), poses.stamp_ns, poses.T_a_b)
-        return GivenOdometry(trajectory, config, match="stamp")
-    by_number = len(poses) > int(scans.scan_index.max())
-    if not by_number and len(poses) != len(scans):
-        raise SegslamError(f"{file}: {len(poses)} poses for {len(scans)} scans; give one a scan, or TUM's format")
-    rows = np.arange(len(poses)) if by_number else scans.scan_index
-    return GivenOdometry(Trajectory(rows, np.zeros(len(poses), dtype=np.int64), poses.T_a_b), config)
-
-
-def _labeller(scans: "Dataset") -> "Labeller | None":
-    """None, for labels by shape, unless `--labels` says that scans without labels stay so."""
-    from segslam.semantics.label_files import unlabelled
-
-    return None if scans.labels.geometric else lambda points: unlabelled(len(points))

@@ -1,34 +1,49 @@
 """`segslam optimize`."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from segslam.cli.console import JsonOption, QuietOption, print_json, say
+from segslam.cli.console import JsonOption, QuietOption, announce, print_json, say
 from segslam.errors import SegslamError
+from segslam.system.whole_files import check_target, whole_file
+
+if TYPE_CHECKING:
+    from segslam.pose_graph import Optimized
 
 
 def optimize(
-    graph: Annotated[Path, typer.Argument(help="A g2o file with VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines.")],
-    out: Annotated[Path, typer.Option(help="The g2o file to write: the same edges, the vertices at the optimum.")],
+    graph: Annotated[Path, typer.Argument(help="g2o file with VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines.")],
+    out: Annotated[Path, typer.Option(help="g2o file to write: the same edges, with the optimised vertices.")],
     robust: Annotated[
-        Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"],
-        typer.Option(help="Least squares, a robust kernel, or graduated non-convexity for edges between distant ids."),
-    ] = "none",
+        Literal["none", "huber", "cauchy", "geman-mcclure", "gnc", "consistent"],
+        typer.Option(
+            help="Treatment of edges between distant ids. consistent: reject outliers, starting from the largest "
+            "pairwise-consistent set, as map does; gnc: reject outliers by graduated non-convexity; huber, cauchy, "
+            "geman-mcclure: robust kernel; none: keep all (least squares)."
+        ),
+    ] = "consistent",
+    force: Annotated[bool, typer.Option("--force", help="Replace the file --out if it exists.")] = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Optimise a pose graph. Errors are GTSAM's, half the chi-square.
+    """Optimise a pose graph. Errors are half the chi-square, as GTSAM's, of the edges that were not rejected.
 
-    Example: segslam optimize parking-garage.g2o --out optimum.g2o --robust gnc
+    A result that may be wrong is reported as such, with the reason.
+
+    Example: segslam optimize parking-garage.g2o --out optimum.g2o
     """
-    if not out.parent.is_dir():
-        raise SegslamError(f"--out {out}: there is no folder {out.parent}; make it first")
+    check_target(out)
+    if out.exists() and not force:
+        raise SegslamError(f"--out {out}: exists; name another file, or replace it with --force")
+    announce(f"optimize: reading {graph}", quiet=quiet)
     from segslam.pose_graph import optimize_graph, read_g2o, write_g2o
 
     result = optimize_graph(read_g2o(graph), robust=robust)
-    write_g2o(out, result.graph)
+    with whole_file(out) as part:
+        write_g2o(part, result.graph)
     if json:
         print_json(
             {
@@ -37,11 +52,29 @@ def optimize(
                 "iterations": result.iterations,
                 "seconds": result.seconds,
                 "num_outliers": result.num_outliers,
+                "robust": result.robust,
+                "robust_cost": result.robust_cost,
+                "outliers": result.outliers,
+                "chi2_per_dof": result.chi2_per_dof,
+                **dict(zip(("chi2_median", "chi2_p95", "chi2_max"), result.chi2_quantiles, strict=True)),
+                "converged": result.converged,
+                "doubts": result.doubts,
             }
         )
     else:
-        say(
-            f"error {result.initial_error:.6g} -> {result.final_error:.6g} in {result.iterations} iterations, "
-            f"{result.seconds:.3f} s; {result.num_outliers} outliers; written to {out}",
-            quiet=quiet,
-        )
+        for line in _lines(result, out):
+            say(line, quiet=quiet)
+        for doubt in result.doubts:
+            say(f"the result may be wrong: {doubt}", quiet=quiet)
+
+
+def _lines(result: "Optimized", out: Path) -> Iterator[str]:
+    yield (
+        f"error {result.initial_error:.6g} -> {result.final_error:.6g} (half the chi-square of the edges kept) in "
+        f"{result.iterations} iterations, {result.seconds:.3f} s; {result.num_outliers} outliers; written to {out}"
+    )
+    if result.robust_cost is not None:
+        yield f"cost under the kernel {result.robust}: {result.robust_cost:.6g}"
+    median, p95, most = result.chi2_quantiles
+    per_dof = "none redundant" if result.chi2_per_dof is None else f"{result.chi2_per_dof:.3g} per degree of freedom"
+    yield f"chi-square of all edges but outliers: {per_dof}; median {median:.3g}, 95 % {p95:.3g}, largest {most:.3g}"

@@ -6,22 +6,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from segslam.cli.checks import check_exists
+from segslam.cli.compiling import compile_kernels
 from segslam.cli.console import (
     ConfigOption,
     EncodingOption,
     JsonOption,
     QuietOption,
     SetOption,
+    announce,
     print_json,
+    print_out,
     say,
 )
-from segslam.experiments.settings import METHOD_NAMES
+from segslam.experiments.method_settings import METHOD_NAMES, check_method
 
 if TYPE_CHECKING:
-    from segslam.alignment import Stopwatch
     from segslam.config import Config
     from segslam.experiments.estimate import Estimate
-    from segslam.types import Labels, Points, Rejected
+    from segslam.registration import Stopwatch
+    from segslam.types import Labels, Points, Rejected, ScanLabels
 
 LABEL_WORDS = ("geometric", "none")
 
@@ -30,58 +34,70 @@ class LabelsCommand(TyperCommand):
     """Takes `--labels S T` as well as `--labels geometric`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Repeat the option before its second value, which is how click takes two."""
+        """Repeat the option before its second value, because click accepts one value per option."""
         if "--labels" in args:
             second = args.index("--labels") + 2
-            if second < len(args) and not _is_word(args[second - 1]):
+            if second < len(args) and not _is_word(args[second - 1]) and not args[second].startswith("-"):
                 args = [*args[:second], "--labels", *args[second:]]
         return super().parse_args(ctx, args)
 
 
 def _is_word(label_source: str) -> bool:
-    """Whether it labels both scans, as no file does."""
+    """Whether the value is a labelling method for both scans, not a file."""
     return label_source in LABEL_WORDS or label_source.startswith("network:")
 
 
 def register(
-    source: Annotated[Path, typer.Argument(help="Scan that is moved: .bin, .npy, .ply or .pcd.")],
-    target: Annotated[Path, typer.Argument(help="Scan that stays.")],
-    dataset: Annotated[str | None, typer.Option(help="kitti: apply KITTI's vertical-angle correction.")] = None,
+    source: Annotated[Path, typer.Argument(help="Scan to be moved: .bin, .npy, .ply or .pcd.")],
+    target: Annotated[Path, typer.Argument(help="Fixed scan.")],
+    dataset: Annotated[str | None, typer.Option(help="kitti: apply KITTI's correction of the vertical angles.")] = None,
     labels: Annotated[
         list[str] | None,
-        typer.Option(help="Two .label files, source's and target's; geometric (default); network:MODEL.onnx; none."),
+        typer.Option(
+            help="Labels: two .label files (source, target), geometric (default), network:MODEL.onnx, or none."
+        ),
     ] = None,
     encoding: EncodingOption = None,
-    method: Annotated[str, typer.Option(help=f"One of {', '.join(METHOD_NAMES)}.")] = "segregator-c2f",
+    method: Annotated[str, typer.Option(help=f"Method: {', '.join(METHOD_NAMES)}.")] = "segregator-c2f",
     refine: Annotated[
-        bool, typer.Option("--refine/--no-refine", help="Of segregator-c2f: sharpen the coarse pose by ICP.")
+        bool, typer.Option("--refine/--no-refine", help="Refine the coarse pose with GICP (method segregator-c2f).")
     ] = True,
     config: ConfigOption = None,
     settings: SetOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Align two scans with no initial guess.
+    """Find the pose of one scan in another, without an initial guess. Exit status 1 if no pose is found.
 
     Example: segslam register 000000.bin 004413.bin --dataset kitti --labels 000000.label 004413.label
     """
-    from segslam.alignment import Stopwatch
     from segslam.config import load_config
-    from segslam.experiments.methods import find_method, prepare
+
+    for scan in (source, target):
+        check_exists(scan, "give two files of scans")
+    check_method(method)
+    settings_now = load_config(config, settings or ())
+    announce(f"register: reading {source} and {target}", quiet=quiet)
+    from segslam.experiments.methods import find_method, prepare_parts
+    from segslam.registration import Stopwatch
 
     if method == "segregator-c2f" and not refine:
         method = "segregator"
     chosen = find_method(method)
-    settings_now = load_config(config, settings or ())
-    clouds = _read(source, target, dataset, labels, encoding, settings_now)
+    compile_kernels(quiet=quiet)
     watch = Stopwatch()
+    clouds = _read(source, target, dataset, labels, encoding, settings_now, watch)
     scans: list[dict[str, Any]] = []
     for name, (points, classes) in zip(("source", "target"), clouds, strict=True):
         with watch(f"describe_{name}"):
-            parts = prepare(points, classes, methods=[method], config=settings_now)
+            parts = prepare_parts(points, classes, methods=[method], config=settings_now)
         scans.append({part: made.value for part, made in parts.items()})
     found = chosen.align(scans[0], scans[1], settings_now, watch)
-    _show(_figures(found, watch), json=json, quiet=quiet)
+    figures = _figures(found, watch)
+    _show(figures, json=json, quiet=quiet)
+    if not figures["accepted"]:
+        say(f"rejected: {figures['reason']} ({figures['detail']})")
+        raise typer.Exit(1)
 
 
 def _read(
@@ -91,23 +107,30 @@ def _read(
     labels: list[str] | None,
     encoding: Any,
     config: "Config",
+    watch: "Stopwatch",
 ) -> list[tuple["Points", "Labels"]]:
-    """The two scans with their labels, in step."""
-    from segslam.alignment import shape_labels
+    """Points and labels of the two scans."""
     from segslam.datasets.clouds import read_cloud, read_intensities
-    from segslam.datasets.kitti import correct_vertical_angle
+    from segslam.datasets.kitti import VERTICAL_ANGLE_DEG
     from segslam.datasets.scans import make_scan
+    from segslam.registration import shape_labels
     from segslam.semantics.label_files import encoding_of, open_labels, read_labels
+    from segslam.semantics.late import made
     from segslam.types import SegslamError
 
     if dataset not in (None, "kitti"):
-        raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; leave the option out")
+        raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; omit the option for other data")
+    angle_deg = config.sensor.vertical_angle_deg
+    if angle_deg is None:
+        angle_deg = VERTICAL_ANGLE_DEG if dataset == "kitti" else 0.0
     stored = [read_cloud(file) for file in (source, target)]
     words = labels or ["geometric"]
     if len(words) == 2:
         files = [Path(word) for word in words]
         numbering = encoding or encoding_of(files)
-        classes = [read_labels(file, len(points), numbering) for file, points in zip(files, stored, strict=True)]
+        classes: list[ScanLabels] = [
+            read_labels(file, len(points), numbering) for file, points in zip(files, stored, strict=True)
+        ]
     elif _is_word(words[0]):
         labeller = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None)
         classes = [
@@ -118,15 +141,15 @@ def _read(
         raise SegslamError(
             f"--labels {words[0]}: give two .label files, the source's and the target's, or geometric, or network:MODEL"
         )
-    corrected = [correct_vertical_angle(points) if dataset == "kitti" else points for points in stored]
     scans = [
-        make_scan(file, 0, 0, points, ids)
-        for file, points, ids in zip((source, target), corrected, classes, strict=True)
+        make_scan(file, 0, 0, points, ids, vertical_angle_deg=angle_deg)
+        for file, points, ids in zip((source, target), stored, classes, strict=True)
     ]
-    return [
-        (scan.points, shape_labels(scan.points, config=config) if words[0] == "geometric" else scan.labels)
-        for scan in scans
-    ]
+    with watch("label"):
+        return [
+            (scan.points, shape_labels(scan.points, config=config) if words[0] == "geometric" else made(scan.labels))
+            for scan in scans
+        ]
 
 
 def _figures(found: "Estimate | Rejected", watch: "Stopwatch") -> dict[str, Any]:
@@ -137,9 +160,9 @@ def _figures(found: "Estimate | Rejected", watch: "Stopwatch") -> dict[str, Any]
         reason, detail = found.reason.value, found.detail
     else:
         pose = found.T_target_source.ravel().tolist()
-    told = {key: getattr(found, key, None) for key in ("num_correspondences", "num_edges", "num_inliers", "overlap")}
+    shown = {key: getattr(found, key, None) for key in ("num_correspondences", "num_edges", "num_inliers", "overlap")}
     answer = {"accepted": reason is None, "reason": reason, "detail": detail, "T_target_source": pose}
-    return answer | told | {"seconds": watch.seconds}
+    return answer | shown | {"seconds": watch.seconds}
 
 
 def _show(figures: dict[str, Any], *, json: bool, quiet: bool) -> None:
@@ -149,10 +172,9 @@ def _show(figures: dict[str, Any], *, json: bool, quiet: bool) -> None:
         print_json(figures)
         return
     if not figures["accepted"]:
-        say(f"rejected: {figures['reason']} ({figures['detail']})", quiet=quiet)
         return
     rows = np.array(figures["T_target_source"]).reshape(4, 4)
-    print("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
+    print_out("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
     overlap = "" if figures["overlap"] is None else f", overlap {figures['overlap']:.2f}"
     times = ", ".join(f"{stage} {1000 * seconds:.0f} ms" for stage, seconds in figures["seconds"].items())
     inliers = "" if figures["num_inliers"] is None else f"{figures['num_inliers']} inliers{overlap}; "

@@ -1,24 +1,28 @@
 """`segslam replay`."""
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from itertools import tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import changed_settings
-from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, progress
+from segslam.cli.checks import changed_settings, check_exists
+from segslam.cli.compiling import compile_kernels
+from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, progress
 from segslam.cli.ending import finish
+from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
+from segslam.cli.in_map import pipeline
+from segslam.system.interrupts import EXIT_STATUS, when_stopped
 
 if TYPE_CHECKING:
     from segslam.config import Config
     from segslam.log import RunLog
-    from segslam.runs import Run
+    from segslam.run.run import Run
     from segslam.types import Step, Trajectory
 
-BEFORE_THE_KEYFRAMES = ("odometry", "keyframes", "geometric")
-"""Sections of the settings whose work the log holds done."""
+BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "keyframes", "geometric")
+"""Sections of the settings that a replay cannot change, because the log holds their results."""
 
 
 def replay(
@@ -26,37 +30,55 @@ def replay(
     out: Annotated[Path, typer.Option(help="New folder for the run.")],
     config: ConfigOption = None,
     settings: SetOption = None,
+    foxglove: FoxgloveOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Do a run again from its log: loops and graph, with its settings but for those given here.
+    """Repeat loop closing and optimisation from the log of a run, with some settings changed.
 
     Example: segslam replay runs/00/log.mcap --out runs/00-strict --set verify.min_overlap=0.6
     """
     from segslam.config import load_config
+
+    check_exists(log, "give a run folder, or its log.mcap")
+    load_config(config, settings or ())  # a wrong setting is refused before the log is read
+    announce(f"replay: reading {log}", quiet=quiet)
     from segslam.log import read_log
-    from segslam.run_files import new_folder
-    from segslam.runs import Run
+    from segslam.run.folder import log_of, new_folder
+    from segslam.run.run import Run
     from segslam.slam import Slam
 
-    recorded = read_log(log)
+    recorded = read_log(log_of(log))
     settings_now = load_config(config, settings or (), base=recorded.config)
     _check_settings(settings_now, recorded)
     reference = recorded.reference()
-    with Run(
-        new_folder(out),
-        Slam(settings_now),
-        dataset=recorded.run["dataset"],
-        T_camera_lidar=recorded.T_camera_lidar,
-        reference=reference,
-    ) as run:
+    in_map = recorded.options.get("in_map")
+    slam_of = pipeline(Path(in_map) if in_map else None)
+    compile_kernels(quiet=quiet)
+    with ExitStack() as stack:
+        server = serve_foxglove(foxglove, stack, quiet=quiet)
+        folder = new_folder(out)
+        when_stopped(f"the log in {folder} is kept, without results")
+        run = stack.enter_context(
+            Run(
+                folder,
+                (slam_of or Slam)(settings_now),
+                dataset=recorded.run["dataset"],
+                T_camera_lidar=recorded.T_camera_lidar,
+                reference=reference,
+                options={"in_map": in_map} if in_map else {},
+                mirror=server.send if server else None,
+            )
+        )
         changes, interrupted = _repeat(run, recorded, quiet=quiet)
-        asked_alike = not interrupted and settings_now.refine == recorded.config.refine
+        if interrupted and run.num_steps == 0:
+            when_stopped("nothing was written")
+            raise typer.Exit(EXIT_STATUS)
         more = changes | _recorded_accuracy(recorded, reference)
-        angles = recorded.angles() if asked_alike else None
-        finish(run, reference, angles=angles, json=json, quiet=quiet, more=more)
+        finish(run, reference, json=json, quiet=quiet, more=lambda _: more)
     if interrupted:
-        raise typer.Exit(130)
+        when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps are replayed; results in {folder}")
+        raise typer.Exit(EXIT_STATUS)
 
 
 def _check_settings(settings_now: "Config", recorded: "RunLog") -> None:
@@ -66,13 +88,13 @@ def _check_settings(settings_now: "Config", recorded: "RunLog") -> None:
     for key, before, _ in changed_settings(recorded.config, settings_now):
         if key.partition(".")[0] in BEFORE_THE_KEYFRAMES:
             raise SegslamError(
-                f"{key}: a replay takes the keyframes as {recorded.path} has them, made with {before}; "
-                "leave it so, or map the data again"
+                f"{key}: a replay uses the keyframes of {recorded.path}, which were made with {before}; "
+                "keep that value, or map the data again"
             )
 
 
 def _repeat(run: "Run", recorded: "RunLog", *, quiet: bool) -> tuple[dict[str, Any], bool]:
-    """Repeat every step. How many loops came and went, and whether Ctrl-C ended it before the last step."""
+    """Repeat every step. Returns the numbers of new and lost loops, and whether Ctrl-C ended it early."""
     before: set[tuple[int, int]] = set()
     after: set[tuple[int, int]] = set()
     originals, sources = tee(recorded.steps())  # read in turn: only one step is kept
@@ -94,8 +116,8 @@ def _closures(step: "Step") -> set[tuple[int, int]]:
 
 
 def _recorded_accuracy(recorded: "RunLog", reference: "Trajectory | None") -> dict[str, Any]:
-    """The error of the run that is replayed, if the truth is known and it was finished."""
-    from segslam.runs import trajectory_accuracy
+    """The error of the replayed run, if it was finished and has ground truth."""
+    from segslam.run.accuracy import trajectory_accuracy
 
     result = recorded.result()
     if reference is None or result is None:

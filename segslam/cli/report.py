@@ -5,21 +5,23 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.console import JsonOption, QuietOption, print_json, say
+from segslam.cli.console import JsonOption, QuietOption, announce, print_json, say
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Run folder; report.html is written there.")],
+    run: Annotated[Path, typer.Argument(help="Run folder; report.html is written into it.")],
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Draw a run: one HTML page with plots and tables.
+    """Write the report of a run again: one HTML page with the map, plots and tables.
 
     Example: segslam report runs/00
     """
-    from segslam.report import write_report
+    announce(f"report: reading {run}", quiet=quiet)
+    from segslam.run.folder import folder_of
+    from segslam.run.report import write_report
 
-    page = write_report(run)
+    page = write_report(folder_of(run))
     if json:
         print_json({"report": str(page)})
     else:

@@ -5,50 +5,70 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.console import JsonOption, QuietOption, print_json, progress, say
-from segslam.interrupts import interrupts_wait
+from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
+from segslam.errors import WorkFailed
+from segslam.system.interrupts import EXIT_STATUS, interrupts_wait, same_command_with, when_stopped
 
 
 def simulate(
-    out: Annotated[Path, typer.Argument(help="Folder to write; it becomes KITTI's: sequences/NN/..., poses/NN.txt.")],
+    out: Annotated[Path, typer.Argument(help="Folder to write, in KITTI's layout: sequences/NN/..., poses/NN.txt.")],
     sequence: Annotated[str, typer.Option(help="Name of the sequence to write.")] = "00",
     poses: Annotated[
         Path | None,
-        typer.Option(help="Drive along this KITTI pose file (camera frame), levelled; else a made-up loop of streets."),
+        typer.Option(
+            help="KITTI pose file (camera frame) to drive along, heights levelled; default: a made-up loop of streets."
+        ),
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; all of the drive unless given.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same scans.")] = 0,
-    sensor: Annotated[str, typer.Option(help="hdl64 (KITTI's), os1-64 or vlp16.")] = "hdl64",
+    frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; default: the whole drive.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same scans.")] = 0,
+    sensor: Annotated[str, typer.Option(help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16.")] = "hdl64",
+    lane: Annotated[
+        float, typer.Option(min=-4, max=4, help="Drive so far to the left of the path (m); negative: to the right.")
+    ] = 0.0,
+    reverse: Annotated[bool, typer.Option("--reverse", help="Drive the path from its end to its start.")] = False,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change the world or the sensor, as in world.cars=3."),
+        typer.Option(
+            "--set",
+            metavar="SECTION.KEY=VALUE",
+            help="Change a setting of the world or the sensor, for example world.cars=3.",
+        ),
     ] = None,
     pairs: Annotated[
         list[Path] | None,
-        typer.Option("--pairs", help="Write only the scans that this list of pairs names; may be repeated."),
+        typer.Option("--pairs", help="Write only the scans named in this list of pairs; may be repeated."),
     ] = None,
     sample: Annotated[
-        int | None, typer.Option(min=1, help="Of so many pairs of each list: those of bench's --sample with --seed 0.")
+        int | None, typer.Option(min=1, help="Keep only N pairs of each list, drawn as by `bench --sample N --seed 0`.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a sequence that was simulated here.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier simulated sequence in this folder.")
+    ] = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate a labelled drive in KITTI's format, with exact poses.
 
+    Another day in the same streets has the same --seed and --set world.day=1; its true poses are in the same frame.
+
     Example: segslam simulate streets --sequence 06 --poses kitti/poses/06.txt --frames 300 --seed 1
     """
+    announce(f"simulate: making a drive in {out}", quiet=quiet)
     from segslam import simulation
 
     config = simulation.simulation_config(sensor, settings or ())
     drive = simulation.made_up_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
+    driven = simulation.in_lane(drive, left_m=lane, reverse=reverse)
     total = min(frames or len(drive.time_s), len(drive.time_s))
     only = _named(pairs, total, sample=sample) if pairs else None
     total = len(only) if only is not None else total
     simulation.prepare_folder(out, sequence, overwrite=overwrite)
-    say(f"building the streets of {total} scans", quiet=quiet)
-    written = simulation.write_drive(out, sequence, drive, config=config, seed=seed, num_frames=frames, only=only)
+    say(f"building the world for {total} scans", quiet=quiet)
+    written = simulation.write_drive(
+        out, sequence, drive, config=config, seed=seed, driven=driven, num_frames=frames, only=only
+    )
     last = 0
+    begin_again = f"to begin again: {same_command_with('--overwrite')}"
     try:
         with interrupts_wait() as interrupts:
             for done in progress(written, total=total, title="simulate", quiet=quiet):
@@ -56,8 +76,10 @@ def simulate(
                 if interrupts:
                     break
     except KeyboardInterrupt:
-        say(f"stopped: {last} scans are complete in {out / 'sequences' / sequence}", quiet=quiet)
-        raise typer.Exit(130) from None
+        when_stopped(f"{last} scans are complete in {out / 'sequences' / sequence}; {begin_again}")
+        raise typer.Exit(EXIT_STATUS) from None
+    except WorkFailed as error:
+        raise WorkFailed(f"{error}; {begin_again}") from error
     folder, true_poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
     if json:
         print_json({"num_scans": last, "sequence": str(folder), "poses": str(true_poses)})
@@ -74,6 +96,6 @@ def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]
     only = scans_named(lists if sample is None else [sample_pairs(one, num_pairs=sample, seed=0) for one in lists])
     if max(only) >= num_scans:
         raise SegslamError(
-            f"--pairs: scan {max(only)} is named, the drive has {num_scans}; take the list of this drive"
+            f"--pairs: the list names scan {max(only)}, but the drive has {num_scans} scans; use the list of this drive"
         )
     return only

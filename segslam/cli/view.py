@@ -2,20 +2,25 @@
 
 import os
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from segslam.cli.console import JsonOption, QuietOption, print_json, progress, say
+from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
+from segslam.errors import SegslamError, WorkFailed
+from segslam.system.extras import how_to_install
 
 if TYPE_CHECKING:
-    from segslam.viewer import Scene
+    from segslam.run.viewer import Scene
 
 
 def view(
     run: Annotated[Path, typer.Argument(help="Run folder, finished or not.")],
-    save: Annotated[Path | None, typer.Option(help="Write a .rrd file for Rerun in place of opening it.")] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="Write a .rrd file for Rerun instead of opening the viewer.")
+    ] = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -23,50 +28,75 @@ def view(
 
     Example: segslam view runs/00
     """
+    if save is None:
+        check_display()
+    announce(f"view: reading {run}", quiet=quiet)
     from segslam.log import read_log
-    from segslam.run_files import LOG
+    from segslam.run.folder import log_of
+    from segslam.system.whole_files import whole_file
 
-    log = read_log(run / LOG)
-    scene = open_scene(save, view_every=log.config.log.view_every)
-    num_steps = 0
-    for step in progress(log.steps(), total=log.num_steps(), title="view", quiet=quiet):
-        scene.add(step)
-        num_steps += 1
-    scene.end()
+    log = read_log(log_of(run))
+    with nullcontext() if save is None else whole_file(save) as part:
+        scene = open_scene(part, view_every=log.config.log.view_every, named=save)
+        num_steps = 0
+        for step in progress(log.steps(), total=log.num_steps(), title="view", quiet=quiet):
+            scene.add(step)
+            num_steps += 1
+        close_scene(scene, save)
     if json:
         print_json({"num_steps": num_steps, "file": str(save) if save else None})
     else:
         say(f"written to {save}" if save else "all steps are in the viewer", quiet=quiet)
 
 
-def open_scene(save: Path | None, *, view_every: int) -> "Scene":
-    """An empty scene in a new viewer, or in a file. Raises SegslamError if there is no viewer."""
-    from segslam.types import SegslamError
+def check_display() -> None:
+    """Raises SegslamError if no window can be opened: the viewer would wait without a message."""
+    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))
+    if sys.platform == "linux" and not has_display:
+        raise SegslamError(
+            "no display here: write a file with `segslam view RUN --save run.rrd`, and open it with rerun on a "
+            "machine that has one"
+        )
 
+
+def open_scene(file: Path | None, *, view_every: int, named: Path | None = None) -> "Scene":
+    """An empty scene in a new viewer, or in a file, which messages call `named`. Raises SegslamError if it fails."""
+    os.environ.setdefault("RUST_LOG", "off")  # otherwise Rerun prints every action
     try:
         import rerun
 
-        from segslam.viewer import Scene
+        from segslam.run.viewer import Scene
     except ImportError as error:
         raise SegslamError(
-            "the viewer is a package of its own: pip install 'segslam[viewer]' (or open log.mcap in Foxglove)"
+            f"the viewer is a package of its own: {how_to_install('viewer')} (or open log.mcap in Foxglove)"
         ) from error
     viewer = rerun.RecordingStream("segslam")
     try:
-        if save is None:
-            _help_the_viewer()
+        if file is None:
+            _find_beside_python()
             viewer.spawn()
         else:
-            viewer.save(save)
+            viewer.save(file)
+        return Scene(viewer, view_every=view_every)
     except (OSError, RuntimeError) as error:
-        reason = str(error).partition("\n")[0]
-        raise SegslamError(
-            f"{save or 'the viewer'}: cannot be opened ({reason}); --save FILE.rrd needs none"
-        ) from error
-    return Scene(viewer, view_every=view_every)
+        raise _no_viewer(named, error) from error
 
 
-def _help_the_viewer() -> None:
-    """Have it found where Python is, which need not be on the path, and keep it from telling of all that it does."""
+def close_scene(scene: "Scene", file: Path | None) -> None:
+    """Wait until the viewer, or the file, has all. Raises SegslamError if it does not take it."""
+    try:
+        scene.end()
+    except (OSError, RuntimeError) as error:
+        raise _no_viewer(file, error) from error
+
+
+def _no_viewer(file: Path | None, error: Exception) -> SegslamError:
+    reason = str(error).partition("\n")[0]
+    if file is None:
+        return SegslamError(f"the viewer cannot be opened or does not answer ({reason}); --save FILE.rrd needs none")
+    return WorkFailed(f"{file}: cannot be written ({reason}); make room there, or name another place")
+
+
+def _find_beside_python() -> None:
+    """Have the viewer found where Python is, which need not be on the path."""
     os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
-    os.environ.setdefault("RUST_LOG", "error")

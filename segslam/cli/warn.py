@@ -6,7 +6,7 @@ from collections import Counter
 
 
 class FirstOfEachKind(logging.Handler):
-    """Warnings are of one kind if the same words were filled in with other values."""
+    """Prints the first warning of each kind and counts the others; a kind is a logger and a message template."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -14,15 +14,15 @@ class FirstOfEachKind(logging.Handler):
         self._first: dict[tuple[str, str], str] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Tell of it, or count it."""
+        """Print or count a warning."""
         kind = (record.name, str(record.msg))
         self._told[kind] += 1
         if kind not in self._first:
             self._first[kind] = f"{record.levelname}: {record.getMessage()}"
             print(f"segslam: {self._first[kind]}", file=sys.stderr)
 
-    def tell_counts(self) -> None:
-        """One line for each kind that came again."""
+    def print_counts(self) -> None:
+        """Print the number of further warnings of each kind."""
         for kind, num_told in self._told.items():
             if num_told > 1:
                 print(f"segslam: {num_told - 1} more like this one: {self._first[kind]}", file=sys.stderr)

@@ -2,10 +2,11 @@
 
 import numpy as np
 from jaxtyping import Bool, UInt64
-from numba import njit
+
+from segslam.system.kernels import kernel
 
 Bits = UInt64[np.ndarray, "_ _"]
-"""A row a vertex: bit k of word w says whether there is an edge to vertex 64 w + k."""
+"""One row per vertex: bit k of word w is 1 for an edge to vertex 64 w + k."""
 
 
 def pack_rows(joined: Bool[np.ndarray, "n n"]) -> Bits:
@@ -16,7 +17,7 @@ def pack_rows(joined: Bool[np.ndarray, "n n"]) -> Bits:
     return np.packbits(padded, axis=1, bitorder="little").view(np.uint64)
 
 
-@njit("uint64(uint64)", cache=True, nogil=True, inline="always")
+@kernel("uint64(uint64)")
 def count_bits(word):
     """How many bits are set, added up in fields of 2, 4 and 8 bits."""
     word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
@@ -25,13 +26,13 @@ def count_bits(word):
     return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
-@njit("int64(uint64)", cache=True, nogil=True, inline="always")
+@kernel("int64(uint64)")
 def lowest_bit(word):
     """Position of the lowest bit set; `word` is not 0."""
     return np.int64(count_bits((word & (~word + np.uint64(1))) - np.uint64(1)))
 
 
-@njit("uint64(uint64[::1])", cache=True, nogil=True, inline="always")
+@kernel("uint64(uint64[::1])")
 def pack_flags(eights):
     """One word from 64 bytes of 0 or 1, eight at a time: the product gathers the lowest bits in its highest byte."""
     word = np.uint64(0)
@@ -40,7 +41,7 @@ def pack_flags(eights):
     return word
 
 
-@njit("int64(uint64[::1], int64[::1])", cache=True, nogil=True)
+@kernel("int64(uint64[::1], int64[::1])")
 def members(row, out):
     """Writes the positions of the bits set in `row`, ascending, and returns how many."""
     count = 0
@@ -53,7 +54,7 @@ def members(row, out):
     return count
 
 
-@njit("int64[:, ::1](uint64[:, ::1])", cache=True, nogil=True)
+@kernel("int64[:, ::1](uint64[:, ::1])")
 def pairs(adjacency):
     """Joined vertices i < j, a row each, in ascending order."""
     count = len(adjacency)
@@ -72,7 +73,7 @@ def pairs(adjacency):
     return found
 
 
-@njit("void(uint64[:, ::1], int64[:, ::1])", cache=True, nogil=True)
+@kernel("void(uint64[:, ::1], int64[:, ::1])")
 def part(adjacency, parted):
     """Takes away the edges between the vertices of each row."""
     for row in range(len(parted)):

@@ -9,9 +9,9 @@ bit-parallel algorithm for the maximum clique problem", C&OR 2011).
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from segslam.cliques.bits import Bits, count_bits, lowest_bit, members
+from segslam.system.kernels import kernel
 from segslam.types import Indices
 
 _FLOOR, _SIZE, _FOUND, _NODES = range(4)  # what `state` holds: only larger cliques count; size and number of those kept
@@ -43,7 +43,7 @@ def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> Cli
     return CliqueSearch(tuple(np.sort(clique) for clique in cliques), proved)
 
 
-@njit("UniTuple(int64[::1], 2)(uint64[:, ::1])", cache=True, nogil=True)
+@kernel("UniTuple(int64[::1], 2)(uint64[:, ::1])")
 def degeneracy_order(adjacency):
     """Vertices as repeatedly taken with the fewest neighbours left, and the core number of each vertex."""
     count = len(adjacency)
@@ -51,10 +51,11 @@ def degeneracy_order(adjacency):
     degree = np.empty(count, np.int64)
     for v in range(count):
         degree[v] = members(adjacency[v], neighbours)
-    starts = np.zeros(degree.max() + 2, np.int64)  # of the vertices of each degree in `order`
+    starts = np.zeros(count + 1, np.int64)  # of the vertices of each degree in `order`
     for v in range(count):
         starts[degree[v] + 1] += 1
-    starts = np.cumsum(starts)
+    for k in range(count):
+        starts[k + 1] += starts[k]
     order, place = np.empty(count, np.int64), np.empty(count, np.int64)
     cursor = starts.copy()
     for v in range(count):
@@ -75,7 +76,7 @@ def degeneracy_order(adjacency):
     return order, degree
 
 
-@njit("uint64[:, ::1](uint64[:, ::1], int64[::1])", cache=True, nogil=True)
+@kernel("uint64[:, ::1](uint64[:, ::1], int64[::1])")
 def _induced(adjacency, vertices):
     """The adjacency among some vertices, renumbered as listed."""
     count = len(vertices)
@@ -90,11 +91,7 @@ def _induced(adjacency, vertices):
     return local
 
 
-@njit(
-    "Tuple((int64, int64[::1], int64[::1]))(uint64[:, ::1], uint64[::1], int64, int64, int64[::1], int64[::1])",
-    cache=True,
-    nogil=True,
-)
+@kernel("Tuple((int64, int64[::1], int64[::1]))(uint64[:, ::1], uint64[::1], int64, int64, int64[::1], int64[::1])")
 def _colour(adjacency, candidates, spare, top, branches, bounds):
     """Pushes the candidates that could begin a clique of more than `spare`, each with a bound of its size.
 
@@ -126,19 +123,18 @@ def _colour(adjacency, candidates, spare, top, branches, bounds):
     return top, branches, bounds
 
 
-@njit("void(int64[::1], int64[:, ::1], int64[::1])", cache=True, nogil=True)
+@kernel("void(int64[::1], int64[:, ::1], int64[::1])")
 def _keep(clique, found, state):
     """Into a room for one it comes in place of the smaller one there, and raises the floor."""
     state[_SIZE] = len(clique)
     if len(found) == 1:
-        found[0, : len(clique)] = clique
-        state[_FLOOR], state[_FOUND] = len(clique), 1
-    else:
-        found[state[_FOUND], : len(clique)] = clique
-        state[_FOUND] += 1
+        state[_FLOOR], state[_FOUND] = len(clique), 0
+    for k in range(len(clique)):
+        found[state[_FOUND], k] = clique[k]
+    state[_FOUND] += 1
 
 
-@njit("void(uint64[:, ::1], int64, int64[::1], int64[:, ::1], int64[::1], int64)", cache=True, nogil=True)
+@kernel("void(uint64[:, ::1], int64, int64[::1], int64[:, ::1], int64[::1], int64)")
 def _search_neighbourhood(adjacency, root, names, found, state, max_nodes):
     """Adds to `found` the cliques of `root` and some of its neighbours; `names` are theirs in the whole graph."""
     count, words = adjacency.shape
@@ -180,7 +176,7 @@ def _search_neighbourhood(adjacency, root, names, found, state, max_nodes):
             return
 
 
-@njit("int64[::1](uint64[:, ::1], int64)", cache=True, nogil=True)
+@kernel("int64[::1](uint64[:, ::1], int64)")
 def _greedy_clique(adjacency, start):
     """A clique grown from one vertex by whichever candidate leaves the most candidates."""
     count, words = adjacency.shape
@@ -204,8 +200,7 @@ def _greedy_clique(adjacency, start):
     return clique[:size]
 
 
-@njit("Tuple((int64[:, ::1], boolean))(uint64[:, ::1], int64[::1], int64[::1], int64, int64, int64)",
-      cache=True, nogil=True)  # fmt: skip
+@kernel("Tuple((int64[:, ::1], boolean))(uint64[:, ::1], int64[::1], int64[::1], int64, int64, int64)")  # fmt: skip
 def _search(adjacency, order, core_numbers, floor, room, max_nodes):
     """Cliques larger than `floor`, a row each, and whether the search came to its end.
 
@@ -213,25 +208,23 @@ def _search(adjacency, order, core_numbers, floor, room, max_nodes):
     all have the size floor + 1, which must be the greatest there is.
     """
     count = len(adjacency)
-    place = np.empty(count, np.int64)
-    for step in range(count):
-        place[order[step]] = step
     found = np.empty((room, core_numbers.max() + 1), np.int64)
     state = np.array([floor, floor, 0, 0])
     if room == 1:
         _keep(_greedy_clique(adjacency, order[count - 1]), found, state)
-    neighbours, later = np.empty(count, np.int64), np.empty(count, np.int64)
+    later = np.empty(count, np.int64)
     for step in range(count - 1, -1, -1):
         v = order[step]
         num_later = 0
         if core_numbers[v] >= state[_FLOOR]:
-            for k in range(members(adjacency[v], neighbours)):
-                if place[neighbours[k]] > step:
-                    later[num_later] = place[neighbours[k]]
+            for other in range(count - 1, step, -1):
+                u = order[other]
+                if (adjacency[v, u >> 6] >> np.uint64(u & 63)) & np.uint64(1):
+                    later[num_later] = u
                     num_later += 1
         if num_later >= state[_FLOOR]:
             state[_NODES] += num_later  # what making this neighbourhood costs, in nodes
-            candidates = order[np.sort(later[:num_later])[::-1]]
+            candidates = later[:num_later]
             _search_neighbourhood(_induced(adjacency, candidates), v, candidates, found, state, max_nodes)
         if state[_NODES] >= max_nodes or (room > 1 and state[_FOUND] == room):
             break

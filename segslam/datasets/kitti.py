@@ -4,7 +4,6 @@ A scan's number is that of its file, and its row in times.txt and in the poses; 
 the left camera's, in the frame of the first one; they leave this file as the LiDAR's.
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,18 @@ import numpy as np
 from jaxtyping import Float32
 
 from segslam import geometry
-from segslam.datasets.scans import make_scan, read_stamps, selected_rows, usable_scans
+from segslam.datasets.scans import check_num_poses, make_scan, read_stamps, selected_rows, usable_scans
 from segslam.semantics.encodings import Encoding
 from segslam.semantics.label_files import LabelSource, open_labels
 from segslam.trajectory import lidar_from_camera, read_poses
-from segslam.types import BadScan, Indices, Points, Scan, SegslamError, Trajectory, Transform
+from segslam.types import BadScan, Indices, Scan, SegslamError, Trajectory, Transform
 
 VERTICAL_ANGLE_DEG = 0.205
-"""By which KITTI's scans have their beams too low; value as in KISS-ICP (Vizzo et al., RA-L 2023)."""
+"""Angle by which the points of KITTI's scans lie too low; value as in KISS-ICP (Vizzo et al., RA-L 2023)."""
+EVERY = 11  # prime, so that the sampled rows start at each of 3 or 5 columns equally often
+FEWEST_COMPARED = 300
+ALIKE = 0.15
+"""Chosen: share of their spread by which quantiles of columns of one distribution differ at most, for 300 rows."""
 LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 """What calib.txt calls T_camera_lidar: in KITTI's odometry, object and tracking benchmark."""
 
@@ -36,7 +39,19 @@ class KittiSequence:
     labels: LabelSource
     T_camera_lidar: Transform
     reference: Trajectory | None
+    num_recorded: int
     has_intensities: bool
+    vertical_angle_deg: float
+
+    @property
+    def is_sequential(self) -> bool:
+        """Never: each scan has a file."""
+        return False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name of each scan's file, without its ending."""
+        return tuple(file.stem for file in self.scan_files)
 
     def __len__(self) -> int:
         return len(self.scan_files)
@@ -50,9 +65,10 @@ class KittiSequence:
             file,
             int(self.scan_index[row]),
             int(self.stamp_ns[row]),
-            correct_vertical_angle(points),
+            points,
             self.labels.read(file.stem, points, intensities),
             intensities=intensities if self.has_intensities else None,
+            vertical_angle_deg=self.vertical_angle_deg,
         )
 
     def __iter__(self) -> Iterator[Scan]:
@@ -72,6 +88,7 @@ def open_kitti(
     encoding: Encoding | None,
     frames: str | None,
     intensities: bool = False,
+    vertical_angle_deg: float | None = None,
 ) -> KittiSequence:
     """The sequence `sequence` of a folder with `sequences/`, or the one that the folder itself is.
 
@@ -79,7 +96,7 @@ def open_kitti(
     """
     folder, poses_file = _find_sequence(data, sequence)
     files, numbers = _numbered_scans(folder / "velodyne")
-    stamps = _stamps_of(folder / "times.txt", numbers)
+    all_stamps = _stamps_of(folder / "times.txt", numbers)
     T_camera_lidar = read_calibration(folder / "calib.txt")
     rows = selected_rows(numbers, frames, folder / "velodyne")
     chosen = tuple(files[row] for row in rows)
@@ -87,11 +104,13 @@ def open_kitti(
         name=f"kitti/{folder.name}",
         scan_files=chosen,
         scan_index=numbers[rows],
-        stamp_ns=stamps[rows],
+        stamp_ns=all_stamps[numbers[rows]],
         labels=open_labels(labels, beside=folder, scan_names=[file.stem for file in chosen], encoding=encoding),
         T_camera_lidar=T_camera_lidar,
-        reference=_reference(poses_file, numbers[rows], stamps[rows], T_camera_lidar),
+        reference=_reference(poses_file, numbers[rows], all_stamps, T_camera_lidar),
+        num_recorded=len(all_stamps),
         has_intensities=intensities,
+        vertical_angle_deg=VERTICAL_ANGLE_DEG if vertical_angle_deg is None else vertical_angle_deg,
     )
 
 
@@ -103,19 +122,27 @@ def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
         raise BadScan(f"{file}: cannot read the scan ({error})") from error
     if len(content) % 16:
         raise BadScan(
-            f"{file}: {len(content)} bytes are no multiple of 16 (float32 x y z intensity): truncated; "
-            "fetch the file again"
+            f"{file}: {len(content)} bytes are no multiple of 16 (float32 x y z intensity): truncated, or not of 4 "
+            "values a point; fetch the file again, or convert it"
         )
-    return np.frombuffer(content, dtype="<f4").reshape(-1, 4)
+    returns = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
+    if _mixes_columns(returns):
+        raise BadScan(
+            f"{file}: its four columns have one distribution, so it has another number of values a point than x y z "
+            "intensity, such as x y z; convert it, for example to .ply"
+        )
+    return returns
 
 
-def correct_vertical_angle(points: Points) -> Points:
-    """The points at the same range and azimuth, their elevation raised by 0.205 degrees; of the same dtype."""
-    cosine, sine = math.cos(math.radians(VERTICAL_ANGLE_DEG)), math.sin(math.radians(VERTICAL_ANGLE_DEG))
-    x, y, z = np.ascontiguousarray(points.T)
-    horizontal = np.maximum(np.hypot(x, y), np.finfo(x.dtype).tiny)  # a point straight above has no azimuth to keep
-    stretch = cosine - sine * z / horizontal
-    return np.stack([x * stretch, y * stretch, sine * horizontal + cosine * z], axis=1)
+def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
+    """Whether the file holds 3 or 5 values a point: each of them then falls into every column by turns."""
+    some = returns[::EVERY]
+    some = some[np.isfinite(some).all(axis=1)]
+    if len(some) < FEWEST_COMPARED:
+        return False
+    levels = np.quantile(some, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
+    spread = np.ptp(levels)
+    return bool(spread > 0 and np.ptp(levels, axis=1).max() < ALIKE * spread)
 
 
 def read_calibration(file: Path) -> Transform:
@@ -177,12 +204,12 @@ def _stamps_of(times_file: Path, numbers: Indices) -> Indices:
         raise SegslamError(
             f"{times_file}: {len(stamps)} lines, but there is a scan {numbers[-1]}; line n + 1 is the time of scan n"
         )
-    return stamps[numbers]
+    return stamps
 
 
 def _reference(poses_file: Path, numbers: Indices, stamps: Indices, T_camera_lidar: Transform) -> Trajectory | None:
     if not poses_file.exists():
         return None
     poses = lidar_from_camera(read_poses(poses_file, format="kitti").T_a_b, T_camera_lidar)
-    posed = numbers < len(poses)
-    return Trajectory(numbers[posed], stamps[posed], poses[numbers[posed]])
+    check_num_poses(poses_file, len(poses), len(stamps))
+    return Trajectory(numbers, stamps[numbers], poses[numbers])

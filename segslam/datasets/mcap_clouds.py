@@ -8,6 +8,8 @@ from typing import Any
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
+from segslam.system.extras import how_to_install
+
 MESSAGE = "sensor_msgs/msg/PointCloud2"
 
 
@@ -24,7 +26,7 @@ class McapClouds:
         try:
             from mcap_ros2.decoder import DecoderFactory
         except ImportError as error:
-            raise ImportError("reading ROS 2 messages needs a package: pip install 'segslam[recordings]'") from error
+            raise ImportError(f"reading ROS 2 messages needs a package: {how_to_install('recordings')}") from error
         self._file = file
         self._decoders = DecoderFactory()
         self._topic, self._num_clouds = _topic_and_count(file, topic)

@@ -55,7 +55,7 @@ HEADER_BYTES = FOOTER_BYTES = 32
 
 @dataclass(frozen=True, slots=True)
 class _Sensor:
-    """What the metadata say, whichever of its two layouts they have."""
+    """The metadata, from either of their two layouts."""
 
     profile: str
     port: int | None
@@ -192,7 +192,7 @@ def _read_sensor(file: Path) -> _Sensor:
             T_sensor_lidar_mm=np.asarray(values["lidar_to_sensor_transform"], dtype=float).reshape(4, 4),
         )
     except KeyError as error:
-        raise ValueError(f"{file.name} does not say {error}; it must be the metadata of an Ouster sensor") from error
+        raise ValueError(f"{file.name} has no key {error}; it must be the metadata of an Ouster sensor") from error
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:

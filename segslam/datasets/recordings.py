@@ -14,10 +14,19 @@ import numpy as np
 from mcap.exceptions import McapError
 
 from segslam.datasets.clouds import read_intensities
+from segslam.datasets.kitti import read_returns
 from segslam.datasets.mcap_clouds import McapClouds
 from segslam.datasets.ouster import OusterFrames
 from segslam.datasets.point_cloud2 import CloudReader
-from segslam.datasets.scans import ASSUMED_PERIOD_NS, make_scan, read_stamps, selected_rows, usable_scans
+from segslam.datasets.scans import (
+    ASSUMED_PERIOD_NS,
+    check_num_poses,
+    make_scan,
+    read_stamps,
+    selected_rows,
+    usable_scans,
+)
+from segslam.datasets.sweep_times import sweep_times
 from segslam.semantics.encodings import Encoding
 from segslam.semantics.label_files import LabelSource, open_labels
 from segslam.trajectory import read_poses
@@ -58,21 +67,25 @@ class Recording:
         encoding: Encoding | None,
         frames: str | None,
         intensities: bool,
+        vertical_angle_deg: float,
     ) -> None:
         beside = _beside(source)
         self.name = f"{kind}/{beside.resolve().name}"
         self._source = source
         self._loader = loader
         self._has_intensities = intensities
-        self._in_order = kind in READ_IN_ORDER
+        self.vertical_angle_deg = vertical_angle_deg
+        self.is_sequential = kind in READ_IN_ORDER
         self._clouds = CloudReader()
-        if self._in_order:
+        if self.is_sequential:
             loader.read_point_cloud = self._clouds
         self._next = 0
         self._stamps = _whole_stamps(beside / "times.txt", len(loader)) if kind == "generic" else None
+        self._is_folder = kind == "generic"
+        self.num_recorded = len(loader)
         self.scan_index = selected_rows(np.arange(len(loader)), frames, source)
-        names = [self._file(int(index)).stem for index in self.scan_index]
-        self.labels: LabelSource = open_labels(labels, beside=beside, scan_names=names, encoding=encoding)
+        self.names = [self._file(int(index)).stem for index in self.scan_index]
+        self.labels: LabelSource = open_labels(labels, beside=beside, scan_names=self.names, encoding=encoding)
         self.reference = self._reference(beside / "poses.txt" if kind == "generic" else None)
 
     def __len__(self) -> int:
@@ -84,14 +97,16 @@ class Recording:
         file = self._file(index)
         points, times = self._read(index, file)
         intensities = self._intensities(file, len(points))
+        stamp_ns = self._stamp_ns(index)
         return make_scan(
             file,
             index,
-            self._stamp_ns(index),
+            stamp_ns,
             points,
             self.labels.read(file.stem, points, intensities),
-            _from_0_to_1(times, len(points)),
+            sweep_times(times, len(points), stamp_ns * 1e-9),
             intensities=intensities if self._has_intensities else None,
+            vertical_angle_deg=self.vertical_angle_deg,
         )
 
     def __iter__(self) -> Iterator[Scan]:
@@ -101,7 +116,8 @@ class Recording:
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 self._go_to(index)
-                item = self._loader[index]
+                is_bin = self._is_folder and file.suffix == ".bin"
+                item = read_returns(file)[:, :3] if is_bin else self._loader[index]
             points, times = item if isinstance(item, tuple) else (item, np.empty(0))
             return np.asarray(points, dtype=np.float64).reshape(-1, 3), np.asarray(times, dtype=np.float64).ravel()
         except LOADER_ERRORS as error:
@@ -111,15 +127,15 @@ class Recording:
         """Of the scan read last, where they are wanted and known."""
         if not self._has_intensities and self.labels.network is None:
             return None
-        known = self._clouds.intensities if self._in_order else getattr(self._loader, "intensities", None)
-        if known is None and not self._in_order:
+        known = self._clouds.intensities if self.is_sequential else getattr(self._loader, "intensities", None)
+        if known is None and not self.is_sequential:
             with contextlib.suppress(BadScan):  # a .bin file of another layout than KITTI's
                 known = read_intensities(file)
         return known if known is not None and len(known) == num_points else None
 
     def _go_to(self, index: int) -> None:
         """Read over what lies before, where a recording can only be read in order."""
-        if not self._in_order:
+        if not self.is_sequential:
             return
         if index < self._next:
             self._loader.reset()
@@ -139,7 +155,7 @@ class Recording:
             return stamp_ns
         if not hasattr(self._loader, "get_frames_timestamps"):
             return index * ASSUMED_PERIOD_NS
-        seconds = self._loader.get_frames_timestamps()[-1 if self._in_order else index]
+        seconds = self._loader.get_frames_timestamps()[-1 if self.is_sequential else index]
         return round(float(np.squeeze(seconds)) * 1e9)
 
     def _file(self, index: int) -> Path:
@@ -150,6 +166,7 @@ class Recording:
     def _reference(self, poses_file: Path | None) -> Trajectory | None:
         if poses_file is not None and poses_file.exists():
             poses = read_poses(poses_file, format="kitti").T_a_b
+            check_num_poses(poses_file, len(poses), self.num_recorded)
         else:
             poses = np.asarray(getattr(self._loader, "gt_poses", np.empty((0, 4, 4))), dtype=float)
         posed = self.scan_index[self.scan_index < len(poses)]
@@ -168,6 +185,7 @@ def open_recording(
     encoding: Encoding | None,
     frames: str | None,
     intensities: bool = False,
+    vertical_angle_deg: float = 0.0,
 ) -> Recording:
     """A recording by the name of its kind in kiss_icp, or by what the file or folder looks like.
 
@@ -179,7 +197,11 @@ def open_recording(
     if kind is not None and kind not in kinds:
         raise SegslamError(f"--dataset {kind}: no such kind of data; known: {', '.join(kinds)}")
     kind = kind or _kind_of(data)
+    if topic and kind not in READ_IN_ORDER:
+        raise SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); leave the option out")
     source = _scans_folder(data) if kind == "generic" else data
+    if kind == "generic":
+        _check_one_kind(source)
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), warnings.catch_warnings():
@@ -192,11 +214,24 @@ def open_recording(
                 loader = dataset_factory(kind, source, sequence=sequence, topic=topic)
             num_scans = len(loader)
     except LOADER_ERRORS as error:
+        if isinstance(error, SystemExit) and kind == "generic":
+            raise SegslamError(
+                f"{source}: its first scan has no points x y z that can be read; fetch the file again, or remove it"
+            ) from error
         complaint = " ".join(said.getvalue().split()) if isinstance(error, SystemExit) else _reason(error)
         raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset") from error
     if num_scans == 0:
         raise SegslamError(f"{data}: holds no scan that the reader for {kind} data finds; see --dataset")
-    return Recording(kind, source, loader, labels=labels, encoding=encoding, frames=frames, intensities=intensities)
+    return Recording(
+        kind,
+        source,
+        loader,
+        labels=labels,
+        encoding=encoding,
+        frames=frames,
+        intensities=intensities,
+        vertical_angle_deg=vertical_angle_deg,
+    )
 
 
 def _kind_of(data: Path) -> str:
@@ -223,6 +258,20 @@ def _has_clouds(folder: Path) -> bool:
     return any(file.suffix in suffixes for file in folder.iterdir())
 
 
+def _check_one_kind(folder: Path) -> None:
+    """Raises SegslamError for scans of several formats: the first would be read, and the others taken for broken."""
+    from kiss_icp.datasets import supported_file_extensions
+
+    counts = {
+        f".{extension}": sum(1 for file in folder.glob(f"*.{extension}") if file.is_file())
+        for extension in supported_file_extensions()
+    }
+    found = {suffix: count for suffix, count in counts.items() if count}
+    if len(found) > 1:
+        listed = ", ".join(f"{suffix} {count}" for suffix, count in found.items())
+        raise SegslamError(f"{folder}: {len(found)} kinds of scans ({listed}); put each kind into a folder of its own")
+
+
 def _beside(source: Path) -> Path:
     """Where the times, poses and labels of a folder of scans are looked for."""
     return source.resolve().parent if source.resolve().name == "velodyne" else source
@@ -233,16 +282,11 @@ def _whole_stamps(times_file: Path, num_scans: int) -> Indices | None:
         return None
     stamps = read_stamps(times_file)
     if len(stamps) != num_scans:
-        raise SegslamError(f"{times_file}: {len(stamps)} lines for {num_scans} scans; mend or remove the file")
+        raise SegslamError(f"{times_file}: {len(stamps)} lines for {num_scans} scans; correct or remove the file")
     return stamps
 
 
-def _from_0_to_1(times: np.ndarray, num_points: int) -> Vector:
-    """Per-point times over one sweep; none where they are missing, of another number than the points, or all equal."""
-    if len(times) != num_points or num_points == 0 or np.ptp(times) == 0:
-        return np.empty(0)
-    return (times - times.min()) / np.ptp(times)
-
-
 def _reason(error: BaseException) -> str:
+    if "positions" in str(error):
+        return "it has no x y z"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

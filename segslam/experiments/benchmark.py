@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from segslam.errors import reason
 from segslam.experiments.job import Job
 from segslam.experiments.rows import Row, RowFile, read_rows
 from segslam.experiments.summary import grouped
 from segslam.experiments.trials import Trial
 from segslam.experiments.workers import LOST_WORKER, cluster, run_here, run_on
+from segslam.system.whole_files import write_whole
 from segslam.types import SegslamError
 
 ROWS_FILE = "details.csv"
@@ -68,9 +70,11 @@ def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
         folder.mkdir(parents=True, exist_ok=True)
         before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
         if before is None:
-            file.write_text(json.dumps(asked, indent=1) + "\n", encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise SegslamError(f"{file}: cannot be read or written ({error}); choose another --out") from error
+            write_whole(file, json.dumps(asked, indent=1) + "\n")
+    except OSError as error:
+        raise SegslamError(f"{file}: cannot be read or written ({reason(error)}); choose another --out") from error
+    except ValueError as error:
+        raise SegslamError(f"{file}: is not JSON ({error}); choose another --out") from error
     if before is None:
         return []
     for key in asked:

@@ -7,7 +7,7 @@ from segslam.types import Transform
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The pose of the source in the target, and what the method tells of how it found it; None is what it has not."""
+    """The pose of the source in the target, and figures of the method; None for figures that it does not have."""
 
     T_target_source: Transform
     num_correspondences: int | None = None

@@ -8,15 +8,16 @@ from functools import lru_cache
 from pathlib import Path
 
 from segslam import geometry
-from segslam.alignment import Stopwatch, shape_labels
 from segslam.config import Config
 from segslam.datasets import Dataset, open_dataset
 from segslam.experiments.estimate import Estimate
 from segslam.experiments.meter import Cost, measured
-from segslam.experiments.methods import METHODS, Part, prepare
+from segslam.experiments.methods import METHODS, Part, prepare_parts
 from segslam.experiments.rows import Row
 from segslam.experiments.trials import ScanVariant, Trial
+from segslam.registration import Stopwatch, shape_labels
 from segslam.semantics.encodings import Encoding
+from segslam.semantics.label_files import unlabelled
 from segslam.types import BadScan, Points, Rejected
 
 logger = logging.getLogger(__name__)
@@ -34,11 +35,17 @@ class DataSource:
     dataset: str | None = None
     labels: str = "auto"
     encoding: Encoding | None = None
+    vertical_angle_deg: float | None = None
 
     def open(self) -> Dataset:
         """Raises SegslamError as `open_dataset` does."""
         return open_dataset(
-            self.data, sequence=self.sequence, dataset=self.dataset, labels=self.labels, encoding=self.encoding
+            self.data,
+            sequence=self.sequence,
+            dataset=self.dataset,
+            labels=self.labels,
+            encoding=self.encoding,
+            vertical_angle_deg=self.vertical_angle_deg,
         )
 
 
@@ -57,12 +64,12 @@ class SharedScan:
 
     parts: Mapping[str, Part]
     labelling: Cost | None = None
-    """Labels by shape; None where labels came from files, whose making nobody timed."""
+    """Labels by shape or by a network; None where labels came from files, whose making nobody timed."""
     unusable: bool = False
 
 
 def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
-    """Read, label, turn, rob and prepare a scan."""
+    """Read, label, rotate and prepare a scan, with some of its labels removed."""
     dataset, row_of_scan = open_once(job.source)
     try:
         scan = dataset[row_of_scan[variant.index]]
@@ -70,21 +77,24 @@ def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
         logger.warning("scan %d left out: %s", variant.index, error)
         return SharedScan({}, unusable=True)
     labels, labelling = scan.labels, None
-    if dataset.labels.geometric and not labels.any():
+    if callable(labels):
+        with measured() as labelling:
+            labels = labels()
+    elif dataset.labels.geometric and not labels.any():
         with measured() as labelling:
             labels = shape_labels(scan.points, config=job.config)
     points, labels = variant.of(scan.points, labels)
-    return SharedScan(prepare(points, labels, methods=job.methods, config=job.config), labelling)
+    return SharedScan(prepare_parts(points, labels, methods=job.methods, config=job.config), labelling)
 
 
 def points_of(source: DataSource, variant: ScanVariant) -> Points:
     """The points of a variant, as the methods see them."""
     dataset, row_of_scan = open_once(source)
     scan = dataset[row_of_scan[variant.index]]
-    return variant.of(scan.points, scan.labels)[0]
+    return variant.of(scan.points, unlabelled(len(scan.points)))[0]
 
 
-def register(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> list[Row]:
+def register_trial(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> list[Row]:
     """The pair registered by every method of the job, from the same scans."""
     return [_register(method, job.config, trial, source, target) for method in job.methods]
 
@@ -113,7 +123,7 @@ def _register(method: str, config: Config, trial: Trial, source: SharedScan, tar
 
 
 def _times(aligned: Cost, prepared: list[Cost], labelled: list[Cost], watch: Stopwatch) -> dict[str, float | None]:
-    """The columns of a row that say what it took."""
+    """The columns of a row for time and memory."""
     costs = [aligned, *prepared, *labelled]
     return {
         "ms": 1000 * sum(cost.seconds for cost in costs),

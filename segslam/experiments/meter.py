@@ -18,9 +18,9 @@ class Cost:
 
     seconds: float = 0.0
     cpu_seconds: float = 0.0
-    """Of all threads of the process; says more than `seconds` on a machine that does other things too."""
+    """CPU time of all threads; more reliable than `seconds` on a busy machine."""
     peak_mb: float | None = None
-    """None where the system does not tell. Means nothing while other threads of the process work too."""
+    """None if the system does not report it. Invalid while other threads of the process work."""
 
 
 @contextmanager

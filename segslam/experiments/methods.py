@@ -5,14 +5,16 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from segslam import alignment, refine, segregator, verify
-from segslam.alignment import PreparedScan, Stopwatch
+from segslam import refinement, registration, segregator
 from segslam.config import Config, RefineConfig
 from segslam.experiments import baselines
 from segslam.experiments.estimate import Estimate
 from segslam.experiments.meter import Cost, measured
-from segslam.experiments.settings import check_method, method_config
+from segslam.experiments.method_settings import check_method, method_config
+from segslam.registration import PreparedScan, Stopwatch
+from segslam.system.extras import how_to_install
 from segslam.types import Alignment, Description, Labels, Points, Registration, Rejected, SegslamError
+from segslam.verification.free_space import FreeSpace, observe_free_space
 
 Values = Mapping[str, Any]
 """The parts of one scan by name."""
@@ -33,23 +35,23 @@ class Method:
     parts: tuple[str, ...]
     align: Callable[[Values, Values, Config, Stopwatch], Estimate | Rejected]
     package: tuple[str, str] | None = None
-    """Module and extra, where it is optional."""
+    """Module and extra, where it is optional or slow to import."""
 
 
 class SurfaceScan:
     """Surface and view of a scan, for refinement and verification. Travels between processes as its points."""
 
-    def __init__(self, thinned: Points, view: verify.View, config: RefineConfig) -> None:
-        self.surface = refine.prepare(thinned, config=config)
-        self.view = view
+    def __init__(self, thinned: Points, free_space: FreeSpace, config: RefineConfig) -> None:
+        self.surface = refinement.make_surface(thinned, config=config)
+        self.free_space = free_space
         self._config = config
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return SurfaceScan, (self.surface.points.astype("float32"), self.view, self._config)
+        return SurfaceScan, (self.surface.points.astype("float32"), self.free_space, self._config)
 
 
 def _surface(points: Points, labels: Labels, config: Config) -> SurfaceScan:
-    return SurfaceScan(refine.thin(points, config=config.refine), verify.view(points), config.refine)
+    return SurfaceScan(refinement.downsample(points, config=config.refine), observe_free_space(points), config.refine)
 
 
 def _description(points: Points, labels: Labels, config: Config) -> Description:
@@ -60,9 +62,14 @@ def _fpfh_description(points: Points, labels: Labels, config: Config) -> Descrip
     return segregator.describe(points, labels, config=method_config(config, "teaser").segregator)
 
 
-def _of_points(prepare: Callable[[Points], Any]) -> Callable[[Points, Labels, Config], Any]:
+def _of_points(make: Callable[[Points], Any]) -> Callable[[Points, Labels, Config], Any]:
     """For a part that neither labels nor settings change."""
-    return lambda points, labels, config: prepare(points)
+    return lambda points, labels, config: make(points)
+
+
+def _open3d(name: str) -> Callable[..., Any]:
+    """A function of `open3d_methods`, imported when it is first called."""
+    return lambda *scans: getattr(importlib.import_module("segslam.experiments.open3d_methods"), name)(*scans)
 
 
 PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
@@ -70,12 +77,12 @@ PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
     "fpfh_description": _fpfh_description,
     "surface": _surface,
     "gicp": _of_points(baselines.prepare_gicp),
-    "fpfh": _of_points(baselines.prepare_fpfh),
+    "fpfh": _of_points(_open3d("prepare_fpfh")),
     "points": _of_points(baselines.prepare_points),
 }
 
 
-def prepare(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> dict[str, Part]:
+def prepare_parts(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> dict[str, Part]:
     """All parts of a scan that these methods need, each made once."""
     parts = {}
     for name in dict.fromkeys(part for method in methods for part in METHODS[method].parts):
@@ -94,7 +101,7 @@ def find_method(name: str) -> Method:
         try:
             importlib.import_module(module)
         except ImportError as error:
-            raise SegslamError(f"--method {name}: needs {module}; pip install 'segslam[{extra}]'") from error
+            raise SegslamError(f"--method {name}: needs {module}: {how_to_install(extra)}") from error
     return method
 
 
@@ -114,10 +121,10 @@ def _segregator(name: str, part: str = "description") -> Method:
 
 def _align(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:
     scans = (
-        PreparedScan(values["description"], values["surface"].surface, values["surface"].view)
+        PreparedScan(values["description"], values["surface"].surface, values["surface"].free_space)
         for values in (source, target)
     )
-    found = alignment.align(*scans, config=config, watch=watch)
+    found = registration.register_prepared(*scans, config=config, watch=watch)
     if isinstance(found, Alignment):
         return _estimate(found.coarse, found.fine, overlap=found.overlap)
     return found
@@ -148,6 +155,6 @@ METHODS: dict[str, Method] = {
     "vgicp": _baseline("gicp", baselines.align_vgicp),
     "gicp": _baseline("gicp", baselines.align_gicp),
     "kiss-matcher": _baseline("points", baselines.align_kiss_matcher, ("kiss_matcher", "bench")),
-    "ransac": _baseline("fpfh", baselines.align_ransac),
-    "fgr": _baseline("fpfh", baselines.align_fgr),
+    "ransac": _baseline("fpfh", _open3d("align_ransac"), ("open3d", "bench")),
+    "fgr": _baseline("fpfh", _open3d("align_fgr"), ("open3d", "bench")),
 }

@@ -99,18 +99,18 @@ def beside_paper(
     """
     whole = {one.name: one.num_whole for one in lists}
     timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and _are_all(whole, TIMING_SEQUENCE)
-    robbed = experiment == "deterioration" and sequence.zfill(2) == "05" and _is_paper_pair(lists)
+    reduced = experiment == "deterioration" and sequence.zfill(2) == "05" and _is_paper_pair(lists)
     return {
         method: own
         | ({"paper": TIMING[method]} if timed and method in TIMING else {})
-        | {"by": [one | _paper_of(method, one, whole, robbed=robbed) for one in own["by"]]}
+        | {"by": [one | _paper_of(method, one, whole, reduced=reduced) for one in own["by"]]}
         for method, own in results.items()
     }
 
 
-def _paper_of(method: str, one: dict[str, Any], whole: dict[str, int], *, robbed: bool) -> dict[str, Any]:
+def _paper_of(method: str, one: dict[str, Any], whole: dict[str, int], *, reduced: bool) -> dict[str, Any]:
     """`paper` for one value of what was varied, or nothing."""
-    if robbed and method == "segregator" and one["lost_percent"] in DETERIORATION:
+    if reduced and method == "segregator" and one["lost_percent"] in DETERIORATION:
         return {"paper": dict(zip(("translation_m", "rotation_deg"), DETERIORATION[one["lost_percent"]], strict=True))}
     if "list" not in one:
         return {}

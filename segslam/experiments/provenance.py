@@ -77,7 +77,7 @@ def simulation_of(job: Job) -> dict[str, Any] | None:
 
 
 def _cpu_model() -> str:
-    """As Linux tells it; elsewhere what Python knows."""
+    """Name of the processor from Linux; elsewhere from Python."""
     if CPU_INFO.is_file():
         for line in CPU_INFO.read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):

@@ -9,12 +9,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
-from segslam.evaluation import FALSE_LOOP_DEG, FALSE_LOOP_M
+from segslam.errors import reason
+from segslam.evaluation import SUCCESS_DEG, SUCCESS_M
 from segslam.experiments.trials import ScanVariant
+from segslam.system.whole_files import whole_file
 from segslam.types import SegslamError, Transform, WorkFailed
-
-SUCCESS_M, SUCCESS_DEG = FALSE_LOOP_M, FALSE_LOOP_DEG
-"""The paper's: a registration with less error is a success."""
 
 
 def _none_if_empty(value: object) -> object:
@@ -57,7 +56,7 @@ class Row(BaseModel):
     refine_ms: Number = None
     verify_ms: Number = None
     peak_mb: Number = None
-    """Memory needed at most beyond what was held before; None where the system does not tell."""
+    """Peak of additional memory; None if the system does not report it."""
     T_target_source: str = ""
     """12 numbers by rows, empty if rejected."""
 
@@ -85,6 +84,13 @@ def _below(value: float | None, bound: float) -> bool:
     return value is not None and value < bound
 
 
+COLUMNS = [*Row.model_fields, "success"]
+
+
+def _cells(row: Row) -> dict[str, object]:
+    return row.model_dump() | {"success": row.success}
+
+
 class RowFile:
     """A CSV file that takes rows, all of one call on the disk before it returns; a context manager.
 
@@ -94,14 +100,17 @@ class RowFile:
     def __init__(self, file: Path, rows: Sequence[Row]) -> None:
         self._file = file
         part = file.with_suffix(".part")
-        with self._room():
-            self._stream = part.open("w", newline="", encoding="utf-8")
-        self._csv = csv.DictWriter(self._stream, [*Row.model_fields, "success"])
-        with self._room():
-            self._csv.writeheader()
-        self.write(rows)
-        with self._room():
-            part.replace(file)
+        try:
+            with self._room():
+                self._stream = part.open("w", newline="", encoding="utf-8")
+                self._csv = csv.DictWriter(self._stream, COLUMNS)
+                self._csv.writeheader()
+            self.write(rows)
+            with self._room():
+                part.replace(file)
+        except WorkFailed:
+            part.unlink(missing_ok=True)
+            raise
 
     def __enter__(self) -> "RowFile":
         return self
@@ -112,7 +121,7 @@ class RowFile:
     def write(self, rows: Sequence[Row]) -> None:
         """Add rows."""
         with self._room():
-            self._csv.writerows(row.model_dump() | {"success": row.success} for row in rows)
+            self._csv.writerows(_cells(row) for row in rows)
             self._stream.flush()
 
     @contextmanager
@@ -120,13 +129,15 @@ class RowFile:
         try:
             yield
         except OSError as error:
-            raise WorkFailed(f"{self._file}: cannot be written ({error.strerror}); make room there") from error
+            raise WorkFailed(f"{self._file}: cannot be written ({reason(error)}); make room there") from error
 
 
 def write_rows(file: Path, rows: Sequence[Row]) -> None:
-    """A file of these rows. Raises WorkFailed if it cannot be written."""
-    with RowFile(file, rows):
-        pass
+    """A file of these rows. Raises SegslamError if it cannot be written."""
+    with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        table = csv.DictWriter(stream, COLUMNS)
+        table.writeheader()
+        table.writerows(_cells(row) for row in rows)
 
 
 def read_rows(file: Path) -> list[Row]:

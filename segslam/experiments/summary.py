@@ -12,7 +12,7 @@ STAGES = ("label_ms", "prepare_ms", "match_ms", "refine_ms", "verify_ms")
 
 
 def figures(rows: Sequence[Row]) -> dict[str, Any]:
-    """What one method did on some pairs; None where nothing tells.
+    """Figures of one method on some pairs; None for unknown figures.
 
     Errors are means over successes, `accepted_m` and `accepted_deg` over all poses that were given. Times are of a
     registration on its own, both scans prepared for it; `p95_mb` leaves out what a first call loads.

@@ -1,4 +1,4 @@
-"""What is to be registered: two scans, each perhaps turned or robbed of labels, and the pose that is true of them."""
+"""A trial: two scans, each possibly rotated or with labels removed, and their true relative pose."""
 
 import math
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ class Trial:
 
     @property
     def key(self) -> tuple[str, ScanVariant, ScanVariant]:
-        """Tells trials apart."""
+        """Identifies the trial."""
         return self.pairs, self.source, self.target
 
 

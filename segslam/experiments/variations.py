@@ -30,7 +30,7 @@ def turned_trials(pairs: PairList, reference: Trajectory | None, *, step_deg: fl
     ]
 
 
-def robbed_trials(
+def unlabelled_trials(
     pairs: PairList,
     reference: Trajectory | None,
     *,
@@ -39,14 +39,14 @@ def robbed_trials(
     seed: int,
     both: bool,
 ) -> list[Trial]:
-    """Each pair with so much of its labels lost, each time drawn anew: of both scans or of the source alone.
+    """Each pair with a share of its labels removed at random, drawn again for each trial: of both scans or the source.
 
     Raises SegslamError as `pair_trials`.
     """
     trials = []
     for ((source, target), T_target_source), percent in product(true_poses(pairs, reference).items(), lost_percent):
         for draw in range(seed * num_draws, (seed + 1) * num_draws):
-            robbed = [ScanVariant(index, lost=percent / 100, draw=draw) for index in (source, target)]
-            kept = robbed[1] if both else ScanVariant(target)
-            trials.append(trial(pairs.name, robbed[0], kept, T_target_source))
+            reduced = [ScanVariant(index, lost=percent / 100, draw=draw) for index in (source, target)]
+            kept = reduced[1] if both else ScanVariant(target)
+            trials.append(trial(pairs.name, reduced[0], kept, T_target_source))
     return trials

@@ -8,9 +8,10 @@ from functools import lru_cache, partial
 from itertools import islice
 from typing import Any
 
-from segslam.experiments.job import Job, failed_row, prepare_scan, register
+from segslam.experiments.job import Job, failed_row, prepare_scan, register_trial
 from segslam.experiments.rows import Row
 from segslam.experiments.trials import ScanVariant, Trial
+from segslam.system.extras import how_to_install
 from segslam.types import SegslamError
 
 NUM_SCANS_KEPT = 128
@@ -26,7 +27,7 @@ def run_here(job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]]:
     """The rows of one trial after the other."""
     prepared = lru_cache(NUM_SCANS_KEPT)(partial(prepare_scan, job))
     for trial in trials:
-        yield register(job, trial, prepared(trial.source), prepared(trial.target))
+        yield register_trial(job, trial, prepared(trial.source), prepared(trial.target))
 
 
 @contextmanager
@@ -38,8 +39,8 @@ def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
     try:
         from distributed import Client, LocalCluster  # optional: extra `cluster`
     except ImportError as error:
-        raise SegslamError("--workers and --scheduler need Dask; pip install 'segslam[cluster]'") from error
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # it tells of each connection else
+        raise SegslamError(f"--workers and --scheduler need Dask: {how_to_install('cluster')}") from error
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # otherwise it logs each connection
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=CONNECT_S)
@@ -61,7 +62,7 @@ def run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]
     """The rows of the trials as the workers finish them.
 
     Each scan is prepared by one worker and handed to whoever registers it. What a worker that dies had, Dask does
-    again elsewhere; a pair that takes several workers down with it is given up and its rows say so.
+    again elsewhere; a pair during which several workers were lost is recorded as failed.
     """
     from distributed import KilledWorker, as_completed
 
@@ -74,7 +75,7 @@ def run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]
         return scans[variant]
 
     def submit(trial: Trial) -> Any:
-        future = client.submit(register, job, trial, prepared(trial.source), prepared(trial.target), pure=False)
+        future = client.submit(register_trial, job, trial, prepared(trial.source), prepared(trial.target), pure=False)
         pending[future.key] = trial
         return future
 

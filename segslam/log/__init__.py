@@ -2,6 +2,6 @@
 
 from segslam.log.output import is_being_written
 from segslam.log.reader import RunLog, read_log
-from segslam.log.writer import LogWriter
+from segslam.log.writer import LogWriter, Mirror
 
-__all__ = ["LogWriter", "RunLog", "is_being_written", "read_log"]
+__all__ = ["LogWriter", "Mirror", "RunLog", "is_being_written", "read_log"]

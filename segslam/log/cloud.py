@@ -18,7 +18,7 @@ from segslam.types import Keyframe, Labels, Points, Vector
 
 
 def _message_class() -> type[Message]:
-    """Built here rather than generated: six fields need no compiler, and no version of one."""
+    """Built here rather than generated: seven fields need no compiler, and no version of one."""
     kinds = {
         "resolution_m": FieldDescriptorProto.TYPE_DOUBLE,
         "num_points": FieldDescriptorProto.TYPE_UINT32,
@@ -26,6 +26,7 @@ def _message_class() -> type[Message]:
         "labels": FieldDescriptorProto.TYPE_BYTES,
         "intensity_greatest": FieldDescriptorProto.TYPE_DOUBLE,
         "intensity_roots": FieldDescriptorProto.TYPE_BYTES,
+        "place": FieldDescriptorProto.TYPE_BYTES,
     }
     optional = FieldDescriptorProto.LABEL_OPTIONAL
     fields = [
@@ -58,6 +59,7 @@ def keyframe_points(keyframe: Keyframe, *, resolution_m: float) -> Message:
         folded_difference_planes=folded.view(np.uint8).reshape(3, -1, 4).transpose(0, 2, 1).tobytes(),
         labels=keyframe.labels.tobytes(),
         **({} if keyframe.intensities is None else _roots(keyframe.intensities)),
+        **({} if keyframe.place is None else {"place": keyframe.place}),
     )
 
 
@@ -76,6 +78,11 @@ def intensities(message: Message) -> Vector | None:
         return None
     shares = (np.frombuffer(message.intensity_roots, np.uint8) / 255) ** 2
     return (message.intensity_greatest * shares).astype(np.float32)
+
+
+def place_of(message: Message) -> dict[str, bytes | None]:
+    """The field `place` of the keyframe; None in logs of older versions."""
+    return {"place": message.place or None}
 
 
 def _roots(intensities: Vector) -> dict[str, object]:

@@ -31,12 +31,22 @@ class CutError(Exception):
         self.offset = offset
 
 
+class Span(NamedTuple):
+    """Bytes of a file."""
+
+    offset: int
+    size: int
+
+
 class Stored(NamedTuple):
     """A message."""
 
     topic: str
     schema: Schema
     data: bytes
+    channel_id: int
+    chunk: "Span"
+    """Where in the file the chunk is that holds it."""
 
 
 def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
@@ -52,6 +62,7 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
             schemas, channels = dict(summary.schemas), dict(summary.channels)
             start = _last_chunk_with(since_last, summary)
         for offset, opcode, body in _records(stream, start):
+            span = Span(offset, _RECORD_HEAD.size + len(body))
             for record in _records_of_chunk(offset, body) if opcode == Opcode.CHUNK else ():
                 if isinstance(record, Schema):
                     schemas[record.id] = record
@@ -59,7 +70,7 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
                     channels[record.id] = record
                 elif isinstance(record, Message):
                     channel = channels[record.channel_id]
-                    yield Stored(channel.topic, schemas[channel.schema_id], record.data)
+                    yield Stored(channel.topic, schemas[channel.schema_id], record.data, channel.id, span)
 
 
 def messages_within(records: bytes) -> Iterator[tuple[int, bytes]]:

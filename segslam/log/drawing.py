@@ -1,6 +1,6 @@
 """What a viewer shows of a run, step by step, in Foxglove's own messages."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,14 @@ from segslam import geometry
 from segslam.config import LogConfig
 from segslam.log import foxglove, schema
 from segslam.log.records import codec
+from segslam.points import voxel_first, within_range
 from segslam.types import (
     GraphEstimate,
     Keyframe,
+    Label,
+    Labels,
     LoopAttempt,
+    Points,
     Rejected,
     RejectReason,
     Step,
@@ -34,7 +38,9 @@ REJECTED_COLORS = {
     RejectReason.LOW_OVERLAP: "#bcbd22ff",
     RejectReason.HIGH_RESIDUAL: "#ffbb78ff",
     RejectReason.FREE_SPACE_VIOLATED: "#ff7f0eff",
-    RejectReason.INCONSISTENT: "#d62728ff",
+    RejectReason.AMBIGUOUS: "#d62728ff",
+    RejectReason.NO_PLACE: "#aec7e8ff",
+    RejectReason.UNCONFIRMED: "#ff9896ff",
 }
 """Cold colours for what failed early, warm ones for what failed late."""
 
@@ -45,7 +51,13 @@ its length (some 20 times the last one) and a viewer that jumps in time finds on
 VIEW_GRID_M = 2.0**-5
 """Chosen: points to look at are rounded to 3 cm, in binary, which halves their size after compression."""
 
+MAP_KEYFRAMES = 500
+"""Chosen: of a longer drive every second keyframe is in the map to look at, or every third, and so on."""
+MAP_RANGE_M, MAP_VOXEL_M = 40.0, 0.2
+
 Topical = tuple[str, Message]
+CloudOf = Callable[[int], tuple[Points, Labels]]
+"""Points of a keyframe, in its frame, and their labels."""
 
 
 class Drawing:
@@ -82,6 +94,12 @@ class Drawing:
             poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
             yield schema.TRAJECTORY, poses
             yield schema.GRAPH, self._graph(estimate, stamp_ns)
+
+    def draw_map(self, estimate: GraphEstimate, cloud: CloudOf, *, stamp_ns: int) -> Iterator[Topical]:
+        """One cloud of the whole drive in world. `cloud` gives the points of a keyframe, in its frame, and labels."""
+        points, labels = map_points(estimate.T_world_keyframe, cloud, view_every=self._config.view_every)
+        if len(points):
+            yield map_message(points, labels, stamp_ns=stamp_ns)
 
     def _odom_in_world(self, stamp_ns: int) -> Topical:
         """Wanted at every step: viewers interpolate, and a correction would begin before the step that made it."""
@@ -135,6 +153,26 @@ class Drawing:
         if keyframe_id in self._T_world_keyframe:
             return self._T_world_keyframe[keyframe_id][:3, 3]
         return (self._T_world_odom @ self._T_odom_keyframe[keyframe_id])[:3, 3]
+
+
+def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, *, view_every: int) -> tuple[Points, Labels]:
+    """Some points of at most `MAP_KEYFRAMES` to twice as many keyframes in world, without what moves; and labels."""
+    every = 1 + len(T_world_keyframe) // MAP_KEYFRAMES
+    some = slice(None, None, view_every)
+    parts = [(np.empty((0, 3)), np.empty(0, np.uint8))]
+    for keyframe_id in list(T_world_keyframe)[::every]:
+        points, labels = cloud(keyframe_id)
+        kept = within_range(points[some], 0.0, MAP_RANGE_M) & (labels[some] < Label.MOVING_CAR)
+        placed = geometry.apply(T_world_keyframe[keyframe_id], points[some][kept].astype(np.float64))
+        parts.append((placed, labels[some][kept]))
+    points, labels = (np.concatenate(column) for column in zip(*parts, strict=True))
+    rows = voxel_first(points, MAP_VOXEL_M)
+    return np.round(points[rows] / VIEW_GRID_M) * VIEW_GRID_M, labels[rows]
+
+
+def map_message(points: Points, labels: Labels, *, stamp_ns: int) -> Topical:
+    """A cloud in world as the map to look at."""
+    return schema.MAP, foxglove.point_cloud(points, labels, frame=schema.WORLD, stamp_ns=stamp_ns)
 
 
 def ground_truth(reference: Trajectory, *, stamp_ns: int) -> Topical:

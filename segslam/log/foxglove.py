@@ -20,14 +20,19 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam import geometry
+from segslam.semantics.class_colors import of_classes
 from segslam.types import Labels, Points, Transform, Vector
 
-_POINT = np.dtype([("xyz", "<f4", 3), ("label", "u1")])
+_POINT = np.dtype([("xyz", "<f4", 3), ("label", "u1"), ("rgba", "u1", 4)])
 _POINT_FIELDS = [
     PackedElementField(name="x", offset=0, type=PackedElementField.FLOAT32),
     PackedElementField(name="y", offset=4, type=PackedElementField.FLOAT32),
     PackedElementField(name="z", offset=8, type=PackedElementField.FLOAT32),
     PackedElementField(name="label", offset=12, type=PackedElementField.UINT8),
+    PackedElementField(name="red", offset=13, type=PackedElementField.UINT8),
+    PackedElementField(name="green", offset=14, type=PackedElementField.UINT8),
+    PackedElementField(name="blue", offset=15, type=PackedElementField.UINT8),
+    PackedElementField(name="alpha", offset=16, type=PackedElementField.UINT8),
 ]
 _IDENTITY = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 
@@ -45,9 +50,10 @@ def frame_transform(T_parent_child: Transform, *, parent: str, child: str, stamp
 
 
 def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) -> PointCloud:
-    """Points as float32, with their labels."""
+    """Points as float32, with their labels and the colours of these."""
     rows = np.empty(len(points), _POINT)
     rows["xyz"], rows["label"] = points, labels
+    rows["rgba"][:, :3], rows["rgba"][:, 3] = of_classes(labels), 255
     return PointCloud(
         timestamp=_timestamp(stamp_ns),
         frame_id=frame,

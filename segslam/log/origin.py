@@ -1,14 +1,20 @@
 """How a run was made: the metadata of its log."""
 
 import json
+import os
 import platform
+import shlex
+import sys
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from segslam.config import Config, config_to_yaml
 from segslam.log import schema
 from segslam.types import Transform
 
+CPU_INFO = Path("/proc/cpuinfo")
 PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
 """Whose versions a log records: those that its figures depend on."""
 
@@ -16,7 +22,7 @@ PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "nu
 def metadata(
     config: Config, dataset: str, T_camera_lidar: Transform | None, options: Mapping[str, str]
 ) -> dict[str, dict[str, str]]:
-    """Records by name; what each holds is said in `schema`."""
+    """Metadata records by name, as documented in `schema`."""
     calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
     return {
         schema.RUN_METADATA: {
@@ -24,12 +30,29 @@ def metadata(
             "dataset": dataset,
             "python": platform.python_version(),
             "platform": platform.platform(),
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "command": _command(),
+            "processor": f"{_processor()}, {os.cpu_count()} cores",
             **calibration,
         },
         schema.CONFIG_METADATA: {"yaml": config_to_yaml(config)},
         schema.OPTIONS_METADATA: dict(options),
         schema.PACKAGES_METADATA: {name: _version(name) for name in PACKAGES},
     }
+
+
+def _command() -> str:
+    name = Path(sys.argv[0]).name
+    return shlex.join(["segslam" if name == "__main__.py" else name, *sys.argv[1:]])
+
+
+def _processor() -> str:
+    """As Linux names it; elsewhere as Python does."""
+    if CPU_INFO.is_file():
+        for line in CPU_INFO.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def _version(package: str) -> str:

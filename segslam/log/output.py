@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from segslam.interrupts import interrupts_wait
+from segslam.system.interrupts import interrupts_wait
 
 
 class Output:
-    """Writes, tells and flushes, which is all that MCAP's writer asks of a stream; unbuffered.
+    """Unbuffered stream with the methods that MCAP's writer uses: write, tell, flush.
 
     After a failure nothing is left to be written later. While it is open nobody else can write the file.
     """
@@ -57,13 +57,13 @@ class Output:
     def whole(self) -> Iterator[None]:
         """What is written within comes to the file whole, or not at all. Ctrl-C waits for its end.
 
-        If the disk is full or fails, the file is cut back to what was before, closed, and the OSError goes on.
+        On any exception, such as the OSError of a full disk, the file is cut back to what was before and closed.
         """
         size = self.tell()
         with interrupts_wait():
             try:
                 yield
-            except OSError:
+            except BaseException:
                 self._raw.truncate(size)
                 self._raw.close()
                 raise

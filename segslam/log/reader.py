@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
@@ -14,14 +14,16 @@ from google.protobuf.message import DecodeError
 
 from segslam.config import Config, config_from_yaml
 from segslam.log import container, schema
-from segslam.log.cloud import KeyframePoints, intensities, points_and_labels
+from segslam.log.cloud import KeyframePoints, intensities, place_of, points_and_labels
 from segslam.log.container import CutError
 from segslam.log.foxglove import transforms
+from segslam.log.keyframes import RecordedKeyframe, RecordedKeyframes
 from segslam.log.records import codec
-from segslam.types import AngleSamples, GraphEstimate, Keyframe, SegslamError, Step, Trajectory, Transform
+from segslam.types import GraphEstimate, Keyframe, LateLoops, LoopAttempt, SegslamError, Step, Trajectory, Transform
 
 logger = logging.getLogger(__name__)
 
+NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
 Parts = Mapping[str, bytes]
 """Topic -> the latest message on it."""
 Encoded = TypeVar("Encoded")
@@ -55,7 +57,7 @@ class RunLog:
         """The steps in the order in which they were made, read as they are asked for.
 
         Without `clouds`, in a quarter of the time, keyframes come with no points.
-        A cut or damaged log gives its complete steps up to there, and a warning that says how many.
+        A cut or damaged log gives its complete steps up to there, and a warning with their number.
         Raises SegslamError where the file does not hold what this version writes.
         """
         num_steps = 0
@@ -90,10 +92,12 @@ class RunLog:
         parts = self._ending()
         return (self._decoded(_estimate, parts), self._decoded(_trajectory, parts[schema.RESULT])) if parts else None
 
-    def angles(self) -> AngleSamples | None:
-        """What its scans told of leftover angles; None if they were not asked, or the run did not get there."""
+    def late_loops(self) -> tuple[LoopAttempt, ...]:
+        """Loops tried after the last scan, if the run got there."""
         parts = self._ending()
-        return self._decoded(_angles, parts[schema.ANGLES]) if schema.ANGLES in parts else None
+        if schema.LATE_LOOPS not in parts:
+            return ()
+        return self._decoded(_late_loops, parts[schema.LATE_LOOPS]).attempts
 
     def _ending(self) -> Parts:
         """The messages of the result; empty if the run did not get there."""
@@ -105,19 +109,38 @@ class RunLog:
                     return parts
         return {}
 
-    def _messages(self, *, since_last: str | None = None) -> Iterator[tuple[str, bytes]]:
-        """Topic and data, as `container.messages`.
+    def keyframes(self) -> "RecordedKeyframes":
+        """The keyframes of the complete steps, and access to their points. Raises SegslamError as `steps` does."""
+        kept: list[RecordedKeyframe] = []
+        parts: dict[str, bytes] = {}
+        cloud: container.Stored | None = None
+        with suppress(CutError):
+            for message in self._stored():
+                parts[message.topic] = message.data
+                if message.topic == schema.KEYFRAME:
+                    cloud = message
+                if message.topic == schema.STEP:
+                    if cloud is not None:
+                        kept.append(self._decoded(_recorded_keyframe, (parts, cloud)))
+                    parts.clear()
+                    cloud = None
+        return RecordedKeyframes(self.path, kept)
 
-        Raises CutError, and SegslamError if the records are not those of this version.
-        """
+    def _messages(self, *, since_last: str | None = None) -> Iterator[tuple[str, bytes]]:
+        """Topic and data, as `_stored`."""
+        for message in self._stored(since_last=since_last):
+            yield message.topic, message.data
+
+    def _stored(self, *, since_last: str | None = None) -> Iterator[container.Stored]:
+        """As `container.messages`. Raises CutError, and SegslamError if the records are not those of this version."""
         own = schema.json_schemas()
         for message in container.messages(self.path, since_last=since_last):
-            if message.topic in own and message.schema.data != schema.schema_text(own.pop(message.topic)):
+            if message.topic in own and not _is_readable(message.schema.data, own.pop(message.topic)):
                 raise SegslamError(
                     f"{self.path}: its {message.schema.name} is not what this version reads; "
                     f"use segslam {self.packages.get('segslam', 'of its time')}, which wrote it"
                 )
-            yield message.topic, message.data
+            yield message
 
     def _decoded(self, decode: Callable[[Encoded], Decoded], encoded: Encoded) -> Decoded:
         try:
@@ -149,14 +172,33 @@ def read_log(path: Path) -> RunLog:
     return RunLog(path=path, config=config, run=run, packages=packages, options=options)
 
 
+def _is_readable(written: bytes, own: dict[str, Any]) -> bool:
+    try:
+        return schema.is_readable(json.loads(written), own)
+    except (ValueError, AttributeError, TypeError):
+        return False
+
+
 def _step(parts: Parts) -> Step:
     keyframe: dict = {}
     if schema.KEYFRAME in parts:
         message = KeyframePoints.FromString(parts[schema.KEYFRAME])
         points, labels = points_and_labels(message)
-        keyframe = {"points": points, "labels": labels, "intensities": intensities(message)}
+        keyframe = {"points": points, "labels": labels, "intensities": intensities(message), **place_of(message)}
     estimate = _estimate(parts) if schema.ESTIMATE in parts else None
     return codec(Step).decode(json.loads(parts[schema.STEP]), {Step: {"estimate": estimate}, Keyframe: keyframe})
+
+
+def _recorded_keyframe(found: tuple[Parts, container.Stored]) -> RecordedKeyframe:
+    parts, stored = found
+    message = KeyframePoints.FromString(stored.data)
+    step = codec(Step).decode(
+        json.loads(parts[schema.STEP]),
+        {Step: {"estimate": None}, Keyframe: {"points": NO_POINTS, "labels": NO_LABELS, **place_of(message)}},
+    )
+    if step.keyframe is None:
+        raise ValueError("points without a keyframe")
+    return RecordedKeyframe(step.keyframe, stored.chunk, stored.channel_id)
 
 
 def _estimate(parts: Parts) -> GraphEstimate:
@@ -167,8 +209,8 @@ def _estimate(parts: Parts) -> GraphEstimate:
     return codec(GraphEstimate).decode(values, {GraphEstimate: {"T_world_keyframe": T_world_keyframe}})
 
 
-def _angles(data: bytes) -> AngleSamples:
-    return codec(AngleSamples).decode(json.loads(data), {})
+def _late_loops(data: bytes) -> LateLoops:
+    return codec(LateLoops).decode(json.loads(data), {})
 
 
 def _trajectory(data: bytes) -> Trajectory:

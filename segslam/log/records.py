@@ -5,13 +5,13 @@ is bulky travels in binary messages beside the JSON, which leaves it out: see `B
 schema parser knows, which is neither arrays in arrays nor alternatives:
 
 - an array of numbers is a flat list, row by row;
-- a field that is None is left out;
+- a field that is None is left out, and a field with a default may be: logs of older versions are read without it;
 - one of several records is an object with one key, the record's name;
 - a mapping with tuples for keys is a list of objects with a `key` and a `value`.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
@@ -28,7 +28,7 @@ Bulk = Mapping[type, Mapping[str, Any]]
 
 BULK: Mapping[type, frozenset[str]] = {
     Step: frozenset({"estimate"}),
-    Keyframe: frozenset({"points", "labels", "intensities"}),
+    Keyframe: frozenset({"points", "labels", "intensities", "place"}),
     GraphEstimate: frozenset({"T_world_keyframe"}),
 }
 """Fields that the JSON leaves out."""
@@ -72,8 +72,10 @@ def codec(hint: Any) -> Codec:
 
 def _record(record: Any) -> Codec:
     hints = get_type_hints(record)
-    names = [field.name for field in fields(record) if field.name not in BULK.get(record, ())]
+    kept = [field for field in fields(record) if field.name not in BULK.get(record, ())]
+    names = [field.name for field in kept]
     optional = {name for name in names if NoneType in get_args(hints[name])}
+    has_default = {field.name for field in kept if not (field.default is field.default_factory is MISSING)}
     codecs = {name: codec(hints[name]) for name in names}
 
     def encode(value: Any) -> Json:
@@ -81,15 +83,16 @@ def _record(record: Any) -> Codec:
         return {name: codecs[name].encode(item) for name, item in present if item is not None}
 
     def decode(value: Json, bulk: Bulk) -> Any:
-        absent = dict.fromkeys(optional - set(value))
-        present = {name: codecs[name].decode(value[name], bulk) for name in names if name not in absent}
+        absent = dict.fromkeys(optional - has_default - set(value))
+        left_out = (optional | has_default) - set(value)
+        present = {name: codecs[name].decode(value[name], bulk) for name in names if name not in left_out}
         return record(**absent, **present, **(bulk[record] if record in BULK else {}))
 
     schema = {
         "title": record.__name__,
         "type": "object",
         "properties": {name: codecs[name].schema for name in names},
-        "required": [name for name in names if name not in optional],
+        "required": [name for name in names if name not in optional | has_default],
     }
     return Codec(encode, decode, schema)
 

@@ -2,22 +2,18 @@
 
 import json
 import resource
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import IO, Any, cast
 
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import register_schema
 
 from segslam.config import Config
 from segslam.log import schema
+from segslam.log.channels import channels
 from segslam.log.cloud import KeyframePoints, keyframe_points, points_and_labels
 from segslam.log.container import messages_within
 from segslam.log.drawing import Drawing, Topical, ground_truth
@@ -25,10 +21,11 @@ from segslam.log.origin import metadata
 from segslam.log.output import Output
 from segslam.log.records import codec
 from segslam.types import (
-    AngleSamples,
     GraphEstimate,
     Keyframe,
     Labels,
+    LateLoops,
+    LoopAttempt,
     Points,
     SegslamError,
     Step,
@@ -37,17 +34,6 @@ from segslam.types import (
     WorkFailed,
 )
 
-PROTOBUF_TOPICS = {
-    schema.TRANSFORMS: FrameTransform,
-    schema.KEYFRAME: KeyframePoints,
-    schema.POINTS: PointCloud,
-    schema.ODOMETRY: PosesInFrame,
-    schema.TRAJECTORY: PosesInFrame,
-    schema.GROUND_TRUTH: PosesInFrame,
-    schema.ACCEPTED: SceneUpdate,
-    schema.REJECTED: SceneUpdate,
-    schema.GRAPH: SceneUpdate,
-}
 POSES_PER_KEYFRAME = 50
 """Chosen: of estimates, so many poses are logged for each keyframe of a run, in some 4 kB, so that a log grows with the
 drive; each of them whole, until closures times keyframes outgrow it: then every second estimate, and so on."""
@@ -58,6 +44,8 @@ _STATM = Path("/proc/self/statm")
 
 Encoded = tuple[str, bytes]
 """Topic and data of a message."""
+Mirror = Callable[[str, bytes, int], None]
+"""Is given topic, data and stamp (ns) of each message, once it is in the file."""
 
 
 class LogWriter:
@@ -77,11 +65,14 @@ class LogWriter:
         T_camera_lidar: Transform | None = None,
         reference: Trajectory | None = None,
         options: Mapping[str, str] = MappingProxyType({}),
+        mirror: Mirror | None = None,
     ) -> None:
         """`reference` holds true poses and `T_camera_lidar` the calibration, for KITTI: a replay has nothing else.
 
         `options` are what was chosen beside the settings, and must be chosen again when the run is resumed.
+        `mirror` is given each message that is written.
         """
+        self._mirror = mirror
         self._path = path
         self._drawing = Drawing(config.log)
         self._resolution_m = config.keyframes.resolution_m
@@ -124,15 +115,15 @@ class LogWriter:
                 return points_and_labels(KeyframePoints.FromString(data))
         raise SegslamError(f"{self._path}: keyframe {keyframe_id} has gone from the log; leave the file alone")
 
-    def write_result(self, estimate: GraphEstimate, trajectory: Trajectory, angles: AngleSamples | None = None) -> None:
-        """Add what the last optimisation gave, and the pose of every scan that follows from it.
-
-        `angles`: what scans told of leftover angles, if they were asked.
-        """
+    def write_result(
+        self, estimate: GraphEstimate, trajectory: Trajectory, late_loops: tuple[LoopAttempt, ...] = ()
+    ) -> None:
+        """Add the final estimate, the pose of every scan that follows from it, and loops tried after the last scan."""
         drawn = self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns)
-        messages = [*_serialised(drawn), _estimate_message(estimate)]
-        if angles is not None:
-            messages.append((schema.ANGLES, _json(AngleSamples, angles)))
+        whole_map = self._drawing.draw_map(estimate, self.cloud, stamp_ns=self._stamp_ns)
+        messages = [*_serialised(whole_map), *_serialised(drawn), _estimate_message(estimate)]
+        if late_loops:
+            messages.append((schema.LATE_LOOPS, _json(LateLoops, LateLoops(late_loops))))
         self._write([*messages, (schema.RESULT, _json(Trajectory, trajectory))], stamp_ns=self._stamp_ns)
 
     def move(self, path: Path) -> None:
@@ -160,7 +151,7 @@ class LogWriter:
         self.close()
 
     def _step_messages(self, step: Step) -> Iterator[Encoded]:
-        """Last comes the step itself, which says that the others are complete."""
+        """Writes the step last; its presence means that its other messages are complete."""
         logs_estimate = step.estimate is not None and self._affords(len(step.estimate.T_world_keyframe))
         yield from _serialised(self._drawing.draw(step, path=logs_estimate))
         if (rss_mb := _rss_mb()) is not None:
@@ -180,6 +171,8 @@ class LogWriter:
 
     def _write(self, messages: Iterable[Encoded], *, stamp_ns: int) -> tuple[int, int]:
         """Where it went in the file, and its size."""
+        if stamp_ns < 0:
+            raise SegslamError(f"{self._path}: stamp {stamp_ns} ns is before 0; shift the stamps of the scans")
         encoded = list(messages)  # before anything is written: what cannot be encoded leaves no half of a step
         self._stamp_ns = stamp_ns
         with self._whole():
@@ -187,7 +180,11 @@ class LogWriter:
             for topic, data in encoded:
                 self._mcap.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
             self._mcap.flush()
-            return offset, self._output.tell() - offset
+            written = offset, self._output.tell() - offset
+        if self._mirror is not None:
+            for topic, data in encoded:
+                self._mirror(topic, data, stamp_ns)
+        return written
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
@@ -206,18 +203,13 @@ class LogWriter:
 
 def _register_channels(mcap: Writer) -> dict[str, int]:
     """Topic -> channel; every topic is in the file from the start, with its schema."""
-    schema_ids = {message: register_schema(mcap, message) for message in dict.fromkeys(PROTOBUF_TOPICS.values())}
-    protobuf = {
-        topic: mcap.register_channel(topic, "protobuf", schema_ids[message])
-        for topic, message in PROTOBUF_TOPICS.items()
-    }
-    own = {
-        topic: mcap.register_channel(
-            topic, "json", mcap.register_schema(values["title"], "jsonschema", schema.schema_text(values))
-        )
-        for topic, values in schema.json_schemas().items()
-    }
-    return protobuf | own
+    schema_ids: dict[str, int] = {}
+    found: dict[str, int] = {}
+    for topic, encoding, name, schema_encoding, description in channels():
+        if name not in schema_ids:
+            schema_ids[name] = mcap.register_schema(name, schema_encoding, description)
+        found[topic] = mcap.register_channel(topic, encoding, schema_ids[name])
+    return found
 
 
 def _serialised(drawn: Iterable[Topical]) -> Iterator[Encoded]:
@@ -235,7 +227,7 @@ def _reference_messages(reference: Trajectory) -> Iterator[Encoded]:
 
 
 def _rss_mb() -> float | None:
-    """What the process has in memory; None where there is no /proc to tell."""
+    """Memory of the process; None without /proc."""
     try:
         pages = int(_STATM.read_text().split()[1])
     except OSError:

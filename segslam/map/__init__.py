@@ -16,6 +16,8 @@ from segslam.map.gathered import Gathered
 from segslam.map.grid import Grid
 from segslam.map.part import Extent, MapFile, Part
 from segslam.map.picture import Picture
+from segslam.system.interrupts import removed_when_stopped
+from segslam.system.whole_files import check_target, whole_file
 from segslam.types import Keyframe, SegslamError, Transform
 
 __all__ = ["MapSummary", "check_names", "write_map"]
@@ -39,16 +41,16 @@ class MapSummary:
     num_points: int
     """In the map: a voxel each."""
     num_moving_points: int
-    """Points of keyframes that were left out because their class says that they move."""
+    """Number of points of moving classes that were removed."""
     num_voxels_seen_through: int
     """Voxels that were left out because other keyframes saw through them."""
 
 
 def check_names(files: Sequence[Path]) -> None:
-    """Raises SegslamError for a file whose ending says no kind of map, or that needs a package that is not there."""
+    """Raises SegslamError for a file with an unknown extension, or one that needs a missing package."""
     for file in files:
         if file.suffix.lower() not in KINDS:
-            raise SegslamError(f"{file}: no kind of map; end its name in {', '.join(KINDS)}")
+            raise SegslamError(f"{file}: unknown kind of map; its name has to end in {', '.join(KINDS)}")
         if KINDS[file.suffix.lower()] is LasCloud:
             check_las(file)
 
@@ -66,23 +68,22 @@ def write_map(
 ) -> MapSummary:
     """Make the map of keyframes, each with its T_world_keyframe, and write it to each of the files, one at least.
 
-    The ending of a name says what is written: .ply, .pcd, .las or .laz the cloud, .png the map from above, .yaml with a
+    The extension selects what is written: .ply, .pcd, .las, .laz the cloud, .png the map from above, .yaml with a
     .pgm beside it the occupancy grid. Files appear when they are whole. `show` is given the parts that are written and
     their number, to show the progress. Raises SegslamError for another ending, for a folder that is not there, or if no
     keyframe has a point, and OSError where the disk is full.
     """
     check_names(files)
     for file in files:
-        if not file.parent.is_dir():
-            raise SegslamError(f"{file}: its folder is not there; make {file.parent}, or name another")
-    with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name:
+        check_target(file)
+    with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name, removed_when_stopped(Path(name)):
         scratch = Path(name)
         gathered = Gathered(scratch, config)
         for keyframe, T_world_keyframe in placed:
             gathered.add(keyframe, T_world_keyframe)
         extent = gathered.extent()
         if extent is None:
-            raise SegslamError(f"{files[0]}: no keyframe has a point that stands still; there is nothing to map")
+            raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
         parts = show(gathered.parts(), gathered.num_tiles)
         num_points = _write(parts, extent, files, scratch=scratch / "files", config=config)
     return MapSummary(
@@ -110,5 +111,6 @@ def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scra
     for file, folder, writer in zip(files, folders, writers, strict=True):
         writer.close()
         for made in folder.iterdir():  # a grid is two files
-            shutil.move(made, file.parent / made.name)
+            with whole_file(file.parent / made.name) as unfinished:
+                shutil.move(made, unfinished)
     return num_points

@@ -8,6 +8,7 @@ import numpy as np
 
 from segslam.config import MapConfig
 from segslam.map.part import Extent, Part
+from segslam.system.extras import how_to_install
 from segslam.types import Label, SegslamError
 
 PLY_ROW = [("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")]
@@ -15,7 +16,7 @@ PCD_ROW = [("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")]
 INTENSITY = [("intensity", "<f4")]
 """Last of a row, where intensities are known."""
 HEADER_BYTES = 512
-"""Room for a header, which is written last: it tells the number of points."""
+"""Bytes reserved for the header, which is written last because it has the number of points."""
 LAS_SCALE_M = 0.001
 ASPRS_OF_LABEL = {
     Label.ROAD: 11,
@@ -132,9 +133,7 @@ def check_las(file: Path) -> None:
     """Raises SegslamError if the packages that LAS and LAZ need are not there."""
     missing = [name for name in ("laspy", "lazrs") if find_spec(name) is None]
     if missing:
-        raise SegslamError(
-            f"{file}: LAS and LAZ need packages of their own: pip install 'segslam[las]'; .ply and .pcd need none"
-        )
+        raise SegslamError(f"{file}: LAS and LAZ need extra packages: {how_to_install('las')}; .ply and .pcd do not")
 
 
 def _begin(file: Path) -> BinaryIO:

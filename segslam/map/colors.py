@@ -1,48 +1,25 @@
-"""Colours of a map: of classes, heights or intensities."""
+"""Colours of a map by heights or intensities."""
 
-import matplotlib
 import numpy as np
-from jaxtyping import UInt8
 
-from segslam.types import Label, Labels, Vector
-
-COLORS = {
-    Label.UNLABELLED: "#9a9a9a",
-    Label.CAR: "#3f7fd6",
-    Label.BICYCLE: "#43c6c9",
-    Label.MOTORCYCLE: "#2b8f9c",
-    Label.TRUCK: "#5a4fcf",
-    Label.OTHER_VEHICLE: "#7d6be0",
-    Label.PERSON: "#e0332e",
-    Label.BICYCLIST: "#e85a9b",
-    Label.MOTORCYCLIST: "#b03a7c",
-    Label.ROAD: "#6f5b73",
-    Label.PARKING: "#a488a8",
-    Label.SIDEWALK: "#8a6f8e",
-    Label.OTHER_GROUND: "#7c5a4a",
-    Label.BUILDING: "#e8b93c",
-    Label.FENCE: "#d9823b",
-    Label.VEGETATION: "#3f9b45",
-    Label.TRUNK: "#8b5a2b",
-    Label.TERRAIN: "#9bcf6a",
-    Label.POLE: "#f4e58c",
-    Label.TRAFFIC_SIGN: "#ff4f3f",
-}
-"""Of what a map keeps; own choice, kinds of ground in violet and green, vehicles in blue."""
-
-Colors = UInt8[np.ndarray, "_ 3"]
-"""Red, green, blue."""
+from segslam.semantics.class_colors import Colors
+from segslam.types import Vector
 
 
-def of_classes(labels: Labels) -> Colors:
-    """The colour of each label's class."""
-    table = np.array([list(bytes.fromhex(COLORS.get(label, "#000000")[1:])) for label in Label], np.uint8)
-    return table[labels]
+def scale_of(span: tuple[float, float], *, steps: int = 6) -> list[tuple[float, str]]:
+    """Numbers from the end of a span to its start, with the colour that `of_numbers` gives them."""
+    values = np.linspace(span[1], span[0], steps)
+    return [
+        (float(value), f"#{r:02x}{g:02x}{b:02x}")
+        for value, (r, g, b) in zip(values, of_numbers(values, span=span), strict=True)
+    ]
 
 
 def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:
     """Colours from dark violet at the span's start and below to yellow at its end and above."""
+    from matplotlib import colormaps
+
     low, high = span
-    table = (255 * matplotlib.colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+    table = (255 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
     share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
     return table[(share * (len(table) - 1)).astype(np.int64)]

@@ -10,9 +10,11 @@ from segslam.config import MapConfig
 from segslam.map import colors
 from segslam.map.cleaning import moved
 from segslam.map.part import Extent, Part
+from segslam.map.sights import Sights
 from segslam.map.tiles import Tile, Tiles, corner, distance_m
 from segslam.map.views import Views
 from segslam.points import within_range
+from segslam.semantics.class_colors import Colors, of_classes
 from segslam.types import Keyframe, Label, Labels, SegslamError, Transform, Vector
 
 
@@ -24,6 +26,7 @@ class Gathered:
         self._config = config
         self._tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
         self._views = Views(scratch / "views", spread_m=config.voxel_m)
+        self._sights = Sights(config)
         self._T_keyframe_world: list[Transform] = []
         self._places: list[np.ndarray] = []
         self._has_intensities = True
@@ -41,14 +44,14 @@ class Gathered:
         return len(self._tiles)
 
     def add(self, keyframe: Keyframe, T_world_keyframe: Transform) -> None:
-        """Take in a keyframe: its points near enough that no class says to move, and all of its view.
+        """Add a keyframe: its near points of static classes, and its whole view.
 
         Raises SegslamError if it has no intensities and the colours are to show them.
         """
         if keyframe.intensities is None and self._config.color == "intensity":
             raise SegslamError(
-                f"map.color=intensity: keyframe {keyframe.id} has none; a run keeps them if it is mapped with `--set "
-                "map.color=intensity` from data that has them; or take map.color=class or height"
+                f"map.color=intensity: keyframe {keyframe.id} has no intensities; they are kept only in runs mapped "
+                "with `--set map.color=intensity`; or use map.color=class or height"
             )
         self._has_intensities &= keyframe.intensities is not None
         moves = keyframe.labels >= Label.MOVING_CAR
@@ -57,6 +60,7 @@ class Gathered:
         intensities = np.zeros(len(kept), np.float32) if keyframe.intensities is None else keyframe.intensities
         points = geometry.apply(T_world_keyframe, keyframe.points[kept].astype(np.float64))
         self._tiles.add(points, keyframe.labels[kept], intensities[kept])
+        self._sights.add(points, keyframe.labels[kept], T_world_keyframe[:3, 3])
         self._views.add(keyframe.points)
         self._T_keyframe_world.append(geometry.inverse(T_world_keyframe))
         self._places.append(T_world_keyframe[:3, 3])
@@ -68,7 +72,10 @@ class Gathered:
             return None
         (west, south), (east, north) = np.min(tiles, axis=0).tolist(), np.max(tiles, axis=0).tolist()
         brightest = self._tiles.brightest if self._has_intensities else None
-        return Extent(west=west, east=east, south=south, north=north, brightest=brightest)
+        path_m = np.array(self._places)
+        return Extent(
+            west, east, south, north, brightest=brightest, path_m=path_m, span=self._span(), sights=self._sights
+        )
 
     def parts(self) -> Iterator[Part]:
         """The clean voxels of each tile, in the order that `MapFile` names."""
@@ -81,14 +88,18 @@ class Gathered:
             paint = self._colors(kept["label"], world[:, 2], kept["intensity"])
             yield Part(tile, world, kept["label"], kept["intensity"], paint)
 
-    def _colors(self, labels: Labels, heights: Vector, intensities: Vector) -> colors.Colors:
+    def _colors(self, labels: Labels, heights: Vector, intensities: Vector) -> Colors:
         match self._config.color:
             case "class":
-                return colors.of_classes(labels)
+                return of_classes(labels)
             case "height":
-                return colors.of_numbers(heights, span=self._tiles.height_span_m())
+                return colors.of_numbers(heights, span=self._span())
             case "intensity":
-                return colors.of_numbers(intensities, span=self._tiles.intensity_span())
+                return colors.of_numbers(intensities, span=self._span())
+
+    def _span(self) -> tuple[float, float]:
+        """Ends of the scale of colours."""
+        return self._tiles.intensity_span() if self._config.color == "intensity" else self._tiles.height_span_m()
 
     def _views_of(self, tile: Tile) -> Iterator[tuple[np.ndarray, Transform]]:
         """What each keyframe near a tile saw, and T_keyframe_tile."""

@@ -1,24 +1,24 @@
 """A 2D occupancy grid for ROS's map_server: `NAME.yaml` beside `NAME.pgm`.
 
-A cell is occupied where enough voxels stand between two heights above the ground, free where the ground was seen and
-nothing stands on it, and else unknown. Rows of tiles are written as they are complete, so that memory holds one.
+A cell is occupied where enough voxels stand between two heights above the ground. It is free where the ground was seen
+and nothing stands on it, or where the ray of a keyframe passed over it, and else unknown. Rows of tiles are written as
+they are complete, so that memory holds one.
 """
 
 from pathlib import Path
 
 import numpy as np
 import yaml
-from scipy.ndimage import distance_transform_edt
 
 from segslam.config import MapConfig
+from segslam.map.ground_heights import ground_heights
 from segslam.map.part import Extent, Part
 from segslam.map.tiles import TILE_M, corner
-from segslam.types import GROUND_LABELS, Points, Vector
+from segslam.types import GROUND_LABELS
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 """Values of map_server's `trinary` mode; 205 lies between its two thresholds."""
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
-GROUND_CELL_M = 2.0
 
 
 class Grid:
@@ -65,7 +65,7 @@ class Grid:
         """(cells, cells) uint8, the southernmost row first."""
         within = part.points - corner(part.tile)
         is_ground = np.isin(part.labels, np.array(GROUND_LABELS, np.uint8))
-        height_m = within[:, 2] - ground_heights(within, within[is_ground] if is_ground.any() else within)
+        height_m = within[:, 2] - ground_heights(within, within[is_ground] if is_ground.any() else within, TILE_M)
         column, row = np.clip((within[:, :2] / TILE_M * self._cells).astype(np.int64), 0, self._cells - 1).T
         low_m, high_m = self._config.obstacle_m
         cell = row * self._cells + column
@@ -74,21 +74,15 @@ class Grid:
             for chosen in ((height_m >= low_m) & (height_m <= high_m) & ~is_ground, is_ground | (height_m < low_m))
         )
         occupied = obstacles >= self._config.min_obstacle_voxels
-        return np.select([occupied, ground > 0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
+        seen = np.select([occupied, ground > 0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
+        return self._filled_along_rays(seen, part)
 
-
-def ground_heights(points: Points, ground: Points) -> Vector:
-    """Height of the ground (m) beneath each point: the lowest of `ground` in its cell, or in the nearest that has any.
-
-    Both lie within a tile, x and y from its corner.
-    """
-    size = round(TILE_M / GROUND_CELL_M)
-    lowest = np.full((size, size), np.inf)
-    np.minimum.at(lowest, _ground_cells(ground, size), ground[:, 2])
-    nearest = distance_transform_edt(np.isinf(lowest), return_distances=False, return_indices=True)
-    return lowest[tuple(nearest)][_ground_cells(points, size)]
-
-
-def _ground_cells(points: Points, size: int) -> tuple[np.ndarray, np.ndarray]:
-    column, row = np.clip((points[:, :2] / GROUND_CELL_M).astype(np.int64), 0, size - 1).T
-    return column, row
+    def _filled_along_rays(self, cells: np.ndarray, part: Part) -> np.ndarray:
+        """Unknown cells that a keyframe's ray to the ground passed over become free."""
+        rows, columns = np.nonzero(cells == UNKNOWN)
+        centres = corner(part.tile)[:2] + (np.column_stack([columns, rows]) + 0.5) * (TILE_M / self._cells)
+        free = np.zeros(len(centres), bool)
+        for passed in self._extent.sights.free(part.tile, centres):
+            free |= passed
+        cells[rows[free], columns[free]] = FREE
+        return cells

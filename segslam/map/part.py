@@ -5,12 +5,16 @@ from pathlib import Path
 from typing import Protocol
 
 from segslam.config import MapConfig
-from segslam.map.colors import Colors
+from segslam.map.sights import Sights
 from segslam.map.tiles import Tile
+from segslam.semantics.class_colors import Colors
 from segslam.types import Labels, Points, Vector
 
+Window = tuple[float, float, float, float]
+"""West, east, south and north end of a picture (m)."""
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Extent:
     """Which tiles a map may have: columns from `west` to `east`, rows from `south` to `north`, those included."""
 
@@ -18,8 +22,14 @@ class Extent:
     east: int
     south: int
     north: int
-    brightest: float | None = None
+    brightest: float | None
     """No voxel's intensity is above it; None if intensities are not known."""
+    path_m: Points
+    """Positions of the keyframes in the world, in order."""
+    span: tuple[float, float]
+    """Of the heights or intensities that the colours show, the ends of the scale."""
+    sights: Sights
+    """Free space as the keyframes saw it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,17 +1,26 @@
-"""A map from above, as a PNG."""
+"""A map from above, as a PNG: shaded by height, with the trajectory, a scale bar and a legend."""
 
 from pathlib import Path
 
-import matplotlib.image
 import numpy as np
+from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from segslam.config import MapConfig
-from segslam.map.part import Extent, Part
+from segslam.map.colors import scale_of
+from segslam.map.part import Extent, Part, Window
 from segslam.map.tiles import TILE_M, corner
+from segslam.semantics.class_colors import COLORS
 
 MAX_SIDE = 4000
 """Pixels of the longer side at most; the memory that a picture takes is bounded by it."""
+MARGIN_M = 4.0
 BACKGROUND = 255
+SHADED_M = 3.0
+"""Chosen: heights are shaded against the mean around them, in a square of this size."""
+GAP_PX = 1.5
+"""Chosen: pixels beside a known one, the diagonal ones too, are filled."""
+RELIEF_M, CONTRAST = 1.5, 0.35
+"""Chosen: a difference of heights that is shaded strongly, and how strongly."""
 
 
 class Picture:
@@ -20,9 +29,13 @@ class Picture:
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._file = file
         self._extent = extent
+        self._color = config.color
         columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
         self._pixels = max(min(round(TILE_M / config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
-        self._image = np.full((rows * self._pixels, columns * self._pixels, 3), BACKGROUND, np.uint8)
+        size = rows * self._pixels, columns * self._pixels
+        self._image = np.full((*size, 3), BACKGROUND, np.uint8)
+        self._height_m = np.full(size, np.nan, np.float32)
+        self._labels: set[int] = set()
 
     def add(self, part: Part) -> None:
         """Draw a part into its square of the picture."""
@@ -31,9 +44,70 @@ class Picture:
         column, row = np.clip(inside.astype(np.int64), 0, self._pixels - 1).T
         top = (self._extent.north - part.tile[1]) * self._pixels
         left = (part.tile[0] - self._extent.west) * self._pixels
-        square = self._image[top : top + self._pixels, left : left + self._pixels]
-        square[self._pixels - 1 - row, column] = part.colors[order]
+        square = np.s_[top : top + self._pixels, left : left + self._pixels]
+        self._image[square][self._pixels - 1 - row, column] = part.colors[order]
+        self._height_m[square][self._pixels - 1 - row, column] = part.points[order, 2]
+        self._labels |= set(np.unique(part.labels).tolist())
 
     def close(self) -> None:
         """Write the picture."""
-        matplotlib.image.imsave(self._file, self._image)
+        rows, columns = self._seen()
+        colors, height_m = closed(self._image[rows, columns], self._height_m[rows, columns])
+        image = shaded(colors, height_m, SHADED_M * self._pixels / TILE_M)
+        from segslam.map.from_above import drawn_map  # matplotlib takes a while to import
+
+        titles = {"class": "class", "height": "height (m)", "intensity": "intensity"}
+        window, path_m = self._window(rows, columns), self._extent.path_m
+        self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=titles[self._color], marks=self._marks()))
+
+    def _seen(self) -> tuple[slice, slice]:
+        """Rows and columns of the picture that have points, with a margin."""
+        margin = round(MARGIN_M * self._pixels / TILE_M)
+        known = np.isfinite(self._height_m)
+        ends = []
+        for axis in (1, 0):
+            places = np.flatnonzero(known.any(axis=axis))
+            ends.append(slice(max(places[0] - margin, 0), places[-1] + 1 + margin))
+        return ends[0], ends[1]
+
+    def _window(self, rows: slice, columns: slice) -> Window:
+        west, south = corner((self._extent.west, self._extent.south))[:2].tolist()
+        pixel_m = TILE_M / self._pixels
+        height, width = self._height_m.shape
+        last_column, last_row = min(columns.stop, width), min(rows.stop, height)
+        return (
+            west + columns.start * pixel_m,
+            west + last_column * pixel_m,
+            south + (height - last_row) * pixel_m,
+            south + (height - rows.start) * pixel_m,
+        )
+
+    def _marks(self) -> list[tuple[str, str]]:
+        """Text and colour of the classes that the map has, or of numbers along the scale."""
+        if self._color == "class":
+            return [(label.name.lower().replace("_", " "), COLORS[label]) for label in COLORS if label in self._labels]
+        return [(f"{value:.3g}", color) for value, color in scale_of(self._extent.span)]
+
+
+def closed(image: np.ndarray, height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and heights with the gaps between points filled: a pixel takes those of a known one beside it."""
+    away, nearest = distance_transform_edt(np.isnan(height_m), return_indices=True)
+    fill = away < GAP_PX
+    rows, columns = (place[fill] for place in nearest)
+    full, heights = image.copy(), height_m.copy()
+    full[fill], heights[fill] = image[rows, columns], height_m[rows, columns]
+    return full, heights
+
+
+def shaded(image: np.ndarray, height_m: np.ndarray, window: float) -> np.ndarray:
+    """Colours (rows, columns, 3) made lighter where they stand above their surroundings, darker where below.
+
+    `height_m` is NaN where nothing is known; `window` is the size of the surroundings in pixels.
+    """
+    known = np.isfinite(height_m)
+    size = max(round(window), 3)
+    weight = uniform_filter(known.astype(np.float32), size)
+    mean = uniform_filter(np.where(known, height_m, 0.0).astype(np.float32), size) / np.maximum(weight, 1e-6)
+    relief = np.tanh(np.where(known, height_m - mean, 0.0) / RELIEF_M)
+    factor = np.where(known, 1.0 + CONTRAST * relief, 1.0)[..., None]
+    return np.clip(image * factor, 0, 255).astype(np.uint8)

@@ -10,8 +10,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
+from segslam.system.kernels import kernel
 from segslam.types import Points
 
 CELL_RAD = math.radians(0.5)
@@ -21,7 +21,7 @@ NUM_ROWS = 180
 """45 degrees down to 45 degrees up."""
 STEP_M = 0.01
 NOTHING = 65535
-"""Of a direction from which nothing returned, which says nothing. Ranges are whole STEP_M, 655 m at most."""
+"""Value of a direction without a return, which is unknown. Ranges are multiples of STEP_M, at most 655 m."""
 MIN_RANGE_M = 1.0
 MAX_SPREAD_CELLS = 12
 """A near point stands for at most so many cells to each side."""
@@ -47,7 +47,7 @@ class Views:
         return np.fromfile(self._file, np.uint16, cells, offset=2 * cells * number).reshape(NUM_ROWS, NUM_COLUMNS)
 
 
-@njit("UniTuple(float64, 3)(float64, float64, float64)", cache=True, nogil=True, inline="always")
+@kernel("UniTuple(float64, 3)(float64, float64, float64)")
 def _direction(x, y, z):
     """Row and column, as fractions, and distance."""
     across = math.sqrt(x * x + y * y)
@@ -56,7 +56,7 @@ def _direction(x, y, z):
     return row, column, math.sqrt(across * across + z * z)
 
 
-@njit("uint16[:, :](float32[:, :], float64)", cache=True, nogil=True)
+@kernel("uint16[:, :](float32[:, :], float64)")
 def view(points, spread_m):
     """The nearest return in each direction, in STEP_M; each point counts for all cells within `spread_m` of it."""
     nearest = np.full((NUM_ROWS, NUM_COLUMNS), NOTHING, np.uint16)
@@ -72,7 +72,7 @@ def view(points, spread_m):
     return nearest
 
 
-@njit("void(float32[:, :], float64[:, :], uint16[:, :], float64[:], uint32[:, :])", cache=True, nogil=True)
+@kernel("void(float32[:, :], float64[:, :], uint16[:, :], float64[:], uint32[:, :])")
 def count_votes(points, T_view_points, nearest, limits, votes):
     """Add one view's word on each point: column 0 of `votes` counts who confirms it, column 1 who saw through it.
 

@@ -3,6 +3,14 @@
 from segslam.odometry.apart import OdometryApart
 from segslam.odometry.given import GivenOdometry
 from segslam.odometry.kiss import KissOdometry
-from segslam.odometry.sweep import Odometry, OdometryResult
+from segslam.odometry.sweep import Followed, Odometry, OdometryResult, deskew_scan
 
-__all__ = ["GivenOdometry", "KissOdometry", "Odometry", "OdometryApart", "OdometryResult"]
+__all__ = [
+    "Followed",
+    "GivenOdometry",
+    "KissOdometry",
+    "Odometry",
+    "OdometryApart",
+    "OdometryResult",
+    "deskew_scan",
+]

@@ -2,15 +2,16 @@
 
 import multiprocessing
 import signal
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from typing import Any
 
 import numpy as np
 
-from segslam.allocator import keep_freed_memory
 from segslam.config import OdometryConfig
 from segslam.odometry.kiss import KissAligner, KissOdometry
+from segslam.system.memory import keep_freed_memory
 from segslam.types import Points, SegslamError, Transform
 
 MOST_SHARED = 2**18
@@ -21,7 +22,8 @@ class OdometryApart(KissOdometry):
     """As `KissOdometry`; while a scan is aligned, the thread that asks waits with Python's lock released.
 
     Its process starts at once; close it, or leave its `with`, when no more scans follow. Every method raises
-    SegslamError if the process has ended.
+    SegslamError if the process has ended. The process imports the script that is run, as all spawned ones do: a script
+    that uses this class needs `if __name__ == "__main__":`.
     """
 
     def __init__(self, config: OdometryConfig) -> None:
@@ -51,22 +53,31 @@ class _AlignerApart:
         self._process.start()
         theirs.close()
 
-    def align(self, points: Points) -> Transform:
-        """T_odom_lidar of the next sweep."""
-        return self._asked(None, points)
+    def align(self, points: Points, gap: float = 1.0) -> Transform:
+        """T_odom_lidar of the next sweep, `gap` intervals after the one before."""
+        return self._asked(gap, points)
 
     def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
         """As `KissAligner.restore`."""
         self._asked(T_odom_lidar, points)
 
-    def _asked(self, T_odom_lidar: Transform | None, points: Points | None) -> Transform:
-        """The pose of the sweep: the one given or, where it is None, the one it is found at."""
+    def follow(
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+    ) -> None:
+        """As `Odometry.follow`."""
+        self._exchange((list(scans), T_odom_lidar, T_before_lidar))
+
+    def _asked(self, known: Transform | float, points: Points | None) -> Transform:
+        """The pose of the sweep: the one given or, after a gap, the one it is found at."""
         sent: Points | int | None = points
         if points is not None and len(points) <= len(self._shared):
             self._shared[: len(points)] = points
             sent = len(points)
+        return self._exchange((known, sent))
+
+    def _exchange(self, request: tuple[Any, ...]) -> Transform:
         try:
-            self._pipe.send((T_odom_lidar, sent))
+            self._pipe.send(request)
             answer: Transform = self._pipe.recv()
         except (EOFError, OSError) as error:
             raise self._ended() from error
@@ -99,7 +110,9 @@ def _as_points(shared: Any) -> Points:
 
 
 def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
-    """Until the other side closes: points without a pose are aligned, points with one restored; the pose is answered.
+    """Until the other side closes: points with a gap are aligned, points with a pose restored; the pose is answered.
+
+    Three things are the arguments of `follow`.
 
     The points come themselves, or their number where they are in the shared memory.
     """
@@ -109,12 +122,17 @@ def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
     shared_points = _as_points(shared)
     try:
         while True:
-            T_odom_lidar, sent = pipe.recv()
+            request = pipe.recv()
+            if len(request) == 3:
+                aligner.follow(*request)
+                pipe.send(request[1])
+                continue
+            known, sent = request
             points = shared_points[:sent] if isinstance(sent, int) else sent
-            if T_odom_lidar is None:
-                T_odom_lidar = aligner.align(points)
+            if isinstance(known, float):
+                known = aligner.align(points, known)
             else:
-                aligner.restore(T_odom_lidar, points)
-            pipe.send(T_odom_lidar)
+                aligner.restore(known, points)
+            pipe.send(known)
     except (EOFError, OSError):
         return

@@ -1,44 +1,61 @@
 """The pose of each scan as another odometry gave it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
 
 from segslam import geometry
 from segslam.config import OdometryConfig
-from segslam.odometry.sweep import OdometryResult, prepare
+from segslam.odometry.sweep import Followed, OdometryResult, deskew_scan
 from segslam.trajectory import Poses
-from segslam.types import BadScan, Scan, Trajectory, Transform
+from segslam.types import BadScan, Points, Scan, Trajectory, Transform
 
 
 class GivenOdometry:
     """The poses of another odometry, moved so that the first scan asked for has the identity."""
 
+    is_from_scans = False
+
     def __init__(
         self, trajectory: Trajectory, config: OdometryConfig, *, match: Literal["scan_index", "stamp"] = "scan_index"
     ) -> None:
-        """`match` says what finds a scan's row: its number, or the nearest stamp within `config.stamp_tolerance_s`."""
+        """`match`: a scan's row is found by its number, or by the nearest stamp within `config.stamp_tolerance_s`."""
         self._config = config
         self._trajectory = trajectory
         self._rows = {int(scan_index): row for row, scan_index in enumerate(trajectory.scan_index)}
         self._row = self._row_of_scan if match == "scan_index" else self._row_of_stamp
-        self._T_given_first: Transform | None = None
+        self._T_odom_given: Transform | None = None
+        """Moves the trajectory to the odometry's frame."""
+        self._T_given_last = np.eye(4)
         self._T_odom_last = np.eye(4)
 
-    def register(self, scan: Scan) -> OdometryResult:
+    def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
         """The pose and the kept points of a scan. Raises BadScan if it has no pose or no point within range."""
         T_given_lidar = self._trajectory.T_world_lidar[self._row(scan)]
-        T_given_first = T_given_lidar if self._T_given_first is None else self._T_given_first
-        T_odom_lidar = geometry.inverse(T_given_first) @ T_given_lidar
-        points, labels, intensities = prepare(scan, geometry.inverse(self._T_odom_last) @ T_odom_lidar, self._config)
-        self._T_given_first, self._T_odom_last = T_given_first, T_odom_lidar
+        T_odom_given = geometry.inverse(T_given_lidar) if self._T_odom_given is None else self._T_odom_given
+        T_odom_lidar = T_odom_given @ T_given_lidar
+        points, labels, intensities = deskew_scan(
+            scan, geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / gap), self._config
+        )
+        self._T_odom_given, self._T_odom_last, self._T_given_last = T_odom_given, T_odom_lidar, T_given_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
-    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
+    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan], *, since: Followed | None = None) -> None:
         """Go on after the scans that were given these poses; the first of them is read, with `scan_of`."""
-        self._T_given_first = self._trajectory.T_world_lidar[self._row(scan_of(0))]
+        row = 0 if since is None else since[0]
+        T_given_lidar = self._trajectory.T_world_lidar[self._row(scan_of(row))]
+        T_first_given = geometry.inverse(T_given_lidar)
+        self._T_odom_given = T_first_given if since is None else T_odom_lidar[row] @ T_first_given
+        self._T_given_last = self._trajectory.T_world_lidar[self._row(scan_of(len(T_odom_lidar) - 1))]
         self._T_odom_last = T_odom_lidar[-1]
+
+    def follow(
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+    ) -> None:
+        """Go on from another pose of the last scan."""
+        self._T_odom_given = T_odom_lidar @ geometry.inverse(self._T_given_last)
+        self._T_odom_last = T_odom_lidar
 
     def _row_of_scan(self, scan: Scan) -> int:
         if scan.index not in self._rows:
@@ -55,7 +72,7 @@ class GivenOdometry:
             raise BadScan(
                 f"scan {scan.index}: the odometry given has no pose within {self._config.stamp_tolerance_s} s of its "
                 f"stamp {scan.stamp_ns} ns (it has {_span(self._trajectory.stamp_ns)}); "
-                "leave the scan out, mend the stamps or raise odometry.stamp_tolerance_s"
+                "leave the scan out, correct the stamps or raise odometry.stamp_tolerance_s"
             )
         return row
 

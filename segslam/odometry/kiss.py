@@ -1,6 +1,6 @@
 """KISS-ICP (Vizzo et al., RA-L 2023), by its authors' package."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -8,8 +8,9 @@ from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingC
 from kiss_icp.config.parser import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
+from segslam import geometry
 from segslam.config import OdometryConfig
-from segslam.odometry.sweep import OdometryResult, prepare
+from segslam.odometry.sweep import Followed, OdometryResult, deskew_scan
 from segslam.trajectory import Poses
 from segslam.types import Points, Scan, Transform
 
@@ -18,12 +19,18 @@ from segslam.types import Points, Scan, Transform
 class Aligner(Protocol):
     """Aligns sweep after sweep with a local map of those before; here or in another process."""
 
-    def align(self, points: Points) -> Transform:
-        """T_odom_lidar of the next sweep, from its points, float64."""
+    def align(self, points: Points, gap: float = 1.0) -> Transform:
+        """T_odom_lidar of the next sweep, from its points, float64, `gap` intervals after the one before."""
         ...
 
     def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
         """As if the next sweep had been aligned there; without points where all have left the local map since."""
+        ...
+
+    def follow(
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+    ) -> None:
+        """As `Odometry.follow`."""
         ...
 
 
@@ -31,12 +38,29 @@ class KissAligner:
     """KISS-ICP's own. Several threads add up in any order: poses repeat to 1e-9 m, on one to the bit."""
 
     def __init__(self, config: OdometryConfig) -> None:
+        self._config = config
         self._kiss = KissICP(_kiss_config(config))
 
-    def align(self, points: Points) -> Transform:
-        """T_odom_lidar of the next sweep, from its points, float64."""
-        self._kiss.register_frame(points, np.empty(0))
-        return np.array(self._kiss.last_pose)
+    def follow(
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+    ) -> None:
+        """As `Odometry.follow`: nothing is left of the state before."""
+        self._kiss = kiss = KissICP(_kiss_config(self._config))
+        for T_odom_scan, points in scans:
+            kiss.local_map.update(points.astype(np.float64), T_odom_scan)
+        kiss.last_pose = np.array(T_odom_lidar)
+        kiss.last_delta = np.array(T_before_lidar)
+
+    def align(self, points: Points, gap: float = 1.0) -> Transform:
+        """T_odom_lidar of the next sweep, from its points, float64.
+
+        KISS-ICP predicts by the last motion, here scaled to `gap` intervals and after that back to one.
+        """
+        kiss = self._kiss
+        kiss.last_delta = geometry.scaled(kiss.last_delta, gap)
+        kiss.register_frame(points, np.empty(0))
+        kiss.last_delta = geometry.scaled(kiss.last_delta, 1 / gap)
+        return np.array(kiss.last_pose)
 
     def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
         """As if the next sweep had been aligned there; without points where all have left the local map since."""
@@ -52,34 +76,50 @@ class KissAligner:
 class KissOdometry:
     """Scan to local map: the scan made ready, and a pose from the aligner, KISS-ICP's in this process unless given."""
 
+    is_from_scans = True
+
     def __init__(self, config: OdometryConfig, aligner: Aligner | None = None) -> None:
         self._config = config
         self._aligner = aligner or KissAligner(config)
         self._T_odom_last = self._T_last_lidar = np.eye(4)
 
-    def register(self, scan: Scan) -> OdometryResult:
-        """The pose and the kept points of the next scan, in order of time.
+    def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
+        """The pose and the kept points of the next scan, in order of time, `gap` intervals after the one before.
 
         Raises BadScan, and forgets the scan, if none of its points is within range.
         """
-        points, labels, intensities = prepare(scan, self._T_last_lidar, self._config)
-        T_odom_lidar = self._aligner.align(points)
+        points, labels, intensities = deskew_scan(scan, self._T_last_lidar, self._config)
+        T_odom_lidar = self._aligner.align(points, gap)
         self._now_at(T_odom_lidar)
+        self._T_last_lidar = geometry.scaled(self._T_last_lidar, 1 / gap)
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
-    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan]) -> None:
+    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan], *, since: Followed | None = None) -> None:
         """The state, to the bit, that registering the scans of these poses has left. `scan_of` reads the scan of a row.
 
         Read are those that can have left points in the local map: it forgets what lies farther than its range, so a
         scan taken at twice the range from the last, and all before it, have nothing in it.
         """
+        done = 0
+        if since is not None:
+            row, scans = since
+            T_before = np.eye(4) if row == 0 else T_odom_lidar[row - 1]
+            self.follow(scans, T_odom_lidar[row], np.linalg.inv(T_before) @ T_odom_lidar[row])
+            done = row + 1
         apart_m = np.linalg.norm(T_odom_lidar[:, :3, 3] - T_odom_lidar[-1, :3, 3], axis=1)
         forgotten = np.flatnonzero(apart_m > 2 * self._config.max_range_m)
         first = forgotten[-1] + 1 if len(forgotten) else 0
-        for row, T_odom_now in enumerate(T_odom_lidar):
-            points = prepare(scan_of(row), self._T_last_lidar, self._config)[0] if row >= first else None
+        for row, T_odom_now in enumerate(T_odom_lidar[done:], start=done):
+            points = deskew_scan(scan_of(row), self._T_last_lidar, self._config)[0] if row >= first else None
             self._aligner.restore(T_odom_now, points)
             self._now_at(T_odom_now)
+
+    def follow(
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+    ) -> None:
+        """Go on from another pose of the last scan, with a local map of these scans alone."""
+        self._aligner.follow(scans, T_odom_lidar, T_before_lidar)
+        self._T_odom_last, self._T_last_lidar = T_odom_lidar, T_before_lidar
 
     def _now_at(self, T_odom_lidar: Transform) -> None:
         self._T_last_lidar = _since(self._T_odom_last, T_odom_lidar)

@@ -1,4 +1,4 @@
-"""An edge of the graph as numbers, and as the factor that GTSAM wants."""
+"""An edge of the graph as numbers, and as a factor of GTSAM."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -53,8 +53,16 @@ def squared_errors(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> V
     return np.array([2.0 * graph.at(i).error(values) for i in range(graph.size())])
 
 
+def values_of(T_world: Transforms) -> gtsam.Values:
+    """Poses under the keys 0, 1, 2, ..."""
+    values = gtsam.Values()
+    for key, T_world_key in enumerate(T_world):
+        values.insert(key, gtsam.Pose3(T_world_key))
+    return values
+
+
 def poses_by_id(values: gtsam.Values) -> Transforms:
-    """All poses, ascending in their key."""
+    """All poses, sorted by key."""
     rows = np.asarray(gtsam.utilities.extractPose3(values)).reshape(-1, 12)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)

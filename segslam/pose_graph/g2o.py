@@ -1,8 +1,8 @@
 """Pose graphs as g2o text: the tags VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX.
 
 A vertex is `id x y z qx qy qz qw`; an edge is `a b`, the pose of b in a as for a vertex, and the upper triangle of its
-information, row by row. g2o puts translation before rotation, we the other way round: turned here and nowhere else.
-Like GTSAM we take the rotational part of the information as it stands.
+information, row by row. g2o puts translation before rotation, segslam after it: only this module converts.
+Like GTSAM, it uses the rotational part of the information as it is.
 """
 
 from collections.abc import Iterable
@@ -31,10 +31,10 @@ QUATERNION_TOLERANCE = 0.01  # chosen: above the rounding of any writer met, far
 
 @dataclass(frozen=True, slots=True, eq=False)
 class G2oGraph:
-    """What a file holds."""
+    """Contents of a g2o file."""
 
     T_world_vertex: dict[int, Transform]
-    """By id, as the file guesses."""
+    """Poses of the vertices by id, as in the file."""
     edges: list[Edge]
     fixed: tuple[int, ...] = ()
     """Vertices that FIX lines name."""
@@ -50,7 +50,7 @@ class _Table:
     numbers: np.ndarray
 
     def refusal(self, row: SupportsIndex, what: str) -> SegslamError:
-        return SegslamError(f"{self.path}:{self.line_numbers[row]}: {what}; mend or remove the line")
+        return SegslamError(f"{self.path}:{self.line_numbers[row]}: {what}; correct or remove the line")
 
 
 def read_g2o(path: Path) -> G2oGraph:
@@ -120,7 +120,7 @@ def _complaint(tag: str, num_fields: int) -> str:
         return f"{tag} belongs to a graph in the plane; only graphs in space ({VERTEX}, {EDGE}) can be read"
     if tag not in NUM_FIELDS:
         return f"unknown tag {tag}; known are {', '.join(NUM_FIELDS)}: remove the line"
-    return f"{tag} takes {NUM_FIELDS[tag]} numbers, found {num_fields}; mend or remove the line"
+    return f"{tag} takes {NUM_FIELDS[tag]} numbers, found {num_fields}; correct or remove the line"
 
 
 def _table(path: Path, tag: str, line_numbers: list[int], fields: list[list[str]]) -> _Table:

@@ -1,4 +1,4 @@
-"""Truncated least squares over a pose graph: which closures to believe, decided together with the poses.
+"""Truncated least squares over a pose graph: inliers among the closures, decided together with the poses.
 
 Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020:
 truncated least squares, in which a closure costs at most its bound.
@@ -10,9 +10,9 @@ truncated least squares, in which a closure costs at most its bound.
 | mu | `control` |
 | w_i | `weights` |
 
-Differs from the paper, and from GTSAM's GncOptimizer, which optimises to the end and from the first values at each mu:
-each mu takes one Gauss-Newton step from the last values, all that a small change of weights asks for. Levenberg-
-Marquardt comes at the end.
+Differs from the paper and from GTSAM's GncOptimizer, which optimise until convergence from the first values at each mu:
+here each mu takes one Gauss-Newton step from the last values, which is enough for a small change of weights.
+Levenberg-Marquardt follows at the end.
 """
 
 from collections.abc import Sequence
@@ -22,45 +22,45 @@ import gtsam
 import numpy as np
 
 from segslam.pose_graph.edges import Edge, factor_graph, squared_errors
-from segslam.pose_graph.solver import Search, search, step
+from segslam.pose_graph.levenberg_marquardt import Search, search, step
+from segslam.robust import CONTROL_FACTOR, first_control, tls_weights
 from segslam.types import Mask, Vector
 
-CONTROL_FACTOR = 1.4  # growth of mu in the paper
 MAX_STEPS = 100
 NEGLIGIBLE_WEIGHT = 1e-6
-"""A closure of less weight is left out of the linear system."""
+"""Closures with a smaller weight are left out of the linear system."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Poses, and which closures to believe."""
+    """Poses, and which closures are inliers."""
 
     search: Search
-    """Its error is of all that is believed."""
+    """Its error is that of the factors without closures that were rejected."""
     weights: Vector
-    """(k,) 1 believed, 0 switched off."""
+    """(k,) 1 for an inlier, 0 for a rejected closure."""
     truncated_cost: float
-    """Error of all that is believed, and half the bound, times its say, for each closure that is not."""
+    """The error of `search` and, for each rejected closure, half the bound times its penalty."""
 
 
 class TruncatedProblem:
-    """Factors that are never doubted, and closures that are believed or cost their say times half of `inlier_bound`.
+    """Factors that are always kept, and closures that are kept or cost their penalty times half of `inlier_bound`.
 
-    The bound is of the squared whitened error (chi-square, not half of it).
+    The bound is one of the squared whitened error (chi-square, not half of it).
     """
 
     def __init__(
         self,
-        trusted: gtsam.NonlinearFactorGraph,
+        backbone: gtsam.NonlinearFactorGraph,
         closures: Sequence[Edge],
         inlier_bound: float,
         *,
-        says: Vector | None = None,
+        penalties: Vector | None = None,
     ) -> None:
-        """`says` (k,) 0 to 1: what not to believe a closure costs; less for closures that may be wrong together."""
+        """`penalties` (k,) 0 to 1: cost of rejecting each closure; low for closures that may be wrong together."""
         self.inlier_bound = inlier_bound
-        self._says = np.ones(len(closures)) if says is None else says
-        self._trusted = trusted
+        self._penalties = np.ones(len(closures)) if penalties is None else penalties
+        self._backbone = backbone
         self._closures = closures
         self._factors = factor_graph(closures)
 
@@ -73,12 +73,12 @@ class TruncatedProblem:
         return (self.squared_errors(values) <= self.inlier_bound).astype(float)
 
     def cost(self, error: float, weights: Vector) -> float:
-        """Of poses with this error of all that is believed: what is compared between solutions."""
-        return error + 0.5 * self.inlier_bound * float(self._says[weights == 0.0].sum())
+        """The truncated cost of a solution, from the error of the factors that it keeps."""
+        return error + 0.5 * self.inlier_bound * float(self._penalties[weights == 0.0].sum())
 
     def weighted(self, weights: Vector) -> gtsam.NonlinearFactorGraph:
         """The least-squares problem in which closure i has its information times `weights[i]`."""
-        graph = gtsam.NonlinearFactorGraph(self._trusted)
+        graph = gtsam.NonlinearFactorGraph(self._backbone)
         for i, (closure, weight) in enumerate(zip(self._closures, weights, strict=True)):
             if weight == 1.0:
                 graph.add(self._factors.at(i))
@@ -88,9 +88,9 @@ class TruncatedProblem:
 
 
 def solve(problem: TruncatedProblem, start: gtsam.Values) -> Solution:
-    """The poses, and for each closure whether to believe it: by graduated non-convexity, or next to `start` if better.
+    """Poses and inliers by graduated non-convexity, or near `start` if their cost is lower there.
 
-    Neither promises the global optimum.
+    Neither is sure to be the global optimum.
     """
     values, iterations = _graduate(problem, start)
     graduated = settle(problem, values, iterations)
@@ -98,23 +98,23 @@ def solve(problem: TruncatedProblem, start: gtsam.Values) -> Solution:
 
 
 def better(first: Solution, second: Solution) -> Solution:
-    """That of the lower cost."""
+    """The solution with the lower truncated cost."""
     return second if second.truncated_cost < first.truncated_cost else first
 
 
 def settle_from(problem: TruncatedProblem, start: gtsam.Values, likely: Mask) -> Solution:
-    """The solution next to the optimum, searched from `start`, of those closures that are `likely` (k,)."""
+    """The solution near the optimum, searched from `start`, of some `likely` closures (k,)."""
     found = search(problem.weighted(likely.astype(float)), start)
     return settle(problem, found.values, found.iterations)
 
 
 def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Values, int]:
-    """Algorithm 1: from the optimum that believes all to where each closure is believed or not; and the iterations."""
-    values, _, iterations = search(problem.weighted(np.ones(len(problem.squared_errors(start)))), start)
+    """Algorithm 1: from the optimum of all closures to weights of 0 and 1; the poses, and the number of iterations."""
+    values, _, iterations, _ = search(problem.weighted(np.ones(len(problem.squared_errors(start)))), start)
     worst = problem.squared_errors(values).max(initial=0.0)
     if worst <= problem.inlier_bound:
         return values, iterations
-    control = problem.inlier_bound / (2.0 * worst - problem.inlier_bound)
+    control = first_control(worst, problem.inlier_bound)
     for _ in range(MAX_STEPS):
         weights = tls_weights(problem.squared_errors(values), control, problem.inlier_bound)
         if np.minimum(weights, 1.0 - weights).max() < NEGLIGIBLE_WEIGHT:
@@ -125,17 +125,11 @@ def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Val
     return values, iterations
 
 
-def tls_weights(squared: Vector, control: float, inlier_bound: float) -> Vector:
-    """(k,) 0 to 1, the surrogate's weights of truncated least squares."""
-    low, high = inlier_bound * control / (control + 1.0), inlier_bound * (control + 1.0) / control
-    weights = np.sqrt(inlier_bound * control * (control + 1.0) / np.clip(squared, low, high)) - control
-    return np.clip(weights, 0.0, 1.0)
-
-
 def settle(problem: TruncatedProblem, values: gtsam.Values, iterations: int = 0) -> Solution:
-    """The optimum of the truncated cost next to `values`: believe what is within the bound, optimise, look again.
+    """Local optimum of the truncated cost near `values`: keep the closures within the bound, optimise, repeat.
 
-    Neither half raises the cost, so this ends; MAX_STEPS guards against rounding at the bound.
+    With penalties of 1 neither half raises the cost, so this ends; MAX_STEPS guards against other penalties and against
+    rounding at the bound.
     """
     within = problem.inliers(values)
     for _ in range(MAX_STEPS):

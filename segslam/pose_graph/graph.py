@@ -1,11 +1,13 @@
-"""The factor graph of keyframes: odometry between neighbours, closures between visits, one estimate for all.
+"""The factor graph of keyframes: odometry between consecutive keyframes, closures between visits of a place.
 
-The graph is small, for it holds keyframes and not scans, so each optimisation is a full one that starts from the last
-estimate: 2,271 keyframes with 396 closures take some 15 ms an iteration, and two or three iterations. On a drive so
-long that this adds up, closures wait for each other.
+The graph holds keyframes, not scans, so it is small. Each optimisation is a full one from the last estimate: 2,271
+keyframes with 396 closures take about 15 ms per iteration, and two or three iterations. On very long drives,
+several closures are collected before an optimisation.
 """
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -13,47 +15,46 @@ import numpy as np
 
 from segslam import geometry
 from segslam.config import GraphConfig
-from segslam.pose_graph import gnc, noise
-from segslam.pose_graph.agreeing import believe_agreeing
-from segslam.pose_graph.consistency import agreements, ends_m, neighbours, num_near
-from segslam.pose_graph.drift import straightened, turns_per_m
-from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors
+from segslam.pose_graph import noise
+from segslam.pose_graph.breaks import is_break, relinked
+from segslam.pose_graph.closure_pairs import consistent_pairs, largest_consistent, pairwise_chi2
+from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors, values_of
+from segslam.pose_graph.final import Measured, solve_consistent, solve_gnc
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
+from segslam.pose_graph.levenberg_marquardt import search
+from segslam.pose_graph.motions import without
 from segslam.pose_graph.rows import Rows
-from segslam.pose_graph.solver import search
-from segslam.types import AngleSamples, GraphEstimate, LoopClosure, SegslamError, Transform, Vector
+from segslam.types import GraphEstimate, Information, LoopClosure, Mask, SegslamError, Transform, Vector
 
 RUNNING_TOLERANCE = 1e-3
-"""Where an optimisation ends while running. Chosen: the same trajectories to a centimetre, a third fewer iterations."""
+"""Relative tolerance of the optimisations while running. Chosen: the same trajectories to a centimetre, with a third
+fewer iterations."""
 FINAL_TOLERANCE = 1e-5
 CLOSURES_PER_WAITING = 200
-"""Chosen: of so many closures in the estimate, one more waits for the next optimisation: it tells less, and the time of
-all optimisations would grow with the square of the drive. The KITTI drives tried have 86 at most."""
-MOST_PAIRED = 5_000
-"""Closures of which every two are compared, in 8 s and 450 MB; of more than that, graduated non-convexity decides."""
-PLACE_M = 30.0
-"""Closures whose ends are this near in travel see the same things, and are wrong together. Chosen."""
-VOICES_OF_A_PLACE = 2.0
-"""All closures between two places have the say of this many. Chosen of 0.5 to 5 with `tools/bench_back_end.py`: with
-less a place of true closures is given up, with more a repeated street outvotes the odometry."""
+"""Chosen: the graph is optimised after 1 + n / 200 new closures, with n closures in the estimate, so that the time of
+all optimisations grows linearly with the drive. The KITTI drives tried have 86 closures at most."""
 
 
 class PoseGraph:
-    """Keyframes of ids 0, 1, 2, ... and the closures among them. It alone owns world poses.
+    """Keyframes 0, 1, 2, ... and the closures between them. It owns all world poses.
 
-    The world is the odometry's frame as the first keyframe sees it.
+    The world frame is the odometry frame of the first keyframe.
     """
 
     def __init__(self, config: GraphConfig) -> None:
+        self._configured = config
         self._config = config
-        self._measured: list[Edge] = []
-        """Odometry as it came."""
+        """The same with the noise of odometry as measured."""
         self._odometry: list[Edge] = []
-        """The same, straightened if it was."""
+        self._rejected = np.zeros(0, dtype=bool)
+        """Of the motions that the last final optimisation knew: whether it rejected them."""
+        self._has_breaks = False
+        self._has_own_information: list[bool] = []
+        """Of each motion: whether its information came with it."""
         self._closures: list[Edge] = []
-        self._trusted = gtsam.NonlinearFactorGraph()
-        """The prior of the first pose and the factors of odometry: never doubted."""
-        self._doubted = gtsam.NonlinearFactorGraph()
+        self._backbone = gtsam.NonlinearFactorGraph()
+        """The prior of the first pose and the factors of odometry."""
+        self._closure_factors = gtsam.NonlinearFactorGraph()
         """The factors of the closures, without robust kernel."""
         self._robust = gtsam.NonlinearFactorGraph()
         """The same under the kernel."""
@@ -68,7 +69,7 @@ class PoseGraph:
 
     @property
     def num_keyframes(self) -> int:
-        """Those added so far."""
+        """Number of keyframes added so far."""
         return len(self._travel_m)
 
     @property
@@ -78,39 +79,59 @@ class PoseGraph:
 
     @property
     def T_world_keyframes(self) -> Transforms:  # noqa: N802
-        """(n, 4, 4) by id: the last estimate, and odometry from there for keyframes that are newer."""
+        """(n, 4, 4) poses by id: the last estimate, continued by odometry for newer keyframes."""
         return self._T_world.all()
 
     @property
     def is_due(self) -> bool:
-        """Whether closures enough wait for an optimisation: one, or more where the estimate has hundreds already."""
+        """Whether enough closures wait for an optimisation: one, or more if the estimate has hundreds already."""
         waiting = len(self._closures) - self._num_closures_in_estimate
         return waiting > self._num_closures_in_estimate // CLOSURES_PER_WAITING
 
     def T_world_keyframe(self, keyframe_id: int) -> Transform:  # noqa: N802
-        """The present estimate of one pose. Raises SegslamError for an id that the graph does not hold."""
+        """The current estimate of one pose. Raises SegslamError for an unknown id."""
         if not self._values.exists(keyframe_id):
             raise SegslamError(f"the pose graph holds keyframes 0 to {self.num_keyframes - 1}, not {keyframe_id}")
         return self._values.atPose3(keyframe_id).matrix()
 
-    def add_keyframe(self, keyframe_id: int, T_odom_keyframe: Transform, travel_m: float) -> None:
-        """The next keyframe, tied by odometry to the one before. Raises ValueError unless ids count from 0."""
+    def add_keyframe(
+        self,
+        keyframe_id: int,
+        T_odom_keyframe: Transform,
+        travel_m: float,
+        *,
+        information: Information | None = None,
+    ) -> None:
+        """Add the next keyframe, with an odometry edge from the one before.
+
+        `information` of the motion from the last keyframe (tangent in the new keyframe) replaces the noise model of
+        odometry: a repaired motion has the information of its registration, an unknown one almost none. The first
+        keyframe has no motion, and ignores it.
+        Raises ValueError unless ids count from 0, and for an information that is not positive semidefinite.
+        """
         if keyframe_id != self.num_keyframes:
             raise ValueError(
                 f"keyframe ids count from 0 without gaps: expected {self.num_keyframes}, got {keyframe_id}"
             )
         if keyframe_id == 0:
             first = gtsam.Pose3(_exact(T_odom_keyframe))
-            self._trusted.add(gtsam.PriorFactorPose3(0, first, noise.first_pose()))
+            self._backbone.add(gtsam.PriorFactorPose3(0, first, noise.first_pose()))
             pose = first
         else:
             T_last_new = _exact(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
             way_m = travel_m - self.travel_m[-1]
-            information = noise.odometry_information(way_m, T_last_new, self._config)
-            edge = Edge(keyframe_id - 1, keyframe_id, T_last_new, information)
-            self._measured.append(edge)
+            edge = Edge(
+                keyframe_id - 1,
+                keyframe_id,
+                T_last_new,
+                noise.odometry_information(way_m, T_last_new, self._config)
+                if information is None
+                else noise.motion_information(information),
+            )
+            self._has_own_information.append(information is not None)
+            self._has_breaks |= is_break(edge)
             self._odometry.append(edge)
-            self._trusted.add(edge.factor())
+            self._backbone.add(edge.factor())
             pose = self._values.atPose3(keyframe_id - 1).compose(gtsam.Pose3(T_last_new))
         self._values.insert(keyframe_id, pose)
         self._T_world.append(pose.matrix())
@@ -118,73 +139,129 @@ class PoseGraph:
         self._travel_m.append(travel_m)
 
     def add_closure(self, closure: LoopClosure) -> None:
-        """A loop between two keyframes that the graph holds; it takes effect with the next optimisation.
+        """Add a loop between two keyframes of the graph; the next optimisation uses it.
 
-        Raises SegslamError for an unknown keyframe, ValueError for an information that is none.
+        Raises SegslamError for an unknown keyframe, ValueError for an invalid information matrix.
         """
-        for keyframe_id in (closure.target_id, closure.source_id):
-            self.T_world_keyframe(keyframe_id)
-        information = noise.closure_information(closure.information, self._config)
-        edge = Edge(closure.target_id, closure.source_id, _exact(closure.T_target_source), information)
+        edge = self._edge(closure)
         self._closures.append(edge)
-        self._doubted.add(edge.factor())
+        self._closure_factors.add(edge.factor())
         self._robust.add(edge.factor(kernel=self._kernel))
 
-    def replace_closures(self, closures: Iterable[LoopClosure]) -> None:
-        """The same loops in the same order, measured better; they take effect with the next optimisation."""
-        self._closures = []
-        self._doubted, self._robust = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-        for closure in closures:
-            self.add_closure(closure)
+    def consistent(self, closures: Sequence[LoopClosure]) -> Mask:
+        """(k,) the largest set of some closures of which every two agree with the odometry between their ends.
 
-    def straighten(self, samples: AngleSamples) -> None:
-        """Turn back in the odometry what leftover angles bent; it takes effect with the next optimisation.
-
-        What an earlier call turned back is put in place again first; keyframes added later are as they come.
+        The closures need not be in the graph, their keyframes must be.
         """
-        travel_m = self.travel_m
-        turned_rad = turns_per_m(samples, (travel_m[:-1] + travel_m[1:]) / 2) * np.diff(travel_m)[:, None]
-        self._odometry = straightened(self._measured, turned_rad)
-        prior = self._trusted.at(0)
-        self._trusted = gtsam.NonlinearFactorGraph()
-        self._trusted.add(prior)
-        self._trusted.push_back(factor_graph(self._odometry))
+        edges = [self._edge(closure) for closure in closures]
+        pairs = consistent_pairs(self._kept_odometry(), edges, self._inlier_bound)
+        return largest_consistent(pairs, np.ones(len(edges), dtype=bool))
+
+    def use_odometry_noise(self, sigma_m: float, sigma_deg: float) -> None:
+        """Use the odometry noise measured on this drive (per root metre), if it is above the configured noise.
+
+        Motions that came with an information keep it. It takes effect with the next optimisation, and for keyframes
+        added later.
+        """
+        self._config = self._config.model_copy(
+            update={
+                "odometry_sigma_m": max(sigma_m, self._configured.odometry_sigma_m),
+                "odometry_sigma_deg": max(sigma_deg, self._configured.odometry_sigma_deg),
+            }
+        )
+        self._odometry = [
+            edge
+            if own
+            else replace(edge, information=noise.odometry_information(float(way_m), edge.T_a_b, self._config))
+            for edge, own, way_m in zip(self._odometry, self._has_own_information, np.diff(self.travel_m), strict=True)
+        ]
+        self._rebuild_backbone()
+
+    def weigh_odometry_by(self, closure: LoopClosure) -> None:
+        """Raise the noise of odometry until the drift that a closure measures, which is certain, is a usual one.
+
+        Drift is usual if its chi-square is the number of its degrees of freedom. Across a break nothing changes.
+        """
+        edge = self._edge(closure)
+        first, last = sorted((edge.a, edge.b))
+        if any(is_break(motion) for motion in self._odometry[first:last]):
+            return
+        at_target = Edge(edge.a, edge.a, np.eye(4), noise.CERTAIN)
+        chi2 = float(pairwise_chi2(self._odometry, [edge, at_target])[0, 1])
+        factor = math.sqrt(chi2 / noise.DEGREES_OF_FREEDOM)
+        if factor > 1.0:
+            self.use_odometry_noise(factor * self._config.odometry_sigma_m, factor * self._config.odometry_sigma_deg)
 
     def optimize(self) -> GraphEstimate:
-        """The optimum under the robust kernel, searched from the last estimate, good enough to go on with."""
+        """Optimise under the robust kernel from the last estimate, with a coarse tolerance."""
         return self._optimize(RUNNING_TOLERANCE)
 
     def finish(self) -> GraphEstimate:
-        """The final optimum, each closure kept or switched off (unless configured not to).
+        """Final optimisation, in which each closure is kept or rejected (unless `final` is `none`).
 
-        Odometry and the first pose are never doubted.
+        `consistent` also rejects motions of the odometry that closures of more than one place contradict.
         """
         robust = self._optimize(FINAL_TOLERANCE)
         if self._config.final == "none":
             return robust
-        places_m = ends_m(self._closures, self.travel_m)
-        says = np.minimum(1.0, VOICES_OF_A_PLACE / num_near(places_m, PLACE_M))
-        problem = gnc.TruncatedProblem(self._trusted, self._closures, self._inlier_bound, says=says)
-        if self._config.final == "gnc" or len(self._closures) > MOST_PAIRED:
-            solution = gnc.solve(problem, self._values)
+        prior = gtsam.NonlinearFactorGraph()
+        prior.add(self._backbone.at(0))
+        measured = Measured(
+            prior,
+            self._odometry,
+            self._closures,
+            self.travel_m,
+            self._inlier_bound,
+            noise.inlier_bound(self._config.inlier_probability),
+        )
+        if self._config.final == "gnc":
+            final = solve_gnc(measured, self._values)
         else:
-            near = neighbours(places_m, PLACE_M)
-            agree = agreements(self._odometry, self._closures, self._inlier_bound)
-            solution = believe_agreeing(problem, self._values, agree, near)
-        self._take(solution.search.values)
-        return self._estimate(solution.search.error, solution.weights)
+            final = solve_consistent(measured, self._values, self._rejected_motions())
+        self._rejected = final.rejected
+        self._rebuild_backbone()
+        self._take(final.solution.search.values)
+        return self._estimate(final.solution.search.error, final.solution.weights)
 
     def write_g2o(self, path: Path) -> None:
         """Poses, odometry and closures (without robust kernel) as g2o text."""
         poses = dict(enumerate(self.T_world_keyframes))
-        write_g2o(path, G2oGraph(poses, self._odometry + self._closures))
+        write_g2o(path, G2oGraph(poses, self._kept_odometry() + self._closures))
+
+    def _edge(self, closure: LoopClosure) -> Edge:
+        for keyframe_id in (closure.target_id, closure.source_id):
+            self.T_world_keyframe(keyframe_id)
+        information = noise.closure_information(closure.information, self._config)
+        return Edge(closure.target_id, closure.source_id, _exact(closure.T_target_source), information)
+
+    def _rejected_motions(self) -> Mask:
+        """(n - 1,) those that the last final optimisation rejected."""
+        return np.concatenate([self._rejected, np.zeros(len(self._odometry) - len(self._rejected), dtype=bool)])
+
+    def _kept_odometry(self) -> list[Edge]:
+        return without(self._odometry, self._rejected_motions())
+
+    def _rebuild_backbone(self) -> None:
+        prior = self._backbone.at(0)
+        self._backbone = gtsam.NonlinearFactorGraph()
+        self._backbone.add(prior)
+        self._backbone.push_back(factor_graph(self._kept_odometry()))
 
     def _optimize(self, tolerance: float) -> GraphEstimate:
-        found = search(joined(self._trusted, self._robust), self._values, tolerance=tolerance)
+        found = search(joined(self._backbone, self._robust), self._linked(), tolerance=tolerance)
         self._take(found.values)
-        errors = np.sqrt(squared_errors(self._doubted, self._values))
+        errors = np.sqrt(squared_errors(self._closure_factors, self._values))
         weights = [1.0 if self._kernel is None else self._kernel.weight(float(error)) for error in errors]
         return self._estimate(found.error, weights)
+
+    def _linked(self) -> gtsam.Values:
+        """The last estimate, with segments between breaks moved to satisfy consistent closures."""
+        if not self._has_breaks or not self._closures:
+            return self._values
+        odometry = self._kept_odometry()
+        consistent = consistent_pairs(odometry, self._closures, self._inlier_bound)
+        likely = largest_consistent(consistent, np.ones(len(consistent), dtype=bool))
+        return values_of(relinked(odometry, self._closures, self.T_world_keyframes, likely))
 
     def _take(self, values: gtsam.Values) -> None:
         """Values that all closures so far were part of."""
@@ -195,10 +272,13 @@ class PoseGraph:
     def _estimate(self, error: float, weights: Iterable[float]) -> GraphEstimate:
         pairs = [(closure.b, closure.a) for closure in self._closures]
         return GraphEstimate(
-            dict(enumerate(self.T_world_keyframes)), float(error), dict(zip(pairs, map(float, weights), strict=True))
+            dict(enumerate(self.T_world_keyframes)),
+            float(error),
+            dict(zip(pairs, map(float, weights), strict=True)),
+            {(int(row), int(row) + 1): 0.0 for row in np.flatnonzero(self._rejected)},
         )
 
 
 def _exact(T_a_b: Transform) -> Transform:
-    """With a rotation that is one: what rounding leaves in a long chain stops the solver far from the optimum."""
+    """The pose with an exact rotation: rounding in a long chain would stop the solver far from the optimum."""
     return geometry.transform(geometry.nearest_rotation(T_a_b[:3, :3]), T_a_b[:3, 3])

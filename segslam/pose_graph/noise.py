@@ -1,4 +1,4 @@
-"""How much each edge of the graph is worth: noise models of odometry, of closures, of the first pose."""
+"""Noise models of the edges: odometry, closures, first pose."""
 
 import math
 
@@ -15,19 +15,26 @@ DEGREES_OF_FREEDOM = 6
 FIRST_POSE_SIGMA = 1e-4  # chosen (rad, m): holds the world in place, far below any other noise and above rounding
 LEAST_STEP_M = 0.1  # chosen: odometry between two scans of a standing sensor jitters by centimetres
 
+UNKNOWN_MOTION = np.diag(geometry.tangent(rotation_rad=math.pi, translation_m=1000.0) ** -2.0)
+"""Information of an unknown motion. Chosen: standard deviations of half a turn and a kilometre, more than any break."""
+
+
+CERTAIN = 1e12 * np.eye(6)
+"""Information of an exactly known pose."""
+
 
 def first_pose() -> gtsam.noiseModel.Base:
-    """The world is where the first keyframe says."""
+    """Noise of the prior on the first keyframe, which fixes the world frame."""
     return gtsam.noiseModel.Isotropic.Sigma(DEGREES_OF_FREEDOM, FIRST_POSE_SIGMA)
 
 
 def odometry_information(travel_m: float, T_a_b: Transform, config: GraphConfig) -> Information:
-    """Of the motion between two keyframes: variances grow with the way travelled, and a turn counts as a way.
+    """Information of the motion between two keyframes: variances grow with the distance travelled and the rotation.
 
     One radian counts as much as `config.turn_m` metres. The defaults are calibrated on KISS-ICP in simulated streets,
-    for single edges and for chains of a hundred. In between, for ten, they claim two to three times the variance: part
-    of an edge's error is of its scans alone and does not add up, part is alike for hundreds of metres and adds up
-    faster than independent steps do, and edges that know nothing of each other can be right at two lengths only.
+    for single edges and for chains of a hundred. For chains of ten they overestimate the variance two to three times:
+    part of the error of an edge does not accumulate, part is correlated over hundreds of metres, and independent edges
+    can match this growth at two chain lengths only.
     """
     way_m = max(travel_m, geometry.distance(T_a_b)) + config.turn_m * geometry.angle(T_a_b)
     growth = math.sqrt(max(way_m, LEAST_STEP_M))
@@ -37,14 +44,24 @@ def odometry_information(travel_m: float, T_a_b: Transform, config: GraphConfig)
     return np.diag(sigmas**-2.0)
 
 
-def closure_information(information: Information, config: GraphConfig) -> Information:
-    """A closure's information once the least noise of any closure is added to its covariance.
+def motion_information(information: Information) -> Information:
+    """The information of a motion that was not measured by odometry, regularised.
 
-    The registration's information knows the shape of the uncertainty; what it cannot know (two scans that saw the place
-    differently, a leftover vertical angle) is the least noise. The graph takes closures for independent, but neighbours
-    are off by much the same: with the default, means of eight neighbours have the chi-square that is claimed (simulated
-    06), single closures a third of it. Where the registration knows nothing, 1e-10 of the least noise's information
-    keeps the sum positive definite.
+    The information of `UNKNOWN_MOTION` is added: it keeps every sum of covariances finite, and changes no other motion.
+    Raises ValueError if `information` is not symmetric positive semidefinite.
+    """
+    if not is_positive_semidefinite(information):
+        raise ValueError("the information of a motion must be finite, symmetric and positive semidefinite")
+    return (information + information.T) / 2 + UNKNOWN_MOTION
+
+
+def closure_information(information: Information, config: GraphConfig) -> Information:
+    """A closure's information after the smallest noise of any closure is added to its covariance.
+
+    The registration gives the shape of the uncertainty. The smallest noise covers errors that it cannot observe, like
+    a remaining vertical angle. The graph treats closures as independent, but the errors of neighbours are similar: with
+    the default, means of eight neighbours have the modelled chi-square (simulated 06), single closures a third of it.
+    In directions without information, 1e-10 of the smallest noise's information keeps the sum positive definite.
     Raises ValueError if `information` is not symmetric positive semidefinite.
     """
     if not is_positive_semidefinite(information):
@@ -64,7 +81,7 @@ def is_positive_semidefinite(matrix: Information) -> bool:
 
 
 def inlier_bound(probability: float, *, error_allowance: float = 1.0) -> float:
-    """The squared whitened error (chi-square, not half of it) below which a true edge lies with this probability.
+    """Squared whitened error (chi-square, not half of it) that a correct edge is below with this probability.
 
     `error_allowance`: when errors are so many times as large as claimed.
     """

@@ -14,14 +14,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from segslam.config import SegregatorConfig
 from segslam.points import EMPTY, canonical_order, find_key, group_means, hash_keys, within_range
+from segslam.system.kernels import kernel
 from segslam.types import Covariances, Indices, Label, Labels, Points, Vector
 
 FIRST_RADIUS_M = 5.0
-"""The first radial bin starts here, or at the nearest point of the class if that is nearer (the authors' program)."""
+"""Start of the first radial bin, or the nearest point of the class if that is nearer (the authors' program) (m)."""
 
 
 class Clusters(NamedTuple):
@@ -37,11 +37,11 @@ NO_CLUSTERS = Clusters(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.uin
 
 
 def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfig) -> Clusters:
-    """The clusters of each class in `config.cluster_min_points`, by class, then by the surface seen, large ones first.
+    """The clusters of each class in `config.cluster_min_points`, by class, then by visible surface, largest first.
 
-    That surface goes as the number of points times the squared range. Of each class the first
-    `config.max_clusters_per_class` are kept.
-    Centres are in the frame of `points`, whose origin is the sensor. Points that are NaN or out of range take no part.
+    The visible surface is proportional to the number of points times the squared range. The first
+    `config.max_clusters_per_class` clusters of each class are kept.
+    Centres are in the frame of `points`, whose origin is the sensor. Points that are NaN or out of range are ignored.
     The result does not depend on the order of the points.
     """
     chosen = np.flatnonzero(np.isin(labels, [int(label) for label in config.cluster_min_points]))
@@ -121,7 +121,7 @@ def _radial_bins(distance: Vector, start_m: float, step_m: float) -> Indices:
     return np.searchsorted(bounds[1:], distance, side="right")
 
 
-@njit("int64(int64[:], int64)", cache=True, nogil=True)
+@kernel("int64(int64[:], int64)")
 def _root(parent, node):
     while parent[node] != node:
         parent[node] = parent[parent[node]]
@@ -129,13 +129,13 @@ def _root(parent, node):
     return node
 
 
-@njit("void(int64[:], int64, int64)", cache=True, nogil=True)
+@kernel("void(int64[:], int64, int64)")
 def _join(parent, a, b):
     a, b = _root(parent, a), _root(parent, b)
     parent[max(a, b)] = min(a, b)
 
 
-@njit("int64[:](int64[:])", cache=True, nogil=True)
+@kernel("int64[:](int64[:])")
 def _numbered(parent):
     number = np.empty(len(parent), np.int64)
     count = 0
@@ -149,7 +149,7 @@ def _numbered(parent):
     return number
 
 
-@njit("int64[:](int64[:], int64, int64)", cache=True, nogil=True)
+@kernel("int64[:](int64[:], int64, int64)")
 def _components(keys, num_radial, num_azimuth):
     """The connected component of each voxel, numbered from 0 by its first voxel.
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
+from segslam.system.kernels import kernel
 from segslam.types import Covariances, Description, IndexPairs, Indices, Label, Labels, Points
 
 Descriptors = Float[np.ndarray, "_ 33"]
@@ -33,7 +33,7 @@ class Correspondences:
         return len(self.source)
 
     def take(self, rows: Indices) -> "Correspondences":
-        """Some of the rows."""
+        """The correspondences in these rows."""
         return Correspondences(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
@@ -43,9 +43,9 @@ def all_to_all(source_classes: Labels, target_classes: Labels) -> IndexPairs:
 
 
 def mutual_nearest(source: Descriptors, target: Descriptors) -> IndexPairs:
-    """Rows that are each other's nearest neighbour, the most similar pair first.
+    """Pairs of rows that are mutual nearest neighbours, the most similar pair first.
 
-    That order is the same whichever side is called the source and however rows are numbered.
+    The order does not depend on which side is the source, nor on the numbering of rows.
     """
     if len(source) == 0 or len(target) == 0:
         return np.empty((0, 2), np.int64)
@@ -61,7 +61,7 @@ def mutual_nearest(source: Descriptors, target: Descriptors) -> IndexPairs:
 def tuple_test(
     source: Points, target: Points, *, similarity: float, trials_per_pair: int, rng: np.random.Generator
 ) -> Indices:
-    """Rows, ascending, that belong to some random triple whose three edges have nearly equal lengths on both sides.
+    """Rows, ascending, that are in a random triple whose three edges have nearly equal lengths on both sides.
 
     Row i of `source` matches row i of `target`. An edge passes if the shorter length is more than `similarity` times
     the longer one. Fewer than three rows leave nothing to test: none pass.
@@ -113,7 +113,7 @@ def _mutual_nearest_of_class(source: Description, target: Description, label: La
 
 
 def _described_rows(description: Description, label: Label) -> Indices:
-    """Key points of a class, but for those without neighbours, whose descriptors are all zero and so all alike."""
+    """Key points of a class that have neighbours; the descriptors of all others are zero."""
     return np.flatnonzero((description.feature_classes == label) & description.feature_descriptors.any(axis=1))
 
 
@@ -130,7 +130,7 @@ def _gaussians(description: Description) -> tuple[Points, Covariances]:
     return means.astype(np.float64), covariances.astype(np.float64)
 
 
-@njit("boolean[::1](float64[:, ::1], float64[:, ::1], int64[:, ::1], float64)", cache=True, nogil=True)
+@kernel("boolean[::1](float64[:, ::1], float64[:, ::1], int64[:, ::1], float64)")
 def _in_similar_triangles(source, target, triples, similarity):
     """Which rows belong to a triple that passes. A row drawn twice makes an edge of length 0, which never passes."""
     passed = np.zeros(len(source), np.bool_)
@@ -138,15 +138,18 @@ def _in_similar_triangles(source, target, triples, similarity):
         similar = True
         for corner in range(3):
             i, j = triples[row, corner], triples[row, (corner + 1) % 3]
-            a = np.sqrt(np.sum((source[i] - source[j]) ** 2))
-            b = np.sqrt(np.sum((target[i] - target[j]) ** 2))
-            similar &= min(a, b) > similarity * max(a, b)
+            a = b = 0.0
+            for axis in range(3):
+                a += (source[i, axis] - source[j, axis]) ** 2
+                b += (target[i, axis] - target[j, axis]) ** 2
+            similar &= min(a, b) > similarity * similarity * max(a, b)
         if similar:
-            passed[triples[row]] = True
+            for corner in range(3):
+                passed[triples[row, corner]] = True
     return passed
 
 
-@njit("Tuple((int64[::1], float64[::1], int64[::1]))(float64[:, ::1], float64[:, ::1])", cache=True, nogil=True)
+@kernel("Tuple((int64[::1], float64[::1], int64[::1]))(float64[:, ::1], float64[:, ::1])")
 def _nearest_both_ways(source, target_columns):
     """Column of the nearest target to each source, the squared distance to it, and the nearest source to each target.
 

@@ -1,4 +1,4 @@
-"""What matching needs of one scan, computed once and kept."""
+"""The description of a scan for matching, computed once per scan."""
 
 import numpy as np
 
@@ -6,14 +6,14 @@ from segslam.config import SegregatorConfig
 from segslam.segregator.clusters import Clusters, semantic_clusters
 from segslam.segregator.features import NO_FEATURES, point_features
 from segslam.segregator.feet import ground_cells, stand_on_ground
-from segslam.segregator.ground import ground_patches
+from segslam.segregator.ground_patches import ground_patches
 from segslam.types import Description, Labels, Points
 
 
 def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
     """The semantic clusters, point features and ground of a scan, in its frame, whose origin is the sensor.
 
-    Points that are NaN or out of range take no part; a scan without usable points has an empty description. The result
+    Points that are NaN or out of range are ignored; a scan without usable points has an empty description. The result
     does not depend on the order of the points. Raises ValueError unless points are rows of three and labels as many.
     """
     if points.ndim != 2 or points.shape[1] != 3:

@@ -19,9 +19,10 @@ from segslam.segregator.fpfh import fpfh
 from segslam.types import Covariances, Labels, Points
 
 MIN_PATCH_POINTS = 4
-"""Chosen: any three points lie on a plane, so that a normal means nothing for fewer than four."""
+"""Chosen: three points always lie on a plane, so a normal needs at least four."""
 MAX_CLOUD_POINTS = 20_000
-"""Chosen: of a class after voxelising, some four times what real scans hold; of more, the nearest are used."""
+"""Chosen: largest number of points of a class after voxelising, about four times that of real scans; the nearest
+points are used if there are more."""
 
 
 class Features(NamedTuple):
@@ -44,7 +45,7 @@ NO_FEATURES = Features(
 def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) -> Features:
     """The key points of each class in `config.feature_classes`, in the frame of `points`; the sensor is at its origin.
 
-    Points that are NaN or out of range take no part. The result does not depend on the order of the points.
+    Points that are NaN or out of range are ignored. The result does not depend on the order of the points.
     """
     parts = []
     for label in config.feature_classes:
@@ -63,7 +64,7 @@ def _voxelised(cloud: Points, voxel_m: float) -> Points:
 
 
 def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Features:
-    """The key points of one class from its voxelised cloud; none where no point has neighbours enough."""
+    """The key points of one class from its voxelised cloud; none if no point has enough neighbours."""
     patches = radius_neighbours(cloud, config.normal_radius_m)
     kept = patches.ends - patches.starts >= MIN_PATCH_POINTS
     covariances = patch_covariances(cloud, patches)[kept]

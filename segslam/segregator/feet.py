@@ -1,30 +1,30 @@
-"""Where upright things stand. Not in the paper.
+"""Positions of upright objects on the ground. Not in the paper.
 
-How much of a trunk or a pole is seen, and so the height of its centre, changes with every view; the ground it stands on
-does not. Of 34 trunks, poles and signs a scan, on 6 pairs of real scans 9 to 35 m apart, 7 have their centre within
-0.2 m of a centre in the other scan, and 16 their foot.
+The visible part of a trunk or pole, and so the height of its centre, changes with the viewpoint; its foot on the ground
+does not. In 6 pairs of real scans 9 to 35 m apart, with 34 trunks, poles and signs per scan, 7 centres are within 0.2 m
+of a centre in the other scan, and 16 feet of a foot.
 """
 
 import math
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
 from segslam.segregator.clusters import Clusters
+from segslam.system.kernels import kernel
 from segslam.types import GROUND_LABELS, Labels, Points, Vector
 
 CELL_M = 1.0
-"""Chosen: the ground is averaged in cells of this edge."""
+"""Chosen: cell size in which the ground is averaged (m)."""
 NUM_CELLS = 5
-"""Chosen: the foot is as high as the middle one of the nearest cells."""
+"""Chosen: number of nearest cells; their median height is that of the foot."""
 
 
 def stand_on_ground(clusters: Clusters, upright: np.ndarray, ground: Points, *, max_distance_m: float) -> Clusters:
-    """The clusters, the `upright` ones (k, bool) moved along z to the ground around them.
+    """The clusters, with the `upright` ones (k, bool) moved along z to the ground around them.
 
-    `ground` is that of `ground_cells` in the clusters' frame. A cluster with none within `max_distance_m`, measured
-    level, stays. Covariances stay: they are those of the points, about their centre.
+    `ground` comes from `ground_cells`, in the clusters' frame. A cluster without ground within `max_distance_m`
+    (horizontally) is not moved. Covariances do not change.
     """
     heights = ground_heights(clusters.means, ground, max_distance_m=max_distance_m)
     means = clusters.means.copy()
@@ -44,9 +44,9 @@ def ground_heights(places: Points, ground: Points, *, max_distance_m: float) -> 
 
 
 def ground_cells(points: Points, labels: Labels, *, reach_m: float) -> Points:
-    """The mean point of the ground in each square cell that has any; nothing beyond `reach_m` in x, y or z.
+    """The mean ground point of each occupied square cell, within `reach_m` in x, y and z.
 
-    Sums in float64 of float32 values are exact, but for those below 1e-5 m, so that the order does not matter.
+    Sums in float64 of float32 values above 1e-5 m are exact, so they do not depend on the order of points.
     """
     is_ground = np.zeros(256, np.bool_)
     is_ground[list(GROUND_LABELS)] = True
@@ -55,7 +55,7 @@ def ground_cells(points: Points, labels: Labels, *, reach_m: float) -> Points:
     return sums[:, :3] / sums[:, 3:]
 
 
-@njit("float64[:, ::1](float64[:, ::1], float64, float64)", cache=True, nogil=True)
+@kernel("float64[:, ::1](float64[:, ::1], float64, float64)")
 def _cell_sums(points, reach, cell):
     """Sums of x, y, z, each rounded to float32, and the number of points in each cell of a square grid."""
     side = math.ceil(2.0 * reach / cell)

@@ -18,9 +18,9 @@ import math
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
 from segslam.points import Neighbours
+from segslam.system.kernels import kernel
 from segslam.types import Indices, Points
 
 BINS = 11
@@ -41,13 +41,13 @@ ANGLE_BOUNDS = (-math.inf, *(_diamond(math.pi * (2.0 * k / BINS - 1.0)) for k in
 """Where the bins of an angle end, on the diamond."""
 
 
-@njit("int64(float64)", cache=True, nogil=True, inline="always")
+@kernel("int64(float64)")
 def _bin(fraction):
     """The bin of a value that lies `fraction` of the way along its range."""
     return min(max(int(BINS * fraction), 0), BINS - 1)
 
 
-@njit("int64(float64, float64)", cache=True, nogil=True, inline="always")
+@kernel("int64(float64, float64)")
 def _angle_bin(y, x):
     """The bin of atan2(y, x), found without it: the place around a diamond grows with it and is at most a bin off."""
     diamond = y / (abs(x) + abs(y)) if x != 0.0 or y != 0.0 else 0.0
@@ -59,7 +59,7 @@ def _angle_bin(y, x):
     return place + (diamond >= ANGLE_BOUNDS[place + 1])
 
 
-@njit("UniTuple(int64, 3)(float64[:, :], float64[:, :], int64, int64)", cache=True, nogil=True, inline="always")
+@kernel("UniTuple(int64, 3)(float64[:, :], float64[:, :], int64, int64)")
 def _pair_columns(points, normals, source, target):
     """The columns of theta, alpha and phi of two points, the same whichever is named first."""
     dx = points[target, 0] - points[source, 0]
@@ -84,7 +84,7 @@ def _pair_columns(points, normals, source, target):
     return theta, BINS + _bin(0.5 * alpha + 0.5), 2 * BINS + _bin(0.5 * phi + 0.5)
 
 
-@njit("boolean[:](int64, int64[:], int64[:], int32[:], int64[:])", cache=True, nogil=True)
+@kernel("boolean[:](int64, int64[:], int64[:], int32[:], int64[:])")
 def _neighbours_of(num_points, starts, ends, rows, chosen):
     """(n,) whether a point is a neighbour of some chosen one."""
     found = np.zeros(num_points, np.bool_)
@@ -94,7 +94,7 @@ def _neighbours_of(num_points, starts, ends, rows, chosen):
     return found
 
 
-@njit("float32[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int32[:], boolean[:])", cache=True, nogil=True)
+@kernel("float32[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int32[:], boolean[:])")
 def simple_histograms(points, normals, starts, ends, rows, wanted):
     """(n, 33) SPFH over its neighbours of each wanted point; zeros for others and for points without neighbours.
 
@@ -109,11 +109,13 @@ def simple_histograms(points, normals, starts, ends, rows, wanted):
                     histograms[row, column] += 1.0
                     histograms[other, column] += 1.0
     for row in range(len(points)):
-        histograms[row] *= np.float32(100.0 * wanted[row] / max(ends[row] - starts[row] - 1, 1))
+        scale = np.float32(100.0 * wanted[row] / max(ends[row] - starts[row] - 1, 1))
+        for column in range(COLUMNS):
+            histograms[row, column] *= scale
     return histograms
 
 
-@njit("float64[:, :](float64[:, :], float32[:, :], int64[:], int64[:], int32[:], int64[:])", cache=True, nogil=True)
+@kernel("float64[:, :](float64[:, :], float32[:, :], int64[:], int64[:], int32[:], int64[:])")
 def neighbour_histograms(points, histograms, starts, ends, rows, chosen):
     """(k, 33) weighted sum of the neighbours' histograms for each chosen row; zeros for a point without neighbours."""
     sums = np.zeros((len(chosen), COLUMNS))
@@ -128,8 +130,11 @@ def neighbour_histograms(points, histograms, starts, ends, rows, chosen):
                 for column in range(COLUMNS):
                     sums[index, column] += weight * histograms[rows[at], column]
         for angle in range(3):
-            part = sums[index, BINS * angle : BINS * (angle + 1)]
-            part *= 100.0 / max(part.sum(), TINY)
+            total = 0.0
+            for column in range(BINS * angle, BINS * (angle + 1)):
+                total += sums[index, column]
+            for column in range(BINS * angle, BINS * (angle + 1)):
+                sums[index, column] *= 100.0 / max(total, TINY)
     return sums
 
 

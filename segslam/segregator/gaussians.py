@@ -1,36 +1,36 @@
-"""The pose that best lays the source's Gaussians, and its ground, on the target's. Not in the paper.
+"""Registration of the Gaussians and the ground of two scans, weighted by covariances. Not in the paper.
 
-Truncated least squares knows one bound for all. But what is seen of a car or a trunk changes with the view, by some
-share of its extent in each direction: a centroid is taken to be off by a Gaussian whose covariance is
+Truncated least squares has one bound for all points. But the visible part of a car or trunk changes with the viewpoint,
+in proportion to its extent in each direction. The error of a centroid is modelled as Gaussian with covariance
 
     noise^2 I + share^2 (Sigma of the cluster),
 
 and the squared Mahalanobis distance of two centroids under a pose is m = e^T S^-1 e, S being the sum of both. The pose
-minimises sum 3 log(1 + m / 3), Cauchy's cost, over the correspondences that are the nearest for both their ends and
-have m below a gate, these being chosen anew until they stay the same, as in generalised ICP (Segal, Haehnel, Thrun,
-RSS 2009). The ground adds the same cost for the distances of each scan's patches from the planes of the other's.
+minimises sum 3 log(1 + m / 3), Cauchy's cost, over the mutually nearest correspondences with m below a gate. Pose and
+correspondences alternate until the set no longer changes, as in generalised ICP (Segal, Haehnel, Thrun, RSS 2009). The
+ground adds the same cost for the distances of each scan's patches from the planes of the other scan.
 """
 
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from segslam import geometry
 from segslam.config import SegregatorConfig
 from segslam.segregator.correspondences import Correspondences
 from segslam.segregator.descent import GATE, least_cost, squared_distances
-from segslam.segregator.solver import PoseFit
+from segslam.segregator.pose_solver import PoseFit
+from segslam.system.kernels import kernel
 from segslam.types import Description, Indices, Information, Points, Rejected, RejectReason, Transform, Vector
 
 MAX_ROUNDS = 8
 GROUND_REACH_M = 4.0
-"""Chosen: patches farther apart are not compared: as far as the next cell of `ground_patches`."""
+"""Chosen: largest distance of compared patches: the next cell of `ground_patches` (m)."""
 
 
 class Planes(NamedTuple):
-    """Points of one scan, and for each the patch of the other that it should lie on. Each in its own scan's frame."""
+    """Points of one scan, and for each the matching patch of the other. Each in its own scan's frame."""
 
     points: Points
     centres: Points
@@ -45,12 +45,11 @@ def align_gaussians(
     *,
     config: SegregatorConfig,
 ) -> PoseFit | Rejected:
-    """The pose nearby that best lays the source on the target; its inliers are rows of `correspondences`.
+    """The pose of least cost near an initial guess; its inliers are rows of `correspondences`.
 
-    `score` counts the inliers, each from 1 where it fits exactly down to 0 at the gate. `information` is that of the
-    noise model, and of the noise that all clusters share. Returns `Rejected` with
-    TOO_FEW_INLIERS below the size that a clique must have, and with DEGENERATE where the pose is left open by more than
-    the paper calls a success.
+    `score` sums the inliers, each between 1 (exact) and 0 (at the gate). `information` follows from the noise model,
+    including the noise common to all clusters. Returns `Rejected` with TOO_FEW_INLIERS below `min_clique`, and with
+    DEGENERATE if a standard deviation of the pose exceeds the limits of a correct registration.
     """
     rows: Indices = np.empty(0, np.int64)
     for _ in range(MAX_ROUNDS):
@@ -78,13 +77,13 @@ def align_gaussians(
 
 
 def nearest_pairs(correspondences: Correspondences, T_target_source: Transform, *, config: SegregatorConfig) -> Indices:
-    """Rows, ascending, that fit the pose within the gate, and no worse than any other row with one of their ends."""
+    """Rows, ascending, within the gate, that fit the pose best among all rows that share one of their ends."""
     squared = _squared(correspondences, T_target_source, config)
     return _least_at_both_ends(squared, correspondences.source_index, correspondences.target_index)
 
 
 def nearest_planes(scan: Description, other: Description, T_other_scan: Transform) -> Planes:
-    """The ground of `scan`, each patch as a point with the patch of `other` that is nearest under the pose."""
+    """The ground of `scan`: the centre of each patch, with the nearest patch of `other` at this pose."""
     points = geometry.apply(T_other_scan, scan.ground_points)
     nearest = _nearest_within(points, other.ground_points.astype(np.float64), GROUND_REACH_M)
     met = nearest >= 0
@@ -100,7 +99,7 @@ def descend(
     *,
     config: SegregatorConfig,
 ) -> tuple[Transform, Information]:
-    """The pose of least cost for these pairs, and for the ground as it is paired now; and the Hessian there."""
+    """The pose of least cost for these pairs and the current pairs of ground patches, and the Hessian there."""
     return least_cost(
         pairs.source,
         pairs.target,
@@ -137,18 +136,17 @@ def _leaves_open(information: Information) -> bool:
     return bool(np.any(sigma > geometry.tangent(rotation_rad=np.radians(5.0), translation_m=2.0)))
 
 
-@njit("int64[::1](float64[::1], int64[::1], int64[::1])", cache=True, nogil=True)
-def _least_at_both_ends(squared, source_index, target_index):
-    """Rows below the gate that no row with one of their ends is below."""
-    best_source, best_target = np.full(source_index.max() + 1, GATE), np.full(target_index.max() + 1, GATE)
-    for i in range(len(squared)):
-        best_source[source_index[i]] = min(best_source[source_index[i]], squared[i])
-        best_target[target_index[i]] = min(best_target[target_index[i]], squared[i])
-    bound = np.minimum(best_source[source_index], best_target[target_index])
+def _least_at_both_ends(squared: Vector, source_index: Indices, target_index: Indices) -> Indices:
+    """Rows below the gate that have the smallest distance among all rows with one of their ends."""
+    bound = np.full(len(squared), GATE)
+    for ends in (source_index, target_index):
+        best = np.full(ends.max(initial=0) + 1, GATE)
+        np.minimum.at(best, ends, squared)
+        bound = np.minimum(bound, best[ends])
     return np.flatnonzero((squared < GATE) & (squared <= bound))
 
 
-@njit("int64[::1](float64[:, ::1], float64[:, ::1], float64)", cache=True, nogil=True)
+@kernel("int64[::1](float64[:, ::1], float64[:, ::1], float64)")
 def _nearest_within(points, others, reach):
     """Row of the nearest other point to each, -1 where none is within reach."""
     nearest = np.full(len(points), -1)

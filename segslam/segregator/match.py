@@ -1,9 +1,9 @@
-"""Two descriptions in, the pose of one scan in the other out.
+"""Matching of two descriptions: the pose of one scan in the other.
 
 Yin et al., "Segregator", ICRA 2023, figure 2: correspondences, consistency graph, maximum clique, pose.
-Differs from the paper: where the pose stays uncertain, every maximum clique is tried, then wider bounds, as in the
-pyramid of graphs of Qiao et al., "G3Reg: Pyramid Graph-Based Global Registration Using Gaussian Ellipsoid Model",
-T-ASE 2024, and only then point features.
+Differs from the paper: while the pose is uncertain, all maximum cliques are tried, then wider bounds, as in the pyramid
+of graphs of Qiao et al., "G3Reg: Pyramid Graph-Based Global Registration Using Gaussian Ellipsoid Model", T-ASE 2024,
+then point features.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ import numpy as np
 from segslam import geometry
 from segslam.cliques import maximum_cliques
 from segslam.config import SegregatorConfig
-from segslam.segregator.consistency import consistency_graph
+from segslam.segregator.consistency_graph import consistency_graph
 from segslam.segregator.correspondences import (
     Correspondences,
     cluster_correspondences,
@@ -22,26 +22,26 @@ from segslam.segregator.correspondences import (
     feature_correspondences,
 )
 from segslam.segregator.gaussians import align_gaussians
-from segslam.segregator.solver import Direction, PoseFit, solve_level, solve_pose
-from segslam.types import Description, Indices, Registration, Rejected, RejectReason, Transform
+from segslam.segregator.pose_solver import PoseFit, solve_level, solve_pose
+from segslam.types import Description, Direction, Indices, Registration, Rejected, RejectReason, Transform
 
 SAME_PLACE_M, SAME_TURN_RAD = 0.5, np.radians(2.0)
-"""Chosen: poses no farther apart are one hypothesis: refinement leads from both to the same one."""
+"""Chosen: closer poses are one hypothesis, because refinement leads to the same pose."""
 MIN_GROUND_PATCHES = 5
-"""Chosen: fewer do not tell which way is up."""
+"""Chosen: smallest number of ground patches that determine the vertical."""
 
 
 def match(source: Description, target: Description, *, config: SegregatorConfig) -> Registration | Rejected:
-    """The pose of the source in the target that most correspondences agree with, without an initial guess.
+    """The pose of the source in the target with the most consistent correspondences, without an initial guess.
 
-    Returns `Rejected` with TOO_FEW_CORRESPONDENCES, SMALL_CLIQUE, DEGENERATE or TOO_FEW_INLIERS where there is none.
+    Returns `Rejected` with TOO_FEW_CORRESPONDENCES, SMALL_CLIQUE, DEGENERATE or TOO_FEW_INLIERS if there is no pose.
     """
     ranked = hypotheses(source, target, config=config)
     return ranked if isinstance(ranked, Rejected) else ranked[0]
 
 
 def hypotheses(source: Description, target: Description, *, config: SegregatorConfig) -> list[Registration] | Rejected:
-    """Different poses, the one that explains most first; only one if that is certain.
+    """Distinct poses, the one with the highest score first; only one if it is certain.
 
     `Rejected` as `match` returns it, for the narrowest bound.
     """
@@ -61,7 +61,7 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
 
 
 class _Attempt(NamedTuple):
-    """A pose, and how many correspondences and edges it was found among."""
+    """A pose, and the numbers of correspondences and edges that it was found in."""
 
     fit: PoseFit
     num_correspondences: int
@@ -79,7 +79,7 @@ class _Attempt(NamedTuple):
 
 
 def _attempts(source: Description, target: Description, config: SegregatorConfig) -> Iterator[_Attempt | Rejected]:
-    """One maximum clique after the other: first of clusters, then of clusters and features, bound by bound."""
+    """Poses of the maximum cliques: first of clusters, then of clusters and features, for increasing bounds."""
     for correspondences in putative(source, target, config=config):
         if len(correspondences) < config.min_clique:
             yield Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
@@ -97,9 +97,9 @@ def _attempts(source: Description, target: Description, config: SegregatorConfig
 
 
 def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Iterator[Correspondences]:
-    """Sets of correspondences to try: of clusters; then, where both scans hold features, of these as well.
+    """Sets of correspondences to try: clusters; then clusters and features, if both scans have features.
 
-    If features are wanted always, they are there from the start.
+    With `features` set to `always`, the first set contains features.
     """
     clusters = cluster_correspondences(source, target)
     if config.features != "always":
@@ -125,7 +125,7 @@ def _solve(
     bound_m: float,
     config: SegregatorConfig,
 ) -> PoseFit | Rejected:
-    """The pose that the members of one clique agree on, by the solver that the configuration names."""
+    """The pose of the members of one clique, by `config.solver`."""
     if config.solver != "gaussians":
         members = correspondences.take(clique)
         return solve_pose(members.source, members.target, bound_m=bound_m, config=config)
@@ -138,7 +138,7 @@ def _solve(
 def _rough_pose(
     source: Description, target: Description, members: Correspondences, bound_m: float, config: SegregatorConfig
 ) -> Transform | Rejected:
-    """As seen from above where both scans know which way that is."""
+    """Initial pose: with the verticals aligned, if both are known."""
     source_up, target_up = upward(source), upward(target)
     if source_up is None or target_up is None:
         fit = solve_pose(members.source, members.target, bound_m=bound_m, config=config)
@@ -147,7 +147,7 @@ def _rough_pose(
 
 
 def upward(description: Description) -> Direction | None:
-    """The mean normal of the ground, None where too little of it is seen."""
+    """Upward unit vector from the mean normal of the ground; None if too little ground is visible."""
     if len(description.ground_normals) < MIN_GROUND_PATCHES:
         return None
     total = description.ground_normals.astype(np.float64).sum(axis=0)

@@ -1,8 +1,8 @@
-"""Poses from floor plans: what stands in two scans, seen from above, laid on one another in every way.
+"""Poses from floor plans: the standing points of two scans, seen from above, correlated over all yaws and shifts.
 
 Correlative scan matching (Olson, "Real-Time Correlative Scan Matching", ICRA 2009) over the full circle. Not in the
-paper. Where walls are all that two scans share, as in a courtyard, there are no clusters to match, and features seen
-from 10 m apart rarely look alike; but the walls still fill the same cells.
+paper. If two scans share only walls, as in a courtyard, there are no clusters to match, and features from viewpoints
+10 m apart are rarely similar; but the walls still occupy the same cells.
 """
 
 import math
@@ -15,34 +15,33 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter
 
 from segslam import geometry
-from segslam.segregator.solver import Direction
-from segslam.types import Points, Registration, Rotation
+from segslam.types import Direction, Points, Registration, Rotation
 
 CELL_M = 0.5
 NUM_YAWS = 90
-"""Chosen: a turn of half a step moves what is 15 m away by a cell."""
+"""Chosen: a rotation by half a step moves a point at 15 m by one cell."""
 REACH_M = 32.0
-"""Chosen: points farther from their sensor are left out."""
+"""Chosen: points farther from their sensor are ignored (m)."""
 MAX_SHIFT_M = 20.0
-"""Chosen: farthest that two scans lie apart."""
+"""Chosen: largest distance between the two scans (m)."""
 MAX_COUNT = 8
-"""Chosen: points of a cell beyond which it counts no more: a tower is no surer than a house."""
+"""Chosen: largest number of points counted per cell, so that tall objects do not dominate."""
 BLUR_CELLS = 0.7
 SLICE_M, NUM_SLICES = 0.25, 80
-"""Of the heights that are compared, the middle slice being the sensor's."""
+"""Number of height slices compared; the middle slice is at the sensor's height."""
 MAX_RISE_SLICES = 20
 SAME_YAWS, SAME_CELLS = 2, 3
-"""Chosen: poses no farther apart in yaw and in either direction are one."""
+"""Chosen: poses within these steps of yaw and shift are the same."""
 
 INFORMATION = np.diag(1.0 / geometry.tangent(rotation_rad=math.pi / NUM_YAWS, translation_m=CELL_M) ** 2)
-"""Of a pose that is right to a cell and half a yaw step."""
+"""Information of a pose with errors of one cell and half a yaw step."""
 
 HALF = int(REACH_M / CELL_M)
 SIZE = next_fast_len(2 * HALF + int(MAX_SHIFT_M / CELL_M), real=True)  # wide enough that nothing wraps onto the other
 
 
 class _Level(NamedTuple):
-    """Points in a frame that shares the scan's origin and is level."""
+    """Points in a level frame with the scan's origin."""
 
     points: Points
     R_level_scan: Rotation
@@ -51,10 +50,10 @@ class _Level(NamedTuple):
 def plan_hypotheses(
     source: Points, target: Points, source_up: Direction, target_up: Direction, *, num_poses: int
 ) -> Iterator[Registration]:
-    """Rough poses of the source in the target, the best agreement first: right to a cell and half a yaw step.
+    """Coarse poses of the source in the target, sorted by agreement; errors up to one cell and half a yaw step.
 
-    Points are those on upright surfaces, thinned evenly, each in its own scan's frame; `up` are the unit directions in
-    which those frames have up. Inliers are the points of the source that find a place of the target filled.
+    Points: evenly downsampled points on upright surfaces, each in its own scan's frame; `up`: upward unit vectors in
+    these frames. Inliers are the points of the source that fall into occupied cells of the target.
     """
     scans = _levelled(source, source_up), _levelled(target, target_up)
     if min(len(scan.points) for scan in scans) == 0:
@@ -76,16 +75,13 @@ def plan_hypotheses(
 
 
 def _levelled(scan: Points, up: Direction) -> _Level:
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    sine = float(np.linalg.norm(axis))
-    turn = axis / sine * math.atan2(sine, up[2]) if sine > 1e-9 else np.zeros(3)
-    R_level_scan = geometry.exp(geometry.tangent(rotation_rad=turn, translation_m=0.0))[:3, :3]
+    R_level_scan = geometry.level(up)
     points = scan @ R_level_scan.T
     return _Level(points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < REACH_M], R_level_scan)
 
 
 def _correlation(source: Points, target: Points) -> tuple[Float[np.ndarray, "yaws shifts shifts"], np.ndarray]:
-    """Agreement of the plans for each yaw of the source and each shift in x and y, and those shifts in cells."""
+    """Correlation of the plans for each yaw of the source and each shift in x and y, and the shifts in cells."""
     angles = math.tau * np.arange(NUM_YAWS) / NUM_YAWS
     cosines, sines = np.cos(angles)[:, None], np.sin(angles)[:, None]
     x, y = source[:, 0], source[:, 1]
@@ -107,7 +103,7 @@ def _plans(x: np.ndarray, y: np.ndarray) -> Float[np.ndarray, "plans size size"]
 
 
 def _peaks(volume: Float[np.ndarray, "yaws shifts shifts"], num_peaks: int) -> Iterator[tuple[int, int, int]]:
-    """The highest places of the volume, which is used up: all around one found is taken out."""
+    """The maxima of the volume, in descending order; it is changed: the surroundings of each maximum are cleared."""
     for _ in range(num_peaks):
         yaw_index, i, j = (int(place) for place in np.unravel_index(volume.argmax(), volume.shape))
         yield yaw_index, i, j
@@ -116,7 +112,7 @@ def _peaks(volume: Float[np.ndarray, "yaws shifts shifts"], num_peaks: int) -> I
 
 
 def _rise(source: Points, target: Points) -> tuple[float, int]:
-    """How far up (m) most of the source's points come to slices of cells that the target fills, and how many do."""
+    """Height offset (m) at which most source points fall into occupied cells of the target, and their number."""
     filled = np.zeros((SIZE, SIZE, NUM_SLICES), bool)
     filled[*_slots(target)] = True
     i, j, k = _slots(source)

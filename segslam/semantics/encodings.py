@@ -70,6 +70,21 @@ def to_labels(ids: Ids, encoding: Encoding) -> Labels:
     return labels
 
 
+def to_ids(labels: Labels, encoding: Encoding) -> Ids:
+    """The ids of labels, as a file holds them. Raises SegslamError for a label that the encoding does not have."""
+    if encoding == "raw":
+        return RAW_OF_LABEL[labels]
+    if encoding == "learning":
+        return labels.astype(np.uint32)
+    missing = (labels == Label.UNLABELLED) | (labels > Label.TRAFFIC_SIGN)
+    if missing.any():
+        name = Label(labels[missing][0]).name.lower()
+        raise SegslamError(
+            f"the encoding {encoding} has no id for {name} ({missing.sum()} points); take raw or learning"
+        )
+    return labels.astype(np.uint32) - 1
+
+
 def detect_encoding(num_points_of_id: Histogram) -> Encoding:
     """The encoding that ids seen in some scans can only be in; `num_points_of_id` counts the points of each id.
 
@@ -84,7 +99,7 @@ def detect_encoding(num_points_of_id: Histogram) -> Encoding:
     if len(possible) != 1:
         shown = ", ".join(str(value) for value in ids[:30]) or "none"
         raise SegslamError(
-            f"the ids cannot tell how the classes are numbered (seen: {shown}): "
+            f"the numbering of the classes cannot be detected (ids: {shown}): "
             f"{_why_undecided(ids)}; pass --encoding {'|'.join(ENCODINGS)}"
         )
     return possible[0]

@@ -8,7 +8,7 @@ import numpy as np
 from segslam.config import GeometricLabelsConfig
 from segslam.points import within_range
 from segslam.semantics.cells import cells_above
-from segslam.semantics.ground import heights_above_ground, turned, upright
+from segslam.semantics.ground_surface import heights_above_ground, turned, upright
 from segslam.semantics.solids import Pieces, pieces
 from segslam.semantics.uprights import NUM_SLICES, on_thin_uprights
 from segslam.semantics.walls import on_walls

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.semantics.encodings import Encoding, Histogram, Ids, detect_encoding, to_labels
+from segslam.semantics.encodings import Encoding, Histogram, Ids, detect_encoding, to_ids, to_labels
 from segslam.semantics.network import Network, open_network
-from segslam.types import BadScan, Label, Labels, Points, SegslamError, Vector
+from segslam.system.whole_files import whole_file
+from segslam.types import BadScan, Label, Labels, Mask, Points, ScanLabels, SegslamError, Vector
 
 logger = logging.getLogger(__name__)
 
 NETWORK = "network:"
-FILES_LOOKED_AT = 8  # chosen: what the encoding is told from, spread over the drive
+FILES_LOOKED_AT = 8  # chosen: number of files that the encoding is detected from, spread over the drive
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,17 +44,18 @@ class LabelSource:
     """Scans that no file labels are to be labelled by shape, when they become keyframes."""
     network: Network | None = None
 
-    def read(self, name: str, points: Points, intensities: Vector | None = None) -> Labels:
+    def read(self, name: str, points: Points, intensities: Vector | None = None) -> ScanLabels:
         """The labels of the scan `name`, points and intensities as its file holds them; all UNLABELLED if none knows.
 
-        A network is given zeros for intensities that are not known. Raises BadScan as `LabelFiles`, SegslamError as
-        `Network.labels`.
+        A network's are made when they are called for, which raises SegslamError as `Network.labels`; it is given zeros
+        for intensities that are not known. Raises BadScan as `LabelFiles`.
         """
         if self.network:
             if intensities is None:
                 _warn_of_zeros()
                 intensities = np.zeros(len(points))
-            return self.network.labels(points, intensities)
+            network, known = self.network, intensities
+            return lambda: network.labels(points, known)
         return self.files.read(name, len(points)) if self.files else unlabelled(len(points))
 
 
@@ -62,7 +64,7 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
 
     `beside` is the folder that relative ones start from, and where `auto` looks for `labels/`; without it, `auto` is
     `geometric`. Raises SegslamError for a folder that is missing or labels none of the scans, for files whose
-    encoding is neither given nor to be told, and for a network that `open_network` refuses.
+    encoding is neither given nor detectable, and for a network that `open_network` refuses.
     """
     if source in ("none", "geometric"):
         return LabelSource(None, geometric=source == "geometric")
@@ -107,8 +109,25 @@ def read_labels(file: Path, num_points: int, encoding: Encoding) -> Labels:
         raise BadScan(f"{file}: {error}") from error
 
 
+def write_labels(file: Path, labels: Labels, kept: Mask | None, encoding: Encoding) -> None:
+    """Write the labels of a scan; where its points are only some of its file's, the others are unlabelled.
+
+    Raises SegslamError, naming the file, for a label that the encoding does not have, and if it cannot be written.
+    """
+    if kept is not None:
+        whole = unlabelled(len(kept))
+        whole[kept] = labels
+        labels = whole
+    try:
+        ids = to_ids(labels, encoding).astype("<u4")
+    except SegslamError as error:
+        raise SegslamError(f"{file}: {error}") from error
+    with whole_file(file) as part:
+        ids.tofile(part)
+
+
 def encoding_of(files: Sequence[Path]) -> Encoding:
-    """The encoding of some label files, told from all together. Raises SegslamError if it cannot be told."""
+    """The encoding of label files, detected from all of them. Raises SegslamError if it is ambiguous."""
     try:
         return detect_encoding(sum((_histogram(file) for file in files), np.zeros(2**16, dtype=np.int64)))
     except SegslamError as error:
@@ -139,7 +158,7 @@ def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | N
 
 
 def _spread(folder: Path, names: list[str]) -> list[Path]:
-    """Files to tell the encoding from, spread over the drive."""
+    """Files to detect the encoding from, spread over the drive."""
     rows = np.unique(np.linspace(0, len(names) - 1, FILES_LOOKED_AT).astype(int))
     return [folder / f"{names[row]}.label" for row in rows]
 

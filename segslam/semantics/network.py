@@ -1,8 +1,9 @@
 """Labels from a network: any range-image model in ONNX format, run by onnxruntime. The only importer of onnxruntime.
 
-A YAML file beside the model, of the same name, says what the input is made of and what the outputs mean.
+A YAML file beside the model, with the same name, defines its inputs and outputs.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from segslam.points import within_range
-from segslam.semantics.network_settings import NetworkSettings, read_settings
+from segslam.semantics.network_settings import NetworkSettings, read_settings, settings_file
 from segslam.semantics.range_image import network_input, project
 from segslam.semantics.votes import point_labels
+from segslam.system.extras import how_to_install
 from segslam.types import Label, Labels, Points, SegslamError, Vector
 
 LabelImage = UInt8[np.ndarray, "_ _"]
@@ -77,13 +79,8 @@ class Network:
             raise _misfit(self._model, f"gives {what} of {_shape(output.shape)}", f"asks for {expected}")
 
 
-def settings_file(model: Path) -> Path:
-    """The YAML file of a model."""
-    return model.with_suffix(".yaml")
-
-
 def open_network(model: Path) -> Network:
-    """The network of an .onnx file and the YAML file beside it, tried on an empty image.
+    """The network of an .onnx file and its `settings_file`, tried on an empty image.
 
     Raises SegslamError for a file that is missing or broken, and where the two contradict each other, with both
     numbers; also if onnxruntime is not installed.
@@ -104,7 +101,7 @@ def _session(model: Path) -> Any:
         import onnxruntime
         from onnxruntime.capi import onnxruntime_pybind11_state as errors
     except ImportError as error:
-        raise SegslamError(f"--labels network: needs a package ({error}): pip install 'segslam[network]'") from error
+        raise SegslamError(f"--labels network: needs a package ({error}): {how_to_install('network')}") from error
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # errors, which are raised anyway
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave the cores to the other stages
@@ -112,7 +109,18 @@ def _session(model: Path) -> Any:
     try:
         return onnxruntime.InferenceSession(model, options, providers=onnxruntime.get_available_providers())
     except broken as error:
-        raise SegslamError(f"{model}: onnxruntime cannot load it ({_brief(error)}); export it again") from error
+        raise SegslamError(f"{model}: onnxruntime cannot load it ({_brief(error)}); {_remedy(error)}") from error
+
+
+def _remedy(error: Exception) -> str:
+    """For a model that cannot be loaded. Weights may lie in a file of their own, which the error names."""
+    outside = re.search(r'External data path does not exist: "([^"]+)"', str(error))
+    if outside is None:
+        return "export it again"
+    name = Path(outside[1]).name
+    return (
+        f"its weights are in a file of their own, {name}: put it beside the model, or export with external_data=False"
+    )
 
 
 def _check_input(session: Any, model: Path, wanted: tuple[int, ...]) -> None:
@@ -120,7 +128,10 @@ def _check_input(session: Any, model: Path, wanted: tuple[int, ...]) -> None:
     inputs = session.get_inputs()
     if len(inputs) != 1 or inputs[0].type != "tensor(float)":
         found = ", ".join(f"{each.name}: {each.type}" for each in inputs)
-        raise SegslamError(f"{model}: takes the inputs {found}; expected a single one of float32, tensor(float)")
+        raise SegslamError(
+            f"{model}: takes the inputs {found}; expected a single one of float32, tensor(float); wrap "
+            "a network that takes more, as docs/network_labels.md shows"
+        )
     shape = inputs[0].shape
     fits = len(shape) == len(wanted) and all(
         not isinstance(size, int) or size == asked for size, asked in zip(shape, wanted, strict=True)
@@ -130,7 +141,7 @@ def _check_input(session: Any, model: Path, wanted: tuple[int, ...]) -> None:
 
 
 def _misfit(model: Path, found: str, expected: str) -> SegslamError:
-    return SegslamError(f"{model}: {found}, but {settings_file(model).name} {expected}; mend one of them")
+    return SegslamError(f"{model}: {found}, but {settings_file(model).name} {expected}; correct one of them")
 
 
 def _shape(sizes: Any) -> str:

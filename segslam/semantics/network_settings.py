@@ -1,15 +1,17 @@
 """What a network expects of its input and means by its output: the YAML file beside the model."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from segslam.config import LabelName, Section
+from segslam.semantics.network_import import ARCH, DATA, Architecture, ClassMap, class_map_file, is_architecture
 from segslam.types import SegslamError
 
-Channel = Literal["range", "x", "y", "z", "intensity"]
+Channel = Literal["range", "x", "y", "z", "intensity", "mask"]
+Model = TypeVar("Model", bound=BaseModel)
 
 
 def _check_odd(value: int) -> int:
@@ -27,14 +29,24 @@ class VoteSettings(Section):
     cutoff_m: float = Field(1.0, gt=0, description="a pixel farther off in range, so weighted, has no vote (m)")
 
 
-class NetworkSettings(Section):
-    """Of one model. The image's columns go clockwise from behind the sensor, its rows from the highest beam down."""
+class ImageSettings(Section):
+    """Size of a range image. Its columns go clockwise from behind the sensor, its rows down from the top."""
 
     field_of_view_deg: tuple[float, float] = Field(description="elevation of the lowest and highest row (degrees)")
     height: int = Field(ge=1, description="rows of the image: beams")
     width: int = Field(ge=1, description="columns of the image: the full circle")
+
+
+class NetworkSettings(ImageSettings):
+    """Settings of one model: its image, and the meaning of its outputs."""
+
+    azimuth_deg: tuple[float, float] = Field(
+        (-180.0, 180.0), description="azimuth of the image's edges (degrees); only the full circle is supported"
+    )
     channels: tuple[Channel, ...] = Field(
-        ("range", "x", "y", "z", "intensity"), min_length=1, description="in the order of the input"
+        ("range", "x", "y", "z", "intensity"),
+        min_length=1,
+        description="in the order of the input; mask is 1 where a point is",
     )
     mean: tuple[float, ...] = Field(description="of each channel, subtracted")
     std: tuple[Annotated[float, Field(gt=0)], ...] = Field(description="of each channel, divided by")
@@ -48,6 +60,12 @@ class NetworkSettings(Section):
         low, high = self.field_of_view_deg
         if not -90 <= low < high <= 90:
             raise ValueError(f"field_of_view_deg: write the lowest elevation, then the highest, not {low}, {high}")
+        if sorted(self.azimuth_deg) != [-180, 180]:
+            left, right = self.azimuth_deg
+            raise ValueError(
+                f"azimuth_deg: {left:g} to {right:g}; an image has to show the full circle from straight behind, -180 "
+                "to 180: places are met again from all sides, so labels of a part of each scan are not enough"
+            )
         for name in ("mean", "std"):
             count = len(getattr(self, name))
             if count != len(self.channels):
@@ -55,18 +73,62 @@ class NetworkSettings(Section):
         return self
 
 
+def settings_file(model: Path) -> Path:
+    """The YAML file of a model; without one, the `arch_cfg.yaml` in its folder."""
+    own, published = model.with_suffix(".yaml"), model.with_name(ARCH)
+    return published if published.is_file() and not own.exists() else own
+
+
 def read_settings(file: Path) -> NetworkSettings:
-    """The settings of a YAML file. Raises SegslamError that names file and key for whatever is wrong with it."""
+    """The settings of a model's YAML file, or of the files that its repository ships.
+
+    `import: arch_cfg.yaml` takes that file and the `data_cfg.yaml` beside it; other keys replace what they give.
+    Raises SegslamError that names file and key for whatever is wrong.
+    """
+    values = _read_yaml(file)
+    if is_architecture(values):
+        return _checked(NetworkSettings, _imported(file, {}), file)
+    if isinstance(values, dict) and isinstance(values.get("import"), str):
+        source = file.parent / values.pop("import")
+        values = _imported(source, values) | values
+    return _checked(NetworkSettings, values, file)
+
+
+def _imported(architecture: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """The settings in an `arch_cfg.yaml`, and in the `data_cfg.yaml` beside it unless `classes` are given."""
+    settings = _checked(Architecture, _read_yaml(architecture), architecture).settings()
+    if "classes" in given:
+        return settings
+    file = class_map_file(architecture)
+    if not file.is_file():
+        raise SegslamError(
+            f"{file}: no such file; {architecture.name} does not name the classes: copy the network's "
+            "config/labels/semantic-kitti.yaml there"
+        )
+    class_map = _checked(ClassMap, _read_yaml(file), file)
     try:
-        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+        return settings | {"classes": class_map.classes()}
+    except SegslamError as error:
+        raise SegslamError(f"{file}: {error}") from error
+
+
+def _read_yaml(file: Path) -> Any:
+    try:
+        return yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{file}: cannot be read ({error}); a network needs this file beside its model") from error
+        raise SegslamError(
+            f"{file}: cannot be read ({error}); a network needs this file beside its model, or the {ARCH} and {DATA} "
+            "that were published with it"
+        ) from error
     except yaml.YAMLError as error:
         raise SegslamError(f"{file}: no valid YAML ({' '.join(str(error).split())})") from error
+
+
+def _checked(model: type[Model], values: Any, file: Path) -> Model:
     try:
-        return NetworkSettings.model_validate(values)
+        return model.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        known = f"; known: {', '.join(NetworkSettings.model_fields)}" if first["type"] == "extra_forbidden" else ""
+        known = f"; known: {', '.join(model.model_fields)}" if first["type"] == "extra_forbidden" else ""
         raise SegslamError(f"{file}: {key + ': ' if key else ''}{first['msg']}{known}") from error

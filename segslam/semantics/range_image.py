@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from segslam.semantics.network_settings import NetworkSettings
+from segslam.semantics.network_settings import ImageSettings, NetworkSettings
 from segslam.types import Indices, Points, Vector
 
 EMPTY = -1
@@ -30,7 +30,7 @@ class Projection(NamedTuple):
         return np.append(self.ranges_m, np.inf)[self.nearest]
 
 
-def project(points: Points, *, settings: NetworkSettings) -> Projection:
+def project(points: Points, *, settings: ImageSettings) -> Projection:
     """The pixels of points (n, 3) of the LiDAR frame, finite and off the origin.
 
     The first column is straight behind, columns go clockwise as seen from above. Points above or below the field of
@@ -52,9 +52,16 @@ def project(points: Points, *, settings: NetworkSettings) -> Projection:
 def network_input(
     points: Points, intensities: Vector, projection: Projection, *, settings: NetworkSettings
 ) -> Float32[np.ndarray, "1 _ _ _"]:
-    """(1, channels, height, width), each channel normalised; pixels without a point are 0."""
+    """(1, channels, height, width), each channel normalised; pixels without a point are exactly 0 in all of them."""
     x, y, z = points.T
-    source = {"range": projection.ranges_m, "x": x, "y": y, "z": z, "intensity": intensities}
+    source = {
+        "range": projection.ranges_m,
+        "x": x,
+        "y": y,
+        "z": z,
+        "intensity": intensities,
+        "mask": np.ones(len(points)),
+    }
     filled = projection.nearest != EMPTY
     at = projection.nearest[filled]
     image = np.zeros((1, len(settings.channels), *filled.shape), np.float32)

@@ -7,12 +7,13 @@ extracted from 3-D lidar scans", ECMR 2019).
 """
 
 import numpy as np
-from numba import njit
+
+from segslam.system.kernels import kernel
 
 NUM_SLICES = 16
 
 
-@njit(cache=True, nogil=True)
+@kernel("boolean[::1](int64[:, ::1], int64[::1], UniTuple(int64, 2), int64, int64, int64, float64)")
 def on_thin_uprights(cells, slices, shape, core, ring, min_slices, min_share):
     """(n,) bool: which points belong to something thin, tall and free-standing.
 
@@ -21,35 +22,13 @@ def on_thin_uprights(cells, slices, shape, core, ring, min_slices, min_share):
     taken off. What is left must span `min_slices` and be `min_share` of what was there. Points outside the grid, or of
     a slice below 0 or from NUM_SLICES on, take no part. Columns nearer than `ring` cells to the border are passed by.
     """
-    masks = np.zeros(shape, np.uint16)
+    masks, thin = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
     for k in range(len(cells)):
         if _takes_part(cells[k], slices[k], shape):
             masks[cells[k, 0], cells[k, 1]] |= np.uint16(1 << slices[k])
-    found = _thin_columns(masks, core, ring, min_slices, min_share)
-    masks[:] = 0
-    inner = _disc(core, -1)
-    for i, j, clear in found:
-        for n in range(len(inner)):
-            masks[i + inner[n, 0], j + inner[n, 1]] |= np.uint16(clear)
-    chosen = np.zeros(len(cells), np.bool_)
-    for k in range(len(cells)):
-        if _takes_part(cells[k], slices[k], shape):
-            chosen[k] = masks[cells[k, 0], cells[k, 1]] >> slices[k] & 1
-    return chosen
-
-
-@njit(cache=True, nogil=True)
-def _takes_part(cell, slice_index, shape):
-    return 0 <= cell[0] < shape[0] and 0 <= cell[1] < shape[1] and 0 <= slice_index < NUM_SLICES
-
-
-@njit(cache=True, nogil=True)
-def _thin_columns(masks, core, ring, min_slices, min_share):
-    """Rows of (i, j, mask): columns in the middle of something thin, and its slices."""
     inner, outer = _disc(core, -1), _disc(ring, core)
-    found = []
-    for i in range(ring, masks.shape[0] - ring):
-        for j in range(ring, masks.shape[1] - ring):
+    for i in range(ring, shape[0] - ring):
+        for j in range(ring, shape[1] - ring):
             if masks[i, j] == 0:
                 continue
             held = _joined(masks, inner, i, j)
@@ -57,11 +36,21 @@ def _thin_columns(masks, core, ring, min_slices, min_share):
                 continue
             clear = _left_clear(masks, outer, i, j, held, min_share * _count(held))
             if _span(clear) >= min_slices:
-                found.append((i, j, clear))
-    return found
+                for n in range(len(inner)):
+                    thin[i + inner[n, 0], j + inner[n, 1]] |= np.uint16(clear)
+    chosen = np.zeros(len(cells), np.bool_)
+    for k in range(len(cells)):
+        if _takes_part(cells[k], slices[k], shape):
+            chosen[k] = thin[cells[k, 0], cells[k, 1]] >> slices[k] & 1
+    return chosen
 
 
-@njit(cache=True, nogil=True)
+@kernel("boolean(int64[::1], int64, UniTuple(int64, 2))")
+def _takes_part(cell, slice_index, shape):
+    return 0 <= cell[0] < shape[0] and 0 <= cell[1] < shape[1] and 0 <= slice_index < NUM_SLICES
+
+
+@kernel("int64[:, ::1](int64, int64)")
 def _disc(radius, inner_radius):
     """Offsets of the cells farther than `inner_radius` and at most `radius` cells from the middle."""
     offsets = np.empty(((2 * radius + 1) ** 2, 2), np.int64)
@@ -75,7 +64,7 @@ def _disc(radius, inner_radius):
     return offsets[:count]
 
 
-@njit(cache=True, nogil=True)
+@kernel("int64(uint16[:, ::1], int64[:, ::1], int64, int64)")
 def _joined(masks, offsets, i, j):
     joined = 0
     for n in range(len(offsets)):
@@ -83,7 +72,7 @@ def _joined(masks, offsets, i, j):
     return joined
 
 
-@njit(cache=True, nogil=True)
+@kernel("int64(uint16[:, ::1], int64[:, ::1], int64, int64, int64, float64)")
 def _left_clear(masks, offsets, i, j, held, min_count):
     """The bits of `held` that no column around has; none if they are fewer than `min_count`."""
     clear = held
@@ -96,7 +85,7 @@ def _left_clear(masks, offsets, i, j, held, min_count):
     return clear
 
 
-@njit(cache=True, nogil=True)
+@kernel("int64(int64)")
 def _count(mask):
     count = 0
     while mask:
@@ -105,7 +94,7 @@ def _count(mask):
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel("int64(int64)")
 def _span(mask):
     """From the lowest to the highest bit set, both included."""
     first, last = NUM_SLICES, -1

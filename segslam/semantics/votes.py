@@ -8,10 +8,10 @@ Differs from the paper: the image goes on from its last column to its first.
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from numba import njit
 
 from segslam.semantics.network_settings import VoteSettings
 from segslam.semantics.range_image import Projection
+from segslam.system.kernels import kernel
 from segslam.types import Label, Labels
 
 
@@ -41,11 +41,7 @@ def window_weights(side: int, sigma_px: float) -> Float[np.ndarray, "side side"]
     return 1.0 - np.outer(bell, bell) / bell.sum() ** 2
 
 
-@njit(
-    "uint8[:](uint8[:, :], float64[:, :], int64[:], int64[:], float64[:], float64[:, :], int64, float64, int64)",
-    cache=True,
-    nogil=True,
-)
+@kernel("uint8[:](uint8[:, :], float64[:, :], int64[:], int64[:], float64[:], float64[:, :], int64, float64, int64)")
 def _vote(image, image_ranges, rows, columns, ranges, weights, num_neighbours, cutoff, num_labels):
     height, width = image.shape
     half = len(weights) // 2

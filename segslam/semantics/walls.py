@@ -1,9 +1,10 @@
 """Vertical faces: where points lie along one line seen from above, high enough."""
 
 import numpy as np
-from numba import njit
+from scipy.ndimage import maximum_filter
 
 from segslam.semantics.cells import cells_above
+from segslam.system.kernels import kernel
 from segslam.types import Mask, Points, Vector
 
 CELL_M = 0.6
@@ -24,12 +25,17 @@ def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: 
     cells, corner, shape = cells_above(points, CELL_M, border=1)
     layers = np.clip(heights / LAYER_M, 0, NUM_LAYERS - 1).astype(np.int64)
     voxel, moments = _moments(points, layers, cells, corner, (NUM_LAYERS, *shape))
-    top = _tops(cells, heights, shape)
-    walls = _walls(voxel, moments, top, thickness_m * 1000, MIN_LENGTH_M * 1000, min_top_m)
+    top = np.full(shape, -np.inf)
+    np.maximum.at(top.ravel(), cells[:, 0] * shape[1] + cells[:, 1], heights)
+    tall = maximum_filter(top, 3) >= min_top_m
+    walls = _walls(voxel, moments, tall, thickness_m * 1000, MIN_LENGTH_M * 1000)
     return walls[voxel[layers, cells[:, 0], cells[:, 1]]]
 
 
-@njit(cache=True, nogil=True)
+@kernel(
+    "Tuple((int32[:, :, ::1], int64[:, ::1]))(float64[:, ::1], int64[::1], int64[:, ::1], float64[::1],"
+    "UniTuple(int64, 3))"
+)
 def _moments(points, layers, cells, corner, shape):
     """The number of each occupied voxel, -1 elsewhere, and for each the sums of 1, x, y, xx, xy, yy over its points.
 
@@ -55,36 +61,30 @@ def _moments(points, layers, cells, corner, shape):
     return voxel, moments[:num_voxels]
 
 
-@njit(cache=True, nogil=True)
-def _tops(cells, heights, shape):
-    top = np.full(shape, -np.inf)
-    for k in range(len(cells)):
-        i, j = cells[k, 0], cells[k, 1]
-        top[i, j] = max(top[i, j], heights[k])
-    return top
-
-
-@njit(cache=True, nogil=True)
-def _walls(voxel, moments, top, thickness_mm, min_length_mm, min_top_m):
+@kernel("boolean[::1](int32[:, :, ::1], int64[:, ::1], boolean[:, ::1], float64, float64)")
+def _walls(voxel, moments, tall, thickness_mm, min_length_mm):
     """Whether each voxel is part of a face. Its surroundings never leave the grid, whose border is empty."""
     walls = np.zeros(len(moments), np.bool_)
+    total = np.zeros(6, np.int64)
     for layer in range(voxel.shape[0]):
         for i in range(1, voxel.shape[1] - 1):
             for j in range(1, voxel.shape[2] - 1):
-                if voxel[layer, i, j] < 0 or top[i - 1 : i + 2, j - 1 : j + 2].max() < min_top_m:
+                if voxel[layer, i, j] < 0 or not tall[i, j]:
                     continue
-                total = np.zeros(6, np.int64)
+                total[:] = 0
                 for a in range(i - 1, i + 2):
                     for b in range(j - 1, j + 2):
                         if voxel[layer, a, b] >= 0:
-                            total += moments[voxel[layer, a, b]]
+                            for m in range(6):
+                                total[m] += moments[voxel[layer, a, b], m]
                 walls[voxel[layer, i, j]] = _is_line(total, thickness_mm, min_length_mm)
     return walls
 
 
-@njit(cache=True, nogil=True)
+@kernel("boolean(int64[::1], float64, float64)")
 def _is_line(moments, thickness_mm, min_length_mm):
-    n, x, y, xx, xy, yy = moments
+    n, x, y = moments[0], moments[1], moments[2]
+    xx, xy, yy = moments[3], moments[4], moments[5]
     if n < MIN_POINTS:
         return False
     a, b, c = xx / n - (x / n) ** 2, xy / n - (x / n) * (y / n), yy / n - (y / n) ** 2

@@ -7,9 +7,9 @@ from segslam.simulation.label_errors import LabelErrorConfig, network_like
 from segslam.simulation.levelling import level, upright
 from segslam.simulation.routes import made_up_loop
 from segslam.simulation.sensor import Sensor, Sweep, make_sensor, sweep
-from segslam.simulation.settings import SensorConfig, SimulationConfig, WorldConfig, simulation_config
-from segslam.simulation.tracks import Drive, made_up_drive, read_drive
+from segslam.simulation.tracks import Drive, in_lane, made_up_drive, read_drive
 from segslam.simulation.world import Hits, World, build_world
+from segslam.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig, simulation_config
 
 __all__ = [
     "Drive",
@@ -24,6 +24,7 @@ __all__ = [
     "WorldConfig",
     "build_world",
     "drive_sweeps",
+    "in_lane",
     "level",
     "made_up_drive",
     "made_up_loop",

@@ -1,7 +1,7 @@
 """What makes odometry drift: errors that change slowly from sweep to sweep and that nobody corrects.
 
 Each is an Ornstein-Uhlenbeck process. Motion left over within a sweep smears it. A spinning head whose axis and encoder
-wander bends it alike ahead and behind, which turns the odometry with every metre, up or down and sideways.
+wander distorts it equally ahead and behind, which rotates the odometry with every metre, up or down and sideways.
 """
 
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from segslam import geometry
-from segslam.simulation.settings import SensorConfig
+from segslam.simulation.world_settings import SensorConfig
 from segslam.types import Points, Tangent, Vector
 
 
@@ -53,7 +53,7 @@ def _slow_noise(time_s: Vector, count: int, correlation_s: float, rng: np.random
 def distorted(points: Points, sweep_fraction: Vector, error: SweepError) -> Points:
     """Points of the LiDAR frame as they come out of a sweep with errors, to first order in them.
 
-    `sweep_fraction` (n,) says when in the sweep each was seen, from -0.5 to 0.5; the pose is that of its middle.
+    `sweep_fraction` (n,): time of each point within the sweep, from -0.5 to 0.5; the pose is that of its middle.
     """
     a, b, c = error.motion[:3]
     turned = np.einsum("ij,kj->ik", points, np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]))

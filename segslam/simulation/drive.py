@@ -6,8 +6,8 @@ import numpy as np
 
 from segslam.simulation.drift import sweep_errors
 from segslam.simulation.sensor import Sweep, make_sensor, sweep
-from segslam.simulation.settings import SensorConfig, SimulationConfig
 from segslam.simulation.world import World, build_world
+from segslam.simulation.world_settings import SensorConfig, SimulationConfig
 from segslam.trajectory import Poses
 from segslam.types import Scan, Vector
 
@@ -31,11 +31,15 @@ def drive_sweeps(
     seed: int,
     only: Collection[int] | None = None,
 ) -> Iterator[Sweep]:
-    """The sweeps of a drive through a world, in its order; of these numbers alone if given."""
+    """The sweeps of a drive through a world, in its order; of these numbers alone if given.
+
+    Every day has the same sensor and other noise.
+    """
     sensor = make_sensor(config, seed=seed)
-    errors = sweep_errors(time_s, config=config, rng=np.random.default_rng([seed, 3]))
+    days = [world.day] if world.day else []
+    errors = sweep_errors(time_s, config=config, rng=np.random.default_rng([seed, 3, *days]))
     for index, (T_world_now, now, error) in enumerate(zip(T_world_lidar, time_s, errors, strict=True)):
         if only is not None and index not in only:
             continue
-        rng = np.random.default_rng([seed, 4, index])
+        rng = np.random.default_rng([seed, 4, index, *days])
         yield sweep(world, sensor, T_world_now, rng=rng, time_s=float(now), error=error)

@@ -56,7 +56,7 @@ def network_like(points: Points, labels: Labels, *, config: LabelErrorConfig, rn
 
 
 def _standing(labels: Labels) -> Labels:
-    """A single scan does not tell what moves."""
+    """Labels without moving classes, which a single scan cannot show."""
     table = np.arange(len(Label), dtype=np.uint8)
     table[list(STANDING)] = list(STANDING.values())
     return table[labels]

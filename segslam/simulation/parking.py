@@ -9,8 +9,8 @@ import numpy as np
 from segslam.simulation import vehicles
 from segslam.simulation.mesh import Mesh
 from segslam.simulation.path import Route, time_between_visits
-from segslam.simulation.settings import WorldConfig
 from segslam.simulation.site import Frontage, Site, Spot, moved
+from segslam.simulation.world_settings import WorldConfig
 from segslam.types import Label
 
 KERB_M, SLOT_M = 4.4, 6.0  # chosen: from the street's middle to a parked car's; room that one takes along the street
@@ -19,6 +19,7 @@ COURT_M, COURT_DEPTH_M, COURT_SLOT_M = (
     12.0,
     2.7,
 )  # chosen: the same across, in courts with cars nose to the street
+VACANT = 0.3  # chosen: share of the parking places that are empty on another day
 TRUCKS = 0.05  # chosen: share of the vehicles at the kerb
 
 
@@ -38,15 +39,35 @@ class ParkedCar:
 
 
 def parked_cars(
-    site: Site, frontage: Frontage, route: Route, config: WorldConfig, rng: np.random.Generator
+    site: Site,
+    frontage: Frontage,
+    route: Route,
+    config: WorldConfig,
+    rng: np.random.Generator,
+    *,
+    today: np.random.Generator | None = None,
 ) -> Iterator[ParkedCar]:
-    """The cars on one side of the streets; at `parked_cars_gone` of the places they differ from visit to visit."""
+    """The cars on one side of the streets; at `parked_cars_gone` of the places they differ from visit to visit.
+
+    `rng` draws the parking places and the cars of the first day, `today` those of another day at the same places.
+    """
     for spot, across in [*_kerb_spots(site, frontage, config, rng), *_court_spots(site, frontage, config, rng)]:
-        turn = (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(scale=0.03)
-        for start, end in _stays(route, spot, config, rng):
-            lorry = not across and rng.uniform() < TRUCKS
-            made = vehicles.truck(rng) if lorry else vehicles.car(rng)
-            yield ParkedCar(site.stand(made, spot, turn_rad=float(turn)), (spot.x, spot.y), start, end)
+        first_day = list(_cars_at(spot, across, site, route, config, rng))  # `rng` goes on the same way on every day
+        if today is None:
+            yield from first_day
+        elif today.uniform() >= VACANT:
+            yield from _cars_at(spot, across, site, route, config, today)
+
+
+def _cars_at(
+    spot: Spot, across: bool, site: Site, route: Route, config: WorldConfig, rng: np.random.Generator
+) -> Iterator[ParkedCar]:
+    """The cars that stand at one place, one after the other."""
+    turn = (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(scale=0.03)
+    for start, end in _stays(route, spot, config, rng):
+        lorry = not across and rng.uniform() < TRUCKS
+        made = vehicles.truck(rng) if lorry else vehicles.car(rng)
+        yield ParkedCar(site.stand(made, spot, turn_rad=float(turn)), (spot.x, spot.y), start, end)
 
 
 def _kerb_spots(

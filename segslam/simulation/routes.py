@@ -16,16 +16,17 @@ TURN_M = 5.0  # chosen: corners are rounded by a Gaussian of this width
 SPEED_M_S, TURN_M_S2, PERIOD_S = 14.0, 5.0, 0.1  # chosen: fastest, and the sideways acceleration that slows a turn
 
 
-def made_up_loop(num_frames: int = 0) -> tuple[Poses, Vector]:
+def made_up_loop(num_frames: int = 0, *, scale: float = 1.0) -> tuple[Poses, Vector]:
     """(T_world_lidar, seconds) of a drive at 10 Hz with a street driven in both directions and again in the first.
 
-    One round and the shared street once more, some 300 scans, or as many scans as asked for if that is more.
+    One round and the shared street once more, some 300 scans, or as many scans as asked for if that is more. `scale`
+    makes the blocks larger.
     """
-    corners = np.array(CORNERS_M, dtype=float)
+    corners = scale * np.array(CORNERS_M, dtype=float)
     ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     stations = np.arange(0.0, ends[-1], STEP_M)
     lane = _rounded(np.column_stack([np.interp(stations, ends, corners[:, axis]) for axis in (0, 1)]))
-    shared = int(SHARED_M / STEP_M)
+    shared = int(scale * SHARED_M / STEP_M)
     rounds = 1 + int(np.ceil(num_frames * SPEED_M_S * PERIOD_S / ends[-1]))
     path = np.tile(lane, (rounds + 1, 1))
     time = np.concatenate([[0.0], np.cumsum(_seconds(path))])

@@ -6,8 +6,8 @@ import numpy as np
 
 from segslam.simulation.drift import NO_ERROR, SweepError, distorted
 from segslam.simulation.mesh import Instances
-from segslam.simulation.settings import SensorConfig, SensorName
 from segslam.simulation.world import Hits, World
+from segslam.simulation.world_settings import SensorConfig, SensorName
 from segslam.types import Label, Labels, Points, Scan, Transform, Vector
 
 
@@ -46,7 +46,7 @@ class Sensor:
     directions: Points
     """(n, 3) unit vectors in the LiDAR frame along which it really looks."""
     reported: Points
-    """(n, 3) along which it says that it looks."""
+    """(n, 3) reported beam directions."""
     range_error_m: Vector
     """(n,)"""
     sweep_fraction: Vector
@@ -64,7 +64,7 @@ class Sweep:
 
     def scan(self, *, index: int, stamp_ns: int) -> Scan:
         """The same without intensity and instances."""
-        return Scan(index, stamp_ns, self.points, self.labels)
+        return Scan(self.points, stamp_ns, index, self.labels)
 
 
 def make_sensor(config: SensorConfig, *, seed: int) -> Sensor:

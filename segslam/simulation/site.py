@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from segslam.simulation.ground import CELL_M, Ground, middle_of_street
 from segslam.simulation.mesh import Mesh, placed
+from segslam.simulation.terrain import CELL_M, Ground, middle_of_street
 from segslam.types import Label, Vector
 
 STREET_GAP_M = 7.0  # chosen: a path this near to an earlier piece of itself is the same street

@@ -7,8 +7,8 @@ import numpy as np
 
 from segslam.simulation import buildings, plants
 from segslam.simulation.mesh import Mesh
-from segslam.simulation.settings import WorldConfig
 from segslam.simulation.site import Frontage, Site, moved
+from segslam.simulation.world_settings import WorldConfig
 from segslam.types import Label
 
 # Chosen: from the street's middle to the middle of a thing, or to a house's front.

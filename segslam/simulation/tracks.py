@@ -31,9 +31,21 @@ class Drive:
     calib: str
 
 
-def made_up_drive(num_frames: int = 0) -> Drive:
-    """The made-up loop with KITTI's nominal calibration: one round, or more if it takes more to fill so many scans."""
-    return Drive(*made_up_loop(num_frames), NOMINAL_CALIB)
+def made_up_drive(num_frames: int = 0, *, scale: float = 1.0) -> Drive:
+    """The made-up loop with KITTI's nominal calibration: one round, or more if it takes more to fill so many scans.
+
+    `scale` makes the blocks larger.
+    """
+    return Drive(*made_up_loop(num_frames, scale=scale), NOMINAL_CALIB)
+
+
+def in_lane(drive: Drive, *, left_m: float = 0.0, reverse: bool = False) -> Drive:
+    """The same streets driven `left_m` to the left of the first drive's path, or from its end to its start."""
+    T_world_lidar, time_s = drive.T_world_lidar, drive.time_s
+    if reverse:
+        T_world_lidar = T_world_lidar[::-1] @ geometry.transform(geometry.yaw(np.pi), np.zeros(3))
+        time_s = time_s[0] + time_s[-1] - time_s[::-1]
+    return Drive(T_world_lidar @ geometry.transform(np.eye(3), [0.0, left_m, 0.0]), time_s, drive.calib)
 
 
 def read_drive(poses_file: Path, *, sequence: str) -> Drive:

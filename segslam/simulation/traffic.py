@@ -8,7 +8,7 @@ import numpy as np
 from segslam.simulation import vehicles
 from segslam.simulation.mesh import Mesh, as_instance, placed
 from segslam.simulation.path import Route
-from segslam.simulation.settings import WorldConfig
+from segslam.simulation.world_settings import WorldConfig
 from segslam.types import Label
 
 LANE_M = 2.7  # chosen: oncoming traffic passes this far to the left of the path

@@ -6,14 +6,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import open3d as o3d
 
-from segslam.simulation.ground import Ground, ground_mesh, ground_of
 from segslam.simulation.mesh import Flags, Instances, Mesh, as_instance, merge
 from segslam.simulation.parking import ParkedCar, parked_cars
 from segslam.simulation.path import Route, route_of, street_of
-from segslam.simulation.settings import WorldConfig
 from segslam.simulation.site import Site, frontages
 from segslam.simulation.streets import furnish
+from segslam.simulation.terrain import Ground, ground_mesh, ground_of
 from segslam.simulation.traffic import MovingCar, meshes_at, moving_cars
+from segslam.simulation.world_settings import WorldConfig
 from segslam.trajectory import Poses
 from segslam.types import Label, Labels, Points, Transform, Vector
 
@@ -37,11 +37,12 @@ class World:
     """Streets along one drive. Made by `build_world`; the same arguments make the same world."""
 
     def __init__(
-        self, ground: Ground, static: Mesh, route: Route, parked: list[ParkedCar], moving: list[MovingCar]
+        self, ground: Ground, static: Mesh, route: Route, parked: list[ParkedCar], moving: list[MovingCar], day: int
     ) -> None:
+        self.day = day
         self.ground = ground
         self.static = static
-        self._scene = _scene(static)
+        self._scene = scene_of(static)
         self._route = route
         self._parked = parked
         self._moving = moving
@@ -52,7 +53,7 @@ class World:
         rays[:, :3] = T_world_lidar[:3, 3]
         R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
         np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # beats BLAS's threads
-        hits = _relabelled(_cast(self._scene, self.static, rays), self.ground, rays)
+        hits = _relabelled(cast_mesh(self._scene, self.static, rays), self.ground, rays)
         for thing in self._changing(time_s, T_world_lidar[:2, 3]):
             _put_nearer(hits, thing, rays)
         return hits
@@ -68,6 +69,7 @@ def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, se
     """Streets along a drive whose poses are level (`levelling.level`), z up, `time_s` (n,) ascending.
 
     Every pose of the drive stands `config.sensor_height_m` above its road; no thing stands on any piece of the path.
+    On another `config.day` the same streets have other parked and moving cars.
     """
     rng = np.random.default_rng([seed, 1])
     route = route_of(T_world_lidar, time_s, sensor_height_m=config.sensor_height_m)
@@ -75,12 +77,13 @@ def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, se
     ground = ground_of(street, rng)
     site = Site(ground)
     sides = frontages(street)
-    parked = _numbered_cars([car for side in sides for car in parked_cars(site, side, route, config, rng)])
+    today = np.random.default_rng([seed, 1, config.day]) if config.day else None
+    parked = _numbered_cars([car for side in sides for car in parked_cars(site, side, route, config, rng, today=today)])
     things = [thing for side in sides for thing in furnish(site, side, config, rng)]
     standing = [car.mesh for car in parked if not car.changes]
     static = merge([ground_mesh(ground), *standing, *_numbered(things)])
     changing = [car for car in parked if car.changes]
-    return World(ground, static, route, changing, moving_cars(route, config, rng))
+    return World(ground, static, route, changing, moving_cars(route, config, today or rng), config.day)
 
 
 def _numbered_cars(cars: list[ParkedCar]) -> list[ParkedCar]:
@@ -93,7 +96,8 @@ def _numbered(things: list[Mesh]) -> list[Mesh]:
     return [as_instance(thing, number, only=NUMBERED) for number, thing in enumerate(things, start=1)]
 
 
-def _scene(part: Mesh) -> o3d.t.geometry.RaycastingScene:
+def scene_of(part: Mesh) -> o3d.t.geometry.RaycastingScene:
+    """A mesh made ready for rays."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(_tensor(part.vertices, np.float32), _tensor(part.triangles, np.uint32))
     return scene
@@ -103,7 +107,8 @@ def _tensor(values: np.ndarray, dtype: type) -> o3d.core.Tensor:
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=dtype))
 
 
-def _cast(scene: o3d.t.geometry.RaycastingScene, part: Mesh, rays: np.ndarray) -> Hits:
+def cast_mesh(scene: o3d.t.geometry.RaycastingScene, part: Mesh, rays: np.ndarray) -> Hits:
+    """What rays (n, 6; float32 origin and direction) meet first of a mesh; `scene` is `scene_of(part)`."""
     answer = scene.cast_rays(_tensor(rays, np.float32))
     range_m = answer["t_hit"].numpy()
     hit = np.where(np.isfinite(range_m), answer["primitive_ids"].numpy(), 0)
@@ -130,7 +135,7 @@ def _put_nearer(hits: Hits, thing: Mesh, rays: np.ndarray) -> None:
     else:
         toward = (away / distance).astype(np.float32)
         rows = np.flatnonzero(np.einsum("ij,j->i", rays[:, 3:], toward) > np.sqrt(1.0 - (radius / distance) ** 2))
-    found = _cast(_scene(thing), thing, rays[rows])
+    found = cast_mesh(scene_of(thing), thing, rays[rows])
     first = found.range_m < hits.range_m[rows]
     for field in fields(Hits):
         getattr(hits, field.name)[rows[first]] = getattr(found, field.name)[first]

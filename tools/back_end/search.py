@@ -79,8 +79,8 @@ def search(drive: Drive, rng: np.random.Generator) -> tuple[list[LoopClosure], d
         looking.graph.add_keyframe(keyframe_id, T_odom_keyframe, float(travel))
         if looking.look(keyframe_id):
             started = time.perf_counter()
-            looking.graph.optimize()
-            looking.detector.note_estimate()
+            estimate = looking.graph.optimize()
+            looking.detector.note_estimate(estimate.closure_weights)
             seconds.append(time.perf_counter() - started)
     last = np.array(seconds[-max(1, len(seconds) // 10) :] or [np.nan])
     looking.graph.finish()

@@ -9,10 +9,10 @@ import numpy as np
 
 from labels.trials import Trial, attempt, clock, judged_trial, prepared, rejected_trial, summary
 from segslam import geometry
-from segslam.alignment import shape_labels
 from segslam.config import Config
 from segslam.datasets.kitti import read_returns
 from segslam.experiments.baselines import align_kiss_matcher, prepare_points
+from segslam.registration import shape_labels
 from segslam.trajectory import Poses
 from segslam.types import Label, Points, Rejected, Transform
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from labels.trials import Trial, attempt, prepared, summary
 from segslam import geometry
-from segslam.alignment import PreparedScan
 from segslam.config import Config
 from segslam.datasets import open_dataset
+from segslam.registration import PreparedScan
 from segslam.semantics import geometric_labels
 from segslam.types import GROUND_LABELS, Label, Points, Scan
 

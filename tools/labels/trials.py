@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from segslam import geometry
-from segslam.alignment import PreparedScan, align, prepare_scan, shape_labels
 from segslam.config import Config
+from segslam.evaluation import SUCCESS_DEG, SUCCESS_M
+from segslam.registration import PreparedScan, prepare_scan, register_prepared, shape_labels
 from segslam.types import Labels, Points, Rejected, Transform
-
-SUCCESS_M, SUCCESS_DEG = 2.0, 5.0
 
 Trial = dict[str, Any]
 """accepted, success, seconds; reason or, of coarse and refined pose, error_m and error_deg."""
@@ -37,7 +36,7 @@ def prepared(points: Points, labels: Labels | None, config: Config) -> tuple[Pre
 def attempt(source: PreparedScan, target: PreparedScan, T_true: Transform, config: Config) -> Trial:
     """The whole pipeline on two scans, verification included."""
     started = clock()
-    found = align(source, target, config=config)
+    found = register_prepared(source, target, config=config)
     seconds = clock() - started
     if isinstance(found, Rejected):
         return rejected_trial(found, seconds)

@@ -8,8 +8,8 @@ from pathlib import Path
 from registration.scans import by_shape, courtyard_points, kitti_pose, real_indices, real_points
 from registration.trials import Row, error, preparer
 from segslam import geometry
-from segslam.alignment import align
 from segslam.config import Config
+from segslam.registration import register_prepared
 from segslam.types import Alignment
 
 MEET_M = 60.0
@@ -31,7 +31,7 @@ def real_negatives(data: Path, config: Config, *, every: int) -> list[Row]:
         T_true = kitti_pose(data, source, target)
         if geometry.distance(T_true) < MEET_M:
             continue
-        outcome = align(kitti(source), kitti(target), config=config)
+        outcome = register_prepared(kitti(source), kitti(target), config=config)
         if not isinstance(outcome, Alignment):
             within[outcome.reason.value] += 1
         elif error(outcome.fine.T_target_source, T_true).within(KITTI_ERR_M, KITTI_ERR_DEG):
@@ -40,7 +40,7 @@ def real_negatives(data: Path, config: Config, *, every: int) -> list[Row]:
             within["accepted"] += 1
     across: Counter[str] = Counter()
     for source, target in product(range(0, NUM_COURTYARD, every), indices):
-        outcome = align(court(source), kitti(target), config=config)
+        outcome = register_prepared(court(source), kitti(target), config=config)
         across["accepted" if isinstance(outcome, Alignment) else outcome.reason.value] += 1
     return [_row("KITTI 00, over 60 m apart", within), _row("courtyard and KITTI 00", across)]
 

@@ -10,8 +10,8 @@ import numpy as np
 from registration.scans import Pair, are_predicted, real_labels, real_points, reference_pairs
 from registration.trials import Row, Trial, attempt, percent
 from segslam import geometry
-from segslam.alignment import PreparedScan, prepare_scan
 from segslam.config import Config
+from segslam.registration import PreparedScan, prepare_scan
 from segslam.semantics import geometric_labels
 
 FAR_M = 20.0

@@ -9,8 +9,8 @@ import numpy as np
 
 from registration.scans import BANDS_M, Labelled, Pair, SimulatedPlace, by_shape
 from registration.trials import RIGHT_DEG, RIGHT_M, SUCCESS_DEG, SUCCESS_M, Row, Trial, attempt, percent, preparer
-from segslam.alignment import PreparedScan, align
 from segslam.config import Config
+from segslam.registration import PreparedScan, register_prepared
 from segslam.types import Alignment
 
 NEGATIVE_M = 100.0
@@ -72,7 +72,7 @@ def _negatives(
     outcomes: Counter[str] = Counter()
     for row in rng.choice(len(apart), min(count, len(apart)), replace=False):
         source, target = apart[row]
-        outcome = align(prepared(source), prepared(target), config=config)
+        outcome = register_prepared(prepared(source), prepared(target), config=config)
         outcomes["accepted" if isinstance(outcome, Alignment) else outcome.reason.value] += 1
     return outcomes
 

@@ -8,12 +8,14 @@ import numpy as np
 
 from registration.scans import Labelled, Pair
 from registration.trials import Row
-from segslam import refine, segregator, verify
-from segslam.alignment import prepare_scan, register
+from segslam import refinement, segregator
 from segslam.config import Config
 from segslam.experiments.baselines import align_gicp, prepare_gicp
 from segslam.experiments.meter import measured
+from segslam.registration import prepare_scan, register
 from segslam.types import Description, Label, Registration
+from segslam.verification import gates
+from segslam.verification.free_space import observe_free_space
 
 BESIDE = "small_gicp"
 NUM_CLUSTERS = 78
@@ -45,16 +47,19 @@ def _timed_stages(source: Labelled, target: Labelled, config: Config) -> Iterabl
     coarse = segregator.match(one.description, other.description, config=config.segregator)
     if isinstance(coarse, Registration):
         T_target_source = coarse.T_target_source
-        yield "refine", timed(lambda: refine.refine(one.surface, other.surface, T_target_source, config=config.refine))
-        sides = (one.surface, one.view), (other.surface, other.view)
-        yield "verify", timed(lambda: verify.agreement(*sides, T_target_source, config=config.verify))
+        yield (
+            "refine",
+            timed(lambda: refinement.refine(one.surface, other.surface, T_target_source, config=config.refine)),
+        )
+        sides = (one.surface, one.free_space), (other.surface, other.free_space)
+        yield "verify", timed(lambda: gates.agreement(*sides, T_target_source, config=config.verify))
     yield "cold pair", timed(lambda: _cold(source, target, config))
     yield BESIDE, timed(lambda: align_gicp(*(prepare_gicp(points) for points, _ in (source, target))))
 
 
 def _surface_and_view(scan: Labelled, config: Config) -> None:
-    refine.prepare(refine.thin(scan[0], config=config.refine), config=config.refine)
-    verify.view(scan[0])
+    refinement.make_surface(refinement.downsample(scan[0], config=config.refine), config=config.refine)
+    observe_free_space(scan[0])
 
 
 def _cold(source: Labelled, target: Labelled, config: Config) -> None:

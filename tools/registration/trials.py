@@ -8,13 +8,12 @@ from functools import cache
 import numpy as np
 
 from registration.scans import Labelled
-from segslam import geometry, refine, segregator
-from segslam.alignment import PreparedScan, Stopwatch, align, prepare_scan
+from segslam import geometry, refinement, segregator
 from segslam.config import Config
+from segslam.evaluation import SUCCESS_DEG, SUCCESS_M
+from segslam.registration import PreparedScan, Stopwatch, prepare_scan, register_prepared
 from segslam.types import Alignment, Registration, Rejected, Transform
 
-SUCCESS_M, SUCCESS_DEG = 2.0, 5.0
-"""The paper's success."""
 RIGHT_M, RIGHT_DEG = 0.5, 2.0
 """Chosen: a refined pose that is farther off has found another minimum; right ones are off by centimetres."""
 
@@ -91,9 +90,9 @@ def attempt(source: PreparedScan, target: PreparedScan, T_true: Transform, *, co
     coarse = segregator.match(source.description, target.description, config=config.segregator)
     refined: Registration | Rejected = coarse
     if isinstance(coarse, Registration):
-        refined = refine.refine(source.surface, target.surface, coarse.T_target_source, config=config.refine)
+        refined = refinement.refine(source.surface, target.surface, coarse.T_target_source, config=config.refine)
     watch = Stopwatch()
-    outcome = align(source, target, config=config, watch=watch)
+    outcome = register_prepared(source, target, config=config, watch=watch)
     fine = outcome.fine if isinstance(outcome, Alignment) else outcome
     return Trial(
         coarse=error_of(coarse, T_true),

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from segslam import geometry
-from segslam.alignment import Stopwatch
 from segslam.config import Config
 from segslam.log import LogWriter
 from segslam.log.drawing import Drawing
@@ -19,6 +18,7 @@ from segslam.odometry import GivenOdometry
 from segslam.pose_graph import G2oGraph, optimize_graph
 from segslam.pose_graph.edges import Edge
 from segslam.proximity import ProximityDetector
+from segslam.registration import Stopwatch
 from segslam.slam import Slam
 from segslam.types import (
     Alignment,
@@ -79,7 +79,7 @@ class Drive(Slam):
     """Where the loops that are tried come from the truth, give or take some noise: no scan is aligned."""
 
     def __init__(self, T_world_true: np.ndarray) -> None:
-        config = Config.model_validate({"graph": {"systematic_drift": "never"}})  # there are no scans to ask
+        config = Config()
         super().__init__(config, odometry=GivenOdometry(_no_scans(), config.odometry))
         self._true = T_world_true
         self._rng = np.random.default_rng(0)
@@ -157,7 +157,7 @@ def _propose_seconds(num_keyframes: int) -> float:
     detector, poses = ProximityDetector(Config().proximity), _rounds(num_keyframes)
     for source in range(LAP, num_keyframes, 5):
         detector.note_closure(_closure(source, source - LAP))
-    detector.note_estimate()
+    detector.note_estimate({})
     travel_m = STEP_M * np.arange(num_keyframes)
     return _timed(lambda: detector.candidates(num_keyframes - 1, poses, travel_m))
 

@@ -1,0 +1,246 @@
+"""Calibration of a LiDAR's vertical angle from scans of one drive that lie some metres apart.
+
+Beams that all point lower than recorded turn every plane into a cone around the sensor. Two scans from different
+places bend one surface differently, and no rigid motion lays the one on the other: the angle is a seventh unknown of
+their registration. An odometry that registers such scans takes a part of the angle for a pitch of every motion, so the
+angle is corrected in the scans, before the odometry (`sensor.vertical_angle_deg`).
+
+Positive angles: the points of a scan lie too low, and have to be raised by the angle.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from segslam import geometry
+from segslam.config import Config, RefineConfig, SensorCalibrationConfig
+from segslam.geometry import raising
+from segslam.keyframes import KeyframeSelector
+from segslam.keyframes import downsample_keyframe as thin_keyframe
+from segslam.odometry import KissOdometry, Odometry
+from segslam.refinement import Surface, downsample, make_surface
+from segslam.semantics.label_files import unlabelled
+from segslam.types import Mask, Points, Scan, Transform, Vector
+
+PointsOf = Callable[[int], Points]
+"""The points of a keyframe, by id, in its own frame."""
+
+APART_M = 10.0
+"""Travel between the two scans of a pair. Chosen on KITTI 00, as it is and with 0.205 degrees corrected: the medians
+are 0.18 and -0.02 degrees. Fewer points meet over 14 to 30 m."""
+MOST_APART = 1.5
+"""Pairs whose straight distance is less than `APART_M` divided by this, or more than it times this, are dropped: the
+sensor stood or jittered, or keyframes are missing."""
+MOST_PAIRS = 24
+"""Pairs that a run measures. Chosen: 1.6 s of one core, whatever the length of the drive."""
+CALIBRATION_PAIRS = 96
+"""Pairs that a calibration measures."""
+MIN_PAIRS = 8
+"""Chosen: the scatter of fewer pairs is not known well enough to claim anything."""
+MOST_TURN_RAD = math.radians(30.0)
+"""Chosen: scans that turned more share less of the scene, and lie on a curve of the drive."""
+MOST_POINTS = 4000
+"""Of the source. Chosen: 1500 change the median by 0.02 degrees, and lose pairs."""
+SEARCH_M = (1.0, 0.8, 0.6, *[0.5] * 17)
+"""Search distance of each step. Chosen: over 10 m odometry is off by less than the first."""
+CONVERGED = 2e-3
+"""A step smaller than this (rad, m) is the last."""
+SETTLED_RAD = math.radians(0.03)
+"""Largest change of the angle in the last step where steps never become that small, for pairs of points still change.
+Chosen: half of what pairs of KITTI's scans scatter by."""
+RESIDUAL_M = 0.05
+"""Distance at which a point has lost three quarters of its weight. Chosen: above the noise of ranges."""
+LEVEL_NORMAL_Z, STANDING_NORMAL_Z = 0.95, 0.15
+"""Chosen: surfaces that are neither level nor upright are mostly foliage."""
+MIN_PAIRED = 500
+"""Chosen: fewer points that meet are no dense scan of a street."""
+MOST_SIGMA_DEG = 0.05
+"""Pairs that know the angle less well, by their own residuals, are dropped. Chosen: KITTI's know it to 0.02, thinned
+clouds of 32 beams to 0.07 or worse."""
+BIAS_DEG = 0.02
+"""Standard deviation added to that of the median. Chosen: on KITTI 00 the medians with 8 to 30 m between the scans
+differ by as much."""
+SIGNIFICANT_SIGMAS, SIGNIFICANT_DEG = 2.5, 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class VerticalAngle:
+    """The vertical angle left over in some scans; positive where their points lie too low."""
+
+    angle_deg: float
+    sigma_deg: float
+    num_pairs: int
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the angle differs from zero by more than its error, and enough to matter."""
+        return abs(self.angle_deg) > max(SIGNIFICANT_SIGMAS * self.sigma_deg, SIGNIFICANT_DEG)
+
+
+def vertical_angle_advice(metrics: Mapping[str, Any], sensor: SensorCalibrationConfig) -> str:
+    """A line on the vertical angle that a run measured, and the setting that corrects it; empty if not significant."""
+    if "vertical_deg" not in metrics:
+        return ""
+    found = VerticalAngle(metrics["vertical_deg"], metrics["vertical_sigma_deg"], MIN_PAIRS)
+    if not found.is_significant:
+        return ""
+    total_deg = found.angle_deg + (sensor.vertical_angle_deg or 0.0)
+    return f"{described(found)}; map again with --set sensor.vertical_angle_deg={total_deg:.2f}"
+
+
+def described(found: VerticalAngle) -> str:
+    """The angle in words."""
+    side = "low" if found.angle_deg >= 0 else "high"
+    return f"beams point {abs(found.angle_deg):.2f} +- {found.sigma_deg:.2f} degrees {side}"
+
+
+def measure_vertical_angle(
+    points_of: PointsOf,
+    T_odom_keyframes: Float[np.ndarray, "n 4 4"],
+    travel_m: Vector,
+    *,
+    config: RefineConfig,
+    most_pairs: int = MOST_PAIRS,
+) -> VerticalAngle | None:
+    """The median over pairs of keyframes `APART_M` apart; None where too few pairs show the angle."""
+
+    @lru_cache(2)
+    def surface(keyframe_id: int) -> Surface:
+        return make_surface(downsample(points_of(keyframe_id), config=config), config=config)
+
+    found = []
+    for target, source in _pairs(T_odom_keyframes, travel_m, most_pairs):
+        T_prior = geometry.inverse(T_odom_keyframes[target]) @ T_odom_keyframes[source]
+        one = register_with_angle(surface(source), surface(target), T_prior)
+        if one is not None and one.sigma_rad < math.radians(MOST_SIGMA_DEG):
+            found.append(math.degrees(one.angle_rad))
+    if len(found) < MIN_PAIRS:
+        return None
+    median = float(np.median(found))
+    spread = 1.4826 * float(np.median(np.abs(np.array(found) - median)))
+    error = math.sqrt(math.pi / 2 / len(found)) * spread  # of the median of normal errors
+    return VerticalAngle(median, math.hypot(error, BIAS_DEG), len(found))
+
+
+class Calibrator:
+    """Measures the vertical angle of the scans of one drive; they need no labels and no map. Memory: keyframes only."""
+
+    def __init__(self, config: Config, *, odometry: Odometry | None = None) -> None:
+        self._config = config
+        self._odometry = odometry or KissOdometry(config.odometry)
+        self._selector = KeyframeSelector(config.keyframes)
+        self._points: list[Points] = []
+        self._T_odom_keyframes: list[Transform] = []
+        self._travel_m: list[float] = []
+
+    @property
+    def travel_m(self) -> float:
+        """Length of the path so far."""
+        return self._selector.travel_m
+
+    def add(self, scan: Scan) -> None:
+        """The next scan in order of time. Raises BadScan, and forgets the scan, if it cannot be used."""
+        registered = self._odometry.register(scan)
+        if self._selector.update(registered.T_odom_lidar):
+            kept = thin_keyframe(
+                registered.points, unlabelled(len(registered.points)), config=self._config.keyframes, whole_classes=()
+            )[0]
+            self._points.append(downsample(kept, config=self._config.refine))
+            self._T_odom_keyframes.append(registered.T_odom_lidar)
+            self._travel_m.append(self._selector.travel_m)
+
+    def vertical_angle(self) -> VerticalAngle | None:
+        """What is left over in the scans so far; None where too few of them show it."""
+        if not self._points:
+            return None
+        poses, travel_m = np.stack(self._T_odom_keyframes), np.array(self._travel_m)
+        return measure_vertical_angle(
+            self._points.__getitem__,
+            poses,
+            travel_m,
+            config=self._config.refine,
+            most_pairs=CALIBRATION_PAIRS,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairAngle:
+    """The pose of one scan in another, and the vertical angle of both."""
+
+    T_target_source: Transform
+    angle_rad: float
+    sigma_rad: float
+    """As if all points erred independently."""
+
+
+def register_with_angle(source: Surface, target: Surface, T_target_source: Transform) -> PairAngle | None:
+    """Pose and angle together, from a first guess of the pose.
+
+    Minimises distances from points to planes under the kernel of Geman and McClure. None where too few points meet, or
+    the angle does not settle.
+    """
+    if min(len(source.points), len(target.points)) < MIN_PAIRED:
+        return None
+    points = source.points[_is_clear(source.normals)]
+    points = points[:: math.ceil(max(len(points), 1) / MOST_POINTS)]
+    target_is_clear = _is_clear(target.normals)
+    angle_rad = 0.0
+    for search_m in SEARCH_M:
+        nearest, distance_m = target.nearest(geometry.apply(T_target_source, points))
+        paired = (distance_m < search_m) & target_is_clear[nearest]
+        if paired.sum() < MIN_PAIRED:
+            return None
+        rows = nearest[paired]
+        step, sigma_rad = _step(points[paired], target.points[rows], target.normals[rows], T_target_source, angle_rad)
+        T_target_source = T_target_source @ geometry.exp(step[:6])
+        angle_rad += float(step[6])
+        if np.linalg.norm(step) < CONVERGED:
+            break
+    return PairAngle(T_target_source, angle_rad, sigma_rad) if abs(step[6]) < SETTLED_RAD else None
+
+
+def _is_clear(normals: Points) -> Mask:
+    """(n,) whether each surface is level or upright, as the ground and walls are."""
+    upward = np.abs(normals[:, 2])
+    return (upward > LEVEL_NORMAL_Z) | (upward < STANDING_NORMAL_Z)
+
+
+def _step(
+    source: Points, target: Points, normals: Points, T_target_source: Transform, angle_rad: float
+) -> tuple[Float[np.ndarray, "7"], float]:
+    """One Gauss-Newton step of matched points, a tangent of the pose and a change of the angle; sigma of the angle."""
+    raising_source, raising_target = raising(source), raising(target)
+    raised = source + angle_rad * raising_source
+    moved = geometry.apply(T_target_source, raised)
+    residual_m = np.einsum("ij,ij->i", normals, moved - target - angle_rad * raising_target)
+    normals_source = normals @ T_target_source[:3, :3]
+    by_angle = (normals_source * raising_source - normals * raising_target).sum(axis=1)
+    jacobian = np.column_stack([np.cross(raised, normals_source), normals_source, by_angle])
+    weight = (1.0 + (residual_m / RESIDUAL_M) ** 2) ** -2
+    weighted = jacobian * weight[:, None]
+    hessian = weighted.T @ jacobian
+    variance = float(weight @ residual_m**2 / weight.sum()) * float(np.linalg.pinv(hessian)[6, 6])
+    known = np.linalg.cond(hessian) < 1e12  # else some direction is open, and the angle perhaps with it
+    return -np.linalg.lstsq(hessian, weighted.T @ residual_m)[0], math.sqrt(variance) if known else math.inf
+
+
+def _pairs(T_odom_keyframes: np.ndarray, travel_m: Vector, most_pairs: int) -> Iterator[tuple[int, int]]:
+    """(older, newer) keyframes some `APART_M` apart, evenly along the drive, without a sharp turn between."""
+    last_m = float(travel_m[-1]) - APART_M if len(travel_m) else -1.0
+    if last_m < 0.0:
+        return
+    starts_m = np.linspace(0.0, last_m, min(most_pairs, 1 + int(last_m / APART_M * 4)))
+    targets = np.unique(np.searchsorted(travel_m, starts_m))
+    sources = np.searchsorted(travel_m, travel_m[targets] + APART_M)
+    for target, source in zip(targets.tolist(), sources.tolist(), strict=True):
+        if source >= len(travel_m):
+            continue
+        T_target_source = geometry.inverse(T_odom_keyframes[target]) @ T_odom_keyframes[source]
+        apart_m = geometry.distance(T_target_source)
+        if APART_M / MOST_APART < apart_m < APART_M * MOST_APART and geometry.angle(T_target_source) < MOST_TURN_RAD:
+            yield target, source

@@ -1,0 +1,92 @@
+"""`segslam map --dry-run`: contents of the data and the resulting settings; nothing is written."""
+
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from segslam.cli.checks import changed_settings
+from segslam.errors import BadScan, SegslamError
+
+if TYPE_CHECKING:
+    from segslam.config import Config
+    from segslam.datasets import Dataset
+    from segslam.types import Scan
+
+
+def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
+    """Figures of the data set and of its first scan that can be read. Raises SegslamError if there is none."""
+    import numpy as np
+
+    from segslam.config import Config
+
+    (first_row, first), (last_row, last) = _first_usable(scans), _first_usable(scans, backwards=True)
+    seconds = (last.stamp_ns - first.stamp_ns) / 1e9
+    ranges_m = np.linalg.norm(first.points, axis=1)
+    elevation_deg = np.degrees(np.arcsin(first.points[:, 2] / ranges_m))
+    changed = {key: value for key, _, value in changed_settings(Config(), settings)}
+    return {
+        "data": scans.name,
+        "num_scans": len(scans),
+        "first_scan": int(scans.scan_index[0]),
+        "last_scan": int(scans.scan_index[-1]),
+        "seconds": seconds,
+        "scans_per_second": int(scans.scan_index[last_row] - scans.scan_index[first_row]) / seconds
+        if seconds > 0
+        else None,
+        "labels": _labels(scans),
+        "num_true_poses": 0 if scans.reference is None else len(scans.reference),
+        "first_usable_scan": {
+            "scan": int(scans.scan_index[first_row]),
+            "num_points": len(first.points),
+            "has_times": len(first.times) > 0,
+            "has_intensities": first.intensities is not None,
+            "range_m": [float(ranges_m.min()), float(np.median(ranges_m)), float(ranges_m.max())],
+            "elevation_deg": [float(value) for value in np.percentile(elevation_deg, (1, 99))],
+        },
+        "odometry": settings.odometry.model_dump(mode="json"),
+        "changed_settings": {key: str(value) for key, value in changed.items()},
+    }
+
+
+def lines(found: dict[str, Any]) -> str:
+    """The figures as text."""
+    scan, odometry = found["first_usable_scan"], found["odometry"]
+    rate = f", {found['scans_per_second']:.1f} a second" if found["scans_per_second"] else ""
+    nearest, middle, farthest = scan["range_m"]
+    low, high = scan["elevation_deg"]
+    truth = f"of {found['num_true_poses']} scans" if found["num_true_poses"] else "none"
+    changed = ", ".join(f"{key}={value}" for key, value in found["changed_settings"].items()) or "all as by default"
+    return "\n".join(
+        [
+            f"{found['data']}: {found['num_scans']} scans, {found['first_scan']} to {found['last_scan']}, over "
+            f"{found['seconds']:.1f} s{rate}",
+            f"scan {scan['scan']}: {scan['num_points']} points at {nearest:.1f} to {farthest:.1f} m (median "
+            f"{middle:.1f} m), elevations {low:.1f} to {high:.1f} degrees; "
+            f"times of points: {'yes' if scan['has_times'] else 'no, taken as motion-compensated'}; "
+            f"intensities: {'read' if scan['has_intensities'] else 'not read'}",
+            f"labels: {found['labels']}",
+            f"ground-truth poses: {truth}",
+            f"odometry: points from {odometry['min_range_m']} to {odometry['max_range_m']} m, "
+            f"motion compensation {'on' if odometry['deskew'] else 'off'}",
+            f"settings: {changed}",
+            "nothing was written",
+        ]
+    )
+
+
+def _first_usable(scans: "Dataset", *, backwards: bool = False) -> "tuple[int, Scan]":
+    """Row and scan."""
+    for row in reversed(range(len(scans))) if backwards else range(len(scans)):
+        with suppress(BadScan):
+            return row, scans[row]
+    raise SegslamError(f"{scans.name}: none of its {len(scans)} scans can be read; check the files")
+
+
+def _labels(scans: "Dataset") -> str:
+    """Source of the labels, as text."""
+    source = scans.labels
+    if source.network is not None:
+        return "by the network, at keyframes"
+    if source.files is not None:
+        others = "the others by shape" if source.geometric else "the others without"
+        return f"{source.files.folder} ({source.files.encoding} ids), {others}"
+    return "by shape" if source.geometric else "none"

@@ -1,0 +1,37 @@
+"""`segslam map --odometry`: a trajectory from a file, in place of KISS-ICP."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from segslam.errors import SegslamError
+
+if TYPE_CHECKING:
+    from segslam.config import OdometryConfig
+    from segslam.datasets import Dataset
+    from segslam.odometry import Odometry
+
+
+def given_odometry(file: Path, scans: "Dataset", config: "OdometryConfig") -> "Odometry":
+    """TUM rows are found by stamp; KITTI rows by the scan's number, or by its place among the scans that are mapped.
+
+    Raises SegslamError for KITTI rows that are neither as many as the scans of the data nor as those that are mapped.
+    """
+    import numpy as np
+
+    from segslam.odometry import GivenOdometry
+    from segslam.trajectory import read_poses
+    from segslam.types import Trajectory
+
+    poses = read_poses(file)
+    if poses.stamp_ns is not None:
+        trajectory = Trajectory(np.arange(len(poses)), poses.stamp_ns, poses.T_a_b)
+        return GivenOdometry(trajectory, config, match="stamp")
+    by_number = len(poses) == scans.num_recorded
+    if not by_number and len(poses) != len(scans):
+        numbers = dict.fromkeys((scans.num_recorded, len(scans)))
+        raise SegslamError(
+            f"{file}: {len(poses)} poses, but {scans.name} has {' or '.join(map(str, numbers))}; KITTI's format needs "
+            "a line for each scan, TUM's is matched by stamp"
+        )
+    rows = np.arange(len(poses)) if by_number else scans.scan_index
+    return GivenOdometry(Trajectory(rows, np.zeros(len(poses), dtype=np.int64), poses.T_a_b), config)

@@ -1,0 +1,251 @@
+"""`segslam label`."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from segslam.cli.console import (
+    ConfigOption,
+    DatasetOption,
+    EncodingOption,
+    FramesOption,
+    JsonOption,
+    LabelsOption,
+    QuietOption,
+    SequenceOption,
+    SetOption,
+    announce,
+    print_json,
+    progress,
+)
+
+if TYPE_CHECKING:
+    from segslam.config import Config
+    from segslam.datasets import Dataset
+    from segslam.semantics.encodings import Encoding
+    from segslam.types import Labels, Scan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Labelled:
+    """A scan, its labels and, where they are asked for, the true ones; a row for each point that can be used."""
+
+    row: int
+    scan: "Scan"
+    labels: "Labels"
+    truth: "Labels | None"
+    seconds: float
+
+
+def label(
+    data: Annotated[Path, typer.Argument(help="KITTI's folder (with sequences/), a folder of scans, or a recording.")],
+    out: Annotated[Path, typer.Option(help="New folder for the labels and pictures.")],
+    labels: LabelsOption,
+    truth: Annotated[Path | None, typer.Option(help="Folder of true .label files to compare with.")] = None,
+    dataset: DatasetOption = None,
+    sequence: SequenceOption = "00",
+    frames: FramesOption = None,
+    topic: Annotated[str, typer.Option(help="Topic of the points, in a recording that has several.")] = "",
+    encoding: EncodingOption = None,
+    truth_encoding: Annotated[
+        Literal["raw", "learning", "learning-0"] | None,
+        typer.Option(help="Numbering of the true labels, if it cannot be detected."),
+    ] = None,
+    write_as: Annotated[
+        Literal["raw", "learning", "learning-0"], typer.Option(help="Numbering of the label files that are written.")
+    ] = "raw",
+    pictures: Annotated[int, typer.Option(min=0, help="Scans that are drawn, spread evenly over the drive.")] = 1,
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Label scans: a .label file for each, pictures, and the accuracy where the truth is known.
+
+    Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
+    """
+    announce(f"label: opening {data}", quiet=quiet)
+    from segslam.config import load_config
+    from segslam.datasets import open_dataset
+    from segslam.run.folder import new_folder
+    from segslam.types import SegslamError
+
+    settings_now = load_config(config, settings or ())
+
+    def opened(source: str, numbering: "Encoding | None") -> "Dataset":
+        return open_dataset(
+            data,
+            sequence=sequence,
+            dataset=dataset,
+            labels=source,
+            encoding=numbering,
+            frames=frames,
+            topic=topic,
+            vertical_angle_deg=settings_now.sensor.vertical_angle_deg,
+        )
+
+    scans = opened(labels, encoding)
+    true_scans = _open_truth(truth, truth_encoding, opened) if truth else None
+    folder = new_folder(out)
+    tally = Tally(scans, folder, write_as=write_as, num_pictures=pictures)
+    found = _labelled(scans, true_scans, settings_now)
+    for one in progress(found, total=len(scans), title="label", quiet=quiet):
+        if one is not None:
+            tally.add(one)
+    if not tally.seconds:
+        raise SegslamError(f"{data}: none of the {len(scans)} scans could be labelled; see the warnings above")
+    figures = tally.figures()
+    if json:
+        print_json(figures)
+    elif not quiet:
+        print(_table(figures, folder))
+
+
+def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Dataset":
+    """The same scans with their true labels. The folder is looked for here, and then beside the scans."""
+    from segslam.types import SegslamError
+
+    try:
+        scans: Dataset = opened(str(truth.expanduser().absolute() if truth.is_dir() else truth), numbering)
+    except SegslamError as error:
+        raise SegslamError(
+            str(error).replace("--labels", "--truth", 1).replace("--encoding", "--truth-encoding")
+        ) from error
+    return scans
+
+
+def _labelled(scans: "Dataset", true_scans: "Dataset | None", config: "Config") -> Iterator[Labelled | None]:
+    """Each scan with its labels; None, with a warning, for one that cannot be used."""
+    import logging
+    from time import perf_counter
+
+    from segslam.registration import shape_labels
+    from segslam.semantics.late import made
+    from segslam.types import BadScan
+
+    for row in range(len(scans)):
+        try:
+            scan = scans[row]
+            truth = None if true_scans is None else made(true_scans[row].labels)
+        except BadScan as error:
+            logging.getLogger(__name__).warning("%s; skipped", error)
+            yield None
+            continue
+        started = perf_counter()
+        labels = made(scan.labels)
+        if scans.labels.geometric and not labels.any():
+            labels = shape_labels(scan.points, config=config)
+        yield Labelled(row, scan, labels, truth, perf_counter() - started)
+
+
+class Tally:
+    """Writes each labelled scan, and counts."""
+
+    def __init__(self, scans: "Dataset", folder: Path, *, write_as: "Encoding", num_pictures: int) -> None:
+        import numpy as np
+
+        from segslam.semantics.scores import NUM_CLASSES
+        from segslam.types import Label
+
+        self._scans = scans
+        self._folder = folder
+        self._encoding = write_as
+        self._drawn = set(np.linspace(0, len(scans) - 1, num_pictures).astype(int).tolist())
+        self._num_points = np.zeros(len(Label), np.int64)
+        self._confusion = np.zeros((NUM_CLASSES, NUM_CLASSES), np.int64)
+        self.seconds: list[float] = []
+
+    def add(self, one: Labelled) -> None:
+        """Write the labels, and the picture if the scan is one of those that are drawn."""
+        import numpy as np
+
+        from segslam.semantics.label_files import write_labels
+        from segslam.semantics.scores import confusion
+        from segslam.system.whole_files import write_whole
+
+        self.seconds.append(one.seconds)
+        self._num_points += np.bincount(one.labels, minlength=len(self._num_points))
+        if one.truth is not None:
+            self._confusion += confusion(one.labels, one.truth)
+        name = self._scans.names[one.row]
+        write_labels(self._folder / f"{name}.label", one.labels, one.scan.kept, self._encoding)
+        if one.row in self._drawn:
+            write_whole(self._folder / f"{name}.png", self._picture(one))
+
+    def figures(self) -> dict[str, Any]:
+        """Shares of classes and time; and the scores, with `confusion.csv` written, where a true class is known."""
+        from statistics import median_low
+
+        import numpy as np
+
+        from segslam.semantics.scores import class_scores, group_scores, largest_confusions
+        from segslam.types import Label
+
+        shares = self._num_points / self._num_points.sum()
+        most_first = np.argsort(-shares, kind="stable")
+        figures: dict[str, Any] = {
+            "num_scans": len(self.seconds),
+            "num_points": int(self._num_points.sum()),
+            "ms_per_scan": 1000 * median_low(self.seconds),
+            "shares": {Label(int(i)).name.lower(): float(shares[i]) for i in most_first if shares[i]},
+        }
+        counts = self._confusion
+        if not counts.any():
+            return figures
+        _write_confusion(self._folder / "confusion.csv", counts)
+        by_class = class_scores(counts)
+        known = [by_class[Label(int(i)).name.lower()] for i in np.flatnonzero(counts.sum(axis=1))]
+        return figures | {
+            "accuracy": float(np.trace(counts) / counts.sum()),
+            "mean_iou": float(np.mean(known)),
+            "iou": by_class,
+            "iou_of_groups": group_scores(counts),
+            "confusions": [
+                {"truth": true.name.lower(), "label": given.name.lower(), "share": share}
+                for true, given, share in largest_confusions(counts, 6)
+            ],
+        }
+
+    def _picture(self, one: Labelled) -> bytes:
+        from segslam.run.report.labels import draw_labels, fitting_image
+
+        network = self._scans.labels.network
+        image = network.settings if network else fitting_image(one.scan.points)
+        title = f"{self._scans.name}, scan {self._scans.names[one.row]}, {len(one.labels)} points"
+        return draw_labels(one.scan.points, one.labels, truth=one.truth, image=image, title=title)
+
+
+def _write_confusion(file: Path, counts: Any) -> None:
+    import csv
+
+    from segslam.types import Label
+
+    names = [label.name.lower() for label in list(Label)[: len(counts)]]
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["truth \\ label", *names])
+        writer.writerows([name, *row] for name, row in zip(names[1:], counts[1:].tolist(), strict=True))
+
+
+def _table(figures: dict[str, Any], folder: Path) -> str:
+    """The figures for a person, a line a class."""
+    scores = figures.get("iou", {})
+    lines = [f"{figures['num_scans']} scans, {figures['num_points']} points, {figures['ms_per_scan']:.0f} ms a scan"]
+    lines.append(f"{'class':16}{'share':>8}{'IoU':>8}" if scores else f"{'class':16}{'share':>8}")
+    for name in [*figures["shares"], *(name for name in scores if name not in figures["shares"])]:
+        score = f"{scores[name]:8.3f}" if name in scores else ""
+        lines.append(f"{name:16}{figures['shares'].get(name, 0.0):8.2%}{score}")
+    if scores:
+        groups = ", ".join(f"{name} {score:.3f}" for name, score in figures["iou_of_groups"].items())
+        confusions = ", ".join(
+            f"{each['truth']} as {each['label']} {each['share']:.1%}" for each in figures["confusions"]
+        )
+        lines += [
+            f"right: {figures['accuracy']:.1%} of the points whose class is known; mean IoU {figures['mean_iou']:.3f}",
+            f"IoU of groups: {groups}",
+            f"confused most: {confusions or 'nothing'}",
+        ]
+    return "\n".join([*lines, f"labels and pictures in {folder}"])

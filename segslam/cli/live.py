@@ -1,0 +1,259 @@
+"""`segslam live`."""
+
+import json as json_text
+from collections.abc import Callable
+from contextlib import ExitStack
+from importlib.util import find_spec
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+
+from segslam.cli.checks import check_exists
+from segslam.cli.compiling import compile_kernels
+from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, say
+from segslam.cli.ending import finish
+from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
+from segslam.cli.live_status import LiveFigures, Status
+from segslam.cli.run_options import MapFileOption, ViewOption, WithMapOption, chosen_maps
+from segslam.cli.view import check_display, close_scene, open_scene
+from segslam.errors import SegslamError, WorkFailed
+from segslam.system.extras import how_to_install
+from segslam.system.interrupts import stopped_by_signals, when_stopped
+
+if TYPE_CHECKING:
+    from segslam.config import Config
+    from segslam.live import Front, LiveMap, Source
+    from segslam.live.live_map import Show
+    from segslam.live.ros import MappingPublisher
+    from segslam.presets import Preset
+    from segslam.registration import Labeller
+    from segslam.run.foxglove_server import FoxgloveServer
+    from segslam.run.run import Run
+    from segslam.run.viewer import Scene
+    from segslam.types import BadScan, Step
+
+MOST_BEHIND = 20
+"""Chosen: keyframes that wait for their loops, 2 MB each; beyond, keyframes are kept but their loops are not searched
+until the end of the run."""
+
+
+def live(
+    out: Annotated[Path, typer.Option(help="New folder for the run.")],
+    folder: Annotated[
+        Path | None, typer.Argument(help="Folder that a recorder writes scans to (.bin .npy .ply .pcd).")
+    ] = None,
+    topic: Annotated[
+        str | None, typer.Option(help="ROS 2 topic of sensor_msgs/PointCloud2 messages, in place of a folder.")
+    ] = None,
+    idle: Annotated[
+        float | None, typer.Option(min=0.1, metavar="SECONDS", help="End after so long without a new scan.")
+    ] = None,
+    labels: Annotated[str, typer.Option("--labels", help="Labels: geometric (auto is the same) or none.")] = "auto",
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    preset: Annotated[str, typer.Option(help="Settings for a kind of place: driving, campus or indoor.")] = "driving",
+    with_map: WithMapOption = False,
+    map_file: MapFileOption = None,
+    view: ViewOption = False,
+    foxglove: FoxgloveOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Map scans while they arrive. Ctrl-C, or SIGTERM, ends it with a finished run.
+
+    Example: segslam live /data/scans --out runs/now --idle 10
+    """
+    if view:
+        check_display()
+    from segslam.config import load_config
+
+    _check_source(folder, topic, out)
+    settings_now = load_config(config, settings or ())
+    if labels not in ("auto", "geometric", "none"):
+        raise SegslamError(f"--labels {labels}: live scans are labelled by shape; give geometric or none")
+    announce("live: starting", quiet=quiet)
+    if preset != "driving":
+        from segslam.presets import SETTINGS
+        from segslam.presets import preset as settings_of
+
+        if preset not in SETTINGS:
+            raise SegslamError(f"--preset {preset}: no such preset; known: {', '.join(SETTINGS)}")
+        settings_now = load_config(config, settings or (), base=settings_of(cast("Preset", preset)))
+    from segslam.run.folder import new_folder
+
+    map_names, map_files = chosen_maps(out, with_map=with_map, map_file=map_file)
+    angle_deg = settings_now.sensor.vertical_angle_deg or 0.0
+    sensor = settings_now.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
+    settings_now = settings_now.model_copy(update={"sensor": sensor})
+    source = _source(folder, topic, intensities=settings_now.map.color == "intensity", vertical_angle_deg=angle_deg)
+    scene = open_scene(None, view_every=settings_now.log.view_every) if view else None
+    with ExitStack() as stack:
+        server = serve_foxglove(foxglove, stack, quiet=quiet)
+        out = new_folder(out)
+        compile_kernels(quiet=quiet)
+        options = {
+            "labels": labels,
+            "live": source.name,
+            "map_files": json_text.dumps([str(name) for name in map_names]),
+        }
+        why = map_live(
+            source,
+            out,
+            settings=settings_now,
+            labeller=_unlabelled() if labels == "none" else None,
+            options=options,
+            idle_s=idle,
+            map_files=map_files,
+            scene=scene,
+            server=server,
+            json=json,
+            quiet=quiet,
+        )
+    if scene:
+        close_scene(scene, None)
+    if why:
+        raise WorkFailed(f"{why}; the scans until then are mapped, results in {out}")
+
+
+def map_live(
+    source: "Source",
+    folder: Path,
+    *,
+    settings: "Config",
+    labeller: "Labeller | None",
+    options: dict[str, str],
+    idle_s: float | None,
+    map_files: list[Path],
+    scene: "Scene | None",
+    server: "FoxgloveServer | None",
+    json: bool,
+    quiet: bool,
+) -> str:
+    """Map what a source gives into a new folder until it ends. What failed, if something did.
+
+    Raises SegslamError if the source cannot be opened or no scan arrived; nothing is left behind then.
+    """
+    from segslam.live import Front, LiveMap
+    from segslam.run.run import Run
+    from segslam.slam import Slam
+
+    when_stopped(f"the log in {folder} is kept; make the results from it: segslam replay {folder} --out NEW")
+    slam = Slam(settings, labeller=labeller)
+
+    def tell(text: str) -> None:
+        say(text, quiet=quiet)
+
+    with ExitStack() as stack:
+        mirror = server.send if server else None
+        run = stack.enter_context(Run(folder, slam, dataset=source.name, options=options, mirror=mirror))
+        publisher = _publisher(source, stack)
+        front = stack.enter_context(Front(source, settings, tell=tell, idle_s=idle_s))
+        stack.enter_context(stopped_by_signals(front.stop))
+        front.wait_until_ready()
+        tell(f"{source.name}: waiting for scans; Ctrl-C ends the run")
+        shows = _shows(server, publisher)
+        with LiveMap(shows, view_every=settings.log.view_every) as live_map:
+            watch = _watch(run, scene, live_map, publisher)
+            figures = _follow(front, run, watch, quiet=quiet)
+        ended = front.ended
+        if run.num_steps == 0:
+            raise SegslamError(f"{source.name}: no scan was mapped{f' ({ended.why})' if ended.why else ''}")
+        if ended.why and not ended.failed:
+            say(f"{source.name}: {ended.why}", quiet=quiet)
+        for file in map_files:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        finish(run, None, map_files=map_files, json=json, quiet=quiet, more=lambda _: figures.metrics(ended))
+    return ended.why if ended.failed else ""
+
+
+def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]", *, quiet: bool) -> LiveFigures:
+    """Close the loops of every scan that was placed, log and show it."""
+    figures = LiveFigures()
+    with Status(quiet=quiet) as status:
+        for placed in front:
+            tries_loops = front.num_keyframes_waiting < MOST_BEHIND
+            watch(run.follow(placed.tracked, tries_loops=tries_loops))
+            figures.note(placed, lag_s=monotonic() - placed.placed_s, tries_loops=tries_loops)
+            status.show(figures)
+    return figures
+
+
+def _watch(
+    run: "Run", scene: "Scene | None", live_map: "LiveMap", publisher: "MappingPublisher | None"
+) -> "Callable[[Step | BadScan], None]":
+    """What shows each step to all who look."""
+    from segslam.types import Step
+
+    def watch(step: "Step | BadScan") -> None:
+        if scene:
+            scene.add(step)
+        if not isinstance(step, Step):
+            return
+        keyframe = step.keyframe
+        if publisher:
+            publisher.note_step(step.stamp_ns, keyframe.T_odom_keyframe if keyframe else None, step.estimate)
+        if keyframe:
+            live_map.note(*run.map_so_far(), stamp_ns=step.stamp_ns, is_corrected=step.estimate is not None)
+
+    return watch
+
+
+def _shows(server: "FoxgloveServer | None", publisher: "MappingPublisher | None") -> "list[Show]":
+    """All that show a map that was drawn."""
+    shows: list[Show] = []
+    if server:
+        shows.append(lambda drawn: server.send_map(drawn.points, drawn.labels, drawn.stamp_ns))
+    if publisher:
+        shows.append(publisher.show_map)
+    return shows
+
+
+def _check_source(folder: Path | None, topic: str | None, out: Path) -> None:
+    """Raises SegslamError unless there is one source; before anything slow is imported."""
+    if (folder is None) == (topic is None):
+        raise SegslamError(
+            "name one source: a folder that scans appear in, as in segslam live /data/scans --out runs/now, "
+            "or a ROS 2 topic, --topic /points"
+        )
+    if folder is not None:
+        check_exists(folder, "name the folder that scans appear in")
+        if not folder.is_dir():
+            raise SegslamError(f"{folder}: not a folder; for a recording: segslam map {folder} --out {out}")
+    elif find_spec("rclpy") is None:
+        raise SegslamError(f"--topic needs ROS 2: source its setup script (Jazzy, Kilted), or: {how_to_install('ros')}")
+
+
+def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertical_angle_deg: float) -> "Source":
+    if folder is not None:
+        from segslam.live import FolderSource
+
+        return FolderSource(folder, intensities=intensities, vertical_angle_deg=vertical_angle_deg)
+    try:
+        from segslam.live.ros import TopicSource
+    except ImportError as error:
+        raise SegslamError(
+            f"--topic: ROS 2 cannot be loaded ({error}); source its setup script again, or: {how_to_install('ros')}"
+        ) from error
+    return TopicSource(topic or "", intensities=intensities, vertical_angle_deg=vertical_angle_deg)
+
+
+def _publisher(source: "Source", stack: ExitStack) -> "MappingPublisher | None":
+    """For a topic, what publishes path and map."""
+    from segslam.live import FolderSource
+
+    if isinstance(source, FolderSource):
+        return None
+    from segslam.live.ros import MappingPublisher
+
+    return stack.enter_context(MappingPublisher())
+
+
+def _unlabelled() -> "Labeller":
+    from segslam.semantics.label_files import unlabelled
+
+    def labeller(points: Any) -> Any:
+        return unlabelled(len(points))
+
+    return labeller

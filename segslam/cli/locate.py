@@ -1,0 +1,113 @@
+"""`segslam locate`."""
+
+from json import dumps
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from segslam.cli.checks import check_exists
+from segslam.cli.compiling import compile_kernels
+from segslam.cli.console import EncodingOption, JsonOption, QuietOption, announce, print_out, progress, say
+
+if TYPE_CHECKING:
+    from segslam.run.locator import Located, Locator
+    from segslam.types import Labels, Points, Rejected
+
+
+def locate(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run, or its log.mcap.")],
+    scans: Annotated[list[Path], typer.Argument(help="Scans to be found: .bin, .npy, .ply or .pcd.")],
+    dataset: Annotated[str | None, typer.Option(help="kitti: apply KITTI's correction of the vertical angles.")] = None,
+    labels: Annotated[
+        str, typer.Option(help="Labels: geometric, none, or a folder of .label files named as the scans are.")
+    ] = "geometric",
+    encoding: EncodingOption = None,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Find where single scans were taken in a finished run, without an initial guess. Exit status 1 if none is found.
+
+    Example: segslam locate runs/00 004413.bin 000020.bin --dataset kitti
+    """
+    for scan in scans:
+        check_exists(scan, "give files of scans")
+    announce(f"locate: reading {run}", quiet=quiet)
+    from segslam.run.folder import folder_of
+    from segslam.run.locator import Locator
+
+    locator = Locator.from_run(folder_of(run))
+    compile_kernels(quiet=quiet)
+    locator.floor()  # before the first scan is timed
+    clouds = (_read(scan, scans, dataset, labels, encoding, locator) for scan in scans)
+    found = []
+    for points, classes in progress(clouds, total=len(scans), title="locate", quiet=quiet):
+        started = perf_counter()
+        found.append(_figures(locator.locate(points, classes)) | {"seconds": perf_counter() - started})
+    if json:
+        print_out(dumps(found, allow_nan=False))
+    else:
+        _show(scans, found, quiet=quiet)
+    if not any(one["found"] for one in found):
+        raise typer.Exit(1)
+
+
+def _read(
+    scan: Path, scans: list[Path], dataset: str | None, labels: str, encoding: Any, locator: "Locator"
+) -> tuple["Points", "Labels | None"]:
+    """A scan and its labels, in step; no labels where they are to be made by shape."""
+    import numpy as np
+
+    from segslam.datasets.clouds import read_cloud
+    from segslam.datasets.kitti import VERTICAL_ANGLE_DEG
+    from segslam.datasets.scans import make_scan
+    from segslam.semantics.label_files import encoding_of, read_labels
+    from segslam.semantics.late import made
+    from segslam.types import SegslamError
+
+    if dataset not in (None, "kitti"):
+        raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; omit the option for other data")
+    angle_deg = locator.config.sensor.vertical_angle_deg
+    if angle_deg is None:
+        angle_deg = VERTICAL_ANGLE_DEG if dataset == "kitti" else 0.0
+    points = read_cloud(scan)
+    ids = np.zeros(len(points), np.uint8)
+    if labels not in ("geometric", "none"):
+        files = [Path(labels) / f"{one.stem}.label" for one in scans]
+        for file in files:
+            check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
+        ids = read_labels(Path(labels) / f"{scan.stem}.label", len(points), encoding or encoding_of(files))
+    ready = make_scan(scan, 0, 0, points, ids, vertical_angle_deg=angle_deg)
+    return ready.points, None if labels == "geometric" else made(ready.labels)
+
+
+def _figures(found: "Located | Rejected") -> dict[str, Any]:
+    from segslam.types import Rejected
+
+    if isinstance(found, Rejected):
+        nothing = dict.fromkeys(("T_world_lidar", "keyframe", "inliers", "overlap"))
+        return {"found": False, **nothing, "reason": found.reason.value, "detail": found.detail}
+    return {
+        "found": True,
+        "T_world_lidar": found.T_world_lidar.ravel().tolist(),
+        "keyframe": found.keyframe_id,
+        "inliers": found.inliers,
+        "overlap": found.overlap,
+        "reason": None,
+        "detail": None,
+    }
+
+
+def _show(scans: list[Path], found: list[dict[str, Any]], *, quiet: bool) -> None:
+    """Of each scan its file and pose on standard output, and the rest on standard error."""
+    for scan, one in zip(scans, found, strict=True):
+        if one["found"]:
+            print_out(f"{scan} " + " ".join(f"{value:.6f}" for value in one["T_world_lidar"]))
+            say(
+                f"{scan}: at keyframe {one['keyframe']}, {one['inliers']} inliers, overlap {one['overlap']:.2f}, "
+                f"{1000 * one['seconds']:.0f} ms",
+                quiet=quiet,
+            )
+        else:
+            say(f"{scan}: not found: {one['reason']} ({one['detail']})")

@@ -1,0 +1,59 @@
+"""`segslam resume`."""
+
+import json as json_text
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from segslam.cli.checks import check_exists, log_to_resume
+from segslam.cli.console import JsonOption, QuietOption, announce
+from segslam.cli.map import map_command
+from segslam.cli.run_options import ViewOption
+from segslam.errors import SegslamError
+
+
+def resume(
+    run: Annotated[Path, typer.Argument(help="Folder of the interrupted run.")],
+    view: ViewOption = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Continue an interrupted run with the data and options that it began with, which its log has.
+
+    Example: segslam resume runs/00
+    """
+    check_exists(run, "give the folder of a run")
+    announce(f"resume: reading {run}", quiet=quiet)
+    recorded = log_to_resume(run)
+    chosen: dict[str, Any] = dict(recorded.options)
+    if chosen.get("live"):
+        raise SegslamError(
+            f"{recorded.path}: a live run cannot be resumed, for its scans are gone; make the results of what it has: "
+            f"segslam replay {run} --out NEW"
+        )
+    if not chosen.get("data"):
+        raise SegslamError(
+            f"{recorded.path}: it has no path of its data; resume it by: segslam map DATA --out {run} --resume"
+        )
+    check_exists(
+        Path(chosen["data"]),
+        f"{recorded.path} began with it. Put it back, or: segslam map DATA --out {run} --resume",
+    )
+    map_command(
+        Path(chosen["data"]),
+        run,
+        dataset=chosen["dataset"] or None,
+        sequence=chosen["sequence"],
+        frames=chosen["frames"] or None,
+        topic=chosen["topic"],
+        labels=chosen["labels"],
+        encoding=chosen["encoding"] or None,
+        odometry=Path(chosen["odometry"]) if chosen["odometry"] else None,
+        map_file=[Path(name) for name in json_text.loads(chosen["map_files"])],
+        view=view,
+        resume=True,
+        in_map=Path(chosen["in_map"]) if chosen.get("in_map") else None,
+        json=json,
+        quiet=quiet,
+    )

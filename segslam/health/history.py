@@ -1,0 +1,111 @@
+"""What the last checks and registrations of a drive found: how it usually is, and whether it is to be watched."""
+
+from collections import deque
+from statistics import median
+
+import numpy as np
+
+from segslam.config import HealthConfig
+from segslam.health.check import Nudge
+from segslam.health.local_map import Fit
+from segslam.types import MotionState
+
+NUM_CHECKS = 9
+"""Chosen: checks whose median correction is watched. On real KITTI it stays below 0.06 m and 0.27 degrees, on the
+courtyard and on NCLT, where KISS-ICP fails, it reaches 0.09 and 0.28 m."""
+NUM_FITS = 30
+MIN_OVERLAPS, LEAST_SHARE = 3, 0.75
+"""Chosen: a check with less overlap than this share of the drive's median fails: where the scans lie metres apart, the
+correction leads nowhere. On real KITTI the least of 178 is 0.80 of the median."""
+LEAST_OVERLAP = 0.35
+"""Chosen: least overlap of a registered scan where the drive has no usual one yet."""
+
+LOST_SCANS = 30
+"""Chosen: after a break, so many scans are still tried against the map before it (3 s at 10 Hz)."""
+LONG_GAP = 1.5
+"""Chosen: a scan that comes after more than this many usual intervals is checked, however near it is."""
+
+
+class Intervals:
+    """The usual time between scans, a moving average over the gaps that are not long."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._usual_s = 0.0
+
+    def note(self, stamp_ns: int) -> float:
+        """Time since the last scan, in usual intervals; 1 if the stamps are unknown."""
+        interval_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) * 1e-9
+        self._last_ns = stamp_ns
+        if interval_s <= 0.0:
+            return 1.0
+        gap = interval_s / self._usual_s if self._usual_s else 1.0
+        if gap < LONG_GAP:
+            self._usual_s = interval_s if not self._usual_s else 0.9 * self._usual_s + 0.1 * interval_s
+        return gap
+
+
+class History:
+    """A pure function of the checks and registrations so far, in their order."""
+
+    def __init__(self, config: HealthConfig) -> None:
+        self._config = config
+        self._tolerance = config.tolerance_m, np.radians(config.tolerance_deg)
+        self._checks: deque[tuple[float, float]] = deque(maxlen=NUM_CHECKS)
+        """Correction of each: metres, radians."""
+        self._overlaps: deque[float] = deque(maxlen=NUM_FITS)
+        self._fits: deque[Fit] = deque(maxlen=NUM_FITS)
+        self._num_to_watch = 0
+        self.scans_lost = 0
+        """Scans since the last break."""
+
+    @property
+    def is_watching(self) -> bool:
+        """Whether each scan is to be registered."""
+        return self._num_to_watch > 0
+
+    def note_check(self, found: Nudge | None) -> None:
+        """Begin to watch if one check fails, or if many correct by half of the tolerance."""
+        if found is None:
+            self.watch()
+        else:
+            self.note_moved(found.moved_m, found.moved_rad, found.overlap)
+
+    def note_moved(self, moved_m: float, moved_rad: float, overlap: float) -> None:
+        """As `note_check`, from the correction and the overlap that were found."""
+        lost = len(self._overlaps) >= MIN_OVERLAPS and overlap < LEAST_SHARE * median(self._overlaps)
+        self._checks.append((moved_m, moved_rad))
+        halves = len(self._checks) == NUM_CHECKS and any(
+            median(check[k] for check in self._checks) > self._tolerance[k] / 2 for k in range(2)
+        )
+        if lost or halves or self._is_off(moved_m, moved_rad):
+            self.watch()
+        else:
+            self._overlaps.append(overlap)
+
+    def watch(self) -> None:
+        """Have the next scans registered, and forget the checks so far."""
+        self._checks.clear()
+        self._num_to_watch = self._config.watch_scans
+
+    def note_registration(self, moved_m: float, moved_rad: float, fit: Fit) -> MotionState:
+        """What a registered motion is, by how far the odometry's was off."""
+        self._fits.append(fit)
+        if self._is_off(moved_m, moved_rad):
+            self.watch()
+            return MotionState.REPAIRED
+        self._num_to_watch = max(self._num_to_watch - 1, 0)
+        return MotionState.REFINED
+
+    def is_usual(self, fit: Fit) -> bool:
+        """Whether a registered scan fits the map about as well as scans of this drive do."""
+        if len(self._fits) < 5:
+            return fit.overlap >= LEAST_OVERLAP
+        usual_overlap = median(other.overlap for other in self._fits)
+        usual_rms_m = median(other.rms_m for other in self._fits)
+        return (
+            fit.overlap >= self._config.min_overlap * usual_overlap and fit.rms_m <= self._config.max_rms * usual_rms_m
+        )
+
+    def _is_off(self, moved_m: float, moved_rad: float) -> bool:
+        return bool(moved_m > self._tolerance[0] or moved_rad > self._tolerance[1])

@@ -1,0 +1,115 @@
+"""The last scans of a drive in one cloud, and the pose of the next scan in it."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from segslam import geometry, refinement
+from segslam.config import HealthConfig, RefineConfig
+from segslam.types import Points, Registration, Rejected, Transform
+
+MIN_STANDING = 50
+"""Chosen: with fewer points above the ground, all points count."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How well a scan fits the local map: the quantities that verification of loops uses, one way."""
+
+    overlap: float
+    """Share of the scan's points on steep surfaces that lie within `inlier_m` of the map, 0 to 1."""
+    rms_m: float
+    """Root mean square distance of these inliers to the planes of the map; `inlier_m` if there is none."""
+
+
+class LocalMap:
+    """The thinned clouds of the last scans that moved, in the frame of the newest one."""
+
+    def __init__(self, config: HealthConfig, refine: RefineConfig) -> None:
+        self._config = config
+        self._base = refine
+        self._refine = refine.model_copy(update={"correspondence_m": config.correspondence_m})
+        self._scans: deque[tuple[Transform, Points, Points]] = deque(maxlen=config.map_scans)
+        """Pose, thinned points and all points of each scan."""
+        self._surface: refinement.Surface | None = None
+
+    @property
+    def scans(self) -> list[tuple[Transform, Points]]:
+        """T_odom_lidar and thinned points (n, 3) of each scan, the oldest first."""
+        return [(T_odom_lidar, thinned) for T_odom_lidar, thinned, _ in self._scans]
+
+    @property
+    def T_odom_map(self) -> Transform:  # noqa: N802
+        """Pose of the newest scan, whose frame is the map's."""
+        return self._scans[-1][0]
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def empty_copy(self) -> "LocalMap":
+        """A map with the same settings and no scan."""
+        return LocalMap(self._config, self._base)
+
+    def clear(self) -> None:
+        """Forget all scans."""
+        self._scans.clear()
+        self._surface = None
+
+    def add(self, T_odom_lidar: Transform, thinned: Points, points: Points) -> bool:
+        """Take in a scan, unless it was taken where the newest one was; whether it was taken in."""
+        if self._scans:
+            T_map_lidar = geometry.inverse(self.T_odom_map) @ T_odom_lidar
+            turned = geometry.angle(T_map_lidar) >= np.radians(self._config.map_spacing_deg)
+            if geometry.distance(T_map_lidar) < self._config.map_spacing_m and not turned:
+                return False
+        self._scans.append((T_odom_lidar, thinned, points))
+        self._surface = None
+        return True
+
+    def cloud(self, enough: int) -> Points:
+        """All points of the newest scans, in the frame of the newest one: so many that they thin to `enough`."""
+        T_map_odom = geometry.inverse(self.T_odom_map)
+        gathered, num_thinned = [], 0
+        for T_odom_lidar, thinned, points in reversed(self._scans):
+            gathered.append(geometry.apply(T_map_odom @ T_odom_lidar, points.astype(np.float64)).astype(np.float32))
+            num_thinned += len(thinned)
+            if num_thinned >= enough:
+                break
+        return np.vstack(gathered)
+
+    def downsample(self, points: Points) -> Points:
+        """What the map keeps of a scan, float32."""
+        return refinement.downsample(points, config=self._refine)
+
+    def make_surface(self, thinned: Points) -> refinement.Surface:
+        """A thinned scan made ready for `register` and `fit`."""
+        return refinement.make_surface(thinned, config=self._refine)
+
+    def surface(self) -> refinement.Surface:
+        """The surface through all scans, in the frame of the newest one; made once for each newest scan."""
+        if self._surface is None:
+            T_map_odom = geometry.inverse(self.T_odom_map)
+            clouds = [geometry.apply(T_map_odom @ T_odom_lidar, thinned) for T_odom_lidar, thinned, _ in self._scans]
+            merged = clouds[0] if len(clouds) == 1 else refinement.merge(clouds, config=self._refine)
+            self._surface = self.make_surface(merged)
+        return self._surface
+
+    def register(self, scan: refinement.Surface, T_map_lidar: Transform) -> Registration | Rejected:
+        """The pose of a scan in the map near an initial guess, by GICP; `Rejected` as `refine` returns it."""
+        return refinement.refine(scan, self.surface(), T_map_lidar, config=self._refine, must_converge=False)
+
+    def fit(self, scan: refinement.Surface, T_map_lidar: Transform) -> Fit:
+        """How well the scan fits the map at this pose."""
+        return _fit(scan, self.surface(), T_map_lidar, inlier_m=self._config.inlier_m)
+
+
+def _fit(source: refinement.Surface, target: refinement.Surface, T_target_source: Transform, *, inlier_m: float) -> Fit:
+    """Overlap and residual of the source's steep points, or of all points where few are steep."""
+    standing = source.standing
+    chosen = standing if len(standing) >= MIN_STANDING else source.points
+    if not len(chosen) or not len(target):
+        return Fit(0.0, inlier_m)
+    to_point, to_plane = target.distances_m(geometry.apply(T_target_source, chosen))
+    met = to_plane[to_point < inlier_m]
+    return Fit(len(met) / len(chosen), float(np.sqrt(np.mean(met**2))) if len(met) else inlier_m)

@@ -1,0 +1,8 @@
+"""Mapping while scans arrive: sources of scans, and odometry in a process that nothing else delays."""
+
+from segslam.live.folder import FolderSource
+from segslam.live.front import Ended, Front, Placed
+from segslam.live.live_map import LiveMap
+from segslam.live.source import Source
+
+__all__ = ["Ended", "FolderSource", "Front", "LiveMap", "Placed", "Source"]

@@ -1,0 +1,51 @@
+"""The keyframes of a log: all but their points in memory, the points read from the file when they are asked for."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from segslam.log.cloud import KeyframePoints, points_and_labels
+from segslam.log.container import CutError, Span, messages_within
+from segslam.types import Keyframe, Labels, Points, SegslamError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedKeyframe:
+    """A keyframe without its points, and where these are in the file."""
+
+    keyframe: Keyframe
+    chunk: Span
+    channel_id: int
+
+
+class RecordedKeyframes:
+    """The keyframes by their number. It serves as `segslam.keyframes.Clouds` of a finished run."""
+
+    def __init__(self, path: Path, kept: Sequence[RecordedKeyframe]) -> None:
+        self._path = path
+        self._kept = {one.keyframe.id: one for one in kept}
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __getitem__(self, keyframe_id: int) -> Keyframe:
+        """A keyframe, with no points."""
+        return self._kept[keyframe_id].keyframe
+
+    def keep(self, keyframe: Keyframe) -> None:
+        """Raises TypeError: a recorded drive does not grow."""
+        raise TypeError(f"keyframe {keyframe.id}: the log {self._path} is read only")
+
+    def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
+        """Points and labels of a keyframe. Raises SegslamError if the file has changed since it was opened."""
+        one = self._kept[keyframe_id]
+        try:
+            with self._path.open("rb") as stream:
+                stream.seek(one.chunk.offset)
+                records = stream.read(one.chunk.size)
+            for channel_id, data in messages_within(records):
+                if channel_id == one.channel_id:
+                    return points_and_labels(KeyframePoints.FromString(data))
+        except (OSError, CutError) as error:
+            raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
+        raise SegslamError(f"{self._path}: keyframe {keyframe_id} has gone from the log; leave the file alone")

@@ -1,0 +1,138 @@
+"""Loop closing: candidates for a keyframe, each registered and verified; a second search with the final poses."""
+
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+
+from segslam.config import Config
+from segslam.far_loops import FarLoops
+from segslam.keyframes import Clouds
+from segslam.pose_graph import Graph
+from segslam.proximity import ProximityDetector
+from segslam.registration import Labeller, PreparedScan, Stopwatch, register_prepared
+from segslam.retrieval import PlaceSignature, signature_of
+from segslam.submaps import Submaps
+from segslam.system.threads import both
+from segslam.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
+from segslam.verification.noise_floor import NeighbourNoise
+from segslam.verification.prior import far_from_prior
+
+NUM_PREPARED = 64
+"""Number of prepared keyframes in memory, about 2 MB each; others are prepared again in about 40 ms."""
+ROUNDS = 3
+"""Chosen: largest number of searches after the final optimisation; the first without a new loop is the last."""
+MOST_AGAIN = 0.5
+"""Chosen: attempts of such a search, as a share of all earlier attempts, which limits its time."""
+LEAST_AGAIN = 40
+
+
+class LoopCloser:
+    """Proposes loops by the graph's poses, and adds those that are verified to the graph."""
+
+    def __init__(self, config: Config, graph: Graph, clouds: Callable[[], Clouds], labeller: Labeller) -> None:
+        """`clouds` gives the points of keyframes; `labeller` labels gathered clouds by shape."""
+        self._config = config
+        self._graph = graph
+        self._detector = ProximityDetector(config.proximity)
+        self.submaps = Submaps(config, clouds, labeller, lambda: graph.travel_m)
+        self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
+        self._floor = NeighbourNoise(
+            lambda number: self._prepared(number).observed,
+            lambda number: self.submaps.T_odom[number],
+            self.submaps.lag,
+            config=config,
+        )
+        self._far = FarLoops(config, graph, self._prepared, lambda number: self.submaps.T_odom[number], self._floor.at)
+        self._tried: set[tuple[int, int]] = set()
+        self._is_finished = False
+
+    def add(self, T_odom_keyframe: Transform, *, labelled_by_shape: bool) -> PlaceSignature | None:
+        """Take note of the newest keyframe, which the graph and the clouds hold already; the signature of its place."""
+        newest_id = len(self.submaps.T_odom)
+        self.submaps.add(T_odom_keyframe, labelled_by_shape=labelled_by_shape)
+        if not self._config.retrieval.enabled:
+            return None
+        made = self.submaps.gathered(newest_id)
+        signature = signature_of(made.points, made.labels, config=self._config.geometric)
+        self._far.add(newest_id, signature)
+        return signature
+
+    def attempt(self, keyframe_id: int, watch: Stopwatch, *, below: int | None = None) -> tuple[LoopAttempt, ...]:
+        """Propose loops for a keyframe, only with keyframes of ids smaller than `below` if given, and try them."""
+        with watch("propose"):
+            candidates = self._detector.candidates(
+                keyframe_id, self._graph.T_world_keyframes, self._graph.travel_m, below=below
+            )
+        near = self._tried_in_turn([c for c in candidates if (c.source_id, c.target_id) not in self._tried], watch)
+        is_newest = below is None and keyframe_id == len(self.submaps.T_odom) - 1 and not self._is_finished
+        return (*near, *self._far_loops(keyframe_id, watch)) if is_newest and not _has_closure(near) else near
+
+    def note_estimate(self, weights: dict[tuple[int, int], float]) -> None:
+        """The graph was optimised: closures that it keeps shorten the chains between keyframes."""
+        self._detector.note_estimate(weights)
+
+    def look_again(self, watch: Stopwatch) -> Iterator[LoopAttempt]:
+        """Try the pairs that the final poses propose and no attempt has had; the nearest first, so many at most."""
+        self._is_finished = True
+        most = max(LEAST_AGAIN, int(MOST_AGAIN * len(self._tried)))
+        for keyframe_id in range(len(self.submaps.T_odom)):
+            for attempt in self.attempt(keyframe_id, watch):
+                yield attempt
+                most -= 1
+            if most <= 0:
+                return
+
+    def _far_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+        """Loops with places that only look alike; odometry that they contradict is weighted down."""
+        if not self._config.retrieval.enabled:
+            return ()
+        attempts = self._far.attempt(keyframe_id, watch)
+        closures = [attempt.outcome for attempt in attempts if isinstance(attempt.outcome, LoopClosure)]
+        if closures:
+            self._graph.weigh_odometry_by(closures[-1])
+        self.take(attempts)
+        return attempts
+
+    def _tried_in_turn(self, candidates: list[LoopCandidate], watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+        attempts = tuple(self._attempt(candidate, watch) for candidate in candidates)
+        self.take(attempts)
+        return attempts
+
+    def take(self, attempts: tuple[LoopAttempt, ...]) -> None:
+        """Add loops that were tried before to the graph; they are not tried again."""
+        for attempt in attempts:
+            self._tried.add((attempt.candidate.source_id, attempt.candidate.target_id))
+            if isinstance(attempt.outcome, LoopClosure):
+                self._graph.add_closure(attempt.outcome)
+                self._detector.note_closure(attempt.outcome)
+
+    def _attempt(self, candidate: LoopCandidate, watch: Stopwatch) -> LoopAttempt:
+        own = Stopwatch()
+        with own("prepare"):
+            source, target = both(self._prepared, (candidate.source_id,), (candidate.target_id,))
+        outcome = register_prepared(
+            source,
+            target,
+            config=self._config,
+            gate=partial(
+                far_from_prior,
+                candidate=candidate,
+                R_world_target=self._graph.T_world_keyframes[candidate.target_id][:3, :3],
+                config=self._config,
+            ),
+            floor=self._floor.at(candidate.source_id),
+            watch=own,
+        )
+        for stage, seconds in own.seconds.items():
+            watch.add(stage, seconds)
+        return LoopAttempt(candidate, _closure(candidate, outcome), own.seconds)
+
+
+def _has_closure(attempts: tuple[LoopAttempt, ...]) -> bool:
+    return any(isinstance(attempt.outcome, LoopClosure) for attempt in attempts)
+
+
+def _closure(candidate: LoopCandidate, outcome: Alignment | Rejected) -> LoopClosure | Rejected:
+    if isinstance(outcome, Rejected):
+        return outcome
+    fine = outcome.fine
+    return LoopClosure(candidate.source_id, candidate.target_id, fine.T_target_source, fine.information, outcome)

@@ -1,0 +1,134 @@
+"""The map by odometry alone beside the corrected map: where loop closing changed most, walls seen twice fall together.
+
+Each pixel counts the points that stand in it, as seen from above: a sharp map has bright lines, a smeared one has haze.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from segslam import geometry
+from segslam.map.from_above import draw_path, png, scale_bar
+from segslam.map.part import Window
+from segslam.points import within_range
+from segslam.types import GROUND_LABELS, GraphEstimate, Keyframe, Label, Points, Transform
+
+MOST_PIXELS = 900
+"""Chosen: of the longer side of a panel."""
+FINEST_M = 0.1
+"""Chosen: edge of a pixel at least, about the error of a keyframe's pose."""
+REACH_M = 40.0
+"""Chosen: points farther from their keyframe are not drawn; far points are sparse and add haze to both maps."""
+DETAIL_M = 30.0
+"""Chosen: half of the width of the detail at least."""
+TRUSTED = 0.5
+"""Weight from which the optimiser kept a closure."""
+BEFORE, AFTER, BACKGROUND = "#E69F00", "#56B4E9", "#10141a"
+
+
+class BeforeAfter:
+    """Keyframes go in one by one; then the picture is drawn."""
+
+    def __init__(self, T_odom_keyframe: Mapping[int, Transform], estimate: GraphEstimate) -> None:
+        """The poses of all keyframes by odometry, and by the last estimate."""
+        first = min(T_odom_keyframe)
+        T_world_odom = estimate.T_world_keyframe[first] @ geometry.inverse(T_odom_keyframe[first])
+        poses = {keyframe_id: T_world_odom @ T for keyframe_id, T in T_odom_keyframe.items()}
+        self._maps = (poses, estimate.T_world_keyframe)
+        whole = _around(np.array([T[:2, 3] for poses in self._maps for T in poses.values()]), REACH_M / 2)
+        self._whole = [_Density(whole) for _ in self._maps]
+        self._loops = [pair for pair, weight in estimate.closure_weights.items() if weight >= TRUSTED]
+        detail = most_changed(*self._maps, self._loops)
+        self._detail = [] if detail is None else [_Density(_detail(poses, detail)) for poses in self._maps]
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Draw a keyframe into both maps."""
+        stands = ~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8)) & (keyframe.labels < Label.MOVING_CAR)
+        points = keyframe.points[stands & within_range(keyframe.points, 0.0, REACH_M)].astype(np.float64)
+        for number, poses in enumerate(self._maps):
+            placed = geometry.apply(poses[keyframe.id], points)
+            for panels in (self._whole, self._detail):
+                if panels:
+                    panels[number].add(placed)
+
+    def draw(self) -> bytes:
+        """The picture, a PNG: the whole maps above, and below them the place that changed most, if a loop closed."""
+        rows = [panels for panels in (self._whole, self._detail) if panels]
+        heights = [panels[0].height_per_width for panels in rows]
+        layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
+        figure = Figure(figsize=(12.0, 6.0 * sum(heights) + 0.3), facecolor=BACKGROUND, layout=layout)
+        grid = figure.subplots(len(rows), 2, squeeze=False, height_ratios=heights)
+        titles = ("before: odometry only", f"after: corrected by {len(self._loops)} loops")
+        for row, panels in zip(grid, rows, strict=True):
+            brightest = max(panel.brightest() for panel in panels)
+            for axes, panel, poses, color in zip(row, panels, self._maps, (BEFORE, AFTER), strict=True):
+                panel.show(axes, brightest)
+                draw_path(axes, np.array([T[:3, 3] for T in poses.values()]), color=color, width=1.4)
+                panel.frame(axes)
+        for axes, title in zip(grid[0], titles, strict=True):
+            axes.set_title(title, color="white", fontsize=15)
+        return png(figure)
+
+
+class _Density:
+    """Counts of points in the pixels of a window."""
+
+    def __init__(self, window: Window) -> None:
+        west, east, south, north = self._window = window
+        width_m, height_m = east - west, north - south
+        self._pixel_m = max(FINEST_M, max(width_m, height_m) / MOST_PIXELS)
+        self._counts = np.zeros((int(height_m / self._pixel_m) + 1, int(width_m / self._pixel_m) + 1), np.uint32)
+        self.height_per_width = height_m / width_m
+
+    def add(self, points: Points) -> None:
+        """Count points of the world."""
+        column, row = ((points[:, :2] - [self._window[0], self._window[2]]) // self._pixel_m).astype(np.int64).T
+        rows, columns = self._counts.shape
+        seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        np.add.at(self._counts, (row[seen], column[seen]), 1)
+
+    def brightest(self) -> float:
+        """Count that few pixels exceed."""
+        counted = self._counts[self._counts > 0]
+        return float(np.percentile(counted, 99)) if len(counted) else 1.0
+
+    def show(self, axes: Axes, brightest: float) -> None:
+        """Draw the counts, as the logarithm."""
+        west, east, south, north = self._window
+        image = np.log1p(self._counts) / np.log1p(brightest)
+        extent = (west, east, south, north)
+        axes.imshow(image, origin="lower", extent=extent, cmap="bone", vmin=0.0, vmax=1.0, interpolation="antialiased")
+
+    def frame(self, axes: Axes) -> None:
+        """Limits, a scale bar, no ticks."""
+        west, east, south, north = self._window
+        axes.set(xlim=(west, east), ylim=(south, north), xticks=[], yticks=[], facecolor=BACKGROUND)
+        scale_bar(axes, east - west, color="white")
+
+
+def most_changed(
+    before: Mapping[int, Transform], after: Mapping[int, Transform], loops: Iterable[tuple[int, int]]
+) -> tuple[int, int] | None:
+    """The loop (source, target) whose two ends moved most against each other; None without loops."""
+
+    def moved_m(loop: tuple[int, int]) -> float:
+        T_before, T_after = (geometry.inverse(poses[loop[1]]) @ poses[loop[0]] for poses in (before, after))
+        return geometry.distance(geometry.inverse(T_after) @ T_before)
+
+    return max(loops, key=moved_m, default=None)
+
+
+def _around(xy: np.ndarray, margin_m: float) -> Window:
+    (west, south), (east, north) = xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m
+    return float(west), float(east), float(south), float(north)
+
+
+def _detail(poses: Mapping[int, Transform], loop: tuple[int, int]) -> Window:
+    """Around both ends of a loop, as wide as two to one."""
+    ends = np.array([poses[keyframe_id][:2, 3] for keyframe_id in loop])
+    (x, y), apart_m = ends.mean(axis=0), float(np.linalg.norm(ends[0] - ends[1]))
+    half_m = DETAIL_M + min(apart_m, DETAIL_M)
+    return x - half_m, x + half_m, y - half_m / 1.6, y + half_m / 1.6

@@ -1,0 +1,71 @@
+"""How pictures of a map from above are drawn: one pixel a pixel, with a scale bar."""
+
+import io
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from segslam.map.part import Window
+from segslam.types import Points
+
+DPI = 100
+PATH = "#d62728"
+LEGEND_PX, LEAST_PX = 190, 700
+"""Chosen: width of the strip of the legend, and of the map at least."""
+
+
+def drawn_map(
+    image: np.ndarray, window: Window, *, path_m: Points, title: str, marks: Iterable[tuple[str, str]]
+) -> bytes:
+    """A map from above as a PNG: (rows, columns, 3) colours, a path and a scale bar over them, a legend beside."""
+    height, width = image.shape[:2]
+    zoom = max(1.0, LEAST_PX / width)
+    share = zoom * width / (zoom * width + LEGEND_PX)
+    figure = Figure(figsize=((zoom * width + LEGEND_PX) / DPI, zoom * height / DPI), facecolor="white")
+    axes, legend = (figure.add_axes(place) for place in ((0.0, 0.0, share, 1.0), (share, 0.0, 1.0 - share, 1.0)))
+    axes.imshow(image, extent=window, interpolation="nearest", aspect="auto")
+    draw_path(axes, path_m, color=PATH, width=1.5)
+    scale_bar(axes, window[1] - window[0], color="black")
+    axes.set(xlim=window[:2], ylim=window[2:])
+    axes.axis("off")
+    legend.axis("off")
+    handles = [Line2D([], [], color=color, marker="s", linestyle="", label=text) for text, color in marks]
+    handles.insert(0, Line2D([], [], color=PATH, label="trajectory"))
+    legend.legend(handles=handles, title=title, loc="upper left", frameon=False, fontsize=10, alignment="left")
+    return png(figure)
+
+
+def scale_bar(axes: Axes, width_m: float, *, color: str, size: float = 11.0) -> None:
+    """A bar of a round length, at most a quarter of the width that is shown, in the lower left corner."""
+    length_m = round_length_m(width_m / 4)
+    share = length_m / width_m
+    left, low = 0.03, 0.035
+    axes.plot(
+        [left, left + share], [low, low], color=color, linewidth=4, solid_capstyle="butt", transform=axes.transAxes
+    )
+    text = f"{length_m:g} m" if length_m < 1000 else f"{length_m / 1000:g} km"
+    axes.text(left, low + 0.012, text, color=color, fontsize=size, transform=axes.transAxes, va="bottom")
+
+
+def round_length_m(longest_m: float) -> float:
+    """1, 2 or 5 times a power of ten, as long as possible."""
+    power = 10.0 ** math.floor(math.log10(longest_m))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= longest_m * (1 + 1e-9))
+
+
+def draw_path(axes: Axes, path_m: Points | Sequence[Points], *, color: str, width: float) -> None:
+    """A trajectory and its start; (n, 3) positions in order."""
+    xy = np.asarray(path_m)[:, :2]
+    axes.plot(*xy.T, color=color, linewidth=width, solid_joinstyle="round")
+    axes.plot(*xy[0], "o", color=color, markersize=3 + 2 * width, markeredgecolor="white", markeredgewidth=0.8)
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG of `DPI`; the same for the same data."""
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=DPI, metadata={"Software": None})
+    return image.getvalue()

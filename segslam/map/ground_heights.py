@@ -1,0 +1,25 @@
+"""Height of the ground beneath points of a square."""
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from segslam.types import Points, Vector
+
+GROUND_CELL_M = 2.0
+
+
+def ground_heights(points: Points, ground: Points, side_m: float) -> Vector:
+    """Height of the ground (m) beneath each point: the lowest of `ground` in its cell, or in the nearest that has any.
+
+    Both lie within a square of `side_m`, x and y from its corner.
+    """
+    size = round(side_m / GROUND_CELL_M)
+    lowest = np.full((size, size), np.inf)
+    np.minimum.at(lowest, _cells(ground, size), ground[:, 2])
+    nearest = distance_transform_edt(np.isinf(lowest), return_distances=False, return_indices=True)
+    return lowest[tuple(nearest)][_cells(points, size)]
+
+
+def _cells(points: Points, size: int) -> tuple[np.ndarray, np.ndarray]:
+    column, row = np.clip((points[:, :2] / GROUND_CELL_M).astype(np.int64), 0, size - 1).T
+    return column, row

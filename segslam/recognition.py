@@ -1,0 +1,160 @@
+"""Where a scan was taken among many places, with no guess: the likeliest places are aligned and verified in turn.
+
+A place is accepted only if no other place fits almost as well, because streets repeat.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from segslam import geometry
+from segslam.config import Config
+from segslam.registration import Gate, PreparedScan, Stopwatch, register_prepared
+from segslam.retrieval import PlaceCandidate
+from segslam.system.short_repr import Record
+from segslam.types import Alignment, Rejected, RejectReason, Transform
+from segslam.verification import gates
+
+MAX_PLACES = 6
+"""Chosen: places tried until one is found; each takes some 100 ms."""
+MAX_RIVALS = 2
+"""Chosen: other places tried after one is found."""
+SPREAD_M = 4.0
+"""Chosen: candidates nearer than this to one that was tried are the same place."""
+ELSEWHERE_M = 10.0
+"""Chosen: a candidate this far from the place found is another place."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Recognised(Record):
+    """A scan found at a place."""
+
+    place_id: int
+    T_world_lidar: Transform
+    alignment: Alignment
+    """Of the scan in the frame of the place."""
+
+
+def recognise(
+    scan: PreparedScan,
+    candidates: Sequence[PlaceCandidate],
+    places: Callable[[int], PreparedScan],
+    T_world_place: Callable[[int], Transform],
+    *,
+    config: Config,
+    floor: gates.NoiseFloor = gates.SINGLE_PAIR,
+    gate: Callable[[int], Gate] = lambda place_id: _no_gate,
+    max_places: int = MAX_PLACES,
+    watch: Stopwatch | None = None,
+) -> Recognised | Rejected:
+    """The place among the candidates, the likeliest first, where the scan was taken.
+
+    Rejects AMBIGUOUS where two places agree with it almost equally, with the first candidate's reason where none does,
+    and TOO_FEW_CORRESPONDENCES where there is no candidate. `gate` gives what else is known of the pose in a place.
+    """
+    watch = watch or Stopwatch()
+
+    def tried(place_id: int, also: Gate) -> Recognised | Rejected:
+        with watch("prepare"):
+            place = places(place_id)
+        both = _Both(gate(place_id), also)
+        found = register_prepared(scan, place, config=config, gate=both, floor=floor, watch=watch)
+        if isinstance(found, Rejected):
+            return found
+        return Recognised(place_id, T_world_place(place_id) @ found.fine.T_target_source, found)
+
+    rejection: Rejected | None = None
+    for place_id in _spread(candidates, T_world_place, max_places):
+        outcome = tried(place_id, _no_gate)
+        if isinstance(outcome, Recognised):
+            rivals = [
+                tried(other, _Elsewhere(outcome.T_world_lidar, T_world_place(other)))
+                for other in _others(outcome, candidates, T_world_place)
+            ]
+            others = [rival for rival in rivals if isinstance(rival, Recognised)]
+            return _clear_winner(scan, [outcome, *others], places, config)
+        if rejection is None:
+            rejection = outcome
+    if rejection is None:
+        return Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, "no place to compare with")
+    return rejection
+
+
+class _Both(NamedTuple):
+    """Two gates in one."""
+
+    first: Gate
+    second: Gate
+
+    def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+        rejected = self.first(T_target_source, slack_m=slack_m)
+        return rejected if rejected is not None else self.second(T_target_source, slack_m=slack_m)
+
+
+class _Elsewhere(NamedTuple):
+    """Rejects poses that put the scan where it was found already."""
+
+    T_world_found: Transform
+    T_world_target: Transform
+
+    def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+        if _apart_m(self.T_world_target @ T_target_source, self.T_world_found) < ELSEWHERE_M:
+            return Rejected(RejectReason.FAR_FROM_PRIOR, "the same place")
+        return None
+
+
+def _no_gate(T_target_source: Transform, *, slack_m: float) -> None:
+    return None
+
+
+def _spread(
+    candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform], most: int
+) -> Iterator[int]:
+    """Candidates that lie apart from those before them."""
+    taken: list[Transform] = []
+    for candidate in candidates:
+        T_world = T_world_place(candidate.place_id)
+        if all(_apart_m(T_world, other) >= SPREAD_M for other in taken):
+            taken.append(T_world)
+            yield candidate.place_id
+        if len(taken) == most:
+            return
+
+
+def _others(
+    found: Recognised, candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform]
+) -> list[int]:
+    """The likeliest places that the scan was not found near, each apart from the others."""
+    taken: list[int] = []
+    for candidate in candidates:
+        T_world = T_world_place(candidate.place_id)
+        if _apart_m(T_world, found.T_world_lidar) < ELSEWHERE_M:
+            continue
+        if all(_apart_m(T_world, T_world_place(other)) >= ELSEWHERE_M for other in taken):
+            taken.append(candidate.place_id)
+        if len(taken) == MAX_RIVALS:
+            break
+    return taken
+
+
+def _clear_winner(
+    scan: PreparedScan, found: Sequence[Recognised], places: Callable[[int], PreparedScan], config: Config
+) -> Recognised | Rejected:
+    """The place that agrees best, unless one somewhere else agrees almost as well."""
+    ranked = sorted(((_mismatch(scan, places(one.place_id), one.alignment), one) for one in found), key=lambda p: p[0])
+    (least, best), *others = ranked
+    for mismatch, other in others:
+        if mismatch < config.verify.rival_ratio * least:
+            return Rejected(RejectReason.AMBIGUOUS, f"two places: keyframes {best.place_id} and {other.place_id}")
+    return best
+
+
+def _mismatch(scan: PreparedScan, place: PreparedScan, alignment: Alignment) -> float:
+    """As `gates.Agreement` has it."""
+    roughness_m = max(scan.surface.roughness_m, place.surface.roughness_m)
+    ratio = alignment.rms_m / roughness_m
+    return gates.Agreement(alignment.overlap, alignment.rms_m, ratio, alignment.free_space_violation).mismatch
+
+
+def _apart_m(T_world_a: Transform, T_world_b: Transform) -> float:
+    return geometry.distance(geometry.inverse(T_world_a) @ T_world_b)

@@ -1,0 +1,184 @@
+"""Coarse-to-fine GICP from a coarse pose; the search distance decreases from stage to stage.
+
+The only importer of small_gicp. Its tangents are [rotation; translation] with the perturbation on the right, as ours.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import small_gicp
+
+from segslam import geometry
+from segslam.config import RefineConfig
+from segslam.points import within_range
+from segslam.types import Direction, Information, Points, Registration, Rejected, RejectReason, Transform
+
+NUM_NEIGHBOURS = 10
+"""Number of neighbours for the covariance of a point; small_gicp's default."""
+NUM_THREADS = 2
+"""Threads for these covariances, which are independent of each other. Sums over pairs use one thread, to be exact."""
+STANDING_NORMAL_Z = math.cos(math.radians(45.0))
+"""Chosen: points on steeper surfaces are above ground (`standing`)."""
+
+
+ROUGHNESS_REACH, LEAST_ROUGHNESS = 1.6, 0.02
+"""Chosen, in voxels: farther neighbours are on other surfaces; a roughness below the second value is rounding."""
+UNOBSERVED = 0.01
+"""Chosen: a ratio of variances below this means unobserved; a smooth tunnel has 0.001, from GICP's tangents."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A scan prepared for GICP: downsampled points with covariances, and their search tree."""
+
+    cloud: Any
+    tree: Any
+    roughness_m: float
+    """Root mean square distance of standing points to the plane through the nearest other point: the residual due to
+    noise and shape within one scan at this voxel size."""
+
+    @property
+    def points(self) -> Points:
+        """(n, 3), in the scan's frame."""
+        return self.cloud.points()[:, :3]
+
+    @property
+    def normals(self) -> Points:
+        """(n, 3), of unit length."""
+        return self.cloud.normals()[:, :3]
+
+    @property
+    def standing(self) -> Points:
+        """(k, 3) points on surfaces steeper than 45 degrees; the scan's z points up."""
+        return self.points[_stands(self.normals)]
+
+    def __len__(self) -> int:
+        return self.cloud.size()
+
+    def nearest(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) each: row of the nearest point of the surface, and the distance to it (m)."""
+        rows, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
+        return np.asarray(rows), np.sqrt(squared)
+
+    def distances_m(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) each: distances of points to the nearest point of the surface, and to the plane through it (m)."""
+        rows, to_point = self.nearest(points)
+        to_plane = np.einsum("ij,ij->i", points - self.points[rows], self.normals[rows])
+        return to_point, np.abs(to_plane)
+
+
+def downsample(points: Points, *, config: RefineConfig) -> Points:
+    """The mean point of each voxel within `max_range_m`, float32; about 100 KB per scan."""
+    near = points.compress(within_range(points, 0.0, config.max_range_m), axis=0).astype(np.float64)
+    return small_gicp.voxelgrid_sampling(near, config.voxel_m, 1).points()[:, :3].astype(np.float32)
+
+
+def merge(clouds: Sequence[Points], *, config: RefineConfig) -> Points:
+    """Downsampled clouds of the same frame merged: the mean point of each voxel, float32."""
+    return (
+        small_gicp.voxelgrid_sampling(np.vstack(clouds).astype(np.float64), config.voxel_m, 1)
+        .points()[:, :3]
+        .astype(np.float32)
+    )
+
+
+def make_surface(thinned: Points, *, config: RefineConfig) -> Surface:
+    """The surface through downsampled points. It may be empty; `refine` then rejects."""
+    cloud = small_gicp.PointCloud(thinned.astype(np.float64))
+    tree = small_gicp.KdTree(cloud)
+    if len(thinned) < config.min_points:
+        return Surface(cloud, tree, LEAST_ROUGHNESS * config.voxel_m)
+    small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, NUM_THREADS)
+    return Surface(cloud, tree, _roughness(cloud, tree, config.voxel_m))
+
+
+def _roughness(cloud: Any, tree: Any, voxel_m: float) -> float:
+    points, normals = cloud.points()[:, :3], cloud.normals()[:, :3]
+    rows = np.flatnonzero(_stands(normals))
+    if not len(rows):
+        return LEAST_ROUGHNESS * voxel_m
+    nearest, squared = (np.asarray(found) for found in tree.batch_knn_search(points[rows], 2, num_threads=1))
+    near = squared[:, 1] < (ROUGHNESS_REACH * voxel_m) ** 2
+    rows, others = rows[near], nearest[near, 1]
+    to_plane = np.einsum("ij,ij->i", points[rows] - points[others], normals[others])
+    return max(float(np.sqrt(np.mean(to_plane**2))) if len(rows) else 0.0, LEAST_ROUGHNESS * voxel_m)
+
+
+def _stands(normals: Points) -> np.ndarray:
+    """(n,) True on surfaces steeper than 45 degrees."""
+    return np.abs(normals[:, 2]) < STANDING_NORMAL_Z
+
+
+def refine(
+    source: Surface,
+    target: Surface,
+    T_target_source: Transform,
+    *,
+    config: RefineConfig,
+    must_converge: bool = True,
+) -> Registration | Rejected:
+    """The pose near `T_target_source` that aligns source and target by GICP (Segal et al. 2009).
+
+    `information` is the scaled Hessian of the last stage, limited by the noise common to all points. In directions of
+    translation that the points do not constrain, its standard deviation is the last search distance. `rms_m` is point
+    to plane. Rejects TOO_FEW_POINTS, and REFINEMENT_DIVERGED if no pairs remain or, with `must_converge`, if the last
+    stage does not converge: one in ten sparse scans oscillates by centimetres between two sets of pairs.
+    """
+    if min(len(source), len(target)) < config.min_points:
+        sizes = f"{len(source)} and {len(target)} points, {config.min_points} needed"
+        return Rejected(RejectReason.TOO_FEW_POINTS, sizes)
+    for correspondence_m in config.correspondence_m:
+        result = small_gicp.align(
+            target.cloud,
+            source.cloud,
+            target.tree,
+            T_target_source,
+            max_correspondence_distance=correspondence_m,
+            max_iterations=config.max_iterations,
+            num_threads=1,
+        )
+        T_target_source = result.T_target_source
+        if result.num_inliers < config.min_points or not np.isfinite(T_target_source).all():
+            return Rejected(RejectReason.REFINEMENT_DIVERGED, f"{result.num_inliers} pairs at {correspondence_m} m")
+    if must_converge and not result.converged:
+        detail = f"still moving after {config.max_iterations} iterations at {correspondence_m} m"
+        return Rejected(RejectReason.REFINEMENT_DIVERGED, detail)
+    to_point, to_plane = target.distances_m(geometry.apply(T_target_source, source.points))
+    paired = to_plane[to_point < config.correspondence_m[-1]]
+    return Registration(
+        T_target_source=T_target_source,
+        num_correspondences=len(source),
+        num_inliers=int(result.num_inliers),
+        rms_m=float(np.sqrt(np.mean(paired**2))),
+        information=_information((result.H + result.H.T) / 2 * config.information_scale, config),
+    )
+
+
+def observability(information: Information, *, config: RefineConfig) -> tuple[float, Direction]:
+    """Smallest divided by largest variance of the translation, and the direction of the largest variance.
+
+    The ratio is 0 to 1, without the noise common to all points; 0 if the information is singular. The direction has
+    unit length, in the source's frame: there the points constrain the pose least.
+    """
+    try:
+        covariance = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        return 0.0, np.array([1.0, 0.0, 0.0])
+    variances, directions = np.linalg.eigh(covariance[3:, 3:] - config.shared_noise_m**2 * np.eye(3))
+    return float(max(variances[0], 0.0) / variances[2]), directions[:, 2]
+
+
+def _information(hessian: Information, config: RefineConfig) -> Information:
+    """The information with the noise common to all points, and without false information along smooth surfaces."""
+    information = geometry.with_noise(
+        hessian, rotation_rad=math.radians(config.shared_noise_deg), translation_m=config.shared_noise_m
+    )
+    ratio, direction = observability(information, config=config)
+    if ratio >= UNOBSERVED:
+        return information
+    wide = np.zeros((6, 6))
+    wide[3:, 3:] = config.correspondence_m[-1] ** 2 * np.outer(direction, direction)
+    return geometry.with_covariance(information, wide)

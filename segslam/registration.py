@@ -1,0 +1,278 @@
+"""Registration of two scans: describe and prepare each scan once, then match, refine and verify the pair."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from segslam import geometry, refinement, segregator
+from segslam.config import Config
+from segslam.semantics import geometric_labels
+from segslam.system.threads import both
+from segslam.types import (
+    Alignment,
+    Description,
+    Direction,
+    Label,
+    Labels,
+    Points,
+    Registration,
+    Rejected,
+    RejectReason,
+    Transform,
+    as_points,
+)
+from segslam.verification import gates
+from segslam.verification.free_space import FreeSpace, observe_free_space
+
+Labeller = Callable[[Points], Labels]
+SHIFTS_M = tuple(sign * float(shift_m) for shift_m in range(1, 9) for sign in (-1.0, 1.0))
+"""Chosen: shifts along the weak direction where rivals are searched; refinement finds rivals within 0.5 m."""
+SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
+"""Chosen: poses closer to each other than this are the same."""
+
+
+@runtime_checkable
+class Gate(Protocol):
+    """Prior knowledge about the pose: a rejection for an impossible pose, None for all others."""
+
+    def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+        """`slack_m`: distance by which refinement may still move the pose."""
+        ...
+
+
+class Stopwatch:
+    """Seconds spent in each stage, added up over all calls."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Context manager that adds the time within it to this stage."""
+        started = perf_counter()
+        try:
+            yield
+        finally:
+            self.add(stage, perf_counter() - started)
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Add a time that was measured elsewhere (s)."""
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedScan:
+    """A scan prepared for registration; computed once per scan."""
+
+    description: Description
+    surface: refinement.Surface
+    free_space: FreeSpace
+
+    @property
+    def observed(self) -> gates.Observed:
+        """Input of the gates: surface and free space."""
+        return self.surface, self.free_space
+
+
+def register(
+    source_points: ArrayLike,
+    target_points: ArrayLike,
+    *,
+    source_labels: Labels | None = None,
+    target_labels: Labels | None = None,
+    config: Config | None = None,
+) -> Alignment | Rejected:
+    """The pose of one scan in another without an initial guess, each in its own sensor's frame (z up, metres).
+
+    Points are rows of x, y, z; further columns, such as intensities, are ignored. Labels are learning ids, one per
+    point; a scan without labels is labelled by shape. The pose is `fine.T_target_source` of the result, or the result
+    is `Rejected`. Raises SegslamError for arrays of another shape.
+    """
+    config = config or Config()
+
+    def prepared(given: ArrayLike, labels: Labels | None) -> PreparedScan:
+        points = as_points(given)
+        return prepare_scan(points, shape_labels(points, config=config) if labels is None else labels, config=config)
+
+    source, target = both(prepared, (source_points, source_labels), (target_points, target_labels))
+    return register_prepared(source, target, config=config)
+
+
+def shape_labels(points: Points, *, config: Config) -> Labels:
+    """Labels computed from shape alone."""
+    return geometric_labels(points, config=config.geometric)
+
+
+def prepare_scan(
+    points: Points, labels: Labels, *, config: Config, seen_from_here: Points | None = None
+) -> PreparedScan:
+    """Description, surface and free space of a scan; `points` in the scan's own frame.
+
+    If `points` are gathered from several scans, `seen_from_here` are the points measured from this pose: free space is
+    computed from these only. Points of moving classes are used for neither surface nor free space.
+    """
+    surface, seen = prepare_observed(points, labels, config=config, seen_from_here=seen_from_here)
+    return PreparedScan(segregator.describe(points, labels, config=config.segregator), surface, seen)
+
+
+def prepare_observed(
+    points: Points, labels: Labels, *, config: Config, seen_from_here: Points | None = None
+) -> gates.Observed:
+    """The surface and the view of `prepare_scan` alone: enough to refine and verify a pose that is nearly known."""
+    still = points.compress(labels < Label.MOVING_CAR, axis=0)
+    surface = refinement.make_surface(refinement.downsample(still, config=config.refine), config=config.refine)
+    return surface, observe_free_space(still if seen_from_here is None else seen_from_here)
+
+
+def register_prepared(
+    source: PreparedScan,
+    target: PreparedScan,
+    *,
+    config: Config,
+    gate: Gate = lambda T_target_source, *, slack_m: None,
+    floor: gates.NoiseFloor = gates.SINGLE_PAIR,
+    watch: Stopwatch | None = None,
+) -> Alignment | Rejected:
+    """The refined and verified pose of the source in the target without an initial guess, or the reason of rejection.
+
+    Hypotheses are tried from best to worst, and the first that passes all gates is returned. If the scans constrain it
+    badly in some direction and a different pose fits almost as well, the result is AMBIGUOUS. `gate` may reject a pose
+    before and after refinement. `floor` is the noise of the run. If no hypothesis passes, the rejection of the best one
+    is returned.
+    """
+    allowed = gates.limits(floor, config=config.verify)
+    trial = _Trial(source, target, config, gate, floor, allowed, watch or Stopwatch())
+    rejections = []
+    for coarse in _coarse(source, target, config=config, watch=trial.watch):
+        outcome = coarse if isinstance(coarse, Rejected) else trial.outcome(coarse)
+        if isinstance(outcome, Found):
+            return _unless_ambiguous(outcome, trial)
+        rejections.append(outcome)
+    return rejections[0]
+
+
+class Found(NamedTuple):
+    """A pose that passed all gates."""
+
+    alignment: Alignment
+    agreement: gates.Agreement
+    weak_direction: Direction
+    """Direction in the source's frame in which the scans constrain the pose least."""
+
+
+class _Trial(NamedTuple):
+    """Two scans, and the gates that a pose between them has to pass."""
+
+    source: PreparedScan
+    target: PreparedScan
+    config: Config
+    gate: Gate
+    floor: gates.NoiseFloor
+    limits: gates.Limits
+    watch: Stopwatch
+
+    def outcome(self, coarse: Registration) -> Found | Rejected:
+        """One hypothesis, refined and verified."""
+        config = self.config.verify
+        if coarse.num_inliers < config.min_inliers:
+            return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {config.min_inliers}")
+        rejected = self.gate(coarse.T_target_source, slack_m=config.max_coarse_fine_m)
+        if rejected is not None:
+            return rejected
+        scans = self.source.observed, self.target.observed
+        with self.watch("verify"):
+            hopeless = gates.early_rejection(*scans, coarse.T_target_source, self.limits, config=config)
+        if hopeless is not None:
+            return hopeless
+        with self.watch("refine"):
+            fine = refinement.refine(
+                self.source.surface, self.target.surface, coarse.T_target_source, config=self.config.refine
+            )
+        if isinstance(fine, Rejected):
+            return fine
+        with self.watch("verify"):
+            return self._verified(coarse, fine)
+
+    def _verified(self, coarse: Registration, fine: Registration) -> Found | Rejected:
+        config = self.config.verify
+        moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ fine.T_target_source)
+        if moved_m > config.max_coarse_fine_m:
+            detail = f"moved {moved_m:.2f} m > {config.max_coarse_fine_m} m"
+            return Rejected(RejectReason.REFINEMENT_DIVERGED, detail)
+        far = self.gate(fine.T_target_source, slack_m=0.0)
+        if far is not None:
+            return far
+        found = gates.agreement(self.source.observed, self.target.observed, fine.T_target_source, config=config)
+        rejected = gates.rejection(found, self.limits)
+        if rejected is not None:
+            return rejected
+        observability, weak_direction = refinement.observability(fine.information, config=self.config.refine)
+        alignment = Alignment(
+            coarse, fine, found.overlap, found.rms_m, found.free_space_violation, observability=observability
+        )
+        return Found(alignment, found, weak_direction)
+
+
+def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
+    """The best of a pose and its rivals; AMBIGUOUS if a different pose fits almost as well.
+
+    Rivals are searched if the scans constrain the pose badly in some direction, as along a tunnel, or fit less well
+    than neighbouring keyframes do.
+    """
+    config = trial.config.verify
+    if found.alignment.observability >= config.well_observed and gates.is_certain(found.agreement, trial.floor):
+        return found.alignment
+    passed, loose = [found], trial._replace(limits=trial.limits.loosened())
+    for coarse in _rivals(found, trial):
+        if not _is_near(coarse.T_target_source, passed):
+            rival = loose.outcome(coarse)
+            if isinstance(rival, Found) and not _is_near(rival.alignment.fine.T_target_source, passed):
+                passed.append(rival)
+    best, *others = sorted(passed, key=lambda one: one.agreement.mismatch)
+    if others and others[0].agreement.mismatch < config.rival_ratio * best.agreement.mismatch:
+        apart = geometry.inverse(best.alignment.fine.T_target_source) @ others[0].alignment.fine.T_target_source
+        beside = f"{others[0].agreement.mismatch:.3f} {geometry.distance(apart):.1f} m off"
+        return Rejected(RejectReason.AMBIGUOUS, f"mismatch {best.agreement.mismatch:.3f}, and {beside}")
+    rejected = gates.rejection(best.agreement, trial.limits)
+    return best.alignment if rejected is None else rejected
+
+
+def _rivals(found: Found, trial: _Trial) -> Iterator[Registration]:
+    """Candidates for other poses that fit as well: along the weak direction, and from the floor plans."""
+    pose = found.alignment.fine
+    for shift_m in SHIFTS_M:
+        shift = geometry.transform(np.eye(3), shift_m * found.weak_direction)
+        yield replace(pose, T_target_source=pose.T_target_source @ shift)
+    yield from _plans(trial.source, trial.target, num_poses=trial.config.verify.max_rivals, watch=trial.watch)
+
+
+def _is_near(T_target_source: Transform, others: Sequence[Found]) -> bool:
+    """Whether a pose is so close to one of the others that refinement would lead to it."""
+    apart = [geometry.inverse(other.alignment.fine.T_target_source) @ T_target_source for other in others]
+    return any(geometry.distance(T) < SAME_POSE_M and geometry.angle(T) < SAME_POSE_RAD for T in apart)
+
+
+def _coarse(
+    source: PreparedScan, target: PreparedScan, *, config: Config, watch: Stopwatch
+) -> Iterator[Registration | Rejected]:
+    """Hypotheses from clusters and features, then from floor plans if the vertical of both scans is known."""
+    with watch("match"):
+        ranked = segregator.hypotheses(source.description, target.description, config=config.segregator)
+    yield from [ranked] if isinstance(ranked, Rejected) else ranked[: config.verify.max_hypotheses]
+    yield from _plans(source, target, num_poses=config.verify.max_plan_hypotheses, watch=watch)
+
+
+def _plans(source: PreparedScan, target: PreparedScan, *, num_poses: int, watch: Stopwatch) -> list[Registration]:
+    """Poses that align the two floor plans; none if the vertical of a scan is unknown."""
+    source_up, target_up = segregator.upward(source.description), segregator.upward(target.description)
+    if num_poses == 0 or source_up is None or target_up is None:
+        return []
+    standing = source.surface.standing, target.surface.standing
+    with watch("match"):
+        return list(segregator.plan_hypotheses(*standing, source_up, target_up, num_poses=num_poses))

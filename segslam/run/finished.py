@@ -1,0 +1,165 @@
+"""A finished run, read from its folder, and ground-truth poses from a file, matched to its scans."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam.config import Config
+from segslam.log import RunLog, read_log
+from segslam.run.folder import LOG
+from segslam.slam import SlamResult
+from segslam.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
+from segslam.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
+
+STAMP_TOLERANCE_NS = 10_000_000
+"""Largest time difference between a scan and its ground-truth pose."""
+
+
+FIGURES = {
+    "ate_m": "absolute trajectory error after alignment, rms (m)",
+    "odometry_ate_m": "the same error, odometry only (m)",
+    "are_deg": "absolute rotation error after alignment, rms (degrees)",
+    "height_m": "height error after alignment, rms (m)",
+    "rpe_m": "error of the motion from pose to pose, rms (m)",
+    "rpe_deg": "rotation error of the motion from pose to pose, rms (degrees)",
+    "kitti_translation_percent": "KITTI's translation error over 100 to 800 m (%)",
+    "kitti_rotation_deg_per_100m": "KITTI's rotation error over 100 to 800 m (degrees per 100 m)",
+    "num_poses": "poses scored",
+    "num_scans": "scans mapped",
+    "num_scans_skipped": "scans skipped (unreadable or empty)",
+    "num_keyframes": "keyframes",
+    "num_candidates": "loop candidates tried",
+    "num_motions_repaired": "motions of the odometry replaced by registrations",
+    "num_motions_broken": "breaks: motions that nothing supports",
+    "num_loops_accepted": "loops accepted",
+    "localised_percent": "scans localised in the old map (%)",
+    "num_sessions": "sessions merged",
+    "num_loops_between": "loops between sessions, accepted",
+    "num_loops_between_switched_off": "of these, rejected by the optimiser",
+    "num_loops_switched_off": "accepted loops rejected by the optimiser",
+    "num_loops_false": "false loops: accepted, but wrong by more than 2 m or 5 degrees",
+    "loop_precision": "share of the accepted loops that are correct",
+    "loop_recall": "share of the revisits within 4 m that a correct loop closes",
+    "vertical_deg": "vertical angle left over in the scans; positive: their points lie too low (degrees)",
+    "vertical_sigma_deg": "standard deviation of that angle (degrees)",
+    "seconds_total": "total time (s)",
+    "scans_per_second": "scans per second",
+    "peak_rss_mb": "peak memory (MB)",
+}
+"""Meaning of the figures of `metrics.json`, the most important first."""
+
+ACCURACY = frozenset(
+    (
+        *("ate_m", "are_deg", "height_m", "rpe_m", "rpe_deg", "kitti_translation_percent"),
+        *("kitti_rotation_deg_per_100m", "num_loops_false", "loop_precision", "loop_recall"),
+    )
+)
+"""Figures that need a reference; another reference replaces all of them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedRun:
+    """The contents of a run folder."""
+
+    folder: Path
+    dataset: str
+    config: Config
+    result: SlamResult
+    reference: Trajectory | None
+    T_camera_lidar: Transform | None
+    metrics: dict[str, Any]
+    options: Mapping[str, str]
+    """Command-line options of the run other than settings, such as `frames`; empty for a replay."""
+
+
+def read_run(folder: str | Path) -> FinishedRun:
+    """The run of a folder. Raises SegslamError if it holds none, or one that did not finish."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SegslamError(f"{folder}: no such folder; name one that `segslam map --out` made")
+    log = read_log(folder / LOG)
+    return FinishedRun(
+        folder=folder,
+        dataset=log.run.get("dataset", ""),
+        config=log.config,
+        result=_result(log),
+        reference=log.reference(),
+        T_camera_lidar=log.T_camera_lidar,
+        metrics=read_metrics(folder),
+        options=log.options,
+    )
+
+
+def read_metrics(folder: Path) -> dict[str, Any]:
+    """The figures of `metrics.json`. Raises SegslamError if there are none."""
+    file = folder / "metrics.json"
+    try:
+        return dict(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise SegslamError(f"{file}: cannot read the run's figures ({error}); replay its log.mcap") from error
+
+
+def true_poses(file: Path, run: FinishedRun) -> Trajectory:
+    """Ground-truth LiDAR poses of the scans of a run, from a KITTI or TUM file.
+
+    KITTI rows are matched by scan number, and are camera poses if the data of the run are KITTI's; TUM rows are matched
+    by stamp. Raises SegslamError if no scan has a pose, or if the number of KITTI rows does not fit the run.
+    """
+    poses = read_poses(file)
+    scans = run.result.trajectory
+    if poses.stamp_ns is None:
+        _check_length(file, len(poses), run)
+    rows, numbers = _rows_and_scans(poses, scans)
+    if len(rows) == 0:
+        raise SegslamError(f"{file}: none of its {len(poses)} poses belongs to a scan of {run.folder}")
+    T_world_lidar = poses.T_a_b
+    if poses.stamp_ns is None and run.T_camera_lidar is not None:
+        T_world_lidar = lidar_from_camera(T_world_lidar, run.T_camera_lidar)
+    return Trajectory(scans.scan_index[numbers], scans.stamp_ns[numbers], T_world_lidar[rows])
+
+
+def _check_length(file: Path, num_poses: int, run: FinishedRun) -> None:
+    last = int(run.result.trajectory.scan_index[-1])
+    num_read = run.metrics.get("num_scans", 0) + run.metrics.get("num_scans_skipped", 0)
+    took_all = run.options.get("frames") == "" and not run.dataset.startswith("kitti/")  # whose numbers may have gaps
+    if num_poses <= last or (took_all and num_poses != num_read):
+        raise SegslamError(
+            f"{file}: {num_poses} poses, but the run has scans up to number {last}; KITTI's format needs a line for "
+            "each scan, line n + 1 for scan n. TUM's is matched by stamp, and may leave scans out"
+        )
+
+
+def _rows_and_scans(poses: PoseFile, scans: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Matching rows of a pose file and of the scans."""
+    if poses.stamp_ns is None:
+        return scans.scan_index, np.arange(len(scans))
+    pairs = rows_of_same_stamp(poses.stamp_ns, scans.stamp_ns, max_difference_ns=STAMP_TOLERANCE_NS)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _result(log: RunLog) -> SlamResult:
+    final = log.result()
+    if final is None:
+        raise SegslamError(f"{log.path}: the run did not finish; `segslam replay` it, or map the data again")
+    estimate, trajectory = final
+    T_odom_lidar, keyframe_rows = [], []
+    attempts: list[LoopAttempt] = []
+    motions: list[Motion] = []
+    for row, step in enumerate(log.steps(clouds=False)):
+        T_odom_lidar.append(step.T_odom_lidar)
+        attempts += step.attempts
+        motions += [step.motion] if step.motion else []
+        if step.keyframe is not None:
+            keyframe_rows.append(row)
+    if len(T_odom_lidar) < len(trajectory):
+        left = f"{len(T_odom_lidar)} of its {len(trajectory)} steps are left"
+        raise SegslamError(f"{log.path}: damaged, {left}; replay it, or map the data again")
+    late = log.late_loops()
+    odometry = Trajectory(trajectory.scan_index, trajectory.stamp_ns, np.array(T_odom_lidar))
+    return SlamResult(
+        trajectory, odometry, estimate, np.array(keyframe_rows), (*attempts, *late), tuple(motions), len(late)
+    )

@@ -1,0 +1,121 @@
+"""Names and writers of the files in a run folder."""
+
+import csv
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam.errors import reason
+from segslam.system.whole_files import whole_file, write_whole
+from segslam.trajectory import camera_from_lidar, write_kitti, write_tum
+from segslam.types import LoopAttempt, LoopClosure, Mask, SegslamError, Trajectory, Transform, Vector, WorkFailed
+
+POSE_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
+STAGES = ("prepare", "match", "refine", "verify")
+LOG = "log.mcap"
+UNFINISHED = ".part"
+"""Suffix of a file that replaces another one when it is complete."""
+
+
+def log_of(run: Path) -> Path:
+    """Path of the log of a run, given its folder or the log itself."""
+    return run if run.is_file() else run / LOG
+
+
+def folder_of(run: Path) -> Path:
+    """Path of the folder of a run, given the folder or its log."""
+    return run.parent if run.is_file() and run.name == LOG else run
+
+
+def new_folder(folder: Path) -> Path:
+    """Create an empty folder for a run. Raises SegslamError if it is not empty, so that no results are overwritten."""
+    check_new(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SegslamError(f"{folder}: cannot be written to ({error.strerror}); name another with --out") from error
+    return folder
+
+
+def check_new(folder: Path) -> None:
+    """Raises SegslamError if there is anything in the folder of a run to be."""
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            raise SegslamError(f"{folder}: not empty; name another folder with --out, or remove it")
+    except OSError as error:
+        raise SegslamError(f"{folder}: cannot be written to ({error.strerror}); name another with --out") from error
+
+
+def write_poses(
+    folder: Path, name: str, trajectory: Trajectory, T_camera_lidar: Transform | None, *, among: Mask | None = None
+) -> None:
+    """`NAME_tum.txt` in the LiDAR frame, and `NAME_kitti.txt`, in the camera frame where there is one.
+
+    TUM's format, whose lines have stamps, holds only the poses `among` the trajectory's if that is given; KITTI's has a
+    line for each scan.
+    """
+    poses = trajectory.T_world_lidar
+    rows = slice(None) if among is None else among
+    with whole_file(folder / f"{name}_tum.txt") as part:
+        write_tum(part, trajectory.stamp_ns[rows], poses[rows])
+    if T_camera_lidar is not None:
+        poses = camera_from_lidar(poses, T_camera_lidar)
+    with whole_file(folder / f"{name}_kitti.txt") as part:
+        write_kitti(part, poses)
+
+
+def write_localised(folder: Path, trajectory: Trajectory, from_map_m: Vector, localised: Mask) -> None:
+    """`localised.csv`, a row for each scan: whether it is localised, and the travel to a keyframe with a place."""
+    with whole_file(folder / "localised.csv") as part, part.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(("scan", "stamp_ns", "localised", "from_placed_keyframe_m"))
+        for scan, stamp_ns, is_localised, distance_m in zip(
+            trajectory.scan_index, trajectory.stamp_ns, localised, from_map_m, strict=True
+        ):
+            writer.writerow((scan, stamp_ns, int(is_localised), f"{distance_m:.2f}" if np.isfinite(distance_m) else ""))
+
+
+def write_loops(file: Path, attempts: tuple[LoopAttempt, ...], weights: dict[tuple[int, int], float]) -> None:
+    """A row for every attempt; cells that do not apply are empty. `weight`: final weight in the graph, 0 to 1."""
+    head = ("source", "target", "outcome", "detail", "distance_m", "correspondences", "inliers", "overlap", "rms_m")
+    with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow((*head, "free_space_violation", "weight", *POSE_COLUMNS, *(f"{stage}_s" for stage in STAGES)))
+        writer.writerows(_loop_row(attempt, weights) for attempt in attempts)
+
+
+def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
+    """Write `metrics.json` atomically; the caller leaves out unknown figures."""
+    with room_for(folder):
+        write_whole(folder / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+
+
+@contextmanager
+def room_for(folder: Path) -> Iterator[None]:
+    """Context manager that raises WorkFailed if a file cannot be written within it."""
+    try:
+        yield
+    except (OSError, WorkFailed) as error:
+        cause = error if isinstance(error, OSError) else error.__cause__
+        why = reason(cause) if isinstance(cause, OSError) else str(error)
+        raise WorkFailed(
+            f"{folder}: cannot write the results ({why}); make room on the disk, then go on with --resume: "
+            "the log has all"
+        ) from error
+
+
+def _loop_row(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> list[object]:
+    candidate, outcome = attempt.candidate, attempt.outcome
+    ids = (candidate.source_id, candidate.target_id)
+    seconds = [f"{attempt.seconds[stage]:.6f}" if stage in attempt.seconds else "" for stage in STAGES]
+    if not isinstance(outcome, LoopClosure):
+        nothing = [""] * (6 + len(POSE_COLUMNS))
+        return [*ids, outcome.reason.value, outcome.detail, candidate.distance_m, *nothing, *seconds]
+    found = outcome.alignment
+    figures = (found.coarse.num_correspondences, found.coarse.num_inliers, found.overlap, found.rms_m)
+    last = (found.free_space_violation, weights[ids], *outcome.T_target_source.ravel())
+    return [*ids, "accepted", "", candidate.distance_m, *figures, *last, *seconds]

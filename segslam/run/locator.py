@@ -1,0 +1,151 @@
+"""Where single scans were taken in a finished run, with no guess."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from segslam.config import Config
+from segslam.keyframes import Clouds, downsample_keyframe
+from segslam.log import read_log
+from segslam.points import within_range
+from segslam.recognition import MAX_PLACES, Recognised, recognise
+from segslam.registration import PreparedScan, prepare_scan, shape_labels
+from segslam.retrieval import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
+from segslam.run.finished import read_run
+from segslam.run.folder import log_of
+from segslam.submaps import Submaps
+from segslam.system.short_repr import Record
+from segslam.types import Alignment, Keyframe, Labels, Rejected, RejectReason, Transform, as_points
+from segslam.verification import gates
+from segslam.verification.noise_floor import NeighbourNoise
+
+NUM_PREPARED = 256
+"""Keyframes ready for alignment in memory, some 2 MB each."""
+NUM_FIRST = 3
+"""Chosen: places tried before the scan is looked at from points around its sensor, too."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Located(Record):
+    """Where a scan was taken."""
+
+    T_world_lidar: Transform
+    """Its pose in the frame of the run."""
+    keyframe_id: int
+    """The keyframe that it was aligned with."""
+    alignment: Alignment
+    """Of the scan in that keyframe."""
+    seconds: float
+
+    @property
+    def ok(self) -> bool:
+        """True, where `Rejected` has False."""
+        return True
+
+    @property
+    def inliers(self) -> int:
+        """Of the coarse pose."""
+        return self.alignment.coarse.num_inliers
+
+    @property
+    def overlap(self) -> float:
+        """Share of the standing points of either that lie on the other; the smaller of the two."""
+        return self.alignment.overlap
+
+
+class Locator:
+    """Finds scans among the keyframes of a finished run, which it only reads."""
+
+    def __init__(
+        self,
+        keyframes: list[Keyframe],
+        clouds: Clouds,
+        T_world_keyframe: dict[int, Transform],
+        *,
+        config: Config,
+    ) -> None:
+        """`keyframes` by their number, with or without points, which `clouds` gives; signatures are made where they
+        have none."""
+        self.config = config
+        self.T_world_keyframe = T_world_keyframe
+        travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
+        self.submaps = Submaps(config, lambda: clouds, partial(shape_labels, config=config), lambda: travel_m)
+        self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
+        """A keyframe by its number, ready for alignment."""
+        self._floor = NeighbourNoise(
+            lambda number: self.prepared(number).observed,
+            lambda number: self.submaps.T_odom[number],
+            self.submaps.lag,
+            config=config,
+        )
+        for keyframe in keyframes:
+            self.submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
+        self.places = Places()
+        for keyframe in keyframes:
+            self.places.add(keyframe.id, self._signature(keyframe))
+
+    @classmethod
+    def from_run(cls, folder: str | Path) -> "Locator":
+        """From the folder of a run. Raises SegslamError, which names the file, if it is damaged or did not finish."""
+        run = read_run(folder)
+        recorded = read_log(log_of(run.folder)).keyframes()
+        keyframes = [recorded[number] for number in range(len(recorded))]
+        return cls(keyframes, recorded, run.result.estimate.T_world_keyframe, config=run.config)
+
+    def floor(self) -> gates.NoiseFloor:
+        """How neighbouring keyframes of the run agree; measured when it is first asked for."""
+        return self._floor.at(len(self.T_world_keyframe) - 1)
+
+    def locate(self, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:
+        """Where a scan was taken, or why that is not known; points are rows of x, y, z in the sensor's frame (m).
+
+        Labels are learning ids, a row a point; a scan without is labelled by shape. Raises SegslamError for an array of
+        another shape.
+        """
+        started = perf_counter()
+        config = self.config
+        near = as_points(points)
+        usable = within_range(near, config.odometry.min_range_m, config.odometry.max_range_m)
+        near = near.compress(usable, axis=0)
+        labels = shape_labels(near, config=config) if labels is None else labels[usable]
+        kept, kept_labels, _ = downsample_keyframe(
+            near, labels, config=config.keyframes, whole_classes=tuple(config.segregator.cluster_min_points)
+        )
+        scan = prepare_scan(kept, kept_labels, config=config)
+        own = signature_of(kept, kept_labels, config=config.geometric)
+        found = self._recognised(scan, self.places.shortlist(own), max_places=NUM_FIRST)
+        if isinstance(found, Rejected) and found.reason != RejectReason.AMBIGUOUS:
+            around = signatures_around(kept, kept_labels, config=config.geometric)
+            found = self._recognised(scan, self.places.shortlist_around((own, *around)), max_places=MAX_PLACES)
+        if isinstance(found, Rejected):
+            return found
+        return Located(found.T_world_lidar, found.place_id, found.alignment, perf_counter() - started)
+
+    def _recognised(
+        self, scan: PreparedScan, candidates: tuple[PlaceCandidate, ...], *, max_places: int
+    ) -> Recognised | Rejected:
+        return recognise(
+            scan,
+            candidates,
+            self.prepared,
+            self.T_world_keyframe.__getitem__,
+            config=self.config,
+            floor=self.floor(),
+            max_places=max_places,
+        )
+
+    def _signature(self, keyframe: Keyframe) -> PlaceSignature:
+        if keyframe.place is not None:
+            return PlaceSignature.from_bytes(keyframe.place)
+        made = self.submaps.gathered(keyframe.id, newest_id=keyframe.id)
+        return signature_of(made.points, made.labels, config=self.config.geometric)
+
+
+def locate(run: str | Path, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:
+    """Where a scan was taken in the run of a folder. For several scans make a `Locator` once: it reads the run."""
+    return Locator.from_run(run).locate(points, labels)

@@ -1,0 +1,104 @@
+"""Map a data set into a run folder with one call."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+from segslam.config import Config
+from segslam.datasets import Dataset, open_dataset
+from segslam.presets import extent_m, preset, preset_for
+from segslam.run.accuracy import accuracy
+from segslam.run.finished import FinishedRun, read_run
+from segslam.run.folder import new_folder, write_metrics
+from segslam.run.run import Run
+from segslam.semantics.label_files import unlabelled
+from segslam.slam import Slam
+from segslam.types import BadScan, SegslamError, Step
+
+if TYPE_CHECKING:
+    from segslam.odometry import Odometry
+    from segslam.registration import Labeller
+    from segslam.semantics.encodings import Encoding
+
+
+@runtime_checkable
+class SlamOf(Protocol):
+    """Makes the pipeline of a run: `Slam`, or another one with the same methods."""
+
+    def __call__(
+        self, config: Config, *, odometry: "Odometry | None" = None, labeller: "Labeller | None" = None
+    ) -> Slam:
+        """As `Slam`."""
+        ...
+
+
+def map_folder(
+    data: str | Path,
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    sequence: str = "00",
+    dataset: str | None = None,
+    labels: str = "auto",
+    encoding: "Encoding | None" = None,
+    frames: str | None = None,
+    topic: str = "",
+    odometry: "Odometry | None" = None,
+    on_step: Callable[[Step], object] = lambda step: None,
+    slam_of: "SlamOf" = Slam,
+    options: Mapping[str, str] = MappingProxyType({}),
+) -> FinishedRun:
+    """Map a folder of scans or a recording into the new folder `out`, as `segslam map` does; the finished run.
+
+    Options as those of `open_dataset` and `Slam`; without `config` the preset that fits the scans. `on_step` is called
+    with each Step, in order. `slam_of` makes the pipeline, another one than `Slam` if given, and `options` go to the
+    log. Scans that cannot be used are skipped with a warning. Raises SegslamError that names the file and the remedy,
+    also if no scan is left.
+    """
+    from segslam.run.report import write_report
+
+    given, config = config, config or Config()
+    scans = open_dataset(
+        data,
+        sequence=sequence,
+        dataset=dataset,
+        labels=labels,
+        encoding=encoding,
+        frames=frames,
+        topic=topic,
+        intensities=config.map.color == "intensity",
+        vertical_angle_deg=config.sensor.vertical_angle_deg,
+    )
+    config = in_effect(given or preset(preset_for(extent_m(scans))), scans)
+    folder = new_folder(Path(out))
+    with Run(
+        folder,
+        slam_of(config, odometry=odometry, labeller=labeller_of(scans)),
+        dataset=scans.name,
+        T_camera_lidar=scans.T_camera_lidar,
+        reference=scans.reference,
+        options=options,
+    ) as run:
+        for step in run.map(scans):
+            if not isinstance(step, BadScan):
+                on_step(step)
+        if run.num_steps == 0:
+            raise SegslamError(f"{data}: none of its {len(scans)} scans could be used; see the warnings")
+        result, metrics = run.finish()
+    if scans.reference is not None:
+        metrics |= accuracy(result, scans.reference)
+    write_metrics(folder, metrics)
+    write_report(folder)
+    return read_run(folder)
+
+
+def in_effect(settings: Config, scans: Dataset) -> Config:
+    """The settings with the vertical angle that the data set was opened with, if they leave it undefined."""
+    sensor = settings.sensor.model_copy(update={"vertical_angle_deg": scans.vertical_angle_deg})
+    return settings.model_copy(update={"sensor": sensor})
+
+
+def labeller_of(scans: Dataset) -> "Labeller | None":
+    """None for labels by shape; a labeller without labels if the data set was opened with `none`."""
+    return None if scans.labels.geometric else lambda points: unlabelled(len(points))

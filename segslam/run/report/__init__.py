@@ -1,0 +1,90 @@
+"""The report of a run: one HTML page with map, plots, figures and settings, without network access."""
+
+from collections.abc import Collection
+from itertools import islice
+from pathlib import Path
+
+import matplotlib
+
+from segslam.log import read_log
+from segslam.map.before_after import BeforeAfter
+from segslam.run.finished import FinishedRun, read_run
+from segslam.run.folder import LOG
+from segslam.run.report import figures, gallery
+from segslam.run.report.page import Pictures, page
+from segslam.system.whole_files import write_whole
+from segslam.types import Keyframe
+
+__all__ = ["BEFORE_AFTER", "write_before_after", "write_report"]
+
+BEFORE_AFTER = "before_after.png"
+
+MOST_KEYFRAMES = 500
+"""Chosen: of a longer drive every second keyframe is drawn, or every third, and so on; each takes some 10 ms."""
+
+
+def write_report(folder: Path) -> Path:
+    """Write `report.html` into a run folder, from the files there; returns its path.
+
+    Raises SegslamError if the folder holds no finished run, or cannot be written to.
+    """
+    run = read_run(folder)
+    log = read_log(folder / LOG)
+    with matplotlib.rc_context(figures.STYLE):
+        plots = _plots(run)
+    about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
+    return _write(folder / "report.html", page(run, plots, _pictures(run), about=about).encode())
+
+
+def write_before_after(folder: Path, file: Path) -> Path:
+    """The map by odometry beside the corrected map, as a PNG file. Raises SegslamError as `write_report`."""
+    picture, _ = _drawn(read_run(folder))
+    return _write(file, picture)
+
+
+def _write(file: Path, content: bytes) -> Path:
+    write_whole(file, content)
+    return file
+
+
+def _plots(run: FinishedRun) -> dict[str, str]:
+    """The plots by caption, as far as the run has the data."""
+    plots = {"Trajectory from above, and its height": figures.draw_paths(run)}
+    true = figures.compared(run)
+    if true is not None:
+        plots["Error along the drive, after alignment"] = figures.draw_errors(true)
+    plots["Loops by outcome"] = figures.draw_loops(run)
+    if run.result.attempts:
+        plots["Loops over time"] = figures.draw_loops_over_time(run)
+    stages = {stage: ms for stage, ms in run.metrics.get("stage_ms", {}).items() if stage != "finish"}
+    if stages:
+        plots["Time per call of each stage"] = figures.draw_stages(stages)
+    return plots
+
+
+def _pictures(run: FinishedRun) -> Pictures:
+    """What needs the clouds of the log: the map before and after, and pairs of keyframes."""
+    chosen = gallery.choose(run.result.attempts)
+    wanted = {number for a in chosen for number in (a.candidate.source_id, a.candidate.target_id)}
+    before_after, kept = _drawn(run, wanted)
+    map_file = run.folder / "map.png"
+    return Pictures(
+        before_after=before_after,
+        map=map_file.read_bytes() if map_file.is_file() else None,
+        loops=gallery.draw(run, chosen, kept),
+    )
+
+
+def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:
+    """The map before and after, and the keyframes of these ids, in one pass over the log."""
+    poses = run.result.odometry.T_world_lidar[run.result.keyframe_rows]
+    before_after = BeforeAfter(dict(enumerate(poses)), run.result.estimate)
+    every = 1 + len(poses) // MOST_KEYFRAMES
+    kept: dict[int, Keyframe] = {}
+    keyframes = (step.keyframe for step in read_log(run.folder / LOG).steps() if step.keyframe is not None)
+    for keyframe in islice(keyframes, len(poses)):
+        if keyframe.id % every == 0:
+            before_after.add(keyframe)
+        if keyframe.id in wanted:
+            kept[keyframe.id] = keyframe
+    return before_after.draw(), kept

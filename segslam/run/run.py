@@ -1,0 +1,288 @@
+"""A run: processes the scans of a data set, and writes the files of the run folder."""
+
+import logging
+import resource
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from segslam.calibration import measure_vertical_angle
+from segslam.config import config_to_yaml
+from segslam.datasets import Dataset
+from segslam.log import LogWriter, Mirror, RunLog
+from segslam.log.drawing import CloudOf
+from segslam.run.folder import LOG, UNFINISHED, room_for, write_localised, write_loops, write_poses
+from segslam.slam import Slam, SlamResult, Tracked
+from segslam.system.threads import in_other_thread
+from segslam.system.whole_files import write_whole
+from segslam.types import (
+    BadScan,
+    LoopClosure,
+    MotionState,
+    Scan,
+    SegslamError,
+    Step,
+    Trajectory,
+    Transform,
+)
+
+logger = logging.getLogger(__name__)
+
+MOST_WAITING = 8
+"""Chosen: scans that odometry may be ahead of loop closing, about 2 MB each: the time of a keyframe with two loops."""
+
+
+class Run:
+    """Maps the scans of a data set into a folder; a context manager."""
+
+    def __init__(
+        self,
+        folder: Path,
+        slam: Slam,
+        *,
+        dataset: str,
+        T_camera_lidar: Transform | None = None,
+        reference: Trajectory | None = None,
+        options: Mapping[str, str] = MappingProxyType({}),
+        resumes: bool = False,
+        mirror: Mirror | None = None,
+    ) -> None:
+        """`T_camera_lidar`, for KITTI, transforms the KITTI-format poses into the camera frame of its ground truth.
+
+        `reference` goes to the log, for whoever scores or repeats the run from its folder; `options` too, for whoever
+        resumes it. A run that `resumes` has a log in its folder, which stays until `resume` has taken it over. The
+        folder of any other run goes where it ends without a step. `mirror` is given each message of the log.
+        """
+        self.folder = folder
+        self.num_steps = 0
+        self.config = slam.config
+        self.num_scans_skipped = 0
+        self.num_scans_resumed = 0
+        self._dataset = dataset
+        self._resumes = resumes
+        self._next_row = 0
+        self._unreported: list[BadScan] = []
+        """Bad scans before the first step; if no step follows, one error reports them."""
+        self._slam = slam
+        self._T_camera_lidar = T_camera_lidar
+        self._started = self._started_mapping = perf_counter()
+        self._stage_ms: dict[str, list[float]] = defaultdict(list)
+        try:
+            write_whole(folder / "config.yaml", config_to_yaml(slam.config))
+            self._log = LogWriter(
+                folder / (LOG + UNFINISHED if resumes else LOG),
+                config=slam.config,
+                dataset=dataset,
+                T_camera_lidar=T_camera_lidar,
+                reference=reference,
+                options=options,
+                mirror=mirror,
+            )
+        except SegslamError:
+            self._remove_unbegun()
+            raise
+        slam.keep_clouds_in(self._log)
+
+    def __enter__(self) -> "Run":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the log, also after a failure; a log that does not yet replace the old one is removed."""
+        try:
+            self._log.close()
+        finally:
+            (self.folder / (LOG + UNFINISHED)).unlink(missing_ok=True)
+            self._remove_unbegun()
+
+    def _remove_unbegun(self) -> None:
+        """Remove the files of a run without a step, so that the folder can be used again."""
+        if self.num_steps == 0 and not self._resumes:
+            for name in ("config.yaml", LOG):
+                (self.folder / name).unlink(missing_ok=True)
+            with suppress(OSError):  # what else is there stays
+                self.folder.rmdir()
+
+    def resume(self, recorded: RunLog, dataset: Dataset) -> Iterator[Step]:
+        """Repeat the logged steps from the keyframes on; `map` then continues with the following scans.
+
+        The steps go to a new log, which replaces the old one when it is complete, so a kill loses no step.
+        Raises SegslamError if the log belongs to another data set.
+        """
+        row_of_scan = {int(index): row for row, index in enumerate(dataset.scan_index)}
+        taken: list[tuple[int, int]] = []
+        for step in recorded.steps():
+            if step.scan_index not in row_of_scan:
+                raise _other_data(recorded.path, f"has scan {step.scan_index}, the data given has not")
+            taken.append((row_of_scan[step.scan_index], step.stamp_ns))
+            yield self._logged(replace(self._slam.repeat(step), stage_seconds=step.stage_seconds))
+
+        def scan_of(number: int) -> Scan:
+            row, stamp_ns = taken[number]
+            scan = dataset[row]
+            if scan.stamp_ns != stamp_ns:
+                raise _other_data(recorded.path, f"has scan {scan.index} at {stamp_ns} ns, the data {scan.stamp_ns} ns")
+            return scan
+
+        self._slam.go_on(scan_of)
+        self._log.move(recorded.path)
+        self.num_scans_resumed = len(taken)
+        self._started_mapping = perf_counter()
+        self._next_row = taken[-1][0] + 1 if taken else 0
+        self.num_scans_skipped = self._next_row - len(taken)
+
+    def map(self, dataset: Dataset) -> Iterator[Step | BadScan]:
+        """Process and log each scan after those resumed; a bad one is reported, counted and skipped.
+
+        Scans are read here, tracked in a thread beside, and in another loops are closed and steps logged.
+        """
+        tracked = in_other_thread(self._read(dataset), self._track, most_waiting=1)
+        return in_other_thread(tracked, self._done, most_waiting=MOST_WAITING)
+
+    def follow(self, tracked: Tracked | BadScan, *, tries_loops: bool = True) -> Step | BadScan:
+        """Close loops for a scan that was tracked elsewhere, and log the step."""
+        return self._done(tracked, tries_loops=tries_loops)
+
+    def map_so_far(self) -> tuple[dict[int, Transform], CloudOf]:
+        """The pose of each keyframe now, and what reads their points; these may be read by another thread."""
+        return dict(enumerate(self._slam.graph.T_world_keyframes.copy())), self._log.cloud
+
+    def repeat(self, steps: Iterator[Step]) -> Iterator[Step]:
+        """Repeat the steps of a log from the keyframes on; the log is read in this thread, the rest runs in another."""
+        return in_other_thread(
+            steps, lambda recorded: self._logged(self._slam.repeat(recorded)), most_waiting=MOST_WAITING
+        )
+
+    def take(self, steps: Iterator[tuple[Step, int, bool]]) -> Iterator[Step]:
+        """Take over recorded steps with their loops: each a Step, and `below` and `optimize` of `Slam.take`."""
+
+        def taken(item: tuple[Step, int, bool]) -> Step:
+            step, below, optimize = item
+            return self._logged(self._slam.take(step, below=below, optimize=optimize))
+
+        return in_other_thread(steps, taken, most_waiting=MOST_WAITING)
+
+    def finish(self) -> tuple[SlamResult, dict[str, Any]]:
+        """Final optimisation; writes all results. Returns the result and the figures that need no reference.
+
+        Raises SegslamError if there was no step.
+        """
+        if self.num_steps == 0:
+            raise SegslamError(f"{self._dataset}: {self._why_nothing()}")
+        started = perf_counter()
+        result = self._slam.finish()
+        self._note_ms("finish", perf_counter() - started)
+        started = perf_counter()
+        vertical = self._vertical_angle(result)
+        self._note_ms("calibrate", perf_counter() - started)
+        late = result.attempts[len(result.attempts) - result.num_late_attempts :]
+        self._log.write_result(result.estimate, result.trajectory, late)
+        self._log.close()
+        seconds, seconds_mapping = (perf_counter() - since for since in (self._started, self._started_mapping))
+        with room_for(self.folder):
+            write_poses(self.folder, "poses", result.trajectory, self._T_camera_lidar, among=result.localised())
+            if result.from_map_m is not None:
+                write_localised(self.folder, result.trajectory, result.from_map_m, result.localised())
+            write_poses(self.folder, "odometry", result.odometry, self._T_camera_lidar)
+            self._slam.graph.write_g2o(self.folder / "graph.g2o")
+            write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
+        closures = [attempt for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
+        return result, {
+            "num_scans": len(result.trajectory),
+            "num_scans_skipped": self.num_scans_skipped,
+            "num_keyframes": len(result.keyframe_rows),
+            "num_motions_repaired": _count(result, MotionState.REPAIRED, MotionState.REJOINED),
+            "num_motions_broken": _count(result, MotionState.BROKEN),
+            "num_candidates": len(result.attempts),
+            "num_loops_accepted": len(closures),
+            "num_loops_switched_off": len(result.estimate.rejected),
+            "seconds_total": seconds,
+            "scans_per_second": (len(result.trajectory) - self.num_scans_resumed) / seconds_mapping,
+            "peak_rss_mb": peak_rss_mb(),
+            **vertical,
+            **({} if result.from_map_m is None else {"localised_percent": 100.0 * float(result.localised().mean())}),
+            "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
+        }
+
+    def _vertical_angle(self, result: SlamResult) -> dict[str, float]:
+        """The remaining vertical angle of the scans as figures; empty if too few scans show it."""
+        found = measure_vertical_angle(
+            lambda keyframe_id: self._log.cloud(keyframe_id)[0],
+            result.odometry.T_world_lidar[result.keyframe_rows],
+            self._slam.graph.travel_m,
+            config=self.config.refine,
+        )
+        return {} if found is None else {"vertical_deg": found.angle_deg, "vertical_sigma_deg": found.sigma_deg}
+
+    def _read(self, dataset: Dataset) -> Iterator[Scan | BadScan]:
+        for row in range(self._next_row, len(dataset)):
+            started = perf_counter()
+            try:
+                scan: Scan | BadScan = dataset[row]
+            except BadScan as error:
+                scan = error
+            self._note_ms("read", perf_counter() - started)
+            yield scan
+
+    def _track(self, scan: Scan | BadScan) -> Tracked | BadScan:
+        try:
+            return scan if isinstance(scan, BadScan) else self._slam.track(scan)
+        except BadScan as error:
+            return error
+
+    def _done(self, tracked: Tracked | BadScan, *, tries_loops: bool = True) -> Step | BadScan:
+        if isinstance(tracked, BadScan):
+            self.num_scans_skipped += 1
+            self._report(tracked)
+            return tracked
+        return self._logged(self._slam.close_loops(tracked, tries_loops=tries_loops))
+
+    def _logged(self, step: Step) -> Step:
+        started = perf_counter()
+        self._log.write(step)
+        self.num_steps += 1
+        while self._unreported:
+            self._report(self._unreported.pop(0))
+        self._note_ms("log", perf_counter() - started)
+        for stage, seconds in step.stage_seconds.items():
+            self._note_ms(stage, seconds)
+        return step
+
+    def _report(self, bad: BadScan) -> None:
+        if self.num_steps:
+            logger.warning("%s; skipped", bad)
+        else:
+            self._unreported.append(bad)
+
+    def _why_nothing(self) -> str:
+        if not self._unreported:
+            return "no scan was mapped"
+        return f"none of {len(self._unreported)} scans could be used; the first: {self._unreported[0]}"
+
+    def _note_ms(self, stage: str, seconds: float) -> None:
+        self._stage_ms[stage].append(1000 * seconds)
+
+
+def _count(result: SlamResult, *states: MotionState) -> int:
+    return sum(motion.state in states for motion in result.motions)
+
+
+def peak_rss_mb() -> float:
+    """Peak memory of this process plus that of the odometry process, which has ended (MB)."""
+    processes = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return sum(resource.getrusage(process).ru_maxrss for process in processes) / 1024
+
+
+def _other_data(log: Path, difference: str) -> SegslamError:
+    return SegslamError(f"{log}: {difference}; resume with the data that the run began with")
+
+
+def _median_and_p95(times: list[float]) -> dict[str, float]:
+    return {"median": median(times), "p95": float(np.percentile(times, 95))}

@@ -1,0 +1,234 @@
+"""Several finished runs as one: one graph, one map, one log."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import Config
+from segslam.run.accuracy import accuracy
+from segslam.run.finished import FinishedRun, read_run
+from segslam.run.folder import new_folder, write_metrics
+from segslam.run.locator import Locator
+from segslam.run.run import Run
+from segslam.sessions.meeting import Meeting, Shown, attempt, meeting, not_shown
+from segslam.sessions.recorded import Session, Shift, next_shift, read_sessions, shifted_steps
+from segslam.slam import Slam, SlamResult
+from segslam.types import LoopAttempt, SegslamError, Step, Trajectory
+
+OPTIMIZE_EVERY = 25
+"""Chosen: keyframes of a later session until the graph is optimised again; odometry drifts little over 50 m."""
+LOOK_EVERY_M = 12.0
+"""Chosen: travel between two keyframes of a later session that are tried against the sessions before."""
+Taken = tuple[Step, int, bool]
+"""A step, and `below` and `optimize` of `Slam.take`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Merged:
+    """Sessions that meet, in the order in which they are taken over, and how."""
+
+    sessions: tuple[Session, ...]
+    meetings: tuple[Meeting | None, ...]
+    """None for the first session."""
+    shifts: tuple[Shift, ...]
+    reference: Trajectory | None
+    """The true poses of all sessions, if they are known to be in one frame."""
+
+    @property
+    def num_steps(self) -> int:
+        """Scans of all sessions."""
+        return sum(len(session.run.result.trajectory) for session in self.sessions)
+
+    @property
+    def dataset(self) -> str:
+        """What the sessions are of."""
+        return " + ".join(dict.fromkeys(session.run.dataset for session in self.sessions))
+
+    def summary(self) -> str:
+        """In words, a line a session: in which run it was found."""
+        lines = [
+            f"{session.name}: found in {self.sessions[found.earlier].name} by {len(found.found)} of its keyframes"
+            for session, found in zip(self.sessions, self.meetings, strict=True)
+            if found is not None
+        ]
+        return "\n".join(lines)
+
+    def options(self) -> dict[str, str]:
+        """For the log: which runs were merged, and what was added to their numbers."""
+        rows = [
+            {
+                "run": str(session.run.folder.resolve()),
+                "num_scans": len(session.run.result.trajectory),
+                "first_keyframe": shift.keyframe_id,
+                "scan_index_shift": shift.scan_index,
+                "stamp_shift_ns": shift.stamp_ns,
+            }
+            for session, shift in zip(self.sessions, self.shifts, strict=True)
+        ]
+        return {"sessions": json.dumps(rows)}
+
+    def steps(self) -> Iterator[Taken]:
+        """The steps of all sessions; those of later ones are tried against the sessions before them."""
+        for session, shift, found in zip(self.sessions, self.shifts, self.meetings, strict=True):
+            last_id = len(session.travel_m) - 1
+            looked_m = -np.inf
+            for step in shifted_steps(session, shift, self._found(shift, found)):
+                below, optimize = 0, False
+                if step.keyframe is not None:
+                    number = step.keyframe.id - shift.keyframe_id
+                    optimize = number == last_id or (found is not None and number % OPTIMIZE_EVERY == 0)
+                    if step.keyframe.travel_m - looked_m >= LOOK_EVERY_M:
+                        below, looked_m = shift.keyframe_id, step.keyframe.travel_m
+                yield step, below, optimize
+
+    def _found(self, shift: Shift, found: Meeting | None) -> dict[int, tuple[LoopAttempt, ...]]:
+        if found is None:
+            return {}
+        target_shift = self.shifts[found.earlier].keyframe_id
+        return {one[0]: (attempt(one, shift.keyframe_id, target_shift),) for one in found.found}
+
+    def figures(self, result: SlamResult) -> dict[str, Any]:
+        """The figures of `metrics.json` that a merged run has beside those of every run."""
+        first_ids = [shift.keyframe_id for shift in self.shifts[1:]]
+        between = [
+            weight
+            for ids, weight in result.estimate.closure_weights.items()
+            if len(set(np.searchsorted(first_ids, ids, side="right").tolist())) > 1
+        ]
+        return {
+            "num_sessions": len(self.sessions),
+            "num_loops_between": len(between),
+            "num_loops_between_switched_off": sum(weight < 0.5 for weight in between),
+        }
+
+
+def plan(
+    sessions: Sequence[Session], *, config: Config, same_reference: bool = False, shown: Shown = not_shown
+) -> Merged:
+    """How some sessions become one run. Writes nothing.
+
+    `same_reference` means that the true poses of all runs are in one frame, which is known of runs of
+    one sequence. Raises SegslamError that names the run if one meets no other.
+    """
+    taken: list[Session] = [sessions[0]]
+    meetings: list[Meeting | None] = [None]
+    locators: list[Locator] = []
+    waiting, why = list(sessions[1:]), dict[tuple[str, int], str]()
+    while waiting:
+        locators += [Locator.from_run(session.run.folder) for session in taken[len(locators) :]]
+        found = None
+        for session in waiting:
+            found = _first_meeting(session, taken, locators, why, config=config, shown=shown)
+            if found is not None:
+                break
+        if found is None:
+            raise SegslamError(_do_not_meet(waiting[0], taken, why))
+        taken.append(session)
+        meetings.append(found)
+        waiting.remove(session)
+    shifts = _shifts(taken, meetings)
+    return Merged(tuple(taken), tuple(meetings), shifts, _reference(taken, shifts, same_reference))
+
+
+def merge(
+    runs: Sequence[str | Path],
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    same_reference: bool = False,
+    on_step: Callable[[Step], object] = lambda step: None,
+) -> FinishedRun:
+    """Merge finished runs into the new folder `out`, as `segslam merge` does; the merged run.
+
+    Its world is that of the first run. `config`: the settings, those of the first run unless given. `same_reference`
+    means that the true poses of all runs are in one frame. `on_step` is called with each Step. Raises SegslamError that
+    names the run if one did not finish, is damaged, is given twice or meets no other.
+    """
+    from segslam.run.report import write_report
+
+    sessions = read_sessions([Path(run) for run in runs])
+    config = config or sessions[0].run.config
+    merged = plan(sessions, config=config, same_reference=same_reference)
+    with run_of(merged, new_folder(Path(out)), config) as run:
+        for step in run.take(merged.steps()):
+            on_step(step)
+        result, metrics = run.finish()
+    metrics |= merged.figures(result)
+    if merged.reference is not None:
+        metrics |= accuracy(result, merged.reference)
+    write_metrics(run.folder, metrics)
+    write_report(run.folder)
+    return read_run(run.folder)
+
+
+def run_of(merged: Merged, folder: Path, config: Config) -> Run:
+    """The run that takes over the steps of all sessions."""
+    return Run(
+        folder,
+        Slam(config),
+        dataset=merged.dataset,
+        T_camera_lidar=merged.sessions[0].run.T_camera_lidar,
+        reference=merged.reference,
+        options=merged.options(),
+    )
+
+
+def _first_meeting(
+    session: Session,
+    taken: Sequence[Session],
+    locators: Sequence[Locator],
+    why: dict[tuple[str, int], str],
+    *,
+    config: Config,
+    shown: Shown,
+) -> Meeting | None:
+    """How a session lies in the first of some others that it meets. `why` has those that it does not meet."""
+    for number, (earlier, locator) in enumerate(zip(taken, locators, strict=True)):
+        if (session.name, number) not in why:
+            found = meeting(session, earlier, number, locator, config=config, shown=shown)
+            if isinstance(found, Meeting):
+                return found
+            why[session.name, number] = found
+    return None
+
+
+def _do_not_meet(session: Session, taken: Sequence[Session], why: dict[tuple[str, int], str]) -> str:
+    tried = "; ".join(f"in {one.name}: {why[session.name, number]}" for number, one in enumerate(taken))
+    return f"{session.name}: does not meet any other run ({tried}); merge runs that pass the same places"
+
+
+def _shifts(sessions: Sequence[Session], meetings: Sequence[Meeting | None]) -> tuple[Shift, ...]:
+    """What is added to the numbers of each session; its odometry starts where it was found to."""
+    shifts = [Shift()]
+    T_first_world = [np.eye(4)]
+    for before, session, found in zip(sessions[:-1], sessions[1:], meetings[1:], strict=True):
+        T_before_world = T_first_world[-1]
+        if found is not None:
+            T_first_world.append(T_first_world[found.earlier] @ found.T_earlier_world)
+        T_last_first = geometry.inverse(T_before_world @ before.T_world_keyframe[-1]) @ (
+            T_first_world[-1] @ session.T_world_keyframe[0]
+        )
+        T_new_first = shifts[-1].pose(before.T_odom_keyframe[-1]) @ T_last_first
+        T_new_old = T_new_first @ geometry.inverse(session.T_odom_keyframe[0])
+        shifts.append(next_shift(shifts[-1], before, T_new_old, session))
+    return tuple(shifts)
+
+
+def _reference(sessions: Sequence[Session], shifts: Sequence[Shift], same_reference: bool) -> Trajectory | None:
+    """The true poses of all sessions by the new numbers of their scans; None if one has none, or another frame."""
+    sequences = {(one.run.options.get("data"), one.run.options.get("sequence")) for one in sessions}
+    is_one_sequence = len(sequences) == 1 and sequences != {(None, None)}
+    references = [session.run.reference for session in sessions]
+    if not (same_reference or is_one_sequence) or any(reference is None for reference in references):
+        return None
+    known = [(one, shift) for one, shift in zip(references, shifts, strict=True) if one is not None]
+    return Trajectory(
+        np.concatenate([one.scan_index + shift.scan_index for one, shift in known]),
+        np.concatenate([one.stamp_ns + shift.stamp_ns for one, shift in known]),
+        np.concatenate([one.T_world_lidar for one, _ in known]),
+    )

@@ -1,0 +1,175 @@
+"""A finished run as one session of a merged run: its keyframes, and its steps with other numbers."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from segslam.config import Config
+from segslam.health import least_informed
+from segslam.log import RunLog, read_log
+from segslam.proximity import BREAK_TRAVEL_M
+from segslam.registration import shape_labels
+from segslam.run.finished import FinishedRun, read_run
+from segslam.run.folder import folder_of, log_of
+from segslam.submaps import Submaps
+from segslam.trajectory import Poses
+from segslam.types import (
+    Information,
+    Labels,
+    LoopAttempt,
+    LoopClosure,
+    Motion,
+    MotionState,
+    Points,
+    SegslamError,
+    Step,
+    Transform,
+    Vector,
+)
+
+GAP_NS = 1_000_000_000
+"""Chosen: the first scan of a session that does not come later than the session before is put so much after it."""
+UNTIED = Motion(MotionState.BEGUN, information=np.zeros((6, 6)))
+"""The motion to the first scan of a session: nothing is known of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """A finished run with the positions of its keyframes."""
+
+    run: FinishedRun
+    log: RunLog
+    T_world_keyframe: Poses
+    """By the run's own estimate."""
+    T_odom_keyframe: Poses
+    travel_m: Vector
+    informations: tuple[Information | None, ...]
+    """Of the motion to each keyframe from the one before; None where the noise model of odometry holds."""
+
+    @property
+    def name(self) -> str:
+        """The folder of the run."""
+        return str(self.run.folder)
+
+
+def read_session(folder: Path) -> Session:
+    """The session of a run folder, or of its log. Raises SegslamError as `read_run`, or if keyframes are missing."""
+    run = read_run(folder_of(folder))
+    log = read_log(log_of(folder))
+    estimate = run.result.estimate.T_world_keyframe
+    T_odom, travel_m, informations = [], [], []
+    since: list[Motion] = []
+    for step in log.steps(clouds=False):
+        since += [step.motion] if step.motion else []
+        if step.keyframe is not None:
+            T_odom.append(step.keyframe.T_odom_keyframe)
+            travel_m.append(step.keyframe.travel_m)
+            informations.append(least_informed(since))
+            since = []
+    if list(estimate) != list(range(len(T_odom))):
+        raise SegslamError(f"{log.path}: damaged, poses of {len(estimate)} keyframes for {len(T_odom)}; replay it")
+    poses = np.array([estimate[number] for number in range(len(T_odom))])
+    return Session(run, log, poses, np.array(T_odom), np.array(travel_m), tuple(informations))
+
+
+def read_sessions(folders: list[Path]) -> list[Session]:
+    """The sessions of several runs, in their order. Raises SegslamError for fewer than two, or one given twice."""
+    if len(folders) < 2:
+        raise SegslamError(f"{len(folders)} run given; name two or more runs to merge")
+    given: dict[Path, Path] = {}
+    for folder in folders:
+        log = log_of(folder).resolve()
+        if log in given:
+            raise SegslamError(f"{folder}: given twice; name each run once")
+        given[log] = folder
+    return [read_session(folder) for folder in folders]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shift:
+    """What is added to the numbers of a session, so that its steps follow on those of the sessions before."""
+
+    keyframe_id: int = 0
+    scan_index: int = 0
+    stamp_ns: int = 0
+    travel_m: float = 0.0
+    T_new_old: Transform | None = None
+    """Moves the frame of its odometry; None: not at all."""
+
+    def pose(self, T_odom_lidar: Transform) -> Transform:
+        """A pose of the session's odometry in that of the merged run."""
+        return T_odom_lidar if self.T_new_old is None else self.T_new_old @ T_odom_lidar
+
+    def attempt(self, attempt: LoopAttempt) -> LoopAttempt:
+        """A loop of the session by the new ids of its keyframes."""
+        ids = {name: getattr(attempt.candidate, name) + self.keyframe_id for name in ("source_id", "target_id")}
+        outcome = attempt.outcome
+        return replace(
+            attempt,
+            candidate=replace(attempt.candidate, **ids),
+            outcome=replace(outcome, **ids) if isinstance(outcome, LoopClosure) else outcome,
+        )
+
+
+def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopAttempt, ...]]) -> Iterator[Step]:
+    """The steps of a session with their points; `more` are further loops of its keyframes, by their own ids.
+
+    Loops that were tried after the session's last scan come with its last keyframe.
+    """
+    late = session.log.late_loops()
+    last_id = len(session.travel_m) - 1
+    for number, step in enumerate(session.log.steps()):
+        attempts, keyframe, motion = [shift.attempt(attempt) for attempt in step.attempts], step.keyframe, step.motion
+        if keyframe is not None:
+            attempts += [shift.attempt(attempt) for attempt in (late if keyframe.id == last_id else ())]
+            attempts += more.get(keyframe.id, ())
+            keyframe = replace(
+                keyframe,
+                id=keyframe.id + shift.keyframe_id,
+                scan_index=keyframe.scan_index + shift.scan_index,
+                stamp_ns=keyframe.stamp_ns + shift.stamp_ns,
+                T_odom_keyframe=shift.pose(keyframe.T_odom_keyframe),
+                travel_m=keyframe.travel_m + shift.travel_m,
+            )
+        if number == 0 and shift.keyframe_id:
+            motion = UNTIED
+        yield Step(
+            step.scan_index + shift.scan_index,
+            step.stamp_ns + shift.stamp_ns,
+            shift.pose(step.T_odom_lidar),
+            keyframe,
+            tuple(attempts),
+            None,
+            step.stage_seconds,
+            motion,
+        )
+
+
+def next_shift(before: Shift, session: Session, T_new_old: Transform, following: Session) -> Shift:
+    """The shift of the session `following`, after `session` with the shift `before`. Stamps that are later stay."""
+    last_ns = int(session.run.result.trajectory.stamp_ns[-1]) + before.stamp_ns
+    first_ns = int(following.run.result.trajectory.stamp_ns[0])
+    return Shift(
+        keyframe_id=before.keyframe_id + len(session.travel_m),
+        scan_index=before.scan_index + int(session.run.result.trajectory.scan_index[-1]) + 1,
+        stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
+        travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_TRAVEL_M,
+        T_new_old=T_new_old,
+    )
+
+
+def submaps(session: Session, config: Config) -> Callable[[int], tuple[Points, Labels]]:
+    """The points and labels of a keyframe of the session by its id; of a thin one with its neighbours'."""
+    recorded = session.log.keyframes()
+    made = Submaps(config, lambda: recorded, partial(shape_labels, config=config), lambda: session.travel_m)
+    for number in range(len(recorded)):
+        made.add(session.T_odom_keyframe[number], labelled_by_shape=bool(recorded[number].labelled_by_shape))
+
+    def of(keyframe_id: int) -> tuple[Points, Labels]:
+        submap = made.submap(keyframe_id)
+        return submap.points, submap.labels
+
+    return of

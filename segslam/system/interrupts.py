@@ -1,0 +1,137 @@
+"""Ctrl-C: one message at the end of a command, and sections that Ctrl-C does not interrupt."""
+
+import os
+import shlex
+import shutil
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import ClassVar
+
+EXIT_STATUS = 130
+PATIENCE = 2
+"""Number of Ctrl-C that end the command in order; the next one ends it at once. The log stays readable."""
+
+
+class _Heard:
+    times = 0
+    line = ""
+    unfinished: ClassVar[set[Path]] = set()
+
+
+def when_stopped(line: str) -> None:
+    """Set the message printed if Ctrl-C ends the command: which results exist, and how to continue."""
+    _Heard.line = line
+
+
+@contextmanager
+def removed_when_stopped(path: Path) -> Iterator[None]:
+    """Have an unfinished file or folder removed also where Ctrl-C ends the process at once."""
+    _Heard.unfinished.add(path)
+    try:
+        yield
+    finally:
+        _Heard.unfinished.discard(path)
+
+
+def stop_line() -> str:
+    """The message set by `when_stopped`."""
+    return f"segslam: stopped: {_Heard.line}"
+
+
+def same_command_with(option: str) -> str:
+    """The command line of this process with one more option, quoted for a shell."""
+    given = sys.argv[1:]
+    return shlex.join(["segslam", *given, *([] if option in given else [option])])
+
+
+@contextmanager
+def ctrl_c_in_order() -> Iterator[None]:
+    """Within it Ctrl-C raises KeyboardInterrupt, except during an import, where it ends the process at once.
+
+    An extension module that is interrupted while it is imported raises another error, or none.
+    """
+    _Heard.times, _Heard.line = 0, "nothing was written"
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGINT, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _interrupt(_: int, frame: FrameType | None) -> None:
+    _Heard.times += 1
+    if _Heard.times > PATIENCE or _is_importing(frame):
+        _remove_unfinished()
+        os.write(2, f"{stop_line()}\n".encode())
+        os._exit(EXIT_STATUS)
+    raise KeyboardInterrupt
+
+
+def _remove_unfinished() -> None:
+    """With modules that are loaded already: this may be in the middle of an import."""
+    for path in tuple(_Heard.unfinished):
+        with suppress(OSError):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+@contextmanager
+def interrupts_wait() -> Iterator[list[int]]:
+    """Within it Ctrl-C has no effect until the end; the returned list receives an entry for each.
+
+    Unlike an exception, a list entry cannot be lost in a callback of a library. If Ctrl-C was ignored before, as in
+    background jobs of a script, it still is. Only the main thread receives Ctrl-C.
+    """
+    interrupts: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+        yield interrupts
+        return
+    signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
+    try:
+        yield interrupts
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if interrupts:
+        signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def stopped_by_signals(stop: Callable[[], object]) -> Iterator[None]:
+    """The first Ctrl-C or SIGTERM calls `stop` and ends nothing; the next does what it would have done without this."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
+    if threading.current_thread() is not threading.main_thread():
+        before = {}
+
+    def hear(_: int, __: FrameType | None) -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        stop()
+
+    for number in before:
+        signal.signal(number, hear)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

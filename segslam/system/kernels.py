@@ -1,0 +1,239 @@
+"""Functions that numba compiles: when they are first called, or all at once by `build`. Their code is kept on disk.
+
+numba itself is imported with the first of them: a command that calls none starts without it.
+"""
+
+import hashlib
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, update_wrapper
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from queue import Queue
+from typing import Any, TypeVar, cast
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+PACKAGE = Path(__file__).resolve().parents[1]
+MODULES = (
+    "segregator.descent",
+    "cliques.search",
+    "cliques.bits",
+    "segregator.fpfh",
+    "segregator.consistency_graph",
+    "semantics.ground_surface",
+    "semantics.solids",
+    "semantics.uprights",
+    "semantics.walls",
+    "semantics.votes",
+    "segregator.clusters",
+    "segregator.correspondences",
+    "segregator.feet",
+    "segregator.gaussians",
+    "segregator.ground_patches",
+    "pose_graph.closure_pairs",
+    "map.views",
+    "verification.free_space",
+    "points",
+)
+"""Modules of this package that define kernels, the slowest to compile first."""
+DONE = "done "
+"""Begins the line of a process that has compiled a kernel."""
+
+_all: list["Kernel"] = []
+_lock = threading.RLock()
+
+
+class Kernel:
+    """A function that is compiled for one signature when it is first called; other kernels may call it."""
+
+    def __init__(self, function: Callable[..., Any], signature: str) -> None:
+        update_wrapper(self, function)
+        self.py_func = function
+        self.signature = signature
+        self._compiled: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:  # noqa: D102
+        return (self._compiled or self.compiled)(*arguments)
+
+    @property
+    def compiled(self) -> Any:
+        """numba's dispatcher, which takes no other signature."""
+        with _lock:
+            if self._compiled is None:
+                self._compiled = _compile(self.py_func, self.signature)
+        return self._compiled
+
+
+def kernel(signature: str) -> Callable[[Function], Function]:
+    """Have a function of numbers and arrays compiled for a signature of numba's; it runs without the global lock."""
+
+    def decorate(function: Function) -> Function:
+        made = Kernel(function, signature)
+        _all.append(made)
+        return cast(Function, made)
+
+    return decorate
+
+
+def num_kernels(modules: Sequence[str] = MODULES) -> int:
+    """How many kernels these modules define."""
+    return sum(_file(name).read_text(encoding="utf-8").count("\n@kernel(") for name in modules)
+
+
+def are_built(modules: Sequence[str] = MODULES) -> bool:
+    """Whether `build` has compiled the kernels as they are now, for this machine and these versions."""
+    return _stamp(modules).exists()
+
+
+def build(modules: Sequence[str] = MODULES) -> Iterator[str]:
+    """Compile all kernels of these modules in two processes; yields the name of each when it is done.
+
+    Raises RuntimeError, with the last lines that a process wrote, if it fails.
+    """
+    lines: Queue[str] = Queue()
+    processes = [_start(modules, backwards=backwards) for backwards in (False, True)]
+    threads = [threading.Thread(target=_pass_on, args=(process, lines)) for process in processes]
+    for thread in threads:
+        thread.start()
+    try:
+        yield from _names_of_done(lines, num_kernels(modules))
+    finally:
+        for process, thread in zip(processes, threads, strict=True):
+            process.kill()  # nothing happens to one that has ended
+            thread.join()
+    stamp = _stamp(modules)
+    stamp.parent.mkdir(parents=True, exist_ok=True)
+    stamp.touch()
+
+
+def cache_folder() -> Path | None:
+    """Where compiled code is kept if not beside the modules, which is numba's choice: None.
+
+    NUMBA_CACHE_DIR if it is set and can be written to; beside the modules if that can be; else a folder of the user's,
+    or one in the folder for temporary files.
+    """
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given and _can_write(Path(given)):
+        return Path(given)
+    if all(os.access(_file(name).parent, os.W_OK) for name in MODULES):
+        return None
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "segslam"
+    return home if _can_write(home) else Path(tempfile.gettempdir()) / f"segslam-{os.getuid()}"
+
+
+def _can_write(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
+
+
+def _compile(function: Callable[..., Any], signature: str) -> Any:
+    numba = _numba()
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(cache_folder() or "")
+    try:
+        return numba.njit(signature, nogil=True, cache=True)(function)
+    except RuntimeError as error:
+        if "cannot cache" not in str(error):
+            raise
+        return numba.njit(signature, nogil=True)(function)  # nowhere to keep it, as on a full disk
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+@cache
+def _numba() -> Any:
+    """numba, with a rule that a kernel called by another has the type of its compiled function."""
+    import numba
+    from numba.core.types import Dispatcher
+    from numba.extending import typeof_impl
+
+    @typeof_impl.register(Kernel)
+    def _type(kernel: Kernel, _: Any) -> Any:
+        return Dispatcher(kernel.compiled)
+
+    return numba
+
+
+def _stamp(modules: Sequence[str]) -> Path:
+    """The file that `build` writes: its name is a digest of source, versions and processor."""
+    digest = hashlib.sha256()
+    for name in modules:
+        about = _file(name).stat()
+        digest.update(f"{name} {about.st_mtime_ns} {about.st_size}\n".encode())
+    versions = [platform.python_version(), *(version(package) for package in ("numba", "llvmlite", "numpy"))]
+    digest.update(f"{versions} {platform.machine()} {_processor()}".encode())
+    return (cache_folder() or PACKAGE / "__pycache__") / f"kernels-{digest.hexdigest()[:16]}.built"
+
+
+def _processor() -> str:
+    """The lines that identify the processor, on Linux."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return platform.processor()
+    return "".join(line for line in text.partition("\n\n")[0].splitlines() if line.startswith(("model name", "flags")))
+
+
+def _start(modules: Sequence[str], *, backwards: bool) -> subprocess.Popen[str]:
+    code = f"from segslam.system.kernels import _build; _build({list(modules)}, backwards={backwards})"
+    path = os.pathsep.join([str(PACKAGE.parent), *filter(None, sys.path)])
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
+    )
+
+
+def _names_of_done(lines: "Queue[str]", total: int) -> Iterator[str]:
+    """The name of each kernel when the first process reports it, until there are `total`."""
+    done: set[str] = set()
+    others: list[str] = []
+    while len(done) < total:
+        line = lines.get()
+        name = line.removeprefix(DONE)
+        if not line:
+            raise RuntimeError(f"the kernels were not compiled: {' '.join(others[-3:]) or 'a process was stopped'}")
+        if name == line:
+            others.append(line)
+        elif name not in done:
+            done.add(name)
+            yield name
+
+
+def _pass_on(process: subprocess.Popen[str], lines: "Queue[str]") -> None:
+    """Each line that the process writes, and an empty one if it ends in failure."""
+    assert process.stdout is not None
+    with process.stdout as output:
+        for line in output:
+            lines.put(line.strip() or "-")
+    if process.wait():
+        lines.put("")
+
+
+def _build(modules: Sequence[str], *, backwards: bool) -> None:
+    """Compile the kernels one by one, and print a line for each.
+
+    Two processes meet in the middle: the kernels that one has compiled the other loads, in milliseconds.
+    """
+    for name in reversed(modules) if backwards else modules:
+        module = import_module(f"segslam.{name}")
+        own = [kernel for kernel in _all if kernel.__module__ == module.__name__]
+        for kernel in reversed(own) if backwards else own:
+            kernel.compiled  # noqa: B018  (compiles it)
+            print(f"{DONE}{kernel.__module__}.{kernel.py_func.__qualname__}", flush=True)
+
+
+def _file(module: str) -> Path:
+    return PACKAGE.joinpath(*module.split(".")).with_suffix(".py")

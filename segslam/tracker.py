@@ -1,0 +1,81 @@
+"""The front of the pipeline: odometry, its check, and which scans become keyframes. It knows no graph and no log."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+from segslam.config import Config
+from segslam.health import CheckedOdometry
+from segslam.keyframes import KeyframeSelector
+from segslam.odometry import KissOdometry, Odometry, OdometryResult
+from segslam.proximity import BREAK_TRAVEL_M
+from segslam.registration import Stopwatch, register
+from segslam.trajectory import Poses
+from segslam.types import BadScan, Indices, Motion, MotionState, Scan, Step, Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """A scan that odometry has placed. What follows, `Slam.close_loops`, may be done while the next is tracked."""
+
+    scan_index: int
+    stamp_ns: int
+    registered: OdometryResult | None
+    """What a keyframe is cut from; None where none is to be cut."""
+    T_odom_lidar: Transform
+    travel_m: float
+    motion: Motion
+    watch: Stopwatch
+
+
+class Tracker:
+    """Places scan after scan by odometry. Its results may be sent to another process."""
+
+    def __init__(self, config: Config, *, odometry: Odometry | None = None) -> None:
+        """`odometry` replaces KISS-ICP."""
+        self._odometry = CheckedOdometry(
+            odometry or KissOdometry(config.odometry), config, recover=partial(register, config=config)
+        )
+        self._selector = KeyframeSelector(config.keyframes)
+        self._num_tracked = 0
+        self._last_stamp_ns: int | None = None
+
+    def track(self, scan: Scan, *, gap: float = 1.0) -> Tracked:
+        """Where the scan was taken, and whether it becomes a keyframe.
+
+        `gap`: time since the scan before, in intervals of the sensor, where scans between were lost; the constant
+        velocity that odometry assumes is scaled by it. Raises BadScan, and forgets the scan, if it cannot be used or is
+        not later than the one before.
+        """
+        self._check_later(scan)
+        index = self._num_tracked if scan.index is None else scan.index
+        scan = replace(scan, index=index)
+        watch = Stopwatch()
+        with watch("odometry"):
+            registered = self._odometry.register(scan, gap=gap)
+        self._last_stamp_ns = scan.stamp_ns
+        self._num_tracked += 1
+        T_odom_lidar = registered.T_odom_lidar
+        motion = registered.motion or Motion(MotionState.UNCHECKED)
+        is_keyframe = self._selector.update(T_odom_lidar, break_m=BREAK_TRAVEL_M * motion.is_break)
+        kept = registered if is_keyframe else None
+        return Tracked(index, scan.stamp_ns, kept, T_odom_lidar, self._selector.travel_m, motion, watch)
+
+    def note(self, recorded: Step) -> None:
+        """Take note of a step that was made before, which `restore` lets `track` follow on."""
+        motion = recorded.motion or Motion(MotionState.UNCHECKED)
+        self._selector.update(recorded.T_odom_lidar, break_m=BREAK_TRAVEL_M * motion.is_break)
+        self._last_stamp_ns = recorded.stamp_ns
+
+    def restore(
+        self, T_odom_lidar: Poses, motions: Sequence[Motion], stamps_ns: Indices, scan_of: Callable[[int], Scan]
+    ) -> None:
+        """Go on after scans with these poses, motions and stamps; `scan_of` reads the scan of a row."""
+        self._odometry.restore(T_odom_lidar, motions, stamps_ns, scan_of)
+
+    def _check_later(self, scan: Scan) -> None:
+        if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:
+            raise BadScan(
+                f"scan {scan.index}: its stamp {scan.stamp_ns} ns is not later than {self._last_stamp_ns} ns, that of "
+                "the scan before; give each scan once, in order of time"
+            )

@@ -1,0 +1,169 @@
+"""`segslam bench` as typed: the contract's figures, reports, and bad usage in one line."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import run
+from helpers.drives import NUM_SCANS, write_kitti_sequence
+
+KEYS = {
+    "num_pairs",
+    "success_percent",
+    "translation_m",
+    "rotation_deg",
+    "num_false_accepted",
+    "num_rejected",
+    "median_ms",
+    "p95_ms",
+    "mean_edges",
+}
+"""Scripts outside the project read them."""
+QUICK = ("--method", "segregator", "--method", "segator", "--labels", "true_labels", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive that holds only the scans that its list names: all others have no file."""
+    folder = tmp_path_factory.mktemp("kitti")
+    velodyne = write_kitti_sequence(folder)
+    named = {0, 10, 3, 55, 5, 57, 9, 60}
+    for number in set(range(NUM_SCANS)) - named:
+        (velodyne / f"{number:06d}.bin").unlink()
+    (folder / "pairs.txt").write_text("3 55\n5 57\n9 60\n")
+    return folder
+
+
+def bench(kind: str, data: Path, *options: object) -> int:
+    return run("bench", kind, data, "--pairs", data / "pairs.txt", *QUICK, *options)
+
+
+def test_pairs_prints_the_figures_of_each_method_and_a_row_a_registration(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert bench("pairs", data, "--json", "--details", tmp_path / "rows.csv") == 0
+    printed = capsys.readouterr()
+    figures = json.loads(printed.out)
+    assert printed.err == ""
+    assert list(figures) == ["segregator", "segator"]
+    for own in figures.values():
+        assert set(own) >= KEYS
+        assert own["num_pairs"] == 3
+        assert own["success_percent"] == 100.0
+        assert own["translation_m"] < 0.3
+        assert 0 < own["median_ms"] <= own["p95_ms"]
+        assert own["mean_edges"] > 0
+    with (tmp_path / "rows.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["source"], row["target"], row["method"]) for row in rows[:2]] == [
+        ("3", "55", "segregator"),
+        ("3", "55", "segator"),
+    ]
+    assert len(rows) == 6
+
+
+def test_a_list_can_be_cut_from_the_true_poses_and_sampled(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cut = ("--min-m", 0, "--max-m", 8, "--min-gap", 45)
+    assert run("bench", "pairs", data, *cut, *QUICK, "--json") == 0
+    whole = json.loads(capsys.readouterr().out)["segregator"]["num_pairs"]
+    assert whole > 2
+    assert run("bench", "pairs", data, *cut, "--sample", 2, *QUICK, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["segregator"]["num_pairs"] == 2
+
+
+def test_the_report_tells_figures_paper_and_conditions_and_draws_failures(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """GICP from the identity fails where 12 m and 40 degrees lie between the scans, which gives something to draw."""
+    out = tmp_path / "out"
+    (tmp_path / "pairs.txt").write_text("0 57\n3 60\n3 9\n")
+    options = ("--pairs", tmp_path / "pairs.txt", "--sample", 2, "--method", "gicp", *QUICK, "--out", out)
+    assert run("bench", "pairs", data, *options, "--draw", 2) == 0
+    assert capsys.readouterr().out == ""
+    report = json.loads((out / "report.json").read_text())
+    assert report["lists"] == [{"name": "pairs", "pairs": 2, "of": 3}]
+    assert report["options"]["seed"] == 0
+    assert {"machine", "commit", "packages", "settings", "notes"} <= set(report)
+    page, text = (out / "report.html").read_text(), (out / "report.md").read_text()
+    assert "http" not in page.split("<body>")[0]
+    assert page.count("data:image/svg+xml") == 2
+    failures = list(out.glob("failure_*.png"))
+    assert len(failures) == page.count("data:image/png") == 2
+    assert "SAMPLED: pairs 2 of 3" in text
+    assert "| segregator | 2 | 100.0 |" in text
+    assert str(data) not in page + text + json.dumps(report)
+    before = (out / "details.csv").read_bytes()
+    assert run("bench", "pairs", data, *options) == 0  # nothing is left to do
+    assert (out / "details.csv").read_bytes() == before
+
+
+def test_yaw_turns_the_source_of_the_papers_pair(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("bench", "yaw", data, "--step-deg", 90, *QUICK, "--json", "--out", tmp_path) == 0
+    by = json.loads(capsys.readouterr().out)["segregator"]["by"]
+    assert [one["yaw_deg"] for one in by] == [0, 90, 180, 270]
+    errors = [one["accepted_m"] for one in by]
+    assert np.ptp(errors) < 0.1  # a turn changes the bins of the clusters and no more
+    assert "Success (%) by yaw" in (tmp_path / "report.md").read_text()
+
+
+def test_deterioration_takes_labels_from_one_scan_or_both(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--lost", 30, "--lost", 100, "--draws", 2, "--json")
+    for clouds in ("one", "both"):
+        assert bench("deterioration", data, *options, "--clouds", clouds, "--out", tmp_path / clouds) == 0
+        by = json.loads(capsys.readouterr().out)["segregator"]["by"]
+        assert [(one["lost_percent"], one["num_pairs"], one["num_rejected"]) for one in by] == [(30, 6, 0), (100, 6, 6)]
+    assert "| 100 | 0.0 | 0.0 |" in (tmp_path / "both" / "report.md").read_text()
+
+
+def test_timing_tells_the_time_of_each_stage(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench("timing", data, "--json") == 0
+    own = json.loads(capsys.readouterr().out)["segregator"]
+    assert own["stage_ms"]["prepare_ms"] > 0
+    assert own["stage_ms"]["match_ms"] > 0
+    assert own["stage_ms"]["refine_ms"] is None
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--method", "magic"], "magic"),
+        (["--min-m", "3"], "not both"),
+        (["--draw", "2"], "--out"),
+        (["--sequence", "09"], "09"),
+        (["--set", "segregator.magic=1"], "segregator.magic"),
+    ],
+)
+def test_bad_usage_is_named_in_one_line(
+    data: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    assert bench("pairs", data, *options) == 2
+    message = capsys.readouterr().err.strip()
+    assert said in message
+    assert len(message.splitlines()) == 1
+
+
+def test_missing_scans_and_lists_are_named(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "other.txt").write_text("3 55\n4 56\n")
+    assert run("bench", "pairs", data, "--pairs", tmp_path / "other.txt", *QUICK) == 2
+    assert "scan 4 has no file" in capsys.readouterr().err
+    assert run("bench", "pairs", data, *QUICK) == 2
+    assert "--pairs" in capsys.readouterr().err
+
+
+def test_a_broken_scan_costs_its_pairs_alone(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = data / "sequences" / "00" / "velodyne" / "000055.bin"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:1001])
+    try:
+        assert bench("pairs", data, "--json", "--details", tmp_path / "rows.csv") == 0
+    finally:
+        file.write_bytes(whole)
+    own = json.loads(capsys.readouterr().out)["segregator"]
+    assert (own["num_pairs"], own["num_rejected"]) == (3, 1)
+    assert "bad_scan" in (tmp_path / "rows.csv").read_text()

@@ -1,0 +1,96 @@
+"""`segslam compare`, `eval --plot` and `doctor` as typed."""
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.commands import run
+from helpers.finished_run import make_run
+from matplotlib.image import imread
+
+from segslam.cli import doctor
+from segslam.run.folder import write_metrics
+from segslam.trajectory import write_kitti
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A run with ground truth and one without."""
+    root = tmp_path_factory.mktemp("runs")
+    folders = [make_run(root / "one").folder, make_run(root / "two", with_truth=False).folder]
+    write_metrics(folders[0], {"ate_m": 0.25, "num_scans": 120, "num_loops_accepted": 4})
+    write_metrics(folders[1], {"num_scans": 120, "num_loops_accepted": 7})
+    return folders
+
+
+def test_runs_stand_side_by_side(runs: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("compare", *runs) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["one", "two"]
+    assert next(line.split()[:2] for line in lines if "loops accepted" in line) == ["4", "7"]
+    assert next(line.split()[:2] for line in lines if "trajectory error" in line) == ["0.25", "-"]
+
+
+def test_figures_and_picture_of_several_runs(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plot = tmp_path / "both.png"
+    assert run("compare", *runs, "--plot", plot, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["plot"] == str(plot)
+    assert found["runs"]["two"]["num_loops_accepted"] == 7
+    assert imread(plot).std() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("second", "options", "said"),
+    [
+        ("nowhere", (), "nowhere: no such file or folder"),
+        ("one", (), "two or more different runs"),
+        ("two", ("--plot", "both.doc"), "both.doc: not a picture"),
+        ("two", ("--plot", "nowhere/both.png"), "there is no folder nowhere"),
+    ],
+)
+def test_what_cannot_be_compared_is_told_in_one_line(
+    runs: list[Path], capsys: pytest.CaptureFixture[str], second: str, options: tuple[str, ...], said: str
+) -> None:
+    assert run("compare", runs[0], runs[0].parent / second, *options) == 2
+    message = capsys.readouterr().err.strip()
+    assert said in message
+    assert len(message.splitlines()) == 1
+
+
+def test_eval_draws_a_run_and_a_trajectory(runs: list[Path], tmp_path: Path) -> None:
+    made = make_run(tmp_path / "run")
+    assert run("eval", made.folder, "--plot", tmp_path / "run.png", "--quiet") == 0
+    for name, trajectory in (("truth", made.truth), ("estimate", made.result.odometry)):
+        write_kitti(tmp_path / f"{name}.txt", trajectory.T_world_lidar)
+    files = ("--estimate", tmp_path / "estimate.txt", "--reference", tmp_path / "truth.txt")
+    assert run("eval", *files, "--plot", tmp_path / "files.svg", "--quiet") == 0
+    assert imread(tmp_path / "run.png").std() > 0.05
+    assert "<svg" in (tmp_path / "files.svg").read_text()
+
+
+def test_the_doctor_names_versions_libraries_and_caches(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("doctor", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["packages"]["core"]["gtsam"]
+    assert found["packages"]["viewer"].keys() == {"rerun-sdk"}
+    assert set(found["libraries"]) == set(doctor.LIBRARIES)
+    assert found["cores"] >= 1
+    assert found["memory_gb"]["total"] > 0
+    assert found["problems"] == []
+    assert run("doctor") == 0
+    assert "shared libraries:" in capsys.readouterr().out
+
+
+def test_the_doctor_names_the_remedy_of_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    version = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "kiss-icp" else version(name))
+    monkeypatch.setattr(doctor, "_loads", lambda name: name != "libGL.so.1")
+    assert run("doctor") == 1
+    told = capsys.readouterr().out
+    assert "pip install kiss-icp" in told
+    assert "apt-get install libgl1" in told

@@ -1,0 +1,128 @@
+"""`segslam eval` as typed: figures out, metrics.json brought up to date, bad input in one line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.finished_run import METRICS, make_run
+
+from segslam import cli
+from segslam.evaluation import trajectory_metrics
+from segslam.trajectory import read_poses, write_kitti, write_tum
+
+
+def _eval(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["eval", *(str(argument) for argument in arguments)])
+    return int(ended.value.code or 0)
+
+
+def _write_pair(folder: Path, *, num_estimated: int = 60) -> tuple[Path, Path]:
+    """An estimate in KITTI's format and the truth of 60 poses, and their TUM twins."""
+    rng = np.random.default_rng(0)
+    truth = np.tile(np.eye(4), (60, 1, 1))
+    truth[:, :3, 3] = np.cumsum(rng.normal(size=(60, 3)), axis=0)
+    estimate = truth.copy()
+    estimate[:, :3, 3] += 0.1 * rng.normal(size=(60, 3))
+    stamps = np.arange(60) * 10**8
+    write_kitti(folder / "truth.txt", truth)
+    write_kitti(folder / "estimate.txt", estimate[:num_estimated])
+    write_tum(folder / "truth_tum.txt", stamps[::-1], truth[::-1])
+    write_tum(folder / "estimate_tum.txt", stamps[:num_estimated] + 3_000_000, estimate[:num_estimated])
+    return folder / "estimate.txt", folder / "truth.txt"
+
+
+def test_two_files_are_scored_as_the_library_scores_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    estimate, truth = _write_pair(tmp_path)
+    assert _eval("--estimate", estimate, "--reference", truth, "--json") == 0
+    figures = json.loads(capsys.readouterr().out)
+    expected = trajectory_metrics(read_poses(estimate).T_a_b, read_poses(truth).T_a_b, up=(0.0, -1.0, 0.0))
+    assert figures == expected | {"num_poses": 60}
+
+
+def test_tum_files_are_matched_by_stamp_to_the_same_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    estimate, truth = _write_pair(tmp_path)
+    _eval("--estimate", estimate, "--reference", truth, "--up", "z", "--json")
+    by_row = json.loads(capsys.readouterr().out)
+    tum = ("--estimate", tmp_path / "estimate_tum.txt", "--reference", tmp_path / "truth_tum.txt", "--json")
+    assert _eval(*tum) == 0
+    assert json.loads(capsys.readouterr().out) == pytest.approx(by_row, abs=1e-9)
+    assert _eval(*tum, "--max-difference", "0.002") == 2
+    assert "only 0 of its 60 poses match one of the 60" in capsys.readouterr().err
+
+
+def test_rows_of_another_number_cannot_be_matched_but_stamps_can(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimate, truth = _write_pair(tmp_path, num_estimated=40)
+    assert _eval("--estimate", estimate, "--reference", truth) == 2
+    assert "estimate.txt: 40 poses, but" in capsys.readouterr().err
+    tum = ("--estimate", tmp_path / "estimate_tum.txt", "--reference", tmp_path / "truth_tum.txt")
+    assert _eval(*tum) == 0
+    printed = capsys.readouterr()
+    assert "scored 40 poses; the estimate has 40, the reference 60" in printed.err
+    assert "absolute trajectory error after alignment" in printed.out
+
+
+def test_figures_of_an_earlier_reference_do_not_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make_run(tmp_path / "run")
+    assert _eval(made.folder, "--json") == 0
+    assert "num_loops_false" in json.loads(capsys.readouterr().out)
+    few = made.truth.stamp_ns[:4], made.truth.T_world_lidar[:4]  # no loop lies within
+    write_tum(tmp_path / "few.txt", *few)
+    assert _eval(made.folder, "--reference", tmp_path / "few.txt", "--json") == 0
+    printed = capsys.readouterr()
+    assert "scored 4 scans that have a reference pose, of 120" in printed.err
+    assert not {"num_loops_false", "loop_precision"} & json.loads(printed.out).keys()
+    write_tum(tmp_path / "few.txt", few[0][:2], few[1][:2])
+    assert _eval(made.folder, "--reference", tmp_path / "few.txt") == 2
+    assert "only 2 of 120 scans have a pose" in capsys.readouterr().err
+
+
+def test_run_takes_the_new_figures_into_its_metrics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make_run(tmp_path / "run")
+    assert _eval(made.folder, "--json") == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures == json.loads((made.folder / "metrics.json").read_text())
+    assert {key: figures[key] for key in METRICS} == METRICS
+    assert figures["num_loops_false"] == 1
+    assert figures["loop_precision"] == 0.75
+    assert figures["ate_m"] < 0.2 * figures["odometry_ate_m"]  # made so: the keyframes are true, the odometry drifts
+
+
+def test_run_is_scored_against_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make_run(tmp_path / "run", with_truth=False)
+    assert _eval(made.folder) == 2
+    assert "the data had no ground-truth poses; give a file with --reference" in capsys.readouterr().err
+    write_tum(tmp_path / "truth.txt", made.truth.stamp_ns, made.truth.T_world_lidar)
+    assert _eval(made.folder, "--reference", tmp_path / "truth.txt", "--quiet") == 0
+    assert capsys.readouterr().out == ""
+    assert json.loads((made.folder / "metrics.json").read_text())["num_loops_false"] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([], "give either a run folder, or two files"),
+        (["--estimate", "estimate.txt"], "give either a run folder, or two files"),
+        (["nowhere"], "nowhere: no such folder"),
+        (["--estimate", "nowhere.txt", "--reference", "truth.txt"], "nowhere.txt: cannot read the poses"),
+        (["--estimate", "estimate.txt", "--reference", "truth_tum.txt"], "not the format of"),
+        (["--estimate", "estimate.txt", "--reference", "truth.txt", "--format", "tum"], "found 12 numbers; TUM"),
+    ],
+)
+def test_bad_input_ends_with_status_2_and_one_line(
+    tmp_path: Path,
+    arguments: list[str],
+    complaint: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _write_pair(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert _eval(*arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert complaint in printed.err
+    assert printed.err.count("\n") == 1

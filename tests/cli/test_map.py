@@ -1,0 +1,88 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import run
+from helpers.drives import round_drive, write_kitti_sequence
+
+from segslam.log import read_log
+from segslam.trajectory import read_poses, write_kitti
+
+RUN_FILES = {
+    "config.yaml",
+    "graph.g2o",
+    "log.mcap",
+    "loops.csv",
+    "metrics.json",
+    "odometry_kitti.txt",
+    "odometry_tum.txt",
+    "poses_kitti.txt",
+    "poses_tum.txt",
+    "report.html",
+}
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten scans in KITTI's format, the fifth truncated."""
+    root = tmp_path_factory.mktemp("kitti")
+    broken = write_kitti_sequence(root, num_scans=10) / "000004.bin"
+    broken.write_bytes(broken.read_bytes()[:-5])
+    return root
+
+
+def test_map_writes_a_whole_run_and_skips_the_bad_scan(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert run("map", kitti, "--out", out, "--json", "--quiet") == 0
+    printed = capsys.readouterr()
+    metrics = json.loads(printed.out)
+    assert metrics == json.loads((out / "metrics.json").read_text())
+    assert {file.name for file in out.iterdir()} >= RUN_FILES
+    assert (metrics["num_scans"], metrics["num_scans_skipped"]) == (9, 1)
+    assert len(read_poses(out / "poses_kitti.txt")) == 9
+    assert len(list(read_log(out / "log.mcap").steps())) == 9
+    assert {"ate_m", "odometry_ate_m", "rpe_m", "stage_ms", "peak_rss_mb"} <= set(metrics)
+    assert metrics["num_motions_broken"] == 0, "a missing scan breaks nothing"
+
+
+def test_a_run_folder_is_never_written_over(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis.txt").write_text("results")
+    assert run("map", kitti, "--out", tmp_path) == 2
+    assert "not empty" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--set", "keyframes.distance=1"], "keyframes.distance"),
+        (["--sequence", "07"], "07"),
+        (["--frames", "50:60"], "--frames 50:60"),
+        (["--labels", "nowhere"], "nowhere"),
+        (["--odometry", "missing.txt"], "missing.txt"),
+        (["--config", "missing.yaml"], "missing.yaml"),
+        (["--dataset", "kitty"], "kitty"),
+    ],
+)
+def test_bad_usage_says_what_is_wrong_in_one_line_and_writes_nothing(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    out = tmp_path / "run"
+    assert run("map", kitti, "--out", out, *options) == 2
+    message = capsys.readouterr().err.strip()
+    assert said in message
+    assert len(message.splitlines()) == 1
+    assert not out.exists()
+
+
+def test_an_odometry_is_taken_as_given(kitti: Path, tmp_path: Path) -> None:
+    given = tmp_path / "given.txt"
+    write_kitti(given, round_drive()[1].T_world_lidar)
+    assert run("map", kitti, "--out", tmp_path / "run", "--odometry", given, "--quiet") == 0
+    poses = read_poses(tmp_path / "run" / "odometry_tum.txt").T_a_b
+    truth = round_drive()[1].T_world_lidar
+    expected = np.linalg.inv(truth[0]) @ truth[[0, 1, 2, 3, 5, 6, 7, 8, 9]]
+    np.testing.assert_allclose(poses, expected, atol=1e-6)

@@ -1,0 +1,105 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from helpers.commands import run
+from helpers.drives import drifting, round_drive
+
+from segslam.config import load_config
+from segslam.log import LogWriter, read_log
+from segslam.odometry import GivenOdometry
+from segslam.slam import Slam
+from segslam.types import LoopAttempt, LoopClosure
+
+pytestmark = pytest.mark.usefixtures("blank_reports")
+
+CONFIG = load_config(None, ["proximity.min_travel_m=60"])
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a drive around a block and a bit more, with loops."""
+    scans, truth = round_drive()
+    slam = Slam(CONFIG, odometry=GivenOdometry(drifting(truth), CONFIG.odometry))
+    path = tmp_path_factory.mktemp("run") / "log.mcap"
+    with LogWriter(path, config=CONFIG, dataset="round", reference=truth) as log:
+        for scan in scans:
+            log.write(slam.process(scan))
+        result = slam.finish()
+        log.write_result(result.estimate, result.trajectory)
+    return path
+
+
+def _attempts(log: Path) -> list[LoopAttempt]:
+    return [attempt for step in read_log(log).steps() for attempt in step.attempts]
+
+
+def _pair_and_outcome(attempt: LoopAttempt) -> tuple[Any, ...]:
+    """All of an attempt that does not depend on the clock."""
+    pair = (attempt.candidate.source_id, attempt.candidate.target_id)
+    if isinstance(attempt.outcome, LoopClosure):
+        return (*pair, attempt.outcome.T_target_source.tolist(), attempt.outcome.alignment.overlap)
+    return (*pair, attempt.outcome)
+
+
+def test_a_replay_with_the_same_settings_repeats_the_run(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "again"
+    assert run("replay", log, "--out", out, "--json", "--quiet") == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics == json.loads((out / "metrics.json").read_text())
+    assert (metrics["num_loops_won"], metrics["num_loops_lost"]) == (0, 0)
+    assert metrics["num_loops_accepted"] > 0
+    assert metrics["ate_m"] == pytest.approx(metrics["recorded_ate_m"], abs=1e-9)
+    before, after = ([_pair_and_outcome(attempt) for attempt in _attempts(path)] for path in (log, out / "log.mcap"))
+    assert before == after
+    poses_before, poses_after = (read_log(path).result()[1] for path in (log, out / "log.mcap"))
+    np.testing.assert_array_equal(poses_before.scan_index, poses_after.scan_index)
+    np.testing.assert_allclose(poses_before.T_world_lidar, poses_after.T_world_lidar, rtol=0, atol=1e-9)
+
+
+def test_other_settings_change_the_loops_and_the_change_is_told(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    overlaps = [a.outcome.alignment.overlap for a in _attempts(log) if isinstance(a.outcome, LoopClosure)]
+    strict = tmp_path / "strict.yaml"
+    strict.write_text(yaml.safe_dump({"verify": {"min_overlap": float(np.median(overlaps)) + 1e-6}}))
+    out = tmp_path / "strict"
+    assert run("replay", log, "--out", out, "--config", strict) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["num_loops_lost"] > 0
+    told = f"{metrics['num_loops_won']} loops more, {metrics['num_loops_lost']} fewer"
+    assert told in capsys.readouterr().err
+    settings = read_log(out / "log.mcap").config
+    assert settings.verify.min_overlap == pytest.approx(np.median(overlaps), abs=1e-5)
+    assert settings.proximity == CONFIG.proximity, "what the log says and nobody changed stays"
+
+
+def test_a_setting_that_acts_before_the_keyframes_is_refused_and_nothing_written(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run("replay", log, "--out", out, "--set", "keyframes.voxel_m=0.31") == 2
+    assert "keyframes.voxel_m: a replay uses the keyframes of" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_cut_log_is_replayed_up_to_the_cut(log: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[: log.stat().st_size // 3])
+    num_steps = len(list(read_log(cut).steps()))
+    assert run("replay", cut, "--out", tmp_path / "out", "--quiet") == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["num_scans"] == num_steps > 0
+    assert "recorded_ate_m" not in metrics
+
+
+def test_what_is_no_log_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "log.mcap").write_text("scans")
+    assert run("replay", tmp_path / "log.mcap", "--out", tmp_path / "out") == 2
+    assert "give the log.mcap of a run" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

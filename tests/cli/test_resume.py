@@ -1,0 +1,112 @@
+"""`segslam resume` and `map --dry-run` as typed: a run says itself how it began."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from helpers.commands import run
+from helpers.drives import write_kitti_sequence
+
+from segslam.log import read_log
+
+pytestmark = pytest.mark.usefixtures("blank_reports")
+
+OPTIONS = ("--frames", "1:9", "--labels", "true_labels", "--set", "keyframes.distance_m=4", "--map-file", "top.png")
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten scans in KITTI's format."""
+    root = tmp_path_factory.mktemp("kitti")
+    write_kitti_sequence(root, num_scans=10)
+    return root
+
+
+@pytest.fixture(scope="module")
+def whole(kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert run("map", kitti, "--out", out, *OPTIONS, "--quiet") == 0
+    return out
+
+
+@pytest.fixture
+def cut(whole: Path, tmp_path: Path) -> Path:
+    """What is left of the run when the machine was switched off half-way."""
+    out = tmp_path / "run"
+    out.mkdir()
+    log = (whole / "log.mcap").read_bytes()
+    (out / "log.mcap").write_bytes(log[: len(log) // 2])
+    return out
+
+
+def test_a_run_is_resumed_with_all_its_options(
+    cut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    num_kept = read_log(cut / "log.mcap").num_steps()
+    assert 0 < num_kept < 8
+    assert run("resume", cut, "--json", "--quiet") == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert (metrics["num_scans"], metrics["num_scans_resumed"]) == (8, num_kept)
+    assert (cut / "top.png").is_file()
+    assert read_log(cut / "log.mcap").config.keyframes.distance_m == 4.0
+    assert run("resume", cut) == 0
+    assert "nothing to resume" in capsys.readouterr().err
+
+
+def test_the_rate_of_a_resumed_run_is_that_of_the_scans_mapped_now(
+    cut: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("resume", cut, "--json", "--quiet") == 0
+    metrics = json.loads(capsys.readouterr().out)
+    num_new = metrics["num_scans"] - metrics["num_scans_resumed"]
+    assert num_new / metrics["scans_per_second"] < metrics["seconds_total"]  # which has the reading of the log in it
+
+
+def test_data_that_are_gone_are_named(
+    kitti: Path, cut: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    log = (cut / "log.mcap").read_bytes()
+    shutil.move(kitti, tmp_path / "away")
+    try:
+        assert run("resume", cut) == 2
+    finally:
+        shutil.move(tmp_path / "away", kitti)
+    message = capsys.readouterr().err.strip()
+    assert str(kitti) in message
+    assert "Put it back" in message
+    assert len(message.splitlines()) == 1
+    assert (cut / "log.mcap").read_bytes() == log
+
+
+@pytest.mark.parametrize("folder", ["nowhere", "."])
+def test_a_folder_without_a_run_is_refused(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("resume", folder) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_dry_run_shows_what_was_found_and_writes_nothing(
+    kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = ("map", kitti, "--dry-run", "--frames", "2:8", "--set", "keyframes.distance_m=4")
+    assert run(*arguments, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["data"], found["num_scans"], found["first_scan"], found["last_scan"]) == ("kitti/00", 6, 2, 7)
+    assert found["scans_per_second"] == pytest.approx(1 / 0.3)
+    assert found["num_true_poses"] == 6
+    assert found["labels"] == "by shape"
+    assert found["first_usable_scan"]["num_points"] > 1000
+    assert found["changed_settings"] == {"keyframes.distance_m": "4.0"}
+    assert run(*arguments) == 0
+    assert "6 scans, 2 to 7" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_folder_to_write_to_nothing_is_mapped(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("map", kitti) == 2
+    assert "--out" in capsys.readouterr().err

@@ -1,0 +1,100 @@
+"""A short simulated drive, and an odometry of it that drifts: small enough for tests of the whole pipeline."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import load_config
+from segslam.datasets.kitti import read_calibration
+from segslam.odometry import GivenOdometry
+from segslam.semantics.encodings import RAW_OF_LABEL
+from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, made_up_drive, simulate_drive
+from segslam.simulation.drive import drive_sweeps
+from segslam.simulation.files import uncorrected
+from segslam.simulation.sensor import Sweep
+from segslam.simulation.world import build_world
+from segslam.slam import Slam
+from segslam.trajectory import Poses, camera_from_lidar, write_kitti
+from segslam.types import Scan, Trajectory
+
+NUM_SCANS = 72
+STEP_M = 2.2
+RADIUS_M = 18.0  # 158 m of driving: a round of 113 m, and 45 m of it again
+
+
+CONFIG = SimulationConfig(
+    world=WorldConfig(moving_cars=0.0), sensor=SensorConfig(name="os1-64", sweep_rotation_sigma_deg=0.0)
+)
+SEED = 3
+
+
+@cache
+def round_drive() -> tuple[tuple[Scan, ...], Trajectory]:
+    """Scans of a drive around a block, a round and a half, with labels, and their true poses."""
+    poses, time_s = _round()
+    scans = tuple(simulate_drive(poses, time_s, seed=SEED, config=CONFIG))
+    stamps = np.array([scan.stamp_ns for scan in scans])
+    return scans, Trajectory(np.arange(NUM_SCANS), stamps, poses)
+
+
+def round_sweeps(*, seed: int = SEED, only: Collection[int] | None = None) -> Iterator[Sweep]:
+    """The same with intensities; with another seed, through another town."""
+    poses, time_s = _round()
+    world = build_world(poses, time_s, config=CONFIG.world, seed=seed)
+    return drive_sweeps(world, poses, time_s, config=CONFIG.sensor, seed=seed, only=only)
+
+
+def _round() -> tuple[Poses, np.ndarray]:
+    along = STEP_M * np.arange(NUM_SCANS) / RADIUS_M
+    poses = np.stack(
+        [geometry.transform(geometry.yaw(a), [RADIUS_M * np.sin(a), -RADIUS_M * np.cos(a), 1.73]) for a in along]
+    )
+    return poses, 0.3 * np.arange(NUM_SCANS)
+
+
+def drifting(truth: Trajectory, *, turn_deg: float = 0.15, climb_m: float = 0.01) -> Trajectory:
+    """The same motion with a constant error in each step: some metres after a round."""
+    error = geometry.exp(geometry.tangent(rotation_rad=[0, 0, np.radians(turn_deg)], translation_m=[0.01, 0, climb_m]))
+    poses = [np.eye(4)]
+    for before, after in zip(truth.T_world_lidar[:-1], truth.T_world_lidar[1:], strict=True):
+        poses.append(poses[-1] @ geometry.inverse(before) @ after @ error)
+    return replace(truth, T_world_lidar=np.stack(poses))
+
+
+def intensities(points: np.ndarray) -> np.ndarray:
+    """What made scans say of points: how far they are, in hundreds of metres, so that a row out of step shows."""
+    return np.linalg.norm(points, axis=1) / 100
+
+
+def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
+    """The drive's first scans as sequence 00 of KITTI's format; returns the folder of the scans.
+
+    Their true labels lie in `true_labels`, where only those find them who ask.
+    """
+    folder = root / "sequences" / "00"
+    (folder / "velodyne").mkdir(parents=True)
+    (folder / "true_labels").mkdir()
+    (root / "poses").mkdir()
+    scans, truth = round_drive()
+    for scan in scans[:num_scans]:
+        rows = np.column_stack([uncorrected(scan.points), intensities(scan.points)])
+        rows.astype("<f4").tofile(folder / "velodyne" / f"{scan.index:06d}.bin")
+        RAW_OF_LABEL[scan.labels].astype("<u4").tofile(folder / "true_labels" / f"{scan.index:06d}.label")
+    (folder / "calib.txt").write_text(made_up_drive(1).calib)
+    (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans))
+    write_kitti(
+        root / "poses" / "00.txt", camera_from_lidar(truth.T_world_lidar, read_calibration(folder / "calib.txt"))
+    )
+    return folder / "velodyne"
+
+
+SLAM_CONFIG = load_config(None, ["proximity.min_travel_m=60"])
+
+
+def drifting_slam() -> Slam:
+    """The pipeline for `round_drive`, with odometry that drifts."""
+    return Slam(SLAM_CONFIG, odometry=GivenOdometry(drifting(round_drive()[1]), SLAM_CONFIG.odometry))

@@ -1,0 +1,268 @@
+import multiprocessing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from segslam import geometry
+from segslam.config import OdometryConfig
+from segslam.odometry import GivenOdometry, KissOdometry, OdometryApart
+from segslam.odometry.sweep import deskew_scan
+from segslam.types import BadScan, Scan, SegslamError, Trajectory
+
+CONFIG = OdometryConfig()
+ONE_THREAD = OdometryConfig(max_num_threads=1)  # the first odometry of a process sets how many all of it have
+
+
+def _scan(points: np.ndarray, *, index: int = 0, stamp_ns: int = 0, times: np.ndarray | None = None) -> Scan:
+    """Labels number the points, so that a row out of step shows."""
+    labels = (np.arange(len(points)) % 251).astype(np.uint8)
+    return Scan(points, stamp_ns, index, labels, np.empty(0) if times is None else times)
+
+
+def _room(rng: np.random.Generator, num: int = 4000) -> np.ndarray:
+    """(n, 3) points on the floor and walls of a hall, the sensor at the origin."""
+    walls = rng.uniform(-1.0, 1.0, (num, 3)) * [30.0, 20.0, 2.0]
+    side = np.arange(num) % 3
+    walls[side == 0, 2] = -1.7
+    walls[side == 1, 0] = 30.0 * np.sign(walls[side == 1, 0])
+    walls[side == 2, 1] = 20.0 * np.sign(walls[side == 2, 1])
+    return walls
+
+
+def _forward(metres: float) -> np.ndarray:
+    return geometry.transform(np.eye(3), [metres, 0.0, 0.0])
+
+
+def _trajectory(T_world_lidar: np.ndarray, *, first: int = 0) -> Trajectory:
+    index = np.arange(first, first + len(T_world_lidar))
+    return Trajectory(index, index * 100_000_000, T_world_lidar)
+
+
+def test_the_first_pose_is_the_identity() -> None:
+    points = _room(np.random.default_rng(0))
+    given = _trajectory(np.array([_forward(7.0), _forward(8.0)]))
+    for odometry in (KissOdometry(CONFIG), GivenOdometry(given, CONFIG)):
+        result = odometry.register(_scan(points))
+        np.testing.assert_allclose(result.T_odom_lidar, np.eye(4), atol=1e-12)
+
+
+def test_kiss_follows_a_sensor_through_a_hall() -> None:
+    rng = np.random.default_rng(0)
+    odometry = KissOdometry(CONFIG)
+    for i in range(6):
+        T_odom_lidar = _forward(0.3 * i)
+        points = geometry.apply(geometry.inverse(T_odom_lidar), _room(rng, 20_000))
+        result = odometry.register(_scan(points, index=i))
+    error = geometry.inverse(T_odom_lidar) @ result.T_odom_lidar
+    assert geometry.distance(error) < 0.1, "a tenth of a voxel: every scan samples the walls anew"
+    assert np.degrees(geometry.angle(error)) < 0.2
+
+
+def test_one_thread_repeats_to_the_bit() -> None:
+    scans = [_scan(geometry.apply(_forward(-0.3 * i), _room(np.random.default_rng(i))), index=i) for i in range(4)]
+    with OdometryApart(ONE_THREAD) as one, OdometryApart(ONE_THREAD) as other:
+        first, second = ([odometry.register(scan).T_odom_lidar for scan in scans] for odometry in (one, other))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_a_process_of_its_own_changes_nothing() -> None:
+    """Poses, points, labels; a scan that cannot be used between them; and what follows a resumed run.
+
+    Threads add up in any order: equal to 1e-9 m is equal.
+    """
+    scans = _street(6)
+    within = KissOdometry(CONFIG)
+    expected = [within.register(scan) for scan in scans]
+    with OdometryApart(CONFIG) as apart:
+        found = [apart.register(scan) for scan in scans[:5]]
+        with pytest.raises(BadScan, match="scan 5: none of its 1 points"):
+            apart.register(_scan(np.zeros((1, 3)), index=5))
+        found.append(apart.register(scans[5]))
+    with OdometryApart(CONFIG) as resumed:
+        resumed.restore(np.stack([result.T_odom_lidar for result in expected[:5]]), scans.__getitem__)
+        found.append(resumed.register(scans[5]))
+    for mine, theirs in zip(found, [*expected, expected[5]], strict=True):
+        np.testing.assert_allclose(mine.T_odom_lidar, theirs.T_odom_lidar, atol=1e-9)
+        np.testing.assert_allclose(mine.points, theirs.points, atol=1e-5)  # float32
+        np.testing.assert_array_equal(mine.labels, theirs.labels)
+
+
+def test_a_sweep_too_large_for_the_shared_memory_is_aligned_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    scans = _street(3)
+    monkeypatch.setattr("segslam.odometry.apart.MOST_SHARED", 100)
+    with OdometryApart(ONE_THREAD) as apart:
+        found = [apart.register(scan).T_odom_lidar for scan in scans]
+    monkeypatch.undo()
+    with OdometryApart(ONE_THREAD) as apart:
+        np.testing.assert_array_equal(found, [apart.register(scan).T_odom_lidar for scan in scans])
+
+
+def test_a_process_that_was_killed_is_told_of_with_the_remedy() -> None:
+    scan = _street(1)[0]
+    odometry = OdometryApart(CONFIG)
+    odometry.register(scan)
+    (process,) = multiprocessing.active_children()
+    process.kill()
+    process.join()
+    with pytest.raises(SegslamError, match=r"exit code -9.*--resume"):
+        odometry.register(scan)
+
+
+def test_points_out_of_range_leave_with_their_labels() -> None:
+    points = np.array([[1.0, 0, 0], [10.0, 0, 0], [np.nan, 0, 0], [0, 20.0, 0], [500.0, 0, 0], [0, 0, -30.0]])
+    result = KissOdometry(CONFIG).register(_scan(points))
+    np.testing.assert_array_equal(result.points, points[[1, 3, 5]].astype(np.float32))
+    np.testing.assert_array_equal(result.labels, [1, 3, 5])
+    assert result.points.dtype == np.float32
+
+
+def test_intensities_go_with_their_points_through_the_process_apart() -> None:
+    scan = _street(1)[0]
+    told = replace(scan, intensities=np.linalg.norm(scan.points, axis=1).astype(np.float32))
+    given = GivenOdometry(_trajectory(np.eye(4)[None]), CONFIG)
+    with OdometryApart(CONFIG) as apart:
+        for result in (apart.register(told), given.register(told)):
+            np.testing.assert_allclose(result.intensities, np.linalg.norm(result.points, axis=1), rtol=1e-6)
+            assert 0 < len(result.points) < len(scan.points), "those out of range have gone"
+    assert KissOdometry(CONFIG).register(scan).intensities is None
+
+
+def test_a_scan_that_moved_is_brought_to_the_end_of_its_sweep() -> None:
+    """The sensor moves 1 m a sweep: what it saw at the start has come 1 m nearer by the end, labels in step."""
+    wall = np.array([[10.0, y, z] for y in (-2.0, 0.0, 2.0) for z in (-1.0, 1.0)])
+    times = np.linspace(0.0, 1.0, len(wall))
+    seen = wall - np.column_stack([1.0 * times, 0 * times, 0 * times])
+    odometry = GivenOdometry(_trajectory(np.array([_forward(-1.0), _forward(0.0), _forward(1.0)])), CONFIG)
+    odometry.register(_scan(wall))
+    result = odometry.register(_scan(seen, index=1, times=times))
+    np.testing.assert_allclose(result.points, wall - [1.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(result.labels, np.arange(len(wall)))
+
+
+def test_motion_compensation_may_carry_points_out_of_range_and_their_labels_go_too() -> None:
+    near = np.array([[3.5, 0.0, 0.0], [3.5, 0.1, 0.0], [9.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [9.0, 1.0, 0.0]])
+    times = np.array([0.0, 1.0, 0.0, 0.5, 1.0])
+    odometry = GivenOdometry(_trajectory(np.array([_forward(0.0), _forward(1.0)])), CONFIG)
+    odometry.register(_scan(near))
+    result = odometry.register(_scan(near, index=1, times=times))
+    np.testing.assert_array_equal(result.labels, [1, 2, 4])
+    np.testing.assert_allclose(result.points, [[3.5, 0.1, 0.0], [8.0, 0.0, 0.0], [9.0, 1.0, 0.0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("times", [np.empty(0), np.full(5, 0.3)], ids=["none", "all equal"])
+def test_without_times_nothing_is_compensated(times: np.ndarray) -> None:
+    points = np.array([[5.0 + i, 0.0, 0.0] for i in range(5)])
+    odometry = GivenOdometry(_trajectory(np.array([_forward(0.0), _forward(1.0)])), CONFIG)
+    odometry.register(_scan(points))
+    np.testing.assert_array_equal(odometry.register(_scan(points, index=1, times=times)).points, points)
+
+
+def test_compensation_can_be_switched_off() -> None:
+    points = np.array([[5.0 + i, 0.0, 0.0] for i in range(5)])
+    odometry = GivenOdometry(_trajectory(np.array([_forward(0.0), _forward(1.0)])), OdometryConfig(deskew=False))
+    odometry.register(_scan(points))
+    times = np.linspace(0.0, 1.0, 5)
+    np.testing.assert_array_equal(odometry.register(_scan(points, index=1, times=times)).points, points)
+
+
+def test_a_given_pose_is_found_by_the_number_of_its_scan() -> None:
+    odometry = GivenOdometry(_trajectory(np.array([_forward(x) for x in (1.0, 3.0, 6.0)]), first=40), CONFIG)
+    points = _room(np.random.default_rng(0), 30)
+    poses = [odometry.register(_scan(points, index=i)).T_odom_lidar for i in (40, 42)]
+    np.testing.assert_allclose(poses, [_forward(0.0), _forward(5.0)])
+
+
+def test_a_given_pose_is_found_by_its_stamp() -> None:
+    given = _trajectory(np.array([_forward(x) for x in (1.0, 3.0, 6.0)]))
+    odometry = GivenOdometry(given, CONFIG, match="stamp")
+    points = _room(np.random.default_rng(0), 30)
+    stamps = (100_000_000 - 9_000_000, 200_000_000 + 9_000_000)
+    poses = [odometry.register(_scan(points, index=70, stamp_ns=stamp)).T_odom_lidar for stamp in stamps]
+    np.testing.assert_allclose(poses, [_forward(0.0), _forward(3.0)])
+
+
+@pytest.mark.parametrize("match", ["scan_index", "stamp"])
+def test_a_scan_without_a_given_pose_is_a_bad_scan(match: str) -> None:
+    points = _room(np.random.default_rng(0), 30)
+    odometry = GivenOdometry(_trajectory(np.array([np.eye(4)])), CONFIG, match=match)
+    with pytest.raises(BadScan, match=r"scan 5: .* no pose"):
+        odometry.register(_scan(points, index=5, stamp_ns=50_000_000))
+    empty = GivenOdometry(_trajectory(np.empty((0, 4, 4))), CONFIG, match=match)
+    with pytest.raises(BadScan, match="it has none"):
+        empty.register(_scan(points))
+
+
+def test_a_scan_without_a_point_in_range_is_a_bad_scan_and_the_next_one_goes_on() -> None:
+    points = _room(np.random.default_rng(0))
+    odometry = KissOdometry(CONFIG)
+    odometry.register(_scan(points))
+    with pytest.raises(BadScan, match=r"scan 1: none of its 1 points lies between 3\.0 and 100\.0 m"):
+        odometry.register(_scan(np.array([[1.0, 1.0, 1.0]]), index=1))
+    assert geometry.distance(odometry.register(_scan(points, index=2)).T_odom_lidar) < 0.05
+
+
+@pytest.mark.data
+def test_ten_real_scans_end_where_the_reference_says(data_dir: Path, real_pairs: object) -> None:
+    (T_10_0,) = [pair.T_target_source for pair in real_pairs.pairs if (pair.source, pair.target) == (0, 10)]
+    odometry = KissOdometry(CONFIG)
+    for index in range(11):
+        result = odometry.register(_scan(real_pairs.points(index), index=index))
+    error = T_10_0 @ result.T_odom_lidar
+    assert geometry.distance(error) < 0.10, "the bound asked of the map command"
+    assert np.degrees(geometry.angle(error)) < 0.3
+    assert len(result.points) == len(result.labels) > 100_000
+
+
+def _street(num_scans: int) -> list[Scan]:
+    """Scans among posts along a street, a metre and a half apart, every other one with times."""
+    rng = np.random.default_rng(5)
+    posts = rng.uniform(-1.0, 1.0, (240, 2)) * [50.0, 10.0] + [30.0, 0.0]
+    world = np.column_stack([np.repeat(posts, 60, axis=0), rng.uniform(-1.7, 3.0, 60 * len(posts))])
+    scans = []
+    for index in range(num_scans):
+        seen = rng.permutation(geometry.apply(_forward(-1.5 * index), world))[:8_000]
+        times = np.linspace(0.0, 1.0, len(seen)) if index % 2 else None
+        scans.append(_scan(seen, index=index, times=times))
+    return scans
+
+
+def test_restored_kiss_goes_on_to_the_bit_and_reads_only_scans_in_reach() -> None:
+    config = ONE_THREAD.model_copy(update={"max_range_m": 15.4, "min_range_m": 1.0})
+    scans, read = _street(34), []
+
+    def scan_of(row: int) -> Scan:
+        read.append(row)
+        return scans[row]
+
+    with OdometryApart(config) as uninterrupted, OdometryApart(config) as resumed:
+        resumed.restore(np.stack([uninterrupted.register(scan).T_odom_lidar for scan in scans[:30]]), scan_of)
+        for scan in scans[30:]:
+            expected, found = uninterrupted.register(scan), resumed.register(scan)
+            np.testing.assert_array_equal(found.T_odom_lidar, expected.T_odom_lidar)
+            np.testing.assert_array_equal(found.points, expected.points)
+    assert np.linalg.norm(expected.T_odom_lidar[:3, 3]) > 45.0, "the drive leaves the reach of its first scans"
+    assert read == list(range(9, 30)), "20 steps are 30 m, and 30.8 m the reach"
+
+
+def test_restored_poses_are_given_as_before() -> None:
+    poses = np.array([_forward(7.0 + i) for i in range(5)])
+    scans = [_scan(_room(np.random.default_rng(i)), index=i, times=np.linspace(0, 1, 4000)) for i in range(5)]
+    uninterrupted, resumed = (GivenOdometry(_trajectory(poses), CONFIG) for _ in range(2))
+    resumed.restore(np.stack([uninterrupted.register(scan).T_odom_lidar for scan in scans[:3]]), scans.__getitem__)
+    for scan in scans[3:]:
+        expected, found = uninterrupted.register(scan), resumed.register(scan)
+        np.testing.assert_array_equal(found.T_odom_lidar, expected.T_odom_lidar)
+        np.testing.assert_array_equal(found.points, expected.points)
+
+
+def test_a_sweep_whose_seam_has_no_returns_is_not_stretched() -> None:
+    """Returns from an eighth to seven eighths of the sweep move by their own share of the motion."""
+    times = np.linspace(0.125, 0.875, 400)
+    points = np.random.default_rng(0).uniform(5.0, 20.0, (400, 3)).astype(np.float32)
+    T_last_lidar = geometry.transform(np.eye(3), [1.0, 0.0, 0.0])
+    scan = _scan(points, times=times)
+    moved = deskew_scan(scan, T_last_lidar, OdometryConfig())[0]
+    np.testing.assert_allclose(moved[:, 0] - points[:, 0], times - 1.0, atol=1e-5)
+    np.testing.assert_allclose(moved[:, 1:], points[:, 1:], atol=1e-5)

@@ -1,0 +1,29 @@
+"""Files of a run's folder, read back."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from helpers.drives import drifting_slam, round_drive
+
+from segslam.run.folder import POSE_COLUMNS, write_loops
+from segslam.types import Rejected
+
+
+def test_loops_csv_has_a_row_for_every_attempt(tmp_path: Path) -> None:
+    slam = drifting_slam()
+    attempts = [attempt for scan in round_drive()[0] for attempt in slam.process(scan).attempts]
+    weights = slam.finish().estimate.closure_weights
+    write_loops(tmp_path / "loops.csv", tuple(attempts), weights)
+    with (tmp_path / "loops.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == len(attempts) > 0
+    for row, attempt in zip(rows, attempts, strict=True):
+        assert int(row["source"]) == attempt.candidate.source_id
+        if isinstance(attempt.outcome, Rejected):
+            assert row["outcome"] == attempt.outcome.reason
+            assert row["T00"] == ""
+        else:
+            matrix = np.array([float(row[column]) for column in POSE_COLUMNS]).reshape(4, 4)
+            np.testing.assert_array_equal(matrix, attempt.outcome.T_target_source)
+            assert 0 <= float(row["weight"]) <= 1

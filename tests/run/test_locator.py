@@ -1,0 +1,132 @@
+"""Single scans in a finished run, with no guess."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import commands
+from helpers.drives import drifting, round_drive, round_sweeps, write_kitti_sequence
+
+import segslam
+from segslam import geometry
+from segslam.config import load_config
+from segslam.log import read_log
+from segslam.odometry import GivenOdometry
+from segslam.run.locator import Locator
+from segslam.types import Rejected, SegslamError
+
+NUM_MAPPED = 50
+"""A round of the drive; the scans after it see it again."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that mapped the first round."""
+    folder = tmp_path_factory.mktemp("located")
+    write_kitti_sequence(folder / "data", num_scans=NUM_MAPPED)
+    config = load_config(None, ["health.check=false"])
+    odometry = GivenOdometry(drifting(round_drive()[1], turn_deg=0.0, climb_m=0.0), config.odometry)
+    segslam.map_folder(folder / "data", folder / "run", config=config, labels="geometric", odometry=odometry)
+    return folder / "run"
+
+
+def test_scans_of_a_second_round_are_found_under_any_yaw(run: Path) -> None:
+    scans, truth = round_drive()
+    locator = Locator.from_run(run)
+    T_world_first = np.linalg.inv(truth.T_world_lidar[0])
+    for number, yaw_deg in ((52, 0.0), (57, 130.0), (63, 250.0)):
+        T_lidar_turned = geometry.transform(geometry.yaw(np.radians(yaw_deg)), np.zeros(3))
+        turned = geometry.apply(geometry.inverse(T_lidar_turned), scans[number].points.astype(np.float64))
+        found = locator.locate(turned)
+        assert not isinstance(found, Rejected)
+        apart = np.linalg.inv(T_world_first @ truth.T_world_lidar[number] @ T_lidar_turned) @ found.T_world_lidar
+        assert geometry.distance(apart) < 0.5  # of which the odometry has a part: 1 cm a step
+        assert geometry.angle(apart) < np.radians(2.0)
+
+
+def test_a_scan_of_another_town_is_not_found(run: Path) -> None:
+    locator = Locator.from_run(run)
+    for sweep in round_sweeps(seed=8, only={10, 40}):
+        found = locator.locate(sweep.points, sweep.labels)
+        assert isinstance(found, Rejected)
+        assert found.reason.value
+
+
+def test_signatures_are_in_the_log_and_made_anew_where_it_has_none(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = read_log(run / "log.mcap").keyframes()
+    stored = [recorded[number].place for number in range(len(recorded))]
+    assert all(place is not None and len(place) == 1440 for place in stored)
+    monkeypatch.setattr("segslam.log.reader.place_of", lambda message: {"place": None})  # as in an older log
+    older = Locator.from_run(run)
+    newer_spectra = [np.frombuffer(place or b"", np.uint8) for place in stored]
+    for number, spectrum in enumerate(newer_spectra):
+        signature = older._signature(read_log(run / "log.mcap").keyframes()[number])
+        assert (signature.spectrum.ravel() == spectrum).all()
+
+
+def test_the_run_is_only_read(run: Path) -> None:
+    before = {file: file.read_bytes() for file in run.iterdir() if file.is_file()}
+    Locator.from_run(run).locate(round_drive()[0][52].points)
+    assert {file: file.read_bytes() for file in run.iterdir() if file.is_file()} == before
+
+
+def test_a_damaged_log_is_refused_by_name(run: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged"
+    damaged.mkdir()
+    data = bytearray((run / "log.mcap").read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 64] = bytes(64)
+    (damaged / "log.mcap").write_bytes(data)
+    (damaged / "metrics.json").write_bytes((run / "metrics.json").read_bytes())
+    with pytest.raises(SegslamError, match=r"log\.mcap"):
+        Locator.from_run(damaged)
+
+
+def test_the_command_prints_a_pose_a_scan_and_fails_where_it_finds_none(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan, nothing = tmp_path / "a.npy", tmp_path / "b.npy"
+    np.save(scan, round_drive()[0][55].points)
+    np.save(nothing, np.random.default_rng(0).uniform(-20, 20, (5000, 3)))
+    assert commands.run("locate", run, scan, nothing, "--json", "--quiet") == 0
+    found, lost = json.loads(capsys.readouterr().out)
+    assert found["found"]
+    assert len(found["T_world_lidar"]) == 16
+    assert found["reason"] is None
+    assert found["overlap"] > 0.3
+    assert found["inliers"] >= 3
+    assert found["seconds"] > 0
+    assert found["keyframe"] < NUM_MAPPED
+    assert not lost["found"]
+    assert lost["T_world_lidar"] is None
+    assert lost["reason"]
+    assert commands.run("locate", run, nothing) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "b.npy: not found: " in err
+    assert commands.run("locate", run / "log.mcap", scan) == 0
+    assert len(capsys.readouterr().out.split()) == 17
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["missing.npy"], "missing.npy: no such file"),
+        (["--dataset", "nclt"], "--dataset nclt: only kitti"),
+        (["--labels", "nowhere"], "nowhere/a.label: no such file"),
+    ],
+)
+def test_bad_usage_of_the_command_is_one_line(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], told: str
+) -> None:
+    scan = tmp_path / "a.npy"
+    np.save(scan, round_drive()[0][55].points)
+    assert commands.run("locate", run, scan, *arguments) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scan = tmp_path / "a.npy"
+    np.save(scan, round_drive()[0][55].points)
+    assert commands.run("locate", tmp_path / "nothing", scan) == 2
+    assert "nothing: no such folder" in capsys.readouterr().err

@@ -1,0 +1,192 @@
+"""The report: one file, whole, readable by a browser, saying what the run's files say."""
+
+import base64
+import re
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from helpers.finished_run import make_run
+
+from segslam import cli
+from segslam.config import Config, load_config
+from segslam.run.accuracy import accuracy
+from segslam.run.finished import FIGURES, read_run
+from segslam.run.folder import write_metrics
+from segslam.run.report import write_report
+from segslam.run.report.figures import draw_loops
+from segslam.run.report.gallery import choose, outcome_text
+from segslam.run.report.page import changed_settings, number, page
+from segslam.types import SegslamError
+
+VOID = {"meta", "img"}
+
+
+class _Tags(HTMLParser):
+    """Checks that every tag is closed in its turn, and collects what the page would load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loads: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.loads += [value or "" for name, value in attrs if name in ("src", "href")]
+        assert tag not in ("script", "link", "iframe")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def _plots(html: str) -> dict[str, str]:
+    """Caption -> the SVG's text."""
+    found = re.findall(r'<img alt="([^"]*)" src="data:image/svg\+xml;base64,([^"]*)">', html)
+    return {caption: base64.b64decode(data).decode() for caption, data in found}
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of a run with ground truth."""
+    made = make_run(tmp_path_factory.mktemp("scored") / "run")
+    run = read_run(made.folder)
+    assert run.reference is not None
+    write_metrics(made.folder, run.metrics | accuracy(run.result, run.reference))
+    return write_report(made.folder)
+
+
+def test_a_map_from_above_is_on_the_page(scored: Path, tmp_path: Path) -> None:
+    assert "Map from above" not in scored.read_text()
+    folder = shutil.copytree(scored.parent, tmp_path / "run")
+    (folder / "map.png").write_bytes(b"a picture")
+    html = write_report(folder).read_text()
+    [data] = re.findall(r'alt="Map from above" src="data:image/png;base64,([^"]*)">', html)
+    assert base64.b64decode(data) == b"a picture"
+    assert html.index("Map by odometry, and corrected") < html.index("Map from above") < html.index("Trajectory from")
+
+
+def test_page_is_whole_and_loads_nothing(scored: Path) -> None:
+    assert scored.name == "report.html"
+    html = scored.read_text()
+    tags = _Tags()
+    tags.feed(html)
+    assert tags.open == []
+    links = [target for target in tags.loads if not target.startswith("data:")]
+    assert {"poses_tum.txt", "log.mcap"} & set(links) == {"log.mcap"}  # this run has no poses_tum.txt
+    assert all((scored.parent / link).is_file() for link in links)
+    assert len(tags.loads) - len(links) == 1 + 5 + 2  # the map, the plots, an accepted loop and a missed one
+    for svg in _plots(html).values():
+        ElementTree.fromstring(svg)
+        assert not re.search(r'href="(?!#)', svg)
+
+
+def test_loops_are_counted_by_outcome_and_the_false_one_is_shown(scored: Path) -> None:
+    plots = _plots(scored.read_text())
+    loops = plots["Loops by outcome"]
+    for label in ("accepted (3)", "false (1)", "small clique (5)", "low overlap (1)"):
+        assert label in loops
+    assert "rejected by the optimiser" not in loops  # the graph's doubt about the false one adds nothing
+
+
+def test_without_truth_nothing_is_compared_with_it(tmp_path: Path) -> None:
+    html = write_report(make_run(tmp_path / "run", with_truth=False).folder).read_text()
+    plots = _plots(html)
+    assert "Error along the drive, after alignment" not in plots
+    assert "truth" not in plots["Trajectory from above, and its height"]
+    assert "rejected by the optimiser (1)" in plots["Loops by outcome"]
+    assert "error after alignment" not in html
+
+
+def test_every_figure_is_in_the_table_with_its_meaning(scored: Path) -> None:
+    html = scored.read_text()
+    metrics = read_run(scored.parent).metrics
+    for key in metrics:
+        if key != "stage_ms" and not key.startswith("odometry_"):
+            assert f"<code>{key}</code>" in html
+    assert number(metrics["odometry_ate_m"]) in html
+    assert FIGURES["ate_m"] in html
+
+
+def test_changed_settings_are_marked_and_shown_open(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    assert '<tr class="changed">' not in page(run, {})
+    changed = page(replace(run, config=load_config(None, ["keyframes.distance_m=1.25"])), {})
+    assert re.search(r'<details open><summary>keyframes</summary>.*<tr class="changed"><td><code>distance_m', changed)
+    assert changed.count('<tr class="changed">') == 1
+    for section in Config.model_fields:
+        assert f"<summary>{section}</summary>" in changed
+
+
+def test_names_are_not_taken_for_markup(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    assert "<script>" not in page(replace(run, dataset="<script>alert(1)</script>"), {"<script>": "<svg/>"})
+
+
+def test_same_run_gives_the_same_page(scored: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(scored.parent, tmp_path / "run")
+    assert write_report(folder).read_text() == scored.read_text()
+
+
+def test_run_without_loops_is_drawn(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    bare = replace(run, metrics={}, result=replace(run.result, attempts=()))
+    html = page(bare, {"Loops": draw_loops(bare)})
+    assert "No place was visited twice" in html
+    assert "accepted" not in _plots(html)["Loops"]
+
+
+def test_folder_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run").folder
+    (folder / "report.html").mkdir()
+    with pytest.raises(SegslamError, match=r"report\.html: exists and is not a regular file"):
+        write_report(folder)
+
+
+def test_unfinished_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match="did not finish"):
+        write_report(make_run(tmp_path / "run", finished=False).folder)
+
+
+def test_command_writes_the_page_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = make_run(tmp_path / "run").folder
+    for arguments, status, said in (
+        (["report", str(folder)], 0, f"report in {folder / 'report.html'}\n"),
+        (["report", str(tmp_path / "nowhere")], 2, "nowhere: no such folder"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(arguments)
+        assert int(ended.value.code or 0) == status
+        assert said in capsys.readouterr().err
+    assert (folder / "report.html").stat().st_size > 10_000
+
+
+def test_conditions_name_when_where_and_how_the_run_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/usr/bin/segslam", "map", "my_drive"])
+    html = write_report(make_run(tmp_path / "run").folder).read_text()
+    conditions = dict(re.findall(r"<tr><td>([^<]*)</td><td>([^<]*)</td></tr>", html.split("<h2>Conditions</h2>")[1]))
+    assert abs(datetime.now(UTC) - datetime.fromisoformat(conditions["started (UTC)"])) < timedelta(hours=1)
+    assert conditions["command"] == "segslam map my_drive"
+    assert "cores" in conditions["processor"]
+    assert conditions["settings other than the defaults"] == "none"
+    assert changed_settings(load_config(None, ["map.color=height"])) == "map.color=height"
+
+
+def test_the_gallery_has_the_best_accepted_and_the_nearest_missed_loops(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    loops = [attempt for attempt in run.result.attempts if attempt.candidate.source_id in (50, 51, 58)]
+    chosen = choose(loops)
+    assert [attempt.candidate.source_id for attempt in chosen] == [50, 58]  # 51, near 58, failed earlier
+    assert outcome_text(run, chosen[0]) == "accepted, overlap 0.80, residual 0.10 m, weight 1.00"
+    assert outcome_text(run, chosen[1]) == "rejected, low overlap (3 < 5)"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(2.3514, "2.35"), (0.33712, "0.337"), (23.14, "23.1"), (412.6, "413"), (7, "7")]
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert number(value) == text

@@ -1,0 +1,43 @@
+"""What an optional package is missing for is told with a command that installs it."""
+
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from segslam.datasets.mcap_clouds import McapClouds
+from segslam.map import clouds
+from segslam.system.extras import how_to_install, requirements
+from segslam.types import SegslamError
+
+PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def _declared(extra: str) -> list[Requirement]:
+    return [Requirement(line) for line in PROJECT["optional-dependencies"][extra]]
+
+
+@pytest.mark.parametrize("extra", sorted(set(PROJECT["optional-dependencies"]) - {"dev"}))
+def test_the_command_names_the_packages_of_the_extra_in_the_versions_that_were_tested(extra: str) -> None:
+    """Not segslam's own extra: PyPI has no segslam to take it from."""
+    told = how_to_install(extra)
+    assert told.startswith("pip install ")
+    assert "segslam" not in told
+    packages = {found.name: found.specifier for found in map(Requirement, told.replace("'", "").split()[2:])}
+    assert packages == {wanted.name: wanted.specifier for wanted in _declared(extra)}
+
+
+def test_requirements_are_those_of_the_project() -> None:
+    core = {found.package for found in requirements() if found.extra is None}
+    assert core == {Requirement(line).name for line in PROJECT["dependencies"]}
+
+
+def test_las_and_ros_messages_say_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clouds, "find_spec", lambda _: None)
+    with pytest.raises(SegslamError, match=r"pip install 'laspy<.*' 'lazrs<"):
+        clouds.check_las(tmp_path / "map.laz")
+    monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
+    with pytest.raises(ImportError, match="pip install 'mcap-ros2-support<"):
+        McapClouds(tmp_path / "drive.mcap", "")

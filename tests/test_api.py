@@ -1,0 +1,116 @@
+"""The package as a program uses it: names, scans from arrays, results, runs in one call."""
+
+import contextlib
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+from helpers.drives import round_drive, write_kitti_sequence
+from helpers.finished_run import MadeRun, make_run
+
+import segslam
+from segslam.run.finished import FinishedRun
+from segslam.trajectory import read_poses
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> MadeRun:
+    return make_run(tmp_path_factory.mktemp("made") / "run")
+
+
+def test_completion_and_help_show_the_public_names() -> None:
+    assert set(segslam.__all__) < set(dir(segslam))
+    assert "import_module" not in dir(segslam)
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        help(segslam)
+    for name in ("map_folder(", "open_dataset(", "read_run(", "register(", "class Slam", "class Scan"):
+        assert name in text.getvalue()
+
+
+def test_every_public_name_is_there_and_the_version_is_that_of_the_package() -> None:
+    assert all(hasattr(segslam, name) for name in segslam.__all__)
+    assert segslam.__version__ == __import__("importlib.metadata").metadata.version("segslam")
+    with pytest.raises(AttributeError, match="no attribute 'regsiter'"):
+        _ = segslam.regsiter
+
+
+def test_points_and_a_stamp_are_a_scan() -> None:
+    scan = segslam.Scan([[1, 2, 3, 0.5], [4, 5, 6, 0.7]], 10)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(scan.points, [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    np.testing.assert_array_equal(scan.labels, [0, 0])
+    assert (scan.stamp_ns, scan.index) == (10, None)
+    kept = np.zeros((2, 3), np.float32)
+    assert np.shares_memory(segslam.Scan(kept, 0).points, kept)
+
+
+@pytest.mark.parametrize("points", [np.zeros((4, 2)), np.zeros(6), [["x", "y", "z"]]])
+def test_what_are_no_points_is_refused(points: object) -> None:
+    with pytest.raises(segslam.SegslamError, match="points:"):
+        segslam.Scan(points, 0)  # type: ignore[arg-type]
+
+
+def test_slam_counts_scans_that_have_no_number() -> None:
+    slam = segslam.Slam()
+    for scan in round_drive()[0][:3]:
+        slam.process(segslam.Scan(scan.points, scan.stamp_ns))
+    assert slam.finish().trajectory.scan_index.tolist() == [0, 1, 2]
+
+
+def test_two_scans_are_registered_as_they_come_from_files() -> None:
+    scans, truth = round_drive()
+    source, target = (np.column_stack([scans[k].points, np.ones(len(scans[k].points))]) for k in (53, 2))
+    found = segslam.register(source, target.astype(np.float32).tolist())
+    assert found
+    expected = np.linalg.inv(truth.T_world_lidar[2]) @ truth.T_world_lidar[53]
+    np.testing.assert_allclose(found.fine.T_target_source[:3, 3], expected[:3, 3], atol=0.3)
+    with pytest.raises(segslam.SegslamError, match="shape"):
+        segslam.register(source[:, :2], target)
+
+
+def test_a_result_is_written_as_other_tools_read_it(made: MadeRun, tmp_path: Path) -> None:
+    made.result.to_tum(tmp_path / "tum.txt")
+    made.result.to_kitti(str(tmp_path / "kitti.txt"))
+    expected = made.result.trajectory.T_world_lidar
+    tum = file_interface.read_tum_trajectory_file(str(tmp_path / "tum.txt"))
+    np.testing.assert_allclose(tum.poses_se3, expected, atol=1e-6)
+    np.testing.assert_allclose(read_poses(tmp_path / "kitti.txt").T_a_b, expected, atol=1e-6)
+
+
+def test_errors_are_those_of_the_matching_scans(made: MadeRun) -> None:
+    figures = made.result.errors(made.truth)
+    assert figures["ate_m"] == pytest.approx(made.result.errors(made.truth.T_world_lidar)["ate_m"])
+    assert figures["ate_m"] < 0.1  # its keyframes are true, and what is between them nearly
+    with pytest.raises(segslam.SegslamError, match="for 120 scans"):
+        made.result.errors(made.truth.T_world_lidar[:-1])
+
+
+def test_a_result_is_drawn_and_kept_as_plain_values(made: MadeRun) -> None:
+    figure = made.result.plot(made.truth)
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert labels == ["reference", "odometry", "corrected", "loops (4)"]
+    values = json.loads(json.dumps(made.result.to_dict()))
+    np.testing.assert_allclose(values["T_world_lidar"], made.result.trajectory.T_world_lidar)
+    assert [loop["weight"] for loop in values["loops"]] == [1.0, 0.9, 1.0, 0.0]
+
+
+def test_a_folder_is_mapped_in_one_call(tmp_path: Path) -> None:
+    write_kitti_sequence(tmp_path / "kitti", num_scans=5)
+    steps = []
+    run = segslam.map_folder(tmp_path / "kitti", tmp_path / "run", on_step=steps.append)
+    assert isinstance(run, FinishedRun)
+    assert len(steps) == len(run.result.trajectory) == run.metrics["num_scans"] == 5
+    assert run.metrics["ate_m"] < 0.5
+    assert (tmp_path / "run" / "report.html").is_file()
+    assert segslam.read_run(str(tmp_path / "run")).metrics == run.metrics
+
+
+def test_a_folder_without_usable_scans_is_an_error(tmp_path: Path) -> None:
+    velodyne = write_kitti_sequence(tmp_path / "kitti", num_scans=2)
+    for file in velodyne.iterdir():
+        file.write_bytes(b"")
+    with pytest.raises(segslam.SegslamError, match="none of its 2 scans"):
+        segslam.map_folder(tmp_path / "kitti", tmp_path / "run")

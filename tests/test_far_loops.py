@@ -1,0 +1,61 @@
+"""Loops that only the look of a place proposes: odometry is off by more than any search radius."""
+
+from functools import cache
+
+import numpy as np
+from helpers.drives import drifting, round_drive
+
+from segslam.config import load_config
+from segslam.odometry import GivenOdometry
+from segslam.slam import Slam
+from segslam.slam_result import SlamResult
+from segslam.types import LoopClosure, RejectReason
+
+FAR_DEG = 1.0
+"""20 m off after a round of 113 m."""
+
+
+@cache
+def mapped(turn_deg: float, *settings: str) -> SlamResult:
+    """The drive with an odometry that turns too far, by so much in each step of 2.2 m."""
+    config = load_config(None, ["health.check=false", *settings])
+    odometry = drifting(round_drive()[1], turn_deg=turn_deg)
+    slam = Slam(config, odometry=GivenOdometry(odometry, config.odometry))
+    for scan in round_drive()[0]:
+        slam.process(scan)
+    return slam.finish()
+
+
+def test_a_drive_whose_odometry_is_far_off_closes_by_the_look_of_its_places() -> None:
+    truth = round_drive()[1]
+    blind = mapped(FAR_DEG, "retrieval.enabled=false")
+    assert not blind.closures()
+    result = mapped(FAR_DEG)
+    assert blind.errors(truth)["ate_m"] > 5.0
+    assert result.errors(truth)["ate_m"] < 0.4
+    assert len(result.closures()) >= 4
+    assert min(result.estimate.closure_weights.values()) > 0.5
+    for closure in result.closures():
+        rows = result.keyframe_rows[[closure.target_id, closure.source_id]]
+        T_true = np.linalg.inv(truth.T_world_lidar[rows[0]]) @ truth.T_world_lidar[rows[1]]
+        assert np.linalg.norm(closure.T_target_source[:3, 3] - T_true[:3, 3]) < 0.3
+
+
+def test_one_keyframe_alone_closes_no_far_loop() -> None:
+    result = mapped(FAR_DEG)
+    outcomes = [attempt.outcome for attempt in result.attempts if attempt.candidate.search_radius_m > 20.0]
+    first_closure = next(k for k, outcome in enumerate(outcomes) if isinstance(outcome, LoopClosure))
+    unconfirmed = [
+        outcome
+        for outcome in outcomes[:first_closure]
+        if not isinstance(outcome, LoopClosure) and outcome.reason is RejectReason.UNCONFIRMED
+    ]
+    assert len(unconfirmed) >= 2
+
+
+def test_a_drive_whose_odometry_is_good_closes_by_proximity_as_before() -> None:
+    before, after = mapped(0.15, "retrieval.enabled=false"), mapped(0.15)
+    pairs = [[(closure.source_id, closure.target_id) for closure in run.closures()] for run in (before, after)]
+    assert pairs[0] == pairs[1]
+    assert pairs[0]
+    np.testing.assert_array_equal(before.trajectory.T_world_lidar, after.trajectory.T_world_lidar)

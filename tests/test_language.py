@@ -1,0 +1,47 @@
+"""Plain English: docstrings, comments, messages and pages avoid words that this project once used for its own."""
+
+import io
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PRIVATE = re.compile(
+    r"\b(robbed|voices?|told|says|worth|believe[ds]?|mends?|mended|(?<!look )alike|anew|doubt(ed|s)?"
+    r"|turned back|what is kept)\b",
+    re.IGNORECASE,
+)
+"""Say instead: weight, inlier, outlier, detect, report, contain, correct, equal, again."""
+NAMES = {"told", "doubts"}
+"""Code may use these as names; text may quote them in backquotes."""
+CODE = sorted((ROOT / "segslam").rglob("*.py"))
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def _texts(file: Path) -> list[tuple[int, str]]:
+    """(line number, text) of every line of comments and strings, without code in backquotes."""
+    source = file.read_text(encoding="utf-8")
+    kinds = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", -1)}
+    found = []
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type in kinds and token.string.strip("\"'") not in NAMES:
+            found += [(token.start[0] + k, line) for k, line in enumerate(token.string.splitlines())]
+    return found
+
+
+def _private(lines: list[tuple[int, str]]) -> list[str]:
+    return [
+        f"{number}: {text.strip()}" for number, text in lines if PRIVATE.search(re.sub(r"`[^`]*`|\{[^}]*\}", "", text))
+    ]
+
+
+@pytest.mark.parametrize("file", CODE, ids=lambda file: str(file.relative_to(ROOT)))
+def test_code_speaks_plain_english(file: Path) -> None:
+    assert not _private(_texts(file))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_speak_plain_english(page: Path) -> None:
+    assert not _private(list(enumerate(page.read_text(encoding="utf-8").splitlines(), 1)))

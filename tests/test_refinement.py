@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+from helpers.streets import corner, small_move
+
+from segslam import geometry
+from segslam.config import RefineConfig
+from segslam.refinement import Surface, downsample, make_surface, refine
+from segslam.types import Registration, Rejected, RejectReason
+
+CONFIG = RefineConfig()
+
+
+def surface(points: np.ndarray) -> Surface:
+    return make_surface(downsample(points, config=CONFIG), config=CONFIG)
+
+
+def _error(T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
+    T = geometry.inverse(T_a) @ T_b
+    return geometry.distance(T), float(np.degrees(geometry.angle(T)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_coarse_pose_is_sharpened_to_centimetres(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T_target_source = geometry.transform(geometry.yaw(rng.uniform(-np.pi, np.pi)), [6.0, -3.0, 0.1])
+    source = surface(geometry.apply(geometry.inverse(T_target_source), corner(rng)))
+    target = surface(corner(rng))
+    coarse = T_target_source @ small_move(rng, rotation_deg=0.7, translation_m=0.2)
+    found = refine(source, target, coarse, config=CONFIG)
+    assert isinstance(found, Registration)
+    metres, degrees = _error(T_target_source, found.T_target_source)
+    assert metres < 0.05, "two samplings of the same surfaces, voxels of 0.5 m: a tenth of a voxel"
+    assert degrees < 0.2
+    assert found.num_inliers > 0.5 * len(source)
+
+
+def test_information_has_the_axes_of_the_scene() -> None:
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-20, 20, (5000, 2)), rng.normal(0, 0.01, 5000)])
+    raised = floor + np.array([0.0, 0.0, 0.1])
+    found = refine(surface(floor), surface(raised), np.eye(4), config=CONFIG)
+    assert isinstance(found, Registration)
+    np.testing.assert_allclose(found.information, found.information.T)
+    variances = np.diag(found.information)
+    assert variances[5] > 10 * max(variances[3:5]), "a floor holds height, not x and y"
+    assert min(variances[:2]) > 10 * variances[2], "and roll and pitch, not yaw"
+
+
+@pytest.mark.parametrize("points", [np.empty((0, 3)), np.zeros((1000, 3)), np.full((5, 3), 1.0)])
+def test_too_few_points_are_rejected(points: np.ndarray) -> None:
+    few = surface(points)
+    found = refine(few, few, np.eye(4), config=CONFIG)
+    assert isinstance(found, Rejected)
+    assert found.reason is RejectReason.TOO_FEW_POINTS
+
+
+def test_scans_that_do_not_meet_are_rejected() -> None:
+    rng = np.random.default_rng(1)
+    seen = surface(corner(rng))
+    found = refine(seen, seen, geometry.transform(np.eye(3), [500.0, 0.0, 0.0]), config=CONFIG)
+    assert isinstance(found, Rejected)
+    assert found.reason is RejectReason.REFINEMENT_DIVERGED
+
+
+def test_a_last_stage_that_does_not_converge_is_rejected() -> None:
+    rng = np.random.default_rng(0)
+    T_coarse = small_move(rng, rotation_deg=0.7, translation_m=0.2)
+    config = RefineConfig(max_iterations=1, correspondence_m=(0.5,))
+    found = refine(surface(corner(rng)), surface(corner(rng)), T_coarse, config=config)
+    assert isinstance(found, Rejected)
+    assert found.reason is RejectReason.REFINEMENT_DIVERGED
+    assert found.detail == "still moving after 1 iterations at 0.5 m"
+
+
+@pytest.mark.data
+def test_real_pairs_are_refined_to_the_reference(real_pairs) -> None:
+    for pair in real_pairs.pairs:
+        rng = np.random.default_rng(pair.source)
+        source, target = (surface(real_pairs.points(index)) for index in (pair.source, pair.target))
+        coarse = pair.T_target_source @ small_move(rng, rotation_deg=0.5, translation_m=0.15)
+        found = refine(source, target, coarse, config=CONFIG)
+        assert isinstance(found, Registration)
+        metres, degrees = _error(pair.T_target_source, found.T_target_source)
+        assert metres < 0.05, f"{pair.source} -> {pair.target}"
+        assert degrees < 0.2, f"{pair.source} -> {pair.target}"

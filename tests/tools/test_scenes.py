@@ -1,0 +1,90 @@
+"""Verification away from the street: nothing may be accepted that is wrong, and nearly all that is right."""
+
+import importlib.util
+import math
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from segslam import geometry, registration
+from segslam.config import Config
+from segslam.registration import PreparedScan, prepare_scan, register_prepared, shape_labels
+from segslam.simulation.scene_sensors import SENSORS, scan_points
+from segslam.simulation.scenes import SCENES, corridor
+from segslam.types import Alignment, Registration, Rejected
+
+CONFIG = Config()
+TARGET_X, SOURCE_X = 20.0, 25.0
+
+
+@cache
+def _bench() -> ModuleType:
+    file = Path(__file__).resolve().parents[2] / "tools" / "bench_scenes.py"
+    spec = importlib.util.spec_from_file_location("bench_scenes", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@cache
+def _corridor_scan(x: float) -> PreparedScan:
+    """64 beams with 2 cm of noise, 1 m above the floor of a corridor 2.4 m wide with a door every 3 m."""
+    rng = np.random.default_rng(int(x))
+    T_world_lidar = geometry.transform(np.eye(3), [x, 0.0, 1.0])
+    points = scan_points(corridor(0, regular=True), "64", T_world_lidar, noise_m=0.02, rng=rng)
+    return prepare_scan(points, shape_labels(points, config=CONFIG), config=CONFIG)
+
+
+def _from(T_target_source: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> Alignment | Rejected:
+    """What becomes of one coarse pose, the only one that is tried."""
+    coarse = Registration(T_target_source, 9, 9, 0.1, np.eye(6))
+    monkeypatch.setattr(registration, "_coarse", lambda *_, **__: iter([coarse]))
+    return register_prepared(_corridor_scan(SOURCE_X), _corridor_scan(TARGET_X), config=CONFIG)
+
+
+@pytest.mark.parametrize("slid_m", [1.26, -1.26, 3.0, 8.7])
+def test_a_pose_slid_along_a_corridor_is_not_accepted(slid_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = _from(geometry.transform(np.eye(3), [SOURCE_X - TARGET_X + slid_m, 0.0, 0.0]), monkeypatch)
+    assert not _is_wrong(found), found
+
+
+def test_a_pose_turned_round_in_a_corridor_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    for shift_m in (5.0, 5.5, 4.5):
+        found = _from(geometry.transform(geometry.yaw(math.pi), [shift_m, 0.0, 0.0]), monkeypatch)
+        assert not _is_wrong(found), (shift_m, found)
+
+
+def _is_wrong(found: Alignment | Rejected) -> bool:
+    """Accepted, and not where the source stands."""
+    if isinstance(found, Rejected):
+        return False
+    T = geometry.inverse(geometry.transform(np.eye(3), [SOURCE_X - TARGET_X, 0.0, 0.0])) @ found.fine.T_target_source
+    return geometry.distance(T) > 0.5 or geometry.angle(T) > math.radians(2.0)
+
+
+@pytest.mark.parametrize(
+    ("scene", "sensor", "noise_m"),
+    [("corridor", "64", 0.03), ("garage", "16", 0.01), ("parking lot", "non-repeating", 0.03)],
+)
+def test_nothing_wrong_is_accepted_and_what_is_right_is_kept(scene: str, sensor: str, noise_m: float) -> None:
+    _check(scene, sensor, noise_m, count=4, kept=0.7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise_m", [0.01, 0.03, 0.1])
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("scene", SCENES)
+def test_every_scene_and_sensor_holds(scene: str, sensor: str, noise_m: float) -> None:
+    _check(scene, sensor, noise_m, count=20, kept=0.85)
+
+
+def _check(scene: str, sensor: str, noise_m: float, *, count: int, kept: float) -> None:
+    row = _bench().bench(scene, sensor, noise_m, count=count, seed=2, config=CONFIG)
+    assert row["false_accepted"] == 0, row
+    assert row["accepted_wrong"] == 0, row
+    assert row["kept"] >= kept * row["overlapping"], row

@@ -1,0 +1,80 @@
+"""Writes docs/commands.md and docs/api.md from the commands and the public names of the package, for the site."""
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+from typer.main import get_command
+
+import segslam
+from segslam import cli
+from segslam.cli import commands
+
+RECORDS = "segslam.types"
+CONFIG = """All settings, by section, frozen: `segslam.Config()` has the defaults,
+`segslam.load_config(path, overrides)` changes some of them. [Every setting](options.md) has a page of its own."""
+
+
+def write(docs: Path) -> None:
+    """Write both pages into a folder."""
+    (docs / "commands.md").write_text(commands_page(), encoding="utf-8")
+    (docs / "api.md").write_text(api_page(), encoding="utf-8")
+
+
+def commands_page() -> str:
+    """Every command with its arguments and options."""
+    commands.add_all(cli.app)
+    parts = ["# Commands\n\nGenerated from the program; `segslam COMMAND --help` shows the same.\n"]
+    for name, command in sorted(_leaves(get_command(cli.app))):
+        about, _, example = inspect.cleandoc(command.help or "").partition("Example:")
+        parts.append(f"## segslam {name}\n\n{about.strip()}\n")
+        if example:
+            parts.append(f"```\n{example.strip()}\n```\n")
+        rows = [_row(parameter) for parameter in command.params if not getattr(parameter, "hidden", False)]
+        parts.append("| argument or option | default | meaning |\n|---|---|---|\n" + "\n".join(rows) + "\n")
+    return "\n".join(parts)
+
+
+def api_page() -> str:
+    """Public functions and classes, and the records of `segslam.types`."""
+    parts = ["# Python\n\n`import segslam` gives these names.\n"]
+    for name in segslam.__all__:
+        made = getattr(segslam, name)
+        if not hasattr(made, "__doc__") or not callable(made):
+            continue
+        if name == "Config":
+            parts.append(f"## Config\n\n{CONFIG}\n")
+            continue
+        kind = "autoclass" if inspect.isclass(made) else "autofunction"
+        target = f"{made.__module__}.{made.__qualname__}"
+        members = "\n:members:" if kind == "autoclass" else ""
+        parts.append(f"## {name}\n\n```{{eval-rst}}\n.. {kind}:: {target}{_indented(members)}\n```\n")
+    parts.append("## Records\n\nStages exchange these frozen records.\n")
+    parts.append(f"```{{eval-rst}}\n.. automodule:: {RECORDS}\n   :members:\n   :noindex:\n```\n")
+    return "\n".join(parts)
+
+
+def _indented(text: str) -> str:
+    return text.replace("\n", "\n   ")
+
+
+def _row(parameter: Any) -> str:
+    names = ", ".join(f"`{name}`" for name in (*parameter.opts, *parameter.secondary_opts))
+    name = f"`{parameter.name.upper()}`" if parameter.param_type_name == "argument" else names
+    default = parameter.default
+    shown = (
+        "required"
+        if parameter.required
+        else ""
+        if callable(default) or default in (None, False, ())
+        else f"`{default}`"
+    )
+    meaning = (getattr(parameter, "help", "") or "").replace("|", "\\|").replace("<", "&lt;")
+    return f"| {name} | {shown} | {meaning} |"
+
+
+def _leaves(command: Any, name: str = "") -> list[tuple[str, Any]]:
+    children = getattr(command, "commands", {})
+    if not children:
+        return [(name, command)]
+    return [leaf for key, child in children.items() for leaf in _leaves(child, f"{name} {key}".strip())]

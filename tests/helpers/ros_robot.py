@@ -19,7 +19,7 @@ FIELDS = [PointField(name=axis, offset=4 * k, datatype=PointField.FLOAT32, count
 
 
 def publish(points: Path, every_s: float, reliability: str, first: int, last: int) -> None:
-    """One cloud after the other, from when somebody listens."""
+    """One cloud after the other, and round again, from when somebody listens."""
     clouds = np.load(points)
     rclpy.init()
     node = rclpy.create_node("robot")
@@ -27,10 +27,10 @@ def publish(points: Path, every_s: float, reliability: str, first: int, last: in
     publisher = node.create_publisher(PointCloud2, TOPIC, profile)
     while publisher.get_subscription_count() == 0:
         sleep(0.05)
-    sleep(0.5)
+    sleep(1.0)
     next_s = monotonic()
     for number in range(first, last):
-        rows = clouds[f"arr_{number}"].astype("<f4")
+        rows = clouds[f"arr_{number % len(clouds)}"].astype("<f4")
         message = PointCloud2(height=1, width=len(rows), point_step=12, row_step=rows.nbytes, fields=FIELDS)
         message.header.frame_id = "lidar_top"
         message.header.stamp = node.get_clock().now().to_msg()

@@ -17,7 +17,7 @@ PLACE_M = 30.0
 """Closures whose ends are this near in travel join the same two places, and may be wrong together. Chosen."""
 PLACE_PENALTY = 2.0
 """Closures joining the same two places are correlated; together they weigh at most as much as this many independent
-ones. Chosen from 0.5 to 5 with `tools/bench_back_end.py`: below, correct closures are rejected; above, a repeated
+ones. Chosen from 0.5 to 5 with `tools/benchmarks/back_end`: below, correct closures are rejected; above, a repeated
 street outweighs odometry."""
 
 

@@ -13,7 +13,7 @@ LAMBDA_FACTOR = 100.0
 SHALLOW = 10_000
 """Poses for which any thread's stack is deep enough."""
 STACK_BYTES_PER_POSE = 4096
-"""Chosen: 8 MB are enough for 50,000 poses of `tools/bench.py`, not for 100,000. Unused stack costs nothing."""
+"""Chosen: 8 MB are enough for 50,000 poses of `tools/benchmarks/speed`, not for 100,000. Unused stack costs nothing."""
 
 Done = TypeVar("Done")
 

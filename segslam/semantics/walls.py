@@ -8,7 +8,7 @@ from segslam.system.kernels import kernel
 from segslam.types import Mask, Points, Vector
 
 CELL_M = 0.6
-"""Chosen, as what follows, by the IoU of buildings on the real KITTI scans 0-2 (`tools/bench_labels.py`)."""
+"""Chosen, as what follows, by the IoU of buildings on the real KITTI scans 0-2 (`tools/benchmarks/labels`)."""
 LAYER_M = 2.0
 NUM_LAYERS = 5
 MIN_LENGTH_M = 0.3

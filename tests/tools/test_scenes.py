@@ -1,10 +1,7 @@
 """Verification away from the street: nothing may be accepted that is wrong, and nearly all that is right."""
 
-import importlib.util
 import math
 from functools import cache
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,20 +12,10 @@ from segslam.registration import PreparedScan, prepare_scan, register_prepared, 
 from segslam.simulation.scene_sensors import SENSORS, scan_points
 from segslam.simulation.scenes import SCENES, corridor
 from segslam.types import Alignment, Registration, Rejected
+from tools.benchmarks import scenes
 
 CONFIG = Config()
 TARGET_X, SOURCE_X = 20.0, 25.0
-
-
-@cache
-def _bench() -> ModuleType:
-    file = Path(__file__).resolve().parents[2] / "tools" / "bench_scenes.py"
-    spec = importlib.util.spec_from_file_location("bench_scenes", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @cache
@@ -84,7 +71,7 @@ def test_every_scene_and_sensor_holds(scene: str, sensor: str, noise_m: float) -
 
 
 def _check(scene: str, sensor: str, noise_m: float, *, count: int, kept: float) -> None:
-    row = _bench().bench(scene, sensor, noise_m, count=count, seed=2, config=CONFIG)
+    row = scenes.bench(scene, sensor, noise_m, count=count, seed=2, config=CONFIG)
     assert row["false_accepted"] == 0, row
     assert row["accepted_wrong"] == 0, row
     assert row["kept"] >= kept * row["overlapping"], row

@@ -1,0 +1,96 @@
+"""Proposals as while driving, closures where the truth is within reach; what another search at the end would add."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from segslam import geometry
+from segslam.evaluation import FOUND_WITHIN_M, REVISIT_MIN_TRAVEL_M
+from segslam.pose_graph import PoseGraph
+from segslam.proximity import ProximityDetector
+from segslam.types import LoopClosure
+from tools.benchmarks.back_end.drives import CONFIG, Drive
+
+REACH_M = 8.0
+"""As far apart as two keyframes are registered without fail."""
+MAX_ROUNDS = 3
+
+
+@dataclass
+class Search:
+    """A drive that is searched for loops."""
+
+    drive: Drive
+    rng: np.random.Generator
+    graph: PoseGraph = field(default_factory=lambda: PoseGraph(CONFIG.graph))
+    detector: ProximityDetector = field(default_factory=lambda: ProximityDetector(CONFIG.proximity))
+    closures: list[LoopClosure] = field(default_factory=list)
+    tried: set[tuple[int, int]] = field(default_factory=set)
+
+    def look(self, keyframe_id: int) -> int:
+        """Tries what is proposed for one keyframe and was not tried before; gives the number of closures found."""
+        found = []
+        for candidate in self.detector.candidates(keyframe_id, self.graph.T_world_keyframes, self.graph.travel_m):
+            pair = (keyframe_id, candidate.target_id)
+            if pair in self.tried:
+                continue
+            self.tried.add(pair)
+            T_target_source = geometry.inverse(self.drive.truth[candidate.target_id]) @ self.drive.truth[keyframe_id]
+            if geometry.distance(T_target_source) <= REACH_M:
+                found.append(self.drive.closure(*pair, self.rng))
+        for loop in found:
+            self.graph.add_closure(loop)
+            self.detector.note_closure(loop)
+        self.closures += found
+        return len(found)
+
+    def figures(self) -> dict[str, Any]:
+        return {
+            "tried": len(self.tried),
+            "closures": len(self.closures),
+            "recall_4m": self._recall(4.0),
+            "recall_10m": self._recall(10.0),
+            **self.drive.errors(self.graph.T_world_keyframes),
+        }
+
+    def _recall(self, within_m: float) -> float | None:
+        """Share of the keyframes this near to an old one that have a closure within 10 m of travel."""
+        wanted = self.drive.travel_m[list(_revisits(self.drive, within_m))]
+        closed = self.drive.travel_m[[loop.source_id for loop in self.closures]]
+        away_m = np.abs(wanted[:, None] - closed).min(axis=1, initial=np.inf)
+        return float((away_m <= FOUND_WITHIN_M).mean()) if len(wanted) else None
+
+
+def _revisits(drive: Drive, within_m: float) -> Iterator[int]:
+    positions = drive.truth[:, :3, 3]
+    for row, position in enumerate(positions):
+        old = positions[:row][drive.travel_m[:row] <= drive.travel_m[row] - REVISIT_MIN_TRAVEL_M]
+        if len(old) and np.linalg.norm(old - position, axis=1).min() <= within_m:
+            yield row
+
+
+def search(drive: Drive, rng: np.random.Generator) -> tuple[list[LoopClosure], dict[str, Any]]:
+    """The closures found while driving; recall, tries, errors; and the same after each search with corrected poses."""
+    looking, seconds = Search(drive, rng), []
+    for keyframe_id, (T_odom_keyframe, travel) in enumerate(zip(drive.odometry, drive.travel_m, strict=True)):
+        looking.graph.add_keyframe(keyframe_id, T_odom_keyframe, float(travel))
+        if looking.look(keyframe_id):
+            started = time.perf_counter()
+            estimate = looking.graph.optimize()
+            looking.detector.note_estimate(estimate.closure_weights)
+            seconds.append(time.perf_counter() - started)
+    last = np.array(seconds[-max(1, len(seconds) // 10) :] or [np.nan])
+    looking.graph.finish()
+    closures, figures = list(looking.closures), looking.figures()
+    figures["optimize_ms_last_tenth"] = {"median": 1e3 * np.median(last), "p95": 1e3 * np.percentile(last, 95)}
+    figures["odometry_ate_m"] = drive.errors(drive.odometry)["ate_m"]
+    figures["again"] = []
+    while len(figures["again"]) < MAX_ROUNDS:
+        if not sum(looking.look(keyframe_id) for keyframe_id in range(len(drive.truth))):
+            break
+        looking.graph.finish()
+        figures["again"].append(looking.figures())
+    return closures, figures

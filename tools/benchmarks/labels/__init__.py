@@ -1,0 +1,1 @@
+"""Labels by shape: the parts of the benchmark."""

@@ -1,0 +1,164 @@
+"""A live run measured: latency, lag, memory, what was dropped, and the same scans mapped offline.
+
+python -m tools.benchmarks.live SCANS --out DIR --every 0.5                      a folder that fills, each scan once
+python -m tools.benchmarks.live SCANS --out DIR --every 0.5 --offline            and the same scans by `segslam map`
+python -m tools.benchmarks.live SCANS --out DIR --every 0.1 --seconds 60 --ros reliable      a ROS 2 topic, on loopback
+python -m tools.benchmarks.live SCANS --out DIR --every 1 --seconds 3600     the hour: latency and memory must be flat
+
+With --seconds the scans are sent forth and back until the time is over. Figures go to DIR/bench.json.
+"""
+
+import argparse
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import chain, cycle, islice
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import numpy as np
+
+from segslam import geometry
+from segslam.datasets import Dataset, open_dataset
+from segslam.log import read_log
+from tools.benchmarks.live.sender import FolderSender, RosSender, Sender
+
+TOPIC = "/segslam_bench/points"
+SAMPLE_S = 5.0
+OWN_DOMAIN = {"ROS_DOMAIN_ID": "87", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
+
+
+def rows_sent(num_scans: int, num_sent: int | None) -> Iterator[int]:
+    """Each scan once, or forth and back so often that so many are sent."""
+    if num_sent is None:
+        return iter(range(num_scans))
+    return islice(cycle(chain(range(num_scans), range(num_scans - 2, 0, -1))), num_sent)
+
+
+def rss_mb(pid: int) -> float:
+    """Memory of a process and of all that it has started."""
+    total = 0.0
+    status = Path(f"/proc/{pid}/status").read_text()
+    total += next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")), 0) / 1024
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return total + sum(rss_mb(int(child)) for child in children)
+
+
+def run_live(dataset: Dataset, sender: Sender, words: list[str], every_s: float, seconds: float | None) -> Any:
+    """Exit status, figures, (seconds, MB) of the memory, and how many scans were sent."""
+    command = [sys.executable, "-m", "segslam", "live", *words, "--json"]
+    live = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert live.stderr
+    while "waiting for scans" not in (line := live.stderr.readline()):
+        assert line, "segslam live has ended"
+        print(line, end="", file=sys.stderr)
+    sender.wait_for_listener()
+    num_sent, memory, started = 0, [], monotonic()
+    next_s, next_sample = started, started
+    for row in rows_sent(len(dataset), None if seconds is None else int(seconds / every_s)):
+        scan = dataset[row]
+        sleep(max(0.0, next_s - monotonic()))
+        stamp_ns = scan.stamp_ns if seconds is None else int(num_sent * every_s * 1e9)
+        sender.send(scan.points, stamp_ns)
+        num_sent += 1
+        next_s += every_s
+        if monotonic() >= next_sample and live.poll() is None:
+            memory.append((monotonic() - started, rss_mb(live.pid)))
+            next_sample += SAMPLE_S
+    sleep(3.0)
+    live.send_signal(signal.SIGINT)
+    printed, told = live.communicate()
+    print(told, end="", file=sys.stderr)
+    return live.returncode, json.loads(printed), memory, num_sent
+
+
+def compared(live: Path, offline: Path) -> dict[str, Any]:
+    """The two runs: closures that only one has, and the largest distance between poses of the same stamp."""
+    closures = [closures_by_stamp(folder) for folder in (live, offline)]
+    trajectories = [read_log(folder / "log.mcap").result()[1] for folder in (live, offline)]
+    of_stamp = {int(stamp): T for stamp, T in zip(trajectories[1].stamp_ns, trajectories[1].T_world_lidar, strict=True)}
+    pairs = [
+        (T, of_stamp[int(stamp)])
+        for stamp, T in zip(trajectories[0].stamp_ns, trajectories[0].T_world_lidar, strict=True)
+        if int(stamp) in of_stamp
+    ]
+    apart = [geometry.distance(geometry.inverse(one) @ other) for one, other in pairs]
+    return {
+        "num_closures": [len(found) for found in closures],
+        "num_only_live": len(closures[0] - closures[1]),
+        "num_only_offline": len(closures[1] - closures[0]),
+        "num_poses_compared": len(apart),
+        "largest_apart_m": max(apart),
+    }
+
+
+def closures_by_stamp(folder: Path) -> set[tuple[int, int]]:
+    """Stamps of the two keyframes of each closure."""
+    log = read_log(folder / "log.mcap")
+    stamps = [step.stamp_ns for step in log.steps(clouds=False) if step.keyframe is not None]
+    with (folder / "loops.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["outcome"] == "accepted"]
+    return {(stamps[int(row["source"])], stamps[int(row["target"])]) for row in rows}
+
+
+def by_fifths(values: list[float]) -> list[float]:
+    """Median of each fifth of the run."""
+    return [round(float(np.median(part)), 1) for part in np.array_split(values, 5) if len(part)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--every", type=float, required=True, help="seconds between two scans")
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--frames")
+    parser.add_argument("--ros", choices=["reliable", "best_effort"])
+    parser.add_argument("--offline", action="store_true")
+    parser.add_argument("--set", action="append", default=[], dest="settings")
+    chosen = parser.parse_args()
+    os.environ.update(OWN_DOMAIN)
+    chosen.out.mkdir(parents=True)
+    settings = [word for setting in chosen.settings for word in ("--set", setting)]
+    dataset = open_dataset(chosen.data, frames=chosen.frames, labels="none", vertical_angle_deg=0.0)
+    if chosen.ros:
+        sender, source = RosSender(TOPIC, chosen.ros), ["--topic", TOPIC]
+    else:
+        sender, source = (
+            FolderSender(chosen.out / "scans", keeps=100 if chosen.seconds else None),
+            [str(chosen.out / "scans")],
+        )
+    words = [*source, "--out", str(chosen.out / "live"), *settings]
+    status, metrics, memory, num_sent = run_live(dataset, sender, words, chosen.every, chosen.seconds)
+    steps = list(read_log(chosen.out / "live" / "log.mcap").steps(clouds=False))
+    process_ms = [1000 * sum(s for stage, s in step.stage_seconds.items() if stage != "odometry") for step in steps]
+    figures = {
+        "status": status,
+        "every_s": chosen.every,
+        "num_sent": num_sent,
+        **{key: metrics[key] for key in metrics if key.startswith(("num_", "latency", "loop_lag", "longest"))},
+        "process_without_odometry_ms": {
+            "median": float(np.median(process_ms)),
+            "p95": float(np.percentile(process_ms, 95)),
+            "max": max(process_ms),
+        },
+        "odometry_ms": metrics["stage_ms"]["odometry"],
+        "odometry_ms_by_fifths": by_fifths([1000 * step.stage_seconds["odometry"] for step in steps]),
+        "rss_mb_by_fifths": by_fifths([mb for _, mb in memory]),
+    }
+    if chosen.offline:
+        command = [sys.executable, "-m", "segslam", "map", str(chosen.out / "scans"), "--labels", "geometric"]
+        subprocess.run([*command, "--out", str(chosen.out / "offline"), "--preset", "driving", *settings], check=True)
+        figures["against_offline"] = compared(chosen.out / "live", chosen.out / "offline")
+    text = json.dumps(figures, indent=2)
+    (chosen.out / "bench.json").write_text(text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

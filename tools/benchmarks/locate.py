@@ -1,0 +1,79 @@
+"""Single scans of another drive located in a finished run: success and false poses, where the truth of both is known.
+
+    python -m tools.benchmarks.locate RUN DATA [--sequence 06] [--every 25] [--labels auto]
+
+The true poses of both are in one frame, as those of two days that `segslam simulate` makes with one seed. A scan counts
+if a keyframe of the run is within 10 m; found is within 2 m and 5 degrees of the true pose in its keyframe.
+"""
+
+import argparse
+import json
+from collections import Counter
+from pathlib import Path
+from time import perf_counter, process_time
+
+import numpy as np
+
+from segslam import geometry
+from segslam.datasets import open_dataset
+from segslam.run.finished import read_run
+from segslam.run.locator import Locator
+from segslam.semantics.late import made
+from segslam.types import Rejected
+
+WITHIN_M = 10.0
+FOUND_M, FOUND_DEG = 2.0, 5.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--sequence", default="00")
+    parser.add_argument("--every", type=int, default=25)
+    parser.add_argument("--labels", default="auto")
+    options = parser.parse_args()
+    run = read_run(options.run)
+    data = open_dataset(options.data, sequence=options.sequence, labels=options.labels)
+    if run.reference is None or data.reference is None:
+        parser.error("the true poses of both drives are needed")
+    T_of_scan = dict(zip(run.reference.scan_index.tolist(), run.reference.T_world_lidar, strict=True))
+    T_of_query = dict(zip(data.reference.scan_index.tolist(), data.reference.T_world_lidar, strict=True))
+    scans = run.result.trajectory.scan_index[run.result.keyframe_rows]
+    T_keyframes = np.stack([T_of_scan[int(scan)] for scan in scans])
+    locator = Locator.from_run(options.run)
+    locator.floor()
+    outcomes: Counter[str] = Counter()
+    seconds, cpu_seconds = [], []
+    for row in range(0, len(data), options.every):
+        scan = data[row]
+        T_true = T_of_query[int(scan.index or 0)]
+        near = np.linalg.norm(T_keyframes[:, :3, 3] - T_true[:3, 3], axis=1).min() <= WITHIN_M
+        labels = made(scan.labels)
+        started, started_cpu = perf_counter(), process_time()
+        found = locator.locate(scan.points, labels if labels.any() else None)
+        seconds.append(perf_counter() - started)
+        cpu_seconds.append(process_time() - started_cpu)
+        if isinstance(found, Rejected):
+            outcome = f"rejected: {found.reason.value}"
+        else:
+            T_lidar_found = geometry.inverse(T_true) @ T_keyframes[found.keyframe_id]
+            apart = T_lidar_found @ found.alignment.fine.T_target_source
+            right = geometry.distance(apart) < FOUND_M and np.degrees(geometry.angle(apart)) < FOUND_DEG
+            outcome = "found" if right else "false"
+        outcomes[("" if near else "off the map, ") + outcome] += 1
+    counted = sum(count for name, count in outcomes.items() if not name.startswith("off"))
+    figures = {
+        "num_keyframes": len(T_keyframes),
+        "num_scans_near": counted,
+        "success": outcomes["found"] / max(counted, 1),
+        "num_false": outcomes["false"] + outcomes["off the map, false"],
+        "outcomes": dict(outcomes),
+        "seconds_median": float(np.median(seconds)),
+        "cpu_seconds_median": float(np.median(cpu_seconds)),
+    }
+    print(json.dumps(figures, indent=2))
+
+
+if __name__ == "__main__":
+    main()

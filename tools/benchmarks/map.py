@@ -1,0 +1,110 @@
+"""How much of what moves a map leaves out, and how much of what stands: a simulated run against its true labels.
+
+Moving classes are hidden from the map first, so that the views of other keyframes alone decide:
+
+    python -m tools.benchmarks.map RUN DATA --sequence 06 --out figures.json
+"""
+
+import argparse
+import json
+import platform
+import resource
+import subprocess
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+
+import numpy as np
+from open3d.io import read_point_cloud
+from scipy.spatial import cKDTree
+
+from segslam import geometry, open_dataset
+from segslam.config import load_config
+from segslam.log import read_log
+from segslam.map import write_map
+from segslam.types import Keyframe, Label, Transform
+
+STANDING = {
+    Label.MOVING_CAR: Label.CAR,
+    Label.MOVING_BICYCLIST: Label.BICYCLIST,
+    Label.MOVING_PERSON: Label.PERSON,
+    Label.MOVING_MOTORCYCLIST: Label.MOTORCYCLIST,
+    Label.MOVING_OTHER_VEHICLE: Label.OTHER_VEHICLE,
+    Label.MOVING_TRUCK: Label.TRUCK,
+}
+HIDDEN = np.array([STANDING.get(label, label) for label in Label], np.uint8)
+
+
+def main() -> None:
+    """Make the map and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--sequence", default="00")
+    parser.add_argument("--set", action="append", default=[], help="a setting, such as map.min_views=2")
+    parser.add_argument("--every", type=int, default=4, help="look at the points of every n-th keyframe")
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    log = read_log(given.run / "log.mcap")
+    config = load_config(None, given.set, base=log.config)
+    result = log.result()
+    if result is None:
+        parser.error(f"{given.run}: the run did not finish")
+    T_world_keyframe = result[0].T_world_keyframe
+
+    def placed() -> Iterator[tuple[Keyframe, Transform]]:
+        for step in log.steps():
+            if step.keyframe is not None:
+                hidden = replace(step.keyframe, labels=HIDDEN[step.keyframe.labels])
+                yield hidden, T_world_keyframe[hidden.id]
+
+    started = perf_counter()
+    with TemporaryDirectory() as folder:
+        cloud = Path(folder) / "map.ply"
+        summary = write_map(placed(), [cloud], config=config.map)
+        points = np.asarray(read_point_cloud(cloud).points)
+    seconds = perf_counter() - started
+    kept = np.unique(_cells(points, config.map.voxel_m))
+    counts: Counter[str] = Counter()
+    scans = open_dataset(given.data, sequence=given.sequence)
+    row_of_scan = {int(number): row for row, number in enumerate(scans.scan_index)}
+    for keyframe, T in islice(placed(), 0, None, given.every):
+        scan = scans[row_of_scan[keyframe.scan_index]]
+        near = np.linalg.norm(keyframe.points, axis=1) < config.map.max_range_m
+        distance_m, match = cKDTree(scan.points).query(keyframe.points[near])
+        if distance_m.max() > 0.02:
+            parser.error(f"{given.data}: scan {scan.index} is not the one that the run mapped")
+        moves = scan.labels[match] >= Label.MOVING_CAR
+        world = geometry.apply(T, keyframe.points[near].astype(np.float64))
+        in_map = np.isin(_cells(world, config.map.voxel_m), kept)
+        counts.update(moving=int(moves.sum()), moving_left=int((moves & in_map).sum()))
+        counts.update(standing=int((~moves).sum()), standing_lost=int((~moves & ~in_map).sum()))
+    figures = {
+        "machine": platform.platform(),
+        "commit": subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip(),
+        "settings": config.map.model_dump(mode="json"),
+        "num_keyframes": summary.num_keyframes,
+        "num_map_points": summary.num_points,
+        **counts,
+        "moving_removed_percent": 100 * (1 - counts["moving_left"] / max(counts["moving"], 1)),
+        "standing_lost_percent": 100 * counts["standing_lost"] / counts["standing"],
+        "seconds": seconds,
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+    text = json.dumps(figures, indent=2)
+    if given.out:
+        given.out.write_text(text + "\n")
+    print(text)
+
+
+def _cells(points: np.ndarray, voxel_m: float) -> np.ndarray:
+    """A number for the voxel of each point."""
+    return (np.floor(points / voxel_m).astype(np.int64) + 2**19) @ np.array([2**42, 2**21, 1])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""How well, how fast and how honestly two scans are registered: Markdown and JSON.
+
+    python -m tools.benchmarks.registration DATA --cache DIR --out FILE.json
+        [--parts real,simulated,negatives,speed,ablation] [--sequences 00,08] [--sample 20] [--seed 11] [--yaws 24]
+        [--set segregator.gate=lengths ...]
+
+DATA is the folder of real data. Simulated scans, at real poses of the sequences named and in a usual and a hard world,
+are made where they are needed and kept in DIR, some 1.5 MB each. The gates of `VerifyConfig` and the noise of
+`RefineConfig` and `SegregatorConfig` were chosen on sequences 00 and 08 with seed 11: judge them on others.
+"""
+
+import argparse
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from segslam import keep_freed_memory
+from segslam.config import Config, load_config
+from segslam.experiments.provenance import commit, machine
+from tools.benchmarks.registration.ablation import Case, ablation
+from tools.benchmarks.registration.negatives import real_negatives
+from tools.benchmarks.registration.real import real_pairs
+from tools.benchmarks.registration.scans import (
+    BANDS_M,
+    PREDICTED,
+    WORLDS,
+    SimulatedPlace,
+    real_labels,
+    real_points,
+    reference_pairs,
+)
+from tools.benchmarks.registration.simulated import scan_of, simulated
+from tools.benchmarks.registration.speed import many_correspondences, sizes, stages
+from tools.benchmarks.registration.trials import Row
+
+PARTS = ("real", "simulated", "negatives", "speed", "ablation")
+Tables = dict[str, list[Row]]
+
+
+def places(options: argparse.Namespace) -> list[SimulatedPlace]:
+    return [
+        SimulatedPlace(options.data, sequence, world, seed=options.seed, cache=options.cache)
+        for sequence in options.sequences.split(",")
+        for world in WORLDS
+    ]
+
+
+def real_part(options: argparse.Namespace, config: Config) -> Tables:
+    return {"Real pairs, the source turned": real_pairs(options.data, config, num_yaws=options.yaws)}
+
+
+def simulated_part(options: argparse.Namespace, config: Config) -> Tables:
+    rng = np.random.default_rng([options.seed, 7])
+    found = simulated(places(options), config, sample=options.sample, num_negatives=options.negatives, rng=rng)
+    return {
+        "Simulated pairs at real poses": found.success,
+        "Gates: simulated scans over 100 m apart, and true pairs turned down": found.gates,
+        "Squared errors by the information claimed": found.information,
+    }
+
+
+def negatives_part(options: argparse.Namespace, config: Config) -> Tables:
+    return {"Real scans that do not overlap": real_negatives(options.data, config, every=options.every)}
+
+
+def speed_part(options: argparse.Namespace, config: Config) -> Tables:
+    network = cache(lambda index: (real_points(options.data, index), real_labels(options.data, index)))
+    real: list[Case] = [
+        (pair, network)
+        for pair in reference_pairs(options.data)
+        if pair.source in PREDICTED and pair.target in PREDICTED
+    ]
+    made = [case for place in places(options) for case in _cases(place, "given", config, options.sample)]
+    scans = [(f"00 {index}", network(index)) for index in PREDICTED]
+    return {
+        "6,000 correspondences": many_correspondences(config, rng=np.random.default_rng(options.seed)),
+        "Stages, real pairs": stages(real, config),
+        "Stages, simulated pairs": stages(made, config),
+        "Descriptions": sizes(scans, config),
+    }
+
+
+def ablation_part(options: argparse.Namespace, config: Config) -> Tables:
+    tables: Tables = {}
+    for labels in ("given", "shape"):
+        cases = [
+            case
+            for place in places(options)
+            for case in _cases(place, labels, config, options.sample, bands_m=BANDS_M[2:])
+        ]
+        tables[f"One thing taken away: 15-30 m, labels {labels}"] = ablation(cases, config, seed=options.seed)
+    return tables
+
+
+def _cases(
+    place: SimulatedPlace, labels: str, config: Config, sample: int, bands_m: tuple[tuple[int, int], ...] = BANDS_M
+) -> list[Case]:
+    scan = cache(scan_of(place, labels, config))
+    return [(pair, scan) for band_m in bands_m for pair in place.pairs(band_m, sample)]
+
+
+def markdown(title: str, rows: list[Row]) -> str:
+    """A table of rows with the same keys."""
+    if not rows:
+        return f"## {title}\n\nnothing\n"
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(map(str, row.values()) for row in rows)]
+    return f"## {title}\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--cache", type=Path, required=True, help="simulated scans are kept here")
+    parser.add_argument("--out", type=Path, required=True, help="a .json file; the tables go to .md beside it")
+    parser.add_argument("--parts", default=",".join(PARTS))
+    parser.add_argument("--sequences", default="00,08")
+    parser.add_argument("--sample", type=int, default=20, help="pairs of each band of distances")
+    parser.add_argument("--negatives", type=int, default=500, help="of each place and source of labels")
+    parser.add_argument("--every", type=int, default=4, help="of the courtyard's scans beside KITTI's")
+    parser.add_argument("--yaws", type=int, default=24)
+    parser.add_argument("--seed", type=int, default=11)
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    options = parser.parse_args()
+    unknown = set(options.parts.split(",")) - set(PARTS)
+    if unknown:
+        parser.error(f"--parts {','.join(sorted(unknown))}: choose from {','.join(PARTS)}")
+    return options
+
+
+def main() -> None:
+    options = arguments()
+    keep_freed_memory()  # as the commands do
+    config = load_config(overrides=options.set)
+    parts = {
+        "real": real_part,
+        "simulated": simulated_part,
+        "negatives": negatives_part,
+        "speed": speed_part,
+        "ablation": ablation_part,
+    }
+    asked = {key: str(value) for key, value in vars(options).items() if key not in ("data", "cache", "out")}
+    results = {"machine": machine(), "commit": commit(), "asked": asked, "tables": {}}
+    for name in options.parts.split(","):
+        for title, rows in parts[name](options, config).items():
+            results["tables"][title] = rows
+            print(markdown(title, rows), flush=True)
+    results["config"] = config.model_dump(mode="json", include={"segregator", "refine", "verify", "geometric"})
+    options.out.write_text(json.dumps(results, indent=2) + "\n")
+    tables = "\n".join(markdown(title, rows) for title, rows in results["tables"].items())
+    options.out.with_suffix(".md").write_text(f"# Registration ({asked}, commit {results['commit']})\n\n{tables}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""What each addition is worth: the coarse pose with one thing taken away, on pairs where it could matter."""
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from segslam import segregator
+from segslam.config import Config, load_config
+from segslam.types import Description, Label
+from tools.benchmarks.registration.scans import Labelled, Pair
+from tools.benchmarks.registration.speed import timed
+from tools.benchmarks.registration.trials import SUCCESS_DEG, SUCCESS_M, Row, error_of, percent
+
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "as it is": (),
+    "gate: published": ("segregator.gate=published",),
+    "gate: lengths": ("segregator.gate=lengths",),
+    "one clique a bound": ("segregator.max_cliques=1",),
+    "one bound, one clique": ("segregator.max_cliques=1", "segregator.noise_bounds_m=[0.2]"),
+    "cars and trunks only": ("segregator.cluster_min_points={car: 6, trunk: 4}",),
+    "cars and trunks of the authors' sizes": ("segregator.cluster_min_points={car: 30, trunk: 15}",),
+    "things at their centres, not feet": ("segregator.foot_classes=[]",),
+    "one noise for all (joint solver)": ("segregator.solver=joint",),
+    "ground without weight": ("segregator.ground_weight=0",),
+    "features never": ("segregator.features=never",),
+    "features always": ("segregator.features=always",),
+}
+LOST_SHARE = 0.7
+"""Of the labels in both scans, in the harder half of the table."""
+
+Case = tuple[Pair, Callable[[int], Labelled]]
+
+
+def ablation(cases: list[Case], config: Config, *, seed: int) -> list[Row]:
+    """A row a variant: success and mean error of coarse poses, labels as they are and with most of them lost."""
+    return [{"variant": name} | _measured(cases, _with(config, changes), seed) for name, changes in VARIANTS.items()]
+
+
+def _with(config: Config, changes: tuple[str, ...]) -> Config:
+    return load_config(overrides=changes, base=config)
+
+
+def _measured(cases: list[Case], config: Config, seed: int) -> Row:
+    row: Row = {}
+    for suffix, share in (("", 0.0), ("_labels_lost", LOST_SHARE)):
+        described = cache(lambda scan, index, share=share: _described(scan(index), share, [seed, index], config))
+        errors, cpu = [], []
+        for pair, scan in cases:
+            source, target = described(scan, pair.source), described(scan, pair.target)
+            outcome = segregator.match(source, target, config=config.segregator)
+            cpu.append(timed(lambda: segregator.match(source, target, config=config.segregator))[1])  # noqa: B023
+            errors.append(error_of(outcome, pair.T_target_source))
+        good = [error for error in errors if error.within(SUCCESS_M, SUCCESS_DEG)]
+        row |= {
+            f"percent{suffix}": percent([error in good for error in errors]),
+            f"mean_m{suffix}": round(float(np.mean([error.metres for error in good])), 3),
+            f"match_cpu_ms{suffix}": round(1e3 * float(np.median(cpu)), 1),
+        }
+    return row
+
+
+def _described(scan: Labelled, lost_share: float, seed: list[int], config: Config) -> Description:
+    points, labels = scan
+    lost = np.random.default_rng(seed).random(len(labels)) < lost_share
+    return segregator.describe(points, np.where(lost, np.uint8(Label.UNLABELLED), labels), config=config.segregator)

@@ -1,0 +1,125 @@
+"""Simulated pairs at real poses: success by distance, what the gates let through and lose, the errors claimed."""
+
+import sys
+from collections import Counter
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from segslam.config import Config
+from segslam.registration import PreparedScan, register_prepared
+from segslam.types import Alignment
+from tools.benchmarks.registration.scans import BANDS_M, Labelled, Pair, SimulatedPlace, by_shape
+from tools.benchmarks.registration.trials import (
+    RIGHT_DEG,
+    RIGHT_M,
+    SUCCESS_DEG,
+    SUCCESS_M,
+    Row,
+    Trial,
+    attempt,
+    percent,
+    preparer,
+)
+
+NEGATIVE_M = 100.0
+"""Scans farther apart share nothing within the range that is aligned."""
+CHI2_95 = 12.592
+"""0.95 quantile of chi-square with 6 degrees of freedom."""
+
+
+class Tables(NamedTuple):
+    success: list[Row]
+    gates: list[Row]
+    information: list[Row]
+
+
+def scan_of(place: SimulatedPlace, labels: str, config: Config) -> Callable[[int], Labelled]:
+    """The place's scans with the labels `given`, or labelled by `shape`."""
+    return place.scan if labels == "given" else by_shape(lambda index: place.scan(index)[0], config)
+
+
+def simulated(
+    places: list[SimulatedPlace], config: Config, *, sample: int, num_negatives: int, rng: np.random.Generator
+) -> Tables:
+    """Tables with a row for each place and source of labels, the first also for each band of distances."""
+    tables = Tables([], [], [])
+    for place in places:
+        for labels in ("given", "shape"):
+            name: Row = {"place": place.name, "labels": labels}
+            prepared = preparer(scan_of(place, labels, config), config)
+            by_band = {band_m: place.pairs(band_m, sample) for band_m in BANDS_M}
+            trials = {band_m: _tried(pairs, prepared, config) for band_m, pairs in by_band.items()}
+            whole = [trial for some in trials.values() for trial in some]
+            seen = sorted(
+                {index for pairs in by_band.values() for pair in pairs for index in (pair.source, pair.target)}
+            )
+            negatives = _negatives(place, seen, num_negatives, prepared, config, rng)
+            tables.success.extend(name | _success(band_m, some) for band_m, some in trials.items())
+            tables.gates.append(name | _gates(whole, negatives))
+            tables.information.append(name | _information(whole))
+            print(tables.gates[-1], tables.information[-1], file=sys.stderr, flush=True)
+    return tables
+
+
+def _tried(pairs: list[Pair], prepared: Callable[[int], PreparedScan], config: Config) -> list[Trial]:
+    return [
+        attempt(prepared(pair.source), prepared(pair.target), pair.T_target_source, config=config) for pair in pairs
+    ]
+
+
+def _negatives(
+    place: SimulatedPlace,
+    indices: list[int],
+    count: int,
+    prepared: Callable[[int], PreparedScan],
+    config: Config,
+    rng: np.random.Generator,
+) -> Counter[str]:
+    """What becomes of random pairs that share nothing: reasons, and how many were accepted."""
+    apart = [(a, b) for a in indices for b in indices if a != b and place.distance_m(a, b) > NEGATIVE_M]
+    outcomes: Counter[str] = Counter()
+    for row in rng.choice(len(apart), min(count, len(apart)), replace=False):
+        source, target = apart[row]
+        outcome = register_prepared(prepared(source), prepared(target), config=config)
+        outcomes["accepted" if isinstance(outcome, Alignment) else outcome.reason.value] += 1
+    return outcomes
+
+
+def _success(band_m: tuple[int, int], trials: list[Trial]) -> Row:
+    good = [trial for trial in trials if trial.fine.within(SUCCESS_M, SUCCESS_DEG)]
+    return {
+        "apart_m": f"{band_m[0]}-{band_m[1]}",
+        "pairs": len(trials),
+        "coarse_percent": percent([trial.coarse.within(SUCCESS_M, SUCCESS_DEG) for trial in trials]),
+        "accepted_percent": percent([trial.fine.within(SUCCESS_M, SUCCESS_DEG) for trial in trials]),
+        "accepted_wrong": sum(trial.wrong for trial in trials),
+        "fine_mean_m": round(float(np.mean([trial.fine.metres for trial in good])), 3) if good else None,
+        "fine_mean_deg": round(float(np.mean([trial.fine.degrees for trial in good])), 3) if good else None,
+    }
+
+
+def _gates(trials: list[Trial], negatives: Counter[str]) -> Row:
+    return {
+        "negatives": negatives.total(),
+        "accepted": negatives["accepted"],
+        "reasons": ", ".join(f"{reason} {count}" for reason, count in negatives.most_common()),
+        "true_pairs": sum(trial.refined.within(RIGHT_M, RIGHT_DEG) for trial in trials),
+        "lost": sum(trial.lost for trial in trials),
+        "accepted_wrong": sum(trial.wrong for trial in trials),
+    }
+
+
+def _information(trials: list[Trial]) -> Row:
+    """Squared errors by the information claimed, of right poses: 6 in the mean, 95 % below the bound, if it is true."""
+    coarse = np.array([trial.coarse_squared for trial in trials if trial.coarse.within(SUCCESS_M, SUCCESS_DEG)])
+    fine = np.array([trial.fine_squared for trial in trials if trial.fine.within(RIGHT_M, RIGHT_DEG)])
+    return {
+        "coarse_poses": len(coarse),
+        "coarse_mean": round(float(coarse.mean()), 2),
+        "coarse_within_95": percent(list(coarse < CHI2_95)),
+        "fine_poses": len(fine),
+        "fine_mean": round(float(fine.mean()), 2),
+        "fine_within_95": percent(list(fine < CHI2_95)),
+    }

@@ -1,0 +1,198 @@
+"""Does verification hold away from the street? Scenes x sensors x noise, pairs of one place and pairs of two places.
+
+    python -m tools.benchmarks.scenes --out FILE.json [--pairs 200] [--scenes corridor,garage] [--sensors 16,64]
+        [--noise 0.01,0.03,0.1] [--seed 0]
+
+Each true pair is two scans of one place, each false pair two scans of different places, both with the prior that a run
+would have: for false pairs a prior that puts the places beside each other. Default settings. Prints a row for each
+combination: false acceptances, true pairs with an overlap above 0.4 at the true pose, and how many of them are kept.
+Settings were chosen on even seeds; report odd ones.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections import Counter
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import Config, load_config
+from segslam.keyframes import downsample_keyframe
+from segslam.registration import PreparedScan, prepare_scan, register_prepared, shape_labels
+from segslam.simulation.scene_sensors import SENSORS, scan_points
+from segslam.simulation.scenes import SCENES, Scene, pose
+from segslam.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
+from segslam.verification.gates import NoiseFloor, agreement
+from segslam.verification.noise_floor import NeighbourNoise
+from segslam.verification.prior import far_from_prior
+
+RIGHT_M, RIGHT_DEG = 0.5, 2.0
+DRIFT_M, DRIFT_DEG, HEIGHT_M = 1.5, 3.0, 0.3
+"""Standard deviations of the prior."""
+RADIUS_M, CHAIN_M = 8.0, 130.0
+ELSEWHERE = 100
+"""Added to the seed of a scene: another one of its kind."""
+
+
+class Place:
+    """Scans of a scene by one sensor, each prepared once."""
+
+    def __init__(self, scene: Scene, sensor: str, noise_m: float, seed: int, config: Config) -> None:
+        self.scene = scene
+        self._sensor, self._noise_m, self._seed, self._config = sensor, noise_m, seed, config
+        self.prepared = cache(self._prepare)
+
+    def pose(self, row: int, visit: int) -> Transform:
+        return pose(self.scene, row, np.random.default_rng([self._seed, row, visit]), turned=visit % 2 == 1)
+
+    def floor(self) -> NoiseFloor:
+        """The noise floor that a run would measure: five scans and their neighbours, some 2 m on."""
+        step_m = float(np.median(np.linalg.norm(np.diff(self.scene.path[:, :3], axis=0), axis=1)))
+        lag = max(1, round(2.0 / step_m))
+        poses = {row: self.pose(row, 0) for row in range(len(self.scene.path))}
+        noise = NeighbourNoise(
+            lambda row: self.prepared(row, 0).observed, poses.__getitem__, lambda _: lag, config=self._config
+        )
+        return noise.at(len(self.scene.path) - 1)
+
+    def _prepare(self, row: int, visit: int) -> PreparedScan:
+        rng = np.random.default_rng([self._seed, row, visit, 1])
+        points = scan_points(self.scene, self._sensor, self.pose(row, visit), noise_m=self._noise_m, rng=rng)
+        labels = shape_labels(points, config=self._config)
+        classes = tuple(self._config.segregator.cluster_min_points)
+        points, labels, _ = downsample_keyframe(points, labels, config=self._config.keyframes, whole_classes=classes)
+        return prepare_scan(points, labels, config=self._config)
+
+
+def true_pairs(scene: Scene, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Rows of the path within reach of each other and on one level."""
+    apart = np.linalg.norm(scene.path[:, None, :3] - scene.path[:, :3], axis=-1)
+    return _drawn((apart < scene.max_shift_m) & (_heights(scene) < 0.5), count, rng)
+
+
+def false_pairs(scene: Scene, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Rows of the path at other levels, or as far apart as the scene allows."""
+    apart = np.linalg.norm(scene.path[:, None, :2] - scene.path[:, :2], axis=-1)
+    return _drawn((apart > 2.5 * scene.max_shift_m) | (_heights(scene) > 1.0), count, rng)
+
+
+def _heights(scene: Scene) -> np.ndarray:
+    return np.abs(scene.path[:, None, 2] - scene.path[:, 2])
+
+
+def _drawn(allowed: np.ndarray, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+    sources, targets = np.nonzero(allowed)
+    rows = rng.choice(len(sources), min(count, len(sources)), replace=False)
+    return list(zip(sources[rows].tolist(), targets[rows].tolist(), strict=True))
+
+
+class Judge:
+    """What a run would make of pairs of a place."""
+
+    def __init__(self, floor: NoiseFloor, config: Config) -> None:
+        self._floor, self._config = floor, config
+
+    def __call__(
+        self, source: PreparedScan, target: PreparedScan, T_prior: Transform, R_world_target: Rotation
+    ) -> Alignment | Rejected:
+        candidate = LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), RADIUS_M, CHAIN_M)
+        gate = partial(far_from_prior, candidate=candidate, R_world_target=R_world_target, config=self._config)
+        return register_prepared(source, target, config=self._config, floor=self._floor, gate=gate)
+
+
+def _prior(T_target_source: Transform, rng: np.random.Generator) -> Transform:
+    drift = rng.normal(scale=[DRIFT_M, DRIFT_M, HEIGHT_M])
+    turn = geometry.yaw(math.radians(rng.normal(scale=DRIFT_DEG)))
+    return geometry.transform(np.eye(3), drift) @ T_target_source @ geometry.transform(turn, 0.0)
+
+
+def bench(name: str, sensor: str, noise_m: float, *, count: int, seed: int, config: Config) -> dict[str, object]:
+    """A row of the table."""
+    rng = np.random.default_rng([seed, 9])
+    started = time.perf_counter()
+    here, elsewhere = (Place(SCENES[name](other), sensor, noise_m, other, config) for other in (seed, seed + ELSEWHERE))
+    floor = here.floor()
+    judge = Judge(floor, config)
+    row: dict[str, object] = {"scene": name, "sensor": sensor, "noise_m": noise_m}
+    row |= _true(here, judge, count, rng, config) | _false(here, elsewhere, judge, count, rng)
+    return row | {"floor": round(floor.residual_ratio, 2), "seconds": round(time.perf_counter() - started, 1)}
+
+
+def _true(place: Place, judge: Judge, count: int, rng: np.random.Generator, config: Config) -> dict[str, object]:
+    lost: Counter[str] = Counter()
+    kept = overlapping = wrong = 0
+    for source, target in true_pairs(place.scene, count, rng):
+        visits = int(rng.integers(2)), int(rng.integers(2)) + 2
+        T_source, T_target = place.pose(source, visits[0]), place.pose(target, visits[1])
+        one, other = place.prepared(source, visits[0]), place.prepared(target, visits[1])
+        T_true = geometry.inverse(T_target) @ T_source
+        counts = agreement(one.observed, other.observed, T_true, config=config.verify).overlap > 0.4
+        found = judge(one, other, _prior(T_true, rng), T_target[:3, :3])
+        right = isinstance(found, Alignment) and is_right(found.fine.T_target_source, T_true)
+        wrong += isinstance(found, Alignment) and not right
+        overlapping += counts
+        kept += counts and right
+        if counts and isinstance(found, Rejected):
+            lost[found.reason.value] += 1
+    return {"overlapping": overlapping, "kept": kept, "lost": dict(lost), "accepted_wrong": wrong}
+
+
+def _false(here: Place, elsewhere: Place, judge: Judge, count: int, rng: np.random.Generator) -> dict[str, object]:
+    """Half of the sources are of the same scene, half of another one of its kind."""
+    accepted = 0
+    rejected: Counter[str] = Counter()
+    for number, (source, target) in enumerate(false_pairs(here.scene, count, rng)):
+        place = here if number % 2 else elsewhere
+        source %= len(place.scene.path)
+        visits = int(rng.integers(2)), int(rng.integers(2)) + 2
+        T_source, T_target = place.pose(source, visits[0]), here.pose(target, visits[1])
+        T_near = geometry.transform(geometry.yaw(rng.choice([0.0, np.pi])), [*rng.uniform(-4.0, 4.0, 2), 0.0])
+        if place is here:
+            T_near[2, 3] = here.scene.path[source, 2] - here.scene.path[target, 2]
+        found = judge(
+            place.prepared(source, visits[0]), here.prepared(target, visits[1]), _prior(T_near, rng), np.eye(3)
+        )
+        if isinstance(found, Rejected):
+            rejected[found.reason.value] += 1
+        elif place is not here or not is_right(found.fine.T_target_source, geometry.inverse(T_target) @ T_source):
+            accepted += 1
+    return {"false_accepted": accepted, "rejected": dict(rejected)}
+
+
+def is_right(T_estimate: Transform, T_true: Transform) -> bool:
+    T = geometry.inverse(T_true) @ T_estimate
+    return geometry.distance(T) < RIGHT_M and math.degrees(geometry.angle(T)) < RIGHT_DEG
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=200, help="true ones, and as many false ones")
+    parser.add_argument("--scenes", default=",".join(SCENES))
+    parser.add_argument("--sensors", default=",".join(SENSORS))
+    parser.add_argument("--noise", default="0.01,0.03,0.1")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    config = load_config(overrides=options.set)
+    rows = []
+    for name in options.scenes.split(","):
+        for sensor in options.sensors.split(","):
+            for noise_m in map(float, options.noise.split(",")):
+                row = bench(name, sensor, noise_m, count=options.pairs, seed=options.seed, config=config)
+                rows.append(row)
+                print(" | ".join(str(value) for value in row.values()), flush=True)
+                options.out.write_text(json.dumps({"seed": options.seed, "rows": rows}, indent=2) + "\n")
+    total = {
+        key: sum(int(str(row[key])) for row in rows)
+        for key in ("overlapping", "kept", "accepted_wrong", "false_accepted")
+    }
+    print(total)
+
+
+if __name__ == "__main__":
+    main()

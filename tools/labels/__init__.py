@@ -1,1 +1,0 @@
-"""What bench_labels.py is made of."""

@@ -1,7 +1,9 @@
 """Loop closing: candidates for a keyframe, each registered and verified; a second search with the final poses."""
 
+import math
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
+from time import monotonic
 
 from segslam.config import Config
 from segslam.far_loops import FarLoops
@@ -70,15 +72,18 @@ class LoopCloser:
         """The graph was optimised: closures that it keeps shorten the chains between keyframes."""
         self._detector.note_estimate(weights)
 
-    def look_again(self, watch: Stopwatch) -> Iterator[LoopAttempt]:
-        """Try the pairs that the final poses propose and no attempt has had; the nearest first, so many at most."""
+    def look_again(self, watch: Stopwatch, *, end_s: float = math.inf) -> Iterator[LoopAttempt]:
+        """Try the pairs that the final poses propose and that were not tried before: a limited number, in order.
+
+        No keyframe is begun after `end_s`, by time.monotonic.
+        """
         self._is_finished = True
         most = max(LEAST_AGAIN, int(MOST_AGAIN * len(self._tried)))
         for keyframe_id in range(len(self.submaps.T_odom)):
             for attempt in self.attempt(keyframe_id, watch):
                 yield attempt
                 most -= 1
-            if most <= 0:
+            if most <= 0 or monotonic() > end_s:
                 return
 
     def _far_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:

@@ -1,8 +1,10 @@
 """The whole pipeline, one call per scan. It knows no file and no viewer; these consume the Steps that it returns."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from time import monotonic
 
 import numpy as np
 
@@ -131,12 +133,15 @@ class Slam:
             T_odom_lidar = np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps])
             self._tracker.restore(T_odom_lidar, self._motions, self._stamps(), scan_of)
 
-    def finish(self) -> SlamResult:
-        """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan."""
+    def finish(self, *, search_s: float = math.inf) -> SlamResult:
+        """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan.
+
+        With the final poses loops are searched again, for `search_s` seconds at most.
+        """
         if not self._steps:
             raise ValueError("no scan was processed")
         self._is_finished = True
-        estimate, late = self._settle()
+        estimate, late = self._settle(monotonic() + search_s)
         odometry = Trajectory(
             scan_index=np.array([index for index, _, _ in self._steps]),
             stamp_ns=self._stamps(),
@@ -153,13 +158,16 @@ class Slam:
         attempts = (*self._attempts, *late)
         return SlamResult(trajectory, odometry, estimate, rows, attempts, tuple(self._motions), len(late))
 
-    def _settle(self) -> tuple[GraphEstimate, list[LoopAttempt]]:
-        """The final estimate, after loops were searched again with better poses; and the attempts of that search."""
+    def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
+        """The final estimate, after loops were searched again with better poses; and the attempts of that search.
+
+        The search ends at `end_s`, by time.monotonic.
+        """
         late: list[LoopAttempt] = []
         estimate = self.graph.finish()
         for _ in range(ROUNDS):
             self._loops.note_estimate(estimate.closure_weights)
-            found = list(self._loops.look_again(Stopwatch()))
+            found = list(self._loops.look_again(Stopwatch(), end_s=end_s))
             late += found
             if not any(isinstance(attempt.outcome, LoopClosure) for attempt in found):
                 break

@@ -1,5 +1,6 @@
 """End of a mapped or replayed run: results, report, figures."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,10 +22,12 @@ def finish(
     json: bool,
     quiet: bool,
     more: Callable[["SlamResult"], Mapping[str, Any]] = lambda result: {},
+    search_s: float = math.inf,
 ) -> dict[str, Any]:
     """End a run: write its results, with a map where files for it are named, and show its figures.
 
-    What `more` makes of the result is among the figures, which are returned.
+    What `more` makes of the result is among the figures, which are returned. `search_s` limits the last search for
+    loops, as in `Slam.finish`.
     """
     from segslam.calibration import vertical_angle_advice
     from segslam.log import read_log
@@ -34,7 +37,7 @@ def finish(
     from segslam.run.run import peak_rss_mb
 
     say("all scans read; final optimisation ...", quiet=quiet)
-    result, metrics = run.finish()
+    result, metrics = run.finish(search_s=search_s)
     if reference is not None:
         metrics |= accuracy(result, reference)
     metrics |= more(result)

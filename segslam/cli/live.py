@@ -38,6 +38,11 @@ MOST_BEHIND = 20
 """Chosen: keyframes that wait for their loops, 2 MB each; beyond, keyframes are kept but their loops are not searched
 until the end of the run."""
 
+MAP_SO_FAR = "map_so_far.ply"
+"""Written by the service `/segslam/save_map`."""
+FINAL_SEARCH_S = 60.0
+"""Chosen: the last search for loops ends after this time, so that the results of a live run are not long in coming."""
+
 
 def live(
     out: Annotated[Path, typer.Option(help="New folder for the run.")],
@@ -148,7 +153,7 @@ def map_live(
     with ExitStack() as stack:
         mirror = server.send if server else None
         run = stack.enter_context(Run(folder, slam, dataset=source.name, options=options, mirror=mirror))
-        publisher = _publisher(source, stack)
+        publisher = _publisher(source, run, stack)
         front = stack.enter_context(Front(source, settings, tell=tell, idle_s=idle_s))
         stack.enter_context(stopped_by_signals(front.stop))
         front.wait_until_ready()
@@ -164,7 +169,11 @@ def map_live(
             say(f"{source.name}: {ended.why}", quiet=quiet)
         for file in map_files:
             file.parent.mkdir(parents=True, exist_ok=True)
-        finish(run, None, map_files=map_files, json=json, quiet=quiet, more=lambda _: figures.metrics(ended))
+
+        def more(_: object) -> dict[str, Any]:
+            return figures.metrics(ended)
+
+        finish(run, None, map_files=map_files, json=json, quiet=quiet, more=more, search_s=FINAL_SEARCH_S)
     return ended.why if ended.failed else ""
 
 
@@ -239,15 +248,21 @@ def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertic
     return TopicSource(topic or "", intensities=intensities, vertical_angle_deg=vertical_angle_deg)
 
 
-def _publisher(source: "Source", stack: ExitStack) -> "MappingPublisher | None":
-    """For a topic, what publishes path and map."""
+def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublisher | None":
+    """For a topic, what publishes path and map, and saves the map where a client of the service asks for it."""
     from segslam.live import FolderSource
+    from segslam.live.saved_map import save_map
 
     if isinstance(source, FolderSource):
         return None
     from segslam.live.ros import MappingPublisher
 
-    return stack.enter_context(MappingPublisher())
+    def save() -> str:
+        file = run.folder / MAP_SO_FAR
+        made = save_map(*run.map_so_far(), file, config=run.config.map)
+        return f"{file}: {made.num_points} points of {made.num_keyframes} keyframes"
+
+    return stack.enter_context(MappingPublisher(save))
 
 
 def _unlabelled() -> "Labeller":

@@ -4,7 +4,7 @@ from array import array
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path as FilePath
-from threading import Event
+from threading import Event, Thread
 from time import monotonic
 from typing import Any
 
@@ -37,6 +37,10 @@ try:
     from tf2_msgs.msg import TFMessage
 except ImportError:  # it is not on PyPI
     TFMessage = None
+try:
+    from std_srvs.srv import Trigger
+except ImportError:  # a minimal installation
+    Trigger = None
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 NAMESPACE = "segslam"
@@ -186,10 +190,18 @@ class TopicSource:
 
 
 class MappingPublisher:
-    """The node `/segslam/mapping`: the corrected path, the map, and where odom lies in map; a context manager."""
+    """The node `/segslam/mapping`: the corrected path, the map, and where odom lies in map; a context manager.
 
-    def __init__(self) -> None:
+    Its service `/segslam/save_map` (std_srvs/Trigger) calls `save`.
+    """
+
+    def __init__(self, save: Callable[[], str]) -> None:
+        """`save` writes the map so far and returns a message; it raises SegslamError or OSError if it cannot."""
+        self._save = save
         self._context, self._node = start_node("mapping")
+        if Trigger is not None:
+            self._node.create_service(Trigger, f"/{NAMESPACE}/save_map", self._save_map)
+        self._services = Thread(target=self._serve, name="services", daemon=True)
         self._path = self._node.create_publisher(Path, f"/{NAMESPACE}/path", LATCHED)
         self._map = self._node.create_publisher(PointCloud2, f"/{NAMESPACE}/map", LATCHED)
         self._correction = self._node.create_publisher(TransformStamped, f"/{NAMESPACE}/map_to_odom", LATCHED)
@@ -197,11 +209,13 @@ class MappingPublisher:
         self._T_map_odom = np.eye(4)
 
     def __enter__(self) -> "MappingPublisher":
+        self._services.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._node.destroy_node()
         self._context.try_shutdown()
+        self._services.join()
+        self._node.destroy_node()
 
     def note_step(self, stamp_ns: int, T_odom_keyframe: Transform | None, estimate: GraphEstimate | None) -> None:
         """Publish `map -> odom` after an optimisation, and on /tf at every step."""
@@ -227,6 +241,19 @@ class MappingPublisher:
             path.poses.append(pose)
         self._path.publish(path)
         self._map.publish(point_cloud2(drawn.points, drawn.labels, frame=MAP, stamp_ns=drawn.stamp_ns))
+
+    def _serve(self) -> None:
+        executor = SingleThreadedExecutor(context=self._context)
+        executor.add_node(self._node)
+        with suppress(ExternalShutdownException):
+            executor.spin()
+
+    def _save_map(self, _: Any, response: Any) -> Any:
+        try:
+            response.success, response.message = True, self._save()
+        except (SegslamError, OSError) as error:
+            response.success, response.message = False, str(error)
+        return response
 
 
 def start_node(name: str) -> tuple[Any, Any]:

@@ -1,6 +1,7 @@
 """A run: processes the scans of a data set, and writes the files of the run folder."""
 
 import logging
+import math
 import resource
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -169,15 +170,15 @@ class Run:
 
         return in_other_thread(steps, taken, most_waiting=MOST_WAITING)
 
-    def finish(self) -> tuple[SlamResult, dict[str, Any]]:
+    def finish(self, *, search_s: float = math.inf) -> tuple[SlamResult, dict[str, Any]]:
         """Final optimisation; writes all results. Returns the result and the figures that need no reference.
 
-        Raises SegslamError if there was no step.
+        `search_s` limits the last search for loops, as in `Slam.finish`. Raises SegslamError if there was no step.
         """
         if self.num_steps == 0:
             raise SegslamError(f"{self._dataset}: {self._why_nothing()}")
         started = perf_counter()
-        result = self._slam.finish()
+        result = self._slam.finish(search_s=search_s)
         self._note_ms("finish", perf_counter() - started)
         started = perf_counter()
         vertical = self._vertical_angle(result)

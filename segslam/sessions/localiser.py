@@ -1,5 +1,6 @@
 """A drive in the frame of an old map, one call a scan."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -54,12 +55,12 @@ class Localiser(Slam):
         self._placed = self._placer.place(keyframe_id, watch)
         return ()
 
-    def _settle(self) -> tuple[GraphEstimate, list[LoopAttempt]]:
+    def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         return self.graph.finish(), []
 
-    def finish(self) -> SlamResult:
+    def finish(self, *, search_s: float = math.inf) -> SlamResult:
         """As `Slam.finish`, in the map's frame; `from_map_m` shows which scans are localised."""
-        return replace(super().finish(), from_map_m=self._from_map_m())
+        return replace(super().finish(search_s=search_s), from_map_m=self._from_map_m())
 
     def _from_map_m(self) -> Vector:
         """(n,) travel from each scan to the nearest keyframe that keeps its place; infinite across a break."""

@@ -24,6 +24,7 @@ from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
 
 from segslam.datasets.point_cloud2 import CloudReader
 from segslam.live.live_map import DrawnMap
@@ -81,6 +82,14 @@ class Listener:
             assert monotonic() < end, {name: len(messages) for name, messages in self.heard.items()}
             self._executor.spin_once(timeout_sec=0.05)
 
+    def call_save_map(self) -> Any:
+        """The answer of the service."""
+        client = self._node.create_client(Trigger, "/segslam/save_map")
+        self.spin_until(client.service_is_ready)
+        answer = client.call_async(Trigger.Request())
+        self.spin_until(answer.done, seconds=60.0)
+        return answer.result()
+
     def num_poses_since(self, time_ns: int) -> int:
         """Poses heard whose scans were published after this time."""
         return sum(stamp_ns(message) > time_ns for message in self.heard["odometry"])
@@ -119,6 +128,7 @@ def test_a_publisher_is_followed_through_its_death_and_every_cloud_accounted_for
             publishing.kill()
             sent += 6 + len(publishing.communicate()[0].splitlines())
         listener.spin_until(lambda: listener.heard["path"] and listener.heard["map"])
+        saved = listener.call_save_map()
         command.signal(signal.SIGINT)
         status, metrics = command.ended()
     assert status == 0, command.told
@@ -126,6 +136,9 @@ def test_a_publisher_is_followed_through_its_death_and_every_cloud_accounted_for
     assert metrics["num_scans_arrived"] == metrics["num_scans"] + metrics["num_scans_dropped"]
     assert 4 <= metrics["num_scans_arrived"] <= sent
     assert metrics["num_gaps"] >= 1  # between the two publishers
+    assert saved.success, saved.message
+    assert saved.message.startswith(f"{tmp_path / 'run' / 'map_so_far.ply'}: ")
+    assert (tmp_path / "run" / "map_so_far.ply").read_bytes().startswith(b"ply")
     odometry = listener.heard["odometry"]
     assert (odometry[0].header.frame_id, odometry[0].child_frame_id) == ("odom", "lidar_top")
     published = [stamp_ns(message) for message in odometry]
@@ -138,7 +151,7 @@ def test_a_publisher_is_followed_through_its_death_and_every_cloud_accounted_for
 
 def test_a_pose_and_a_map_are_published_as_they_are(listener: Listener) -> None:
     turned = np.array([[0.0, -1, 0, 3], [1, 0, 0, 2], [0, 0, 1, 1], [0, 0, 0, 1]])
-    with MappingPublisher() as publisher:
+    with MappingPublisher(lambda: "") as publisher:
         drawn = DrawnMap(np.full((4, 3), 1.5), np.full(4, 9, np.uint8), {0: np.eye(4), 1: turned}, 3_000_000_007)
         publisher.show_map(drawn)
         listener.spin_until(lambda: listener.heard["path"] and listener.heard["map"])
@@ -148,6 +161,15 @@ def test_a_pose_and_a_map_are_published_as_they_are(listener: Listener) -> None:
     assert [pose.position.x, pose.position.y, pose.position.z] == [3, 2, 1]
     assert [pose.orientation.z, pose.orientation.w] == pytest.approx([np.sqrt(0.5)] * 2)
     np.testing.assert_array_equal(CloudReader()(cloud)[0], drawn.points)
+
+
+def test_a_map_that_cannot_be_saved_is_an_answer_with_the_reason(listener: Listener) -> None:
+    def save() -> str:
+        raise SegslamError("there is no keyframe yet")
+
+    with MappingPublisher(save):
+        answer = listener.call_save_map()
+    assert (answer.success, answer.message) == (False, "there is no keyframe yet")
 
 
 def test_a_cloud_is_read_as_it_was_sent() -> None:

@@ -14,4 +14,3 @@ class Estimate:
     num_inliers: int | None = None
     num_edges: int | None = None
     """Of the consistency graph."""
-    overlap: float | None = None

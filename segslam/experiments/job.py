@@ -1,7 +1,6 @@
 """One benchmark's scans, methods and settings, and the two pieces of work it consists of, wherever they are done."""
 
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,6 +9,7 @@ from pathlib import Path
 from segslam import geometry
 from segslam.config import Config
 from segslam.datasets import Dataset, open_dataset
+from segslam.evaluation import PoseError
 from segslam.experiments.estimate import Estimate
 from segslam.experiments.meter import Cost, measured
 from segslam.experiments.methods import METHODS, Part, prepare_parts
@@ -17,7 +17,6 @@ from segslam.experiments.rows import Row
 from segslam.experiments.trials import ScanVariant, Trial
 from segslam.registration import Stopwatch, shape_labels
 from segslam.semantics.encodings import Encoding
-from segslam.semantics.label_files import unlabelled
 from segslam.types import BadScan, Points, Rejected
 
 logger = logging.getLogger(__name__)
@@ -69,29 +68,29 @@ class SharedScan:
 
 
 def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
-    """Read, label, rotate and prepare a scan, with some of its labels removed."""
+    """Read, rotate, label and prepare a scan, with some labels removed. Labels by shape are those of rotated points."""
     dataset, row_of_scan = open_once(job.source)
     try:
         scan = dataset[row_of_scan[variant.index]]
     except BadScan as error:
         logger.warning("scan %d left out: %s", variant.index, error)
         return SharedScan({}, unusable=True)
-    labels, labelling = scan.labels, None
+    points, labels, labelling = variant.turned(scan.points), scan.labels, None
     if callable(labels):
         with measured() as labelling:
             labels = labels()
     elif dataset.labels.geometric and not labels.any():
         with measured() as labelling:
-            labels = shape_labels(scan.points, config=job.config)
-    points, labels = variant.of(scan.points, labels)
-    return SharedScan(prepare_parts(points, labels, methods=job.methods, config=job.config), labelling)
+            labels = shape_labels(points, config=job.config)
+    parts = prepare_parts(points, variant.remaining(labels), methods=job.methods, config=job.config)
+    return SharedScan(parts, labelling)
 
 
 def points_of(source: DataSource, variant: ScanVariant) -> Points:
     """The points of a variant, as the methods see them."""
     dataset, row_of_scan = open_once(source)
     scan = dataset[row_of_scan[variant.index]]
-    return variant.of(scan.points, unlabelled(len(scan.points)))[0]
+    return variant.turned(scan.points)
 
 
 def register_trial(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> list[Row]:
@@ -135,11 +134,11 @@ def _times(aligned: Cost, prepared: list[Cost], labelled: list[Cost], watch: Sto
 
 
 def _found(estimate: Estimate, trial: Trial) -> dict[str, object]:
-    T_error = estimate.T_target_source @ geometry.inverse(trial.T_target_source)
+    error = PoseError.of(estimate.T_target_source @ geometry.inverse(trial.T_target_source))
     return {
         "accepted": True,
-        "error_m": geometry.distance(T_error),
-        "error_deg": math.degrees(geometry.angle(T_error)),
+        "error_m": error.translation_m,
+        "error_deg": error.rotation_deg,
         "num_correspondences": estimate.num_correspondences,
         "num_edges": estimate.num_edges,
         "num_inliers": estimate.num_inliers,

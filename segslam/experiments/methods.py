@@ -126,14 +126,12 @@ def _align(source: Values, target: Values, config: Config, watch: Stopwatch) -> 
     )
     found = registration.register_prepared(*scans, config=config, watch=watch)
     if isinstance(found, Alignment):
-        return _estimate(found.coarse, found.fine, overlap=found.overlap)
+        return _estimate(found.coarse, found.fine)
     return found
 
 
-def _estimate(coarse: Registration, fine: Registration, *, overlap: float | None = None) -> Estimate:
-    return Estimate(
-        fine.T_target_source, coarse.num_correspondences, coarse.num_inliers, coarse.num_edges, overlap=overlap
-    )
+def _estimate(coarse: Registration, fine: Registration) -> Estimate:
+    return Estimate(fine.T_target_source, coarse.num_correspondences, coarse.num_inliers, coarse.num_edges)
 
 
 def _baseline(

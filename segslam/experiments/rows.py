@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from segslam.errors import reason
-from segslam.evaluation import SUCCESS_DEG, SUCCESS_M
+from segslam.evaluation import PoseError
 from segslam.experiments.trials import ScanVariant
 from segslam.system.whole_files import whole_file
 from segslam.types import SegslamError, Transform, WorkFailed
@@ -63,7 +63,9 @@ class Row(BaseModel):
     @property
     def success(self) -> bool:
         """By the paper's rule: 2 m and 5 degrees."""
-        return self.accepted and _below(self.error_m, SUCCESS_M) and _below(self.error_deg, SUCCESS_DEG)
+        if self.error_m is None or self.error_deg is None:
+            return False
+        return self.accepted and PoseError(self.error_m, self.error_deg).success
 
     @property
     def key(self) -> tuple[str, ScanVariant, ScanVariant, str]:
@@ -78,10 +80,6 @@ class Row(BaseModel):
         if not self.T_target_source:
             return None
         return np.vstack([np.array(self.T_target_source.split(), dtype=float).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-
-
-def _below(value: float | None, bound: float) -> bool:
-    return value is not None and value < bound
 
 
 COLUMNS = [*Row.model_fields, "success"]

@@ -26,14 +26,16 @@ class ScanVariant:
         """The turn."""
         return geometry.transform(geometry.yaw(math.radians(self.yaw_deg)), 0.0)
 
-    def of(self, points: Points, labels: Labels) -> tuple[Points, Labels]:
-        """Points and labels of the scan, as this variant has them."""
-        if self.yaw_deg:
-            points = geometry.apply(self.T_variant_scan, points).astype(points.dtype)
-        if self.lost:
-            rng = np.random.default_rng([self.draw, self.index])
-            labels = np.where(rng.random(len(labels)) < self.lost, np.uint8(Label.UNLABELLED), labels)
-        return points, labels
+    def turned(self, points: Points) -> Points:
+        """The points of the scan in the frame of this variant."""
+        return geometry.apply(self.T_variant_scan, points).astype(points.dtype) if self.yaw_deg else points
+
+    def remaining(self, labels: Labels) -> Labels:
+        """The labels of the scan without those that are taken away."""
+        if not self.lost:
+            return labels
+        lost = np.random.default_rng([self.draw, self.index]).random(len(labels)) < self.lost
+        return np.where(lost, np.uint8(Label.UNLABELLED), labels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -111,20 +111,19 @@ def test_a_scan_that_is_missing_is_named() -> None:
 
 def test_the_truth_of_a_turned_source_carries_its_points_where_they_were() -> None:
     points = np.random.default_rng(0).normal(size=(50, 3)) * 10
-    labels = np.ones(50, np.uint8)
     reference = drive()
     turned = turned_trials(PAPER_PAIR, reference, step_deg=30)
     assert len(turned) == 12
     assert len({one.key for one in turned}) == 12
     for one in turned:
-        seen, _ = one.source.of(points, labels)
+        seen = one.source.turned(points)
         T_true = geometry.inverse(reference.T_world_lidar[10]) @ reference.T_world_lidar[0]
         np.testing.assert_allclose(geometry.apply(one.T_target_source, seen), geometry.apply(T_true, points), atol=1e-9)
 
 
 def test_labels_are_lost_in_the_asked_share_and_anew_at_each_draw() -> None:
-    points, labels = np.zeros((20_000, 3)), np.full(20_000, 13, np.uint8)
-    lost = [ScanVariant(4, lost=0.3, draw=draw).of(points, labels)[1] == 0 for draw in (0, 0, 1)]
+    labels = np.full(20_000, 13, np.uint8)
+    lost = [ScanVariant(4, lost=0.3, draw=draw).remaining(labels) == 0 for draw in (0, 0, 1)]
     assert abs(lost[0].mean() - 0.3) < 0.02  # 6 standard deviations of a share of 20,000 draws
     np.testing.assert_array_equal(lost[0], lost[1])
     assert (lost[0] != lost[2]).mean() > 0.3

@@ -5,12 +5,13 @@
 WORK is a folder for scans and runs; what is there already is used again. Both maps of a drive share one odometry.
 """
 
-import argparse
 import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
+from tools.benchmarks import common
 
 KEYS = (
     "num_scans",
@@ -56,7 +57,7 @@ def compared(work: Path, sensor: str, *, num_frames: int | None, seed: int) -> d
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "label_maps")
     parser.add_argument("work", type=Path)
     parser.add_argument("--sensor", action="append", help="hdl64, os1-64 or vlp16; may be repeated")
     parser.add_argument("--frames", type=int)
@@ -67,7 +68,7 @@ def main() -> None:
         sensor: compared(options.work, sensor, num_frames=options.frames, seed=options.seed)
         for sensor in options.sensor or ("vlp16", "hdl64")
     }
-    options.out.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
+    common.write_report(options.out, results)
     print(json.dumps(results, indent=2))
 
 

@@ -6,7 +6,6 @@ The true poses of both are in one frame, as those of two days that `segslam simu
 if a keyframe of the run is within 10 m; found is within 2 m and 5 degrees of the true pose in its keyframe.
 """
 
-import argparse
 import json
 from collections import Counter
 from pathlib import Path
@@ -16,17 +15,18 @@ import numpy as np
 
 from segslam import geometry
 from segslam.datasets import open_dataset
+from segslam.evaluation import PoseError
 from segslam.run.finished import read_run
 from segslam.run.locator import Locator
 from segslam.semantics.late import made
 from segslam.types import Rejected
+from tools.benchmarks import common
 
 WITHIN_M = 10.0
-FOUND_M, FOUND_DEG = 2.0, 5.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "locate")
     parser.add_argument("run", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--sequence", default="00")
@@ -58,9 +58,8 @@ def main() -> None:
             outcome = f"rejected: {found.reason.value}"
         else:
             T_lidar_found = geometry.inverse(T_true) @ T_keyframes[found.keyframe_id]
-            apart = T_lidar_found @ found.alignment.fine.T_target_source
-            right = geometry.distance(apart) < FOUND_M and np.degrees(geometry.angle(apart)) < FOUND_DEG
-            outcome = "found" if right else "false"
+            error = PoseError.of(T_lidar_found @ found.alignment.fine.T_target_source)
+            outcome = "found" if error.success else "false"
         outcomes[("" if near else "off the map, ") + outcome] += 1
     counted = sum(count for name, count in outcomes.items() if not name.startswith("off"))
     figures = {

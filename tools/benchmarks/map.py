@@ -5,11 +5,8 @@ Moving classes are hidden from the map first, so that the views of other keyfram
     python -m tools.benchmarks.map RUN DATA --sequence 06 --out figures.json
 """
 
-import argparse
 import json
-import platform
 import resource
-import subprocess
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,7 +23,9 @@ from segslam import geometry, open_dataset
 from segslam.config import load_config
 from segslam.log import read_log
 from segslam.map import write_map
+from segslam.semantics.late import made
 from segslam.types import Keyframe, Label, Transform
+from tools.benchmarks import common
 
 STANDING = {
     Label.MOVING_CAR: Label.CAR,
@@ -41,11 +40,11 @@ HIDDEN = np.array([STANDING.get(label, label) for label in Label], np.uint8)
 
 def main() -> None:
     """Make the map and print one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = common.parser(__doc__, "map")
     parser.add_argument("run", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--sequence", default="00")
-    parser.add_argument("--set", action="append", default=[], help="a setting, such as map.min_views=2")
+    common.add_settings(parser)
     parser.add_argument("--every", type=int, default=4, help="look at the points of every n-th keyframe")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
@@ -78,14 +77,12 @@ def main() -> None:
         distance_m, match = cKDTree(scan.points).query(keyframe.points[near])
         if distance_m.max() > 0.02:
             parser.error(f"{given.data}: scan {scan.index} is not the one that the run mapped")
-        moves = scan.labels[match] >= Label.MOVING_CAR
+        moves = made(scan.labels)[match] >= Label.MOVING_CAR
         world = geometry.apply(T, keyframe.points[near].astype(np.float64))
         in_map = np.isin(_cells(world, config.map.voxel_m), kept)
         counts.update(moving=int(moves.sum()), moving_left=int((moves & in_map).sum()))
         counts.update(standing=int((~moves).sum()), standing_lost=int((~moves & ~in_map).sum()))
     figures = {
-        "machine": platform.platform(),
-        "commit": subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip(),
         "settings": config.map.model_dump(mode="json"),
         "num_keyframes": summary.num_keyframes,
         "num_map_points": summary.num_points,
@@ -95,10 +92,9 @@ def main() -> None:
         "seconds": seconds,
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
-    text = json.dumps(figures, indent=2)
     if given.out:
-        given.out.write_text(text + "\n")
-    print(text)
+        common.write_report(given.out, figures)
+    print(json.dumps(figures, indent=2))
 
 
 def _cells(points: np.ndarray, voxel_m: float) -> np.ndarray:

@@ -11,7 +11,6 @@ SCANS is a folder of scans with poses.txt; kiss-slam reads the scans alone.
 What is in the folder `--work` from an earlier call is not made again.
 """
 
-import argparse
 import json
 import os
 import re
@@ -24,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from segslam.evaluation import trajectory_metrics
-from segslam.experiments.provenance import commit, machine
 from segslam.run.finished import FinishedRun, read_run
 from segslam.trajectory import lidar_from_camera
+from tools.benchmarks import common
 
 FIGURES = ("ate_m", "height_m", "kitti_translation_percent")
 OWN_FIGURES = (*FIGURES, "odometry_ate_m", "num_loops_accepted", "num_loops_false", "loop_recall", "seconds_total")
@@ -74,7 +73,7 @@ def _scans(data: Path) -> Path:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "peers")
     parser.add_argument("data", type=Path, help="folder with sequences/ and poses/, or of scans with poses.txt")
     parser.add_argument("--sequence", help="for a folder with sequences/")
     parser.add_argument("--kiss-slam", type=Path, required=True, help="its program kiss_slam_pipeline")
@@ -87,8 +86,7 @@ def main() -> None:
     theirs = kiss_slam(options.data, options.sequence, options.kiss_slam, folder, run)
     result = {"sequence": name, "segslam": ours, "kiss-slam": theirs}
     print(json.dumps(result, indent=1))
-    report = {"machine": machine(), "commit": commit(), **result}
-    options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    common.write_report(options.out, result)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ DATA is the folder of real data with `nclt/`. Each query is a submap of 11 scans
 of travel before a query are left out. Found is within 2 m and 5 degrees of the optimised poses.
 """
 
-import argparse
 import json
 from collections import Counter
 from pathlib import Path
@@ -16,18 +15,20 @@ import numpy as np
 
 from segslam import geometry
 from segslam.config import load_config
+from segslam.evaluation import PoseError
 from segslam.recognition import MAX_PLACES, recognise
 from segslam.retrieval import Places, signature_of, signatures_around
 from segslam.types import Rejected
+from tools.benchmarks import common
 from tools.benchmarks.submaps import Submaps
 
-FOUND_M, FOUND_DEG, WRONG_M = 2.0, 5.0, 10.0
+WRONG_M = 10.0
 NEAR_M = 10.0
 """A query counts if there is an older place this near."""
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "recognition")
     parser.add_argument("data", type=Path)
     parser.add_argument("--queries", default="473:560")
     parser.add_argument("--every", type=int, default=1)
@@ -66,10 +67,8 @@ def main() -> None:
         if isinstance(found, Rejected):
             outcome = f"rejected: {found.reason.value}"
         else:
-            apart = geometry.inverse(submaps.T_world_lidar[row]) @ found.T_world_lidar
-            metres, degrees = geometry.distance(apart), np.degrees(geometry.angle(apart))
-            right = metres < FOUND_M and degrees < FOUND_DEG
-            outcome = "found" if right else ("wrong" if metres > WRONG_M else "off")
+            error = PoseError.of(geometry.inverse(submaps.T_world_lidar[row]) @ found.T_world_lidar)
+            outcome = "found" if error.success else ("wrong" if error.translation_m > WRONG_M else "off")
         outcomes[("" if revisits else "no revisit, ") + outcome] += 1
     figures = {
         "queries": len(ranks),

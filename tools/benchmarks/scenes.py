@@ -9,8 +9,6 @@ combination: false acceptances, true pairs with an overlap above 0.4 at the true
 Settings were chosen on even seeds; report odd ones.
 """
 
-import argparse
-import json
 import math
 import time
 from collections import Counter
@@ -29,8 +27,8 @@ from segslam.types import Alignment, LoopCandidate, Rejected, Rotation, Transfor
 from segslam.verification.gates import NoiseFloor, agreement
 from segslam.verification.noise_floor import NeighbourNoise
 from segslam.verification.prior import far_from_prior
+from tools.benchmarks import common
 
-RIGHT_M, RIGHT_DEG = 0.5, 2.0
 DRIFT_M, DRIFT_DEG, HEIGHT_M = 1.5, 3.0, 0.3
 """Standard deviations of the prior."""
 RADIUS_M, CHAIN_M = 8.0, 130.0
@@ -71,23 +69,17 @@ class Place:
 def true_pairs(scene: Scene, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
     """Rows of the path within reach of each other and on one level."""
     apart = np.linalg.norm(scene.path[:, None, :3] - scene.path[:, :3], axis=-1)
-    return _drawn((apart < scene.max_shift_m) & (_heights(scene) < 0.5), count, rng)
+    return common.draw_pairs((apart < scene.max_shift_m) & (_heights(scene) < 0.5), count, rng)
 
 
 def false_pairs(scene: Scene, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
     """Rows of the path at other levels, or as far apart as the scene allows."""
     apart = np.linalg.norm(scene.path[:, None, :2] - scene.path[:, :2], axis=-1)
-    return _drawn((apart > 2.5 * scene.max_shift_m) | (_heights(scene) > 1.0), count, rng)
+    return common.draw_pairs((apart > 2.5 * scene.max_shift_m) | (_heights(scene) > 1.0), count, rng)
 
 
 def _heights(scene: Scene) -> np.ndarray:
     return np.abs(scene.path[:, None, 2] - scene.path[:, 2])
-
-
-def _drawn(allowed: np.ndarray, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    sources, targets = np.nonzero(allowed)
-    rows = rng.choice(len(sources), min(count, len(sources)), replace=False)
-    return list(zip(sources[rows].tolist(), targets[rows].tolist(), strict=True))
 
 
 class Judge:
@@ -132,7 +124,7 @@ def _true(place: Place, judge: Judge, count: int, rng: np.random.Generator, conf
         T_true = geometry.inverse(T_target) @ T_source
         counts = agreement(one.observed, other.observed, T_true, config=config.verify).overlap > 0.4
         found = judge(one, other, _prior(T_true, rng), T_target[:3, :3])
-        right = isinstance(found, Alignment) and is_right(found.fine.T_target_source, T_true)
+        right = isinstance(found, Alignment) and common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
         wrong += isinstance(found, Alignment) and not right
         overlapping += counts
         kept += counts and right
@@ -158,24 +150,21 @@ def _false(here: Place, elsewhere: Place, judge: Judge, count: int, rng: np.rand
         )
         if isinstance(found, Rejected):
             rejected[found.reason.value] += 1
-        elif place is not here or not is_right(found.fine.T_target_source, geometry.inverse(T_target) @ T_source):
+        elif place is not here or not common.is_right(
+            geometry.inverse(T_source) @ T_target @ found.fine.T_target_source
+        ):
             accepted += 1
     return {"false_accepted": accepted, "rejected": dict(rejected)}
 
 
-def is_right(T_estimate: Transform, T_true: Transform) -> bool:
-    T = geometry.inverse(T_true) @ T_estimate
-    return geometry.distance(T) < RIGHT_M and math.degrees(geometry.angle(T)) < RIGHT_DEG
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "scenes")
     parser.add_argument("--pairs", type=int, default=200, help="true ones, and as many false ones")
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--sensors", default=",".join(SENSORS))
     parser.add_argument("--noise", default="0.01,0.03,0.1")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    common.add_settings(parser)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     config = load_config(overrides=options.set)
@@ -186,7 +175,7 @@ def main() -> None:
                 row = bench(name, sensor, noise_m, count=options.pairs, seed=options.seed, config=config)
                 rows.append(row)
                 print(" | ".join(str(value) for value in row.values()), flush=True)
-                options.out.write_text(json.dumps({"seed": options.seed, "rows": rows}, indent=2) + "\n")
+                common.write_report(options.out, {"seed": options.seed, "rows": rows})
     total = {
         key: sum(int(str(row[key])) for row in rows)
         for key in ("overlapping", "kept", "accepted_wrong", "false_accepted")

@@ -8,8 +8,6 @@ closures that were found stand exact ones: at the same places, and wherever two 
     python -m tools.benchmarks.sequences runs/06 --out sequences.json
 """
 
-import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -17,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from segslam.evaluation import trajectory_metrics
-from segslam.experiments.provenance import commit, machine
 from segslam.pose_graph import PoseGraph
 from segslam.types import LoopClosure
+from tools.benchmarks import common
 from tools.benchmarks.back_end.calibration import closure_calibration, odometry_calibration
 from tools.benchmarks.back_end.drives import CONFIG, exact
 from tools.benchmarks.back_end.recorded import Recorded, exact_everywhere, read_recorded
@@ -100,13 +98,12 @@ def _number(value: float | None) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "sequences")
     parser.add_argument("runs", type=Path, nargs="+", help="folders that `segslam map` wrote, of data with true poses")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     options = parser.parse_args()
     rows = [row_of(run) for run in options.runs]
-    report = {"machine": machine(), "commit": commit(), "config": CONFIG.model_dump(mode="json"), "rows": rows}
-    options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    common.write_report(options.out, {"config": CONFIG.model_dump(mode="json"), "rows": rows})
     print(table(rows))
 
 

@@ -6,8 +6,6 @@ DATA is the folder of real data with `nclt/`. Right is below 0.5 m and 2 degrees
 Verification was set while looking at seed 5; report others.
 """
 
-import argparse
-import math
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -19,13 +17,13 @@ from segslam.config import Config, load_config
 from segslam.datasets import open_dataset
 from segslam.registration import PreparedScan, prepare_scan, register_prepared, shape_labels
 from segslam.types import Alignment, Points, Transform
+from tools.benchmarks import common
 
 NUM_BESIDE = 5
 """Scans before and after the middle one."""
 MIN_GAP = 100
 """Keyframes between the two of a pair."""
 NEAR_M, FAR_M = 20.0, 100.0
-RIGHT_M, RIGHT_DEG = 0.5, 2.0
 
 
 class Submaps:
@@ -44,15 +42,12 @@ class Submaps:
         at = self.T_world_lidar[:, :3, 3]
         apart = np.linalg.norm(at[:, None] - at, axis=-1)
         late = np.arange(len(at))[:, None] - np.arange(len(at)) > MIN_GAP
-        sources, targets = np.nonzero(late & (apart < NEAR_M if near else apart > FAR_M))
-        rows = rng.choice(len(sources), min(count, len(sources)), replace=False)
-        return list(zip(sources[rows].tolist(), targets[rows].tolist(), strict=True))
+        return common.draw_pairs(late & (apart < NEAR_M if near else apart > FAR_M), count, rng)
 
-    def error(self, source: int, target: int, T_target_source: Transform) -> tuple[float, float]:
-        """Metres and degrees from the optimised poses."""
+    def error(self, source: int, target: int, T_target_source: Transform) -> Transform:
+        """The pose of the source by the registration in that by the optimised poses."""
         T_true = geometry.inverse(self.T_world_lidar[target]) @ self.T_world_lidar[source]
-        T = geometry.inverse(T_true) @ T_target_source
-        return geometry.distance(T), math.degrees(geometry.angle(T))
+        return geometry.inverse(T_true) @ T_target_source
 
     def _read(self, index: int) -> Points:
         return self._scans[index].points
@@ -83,20 +78,20 @@ def run(submaps: Submaps, pairs: list[tuple[int, int]], config: Config) -> Count
     for source, target in pairs:
         found = register_prepared(submaps.prepared(source), submaps.prepared(target), config=config)
         if isinstance(found, Alignment):
-            metres, degrees = submaps.error(source, target, found.fine.T_target_source)
-            outcomes["right" if metres < RIGHT_M and degrees < RIGHT_DEG else "wrong"] += 1
+            T_error = submaps.error(source, target, found.fine.T_target_source)
+            outcomes["right" if common.is_right(T_error) else "wrong"] += 1
         else:
             outcomes[found.reason.value] += 1
     return outcomes
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "submaps")
     parser.add_argument("data", type=Path)
     parser.add_argument("--pairs", type=int, default=45)
     parser.add_argument("--negatives", type=int, default=45)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    common.add_settings(parser)
     options = parser.parse_args()
     config = load_config(overrides=options.set)
     submaps = Submaps(options.data / "nclt", config)

@@ -4,7 +4,6 @@ Example: python -m tools.benchmarks.trouble DRIVE --sequence 06 --frames 0:300 -
 DRIVE is a folder that `segslam simulate` made. Every row is mapped with default settings.
 """
 
-import argparse
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from segslam.evaluation import trajectory_metrics
 from segslam.odometry import GivenOdometry
 from segslam.slam import Slam
 from segslam.types import Scan, Trajectory
+from tools.benchmarks import common
 
 
 @dataclass(frozen=True)
@@ -138,18 +138,18 @@ def mapped(drive: Drive, config: Config) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "trouble")
     parser.add_argument("drive", type=Path)
     parser.add_argument("--sequence", default="06")
     parser.add_argument("--frames")
     parser.add_argument("--at", type=int, default=150, help="row where the trouble begins")
     parser.add_argument("--put-down", type=int, default=850, help="row where a kidnapped sensor is put down")
     parser.add_argument("--only", nargs="*", help="rows by name")
-    parser.add_argument("--set", nargs="*", default=[], dest="settings")
+    common.add_settings(parser)
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     dataset = open_dataset(arguments.drive, sequence=arguments.sequence, frames=arguments.frames)
-    config = load_config(None, arguments.settings)
+    config = load_config(None, arguments.set)
     if dataset.reference is None:
         parser.error("the drive has no true poses")
     plain = Drive(lambda: (dataset[row] for row in range(len(dataset))), dataset.reference.T_world_lidar)
@@ -172,7 +172,7 @@ def main() -> None:
             rows[name] = mapped(make(), config)
             print(name, json.dumps(rows[name]), flush=True)
     if arguments.out:
-        arguments.out.write_text(json.dumps(rows, indent=2))
+        common.write_report(arguments.out, {"rows": rows})
 
 
 if __name__ == "__main__":

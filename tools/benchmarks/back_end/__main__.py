@@ -6,14 +6,13 @@ none is found. Outliers are a share of all closures. Beside each drive stands th
     python -m tools.benchmarks.back_end ../shared/data --out back_end.json --sequence 00 --sequence 08 --seeds 3
 """
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from segslam.experiments.provenance import commit, machine
+from tools.benchmarks import common
 from tools.benchmarks.back_end.drives import CONFIG, exact, read_drive
 from tools.benchmarks.back_end.outliers import KINDS, draw_outliers, finished
 from tools.benchmarks.back_end.search import search
@@ -25,7 +24,13 @@ def measure(data: Path, sequence: str, odometry: str, seed: int, shares: list[fl
     """All figures of one drive."""
     drive = read_drive(data, sequence, odometry, np.random.default_rng([seed, 0]))
     true, found = search(drive, np.random.default_rng([seed, 1]))
-    row = {"sequence": sequence, "odometry": odometry, "seed": seed, "keyframes": len(drive.truth), "search": found}
+    row: dict[str, Any] = {
+        "sequence": sequence,
+        "odometry": odometry,
+        "seed": seed,
+        "keyframes": len(drive.truth),
+        "search": found,
+    }
     row["without_outliers"] = finished(drive, true, [])
     row["exact_closures"] = finished(drive, exact(true, drive.truth), [])
     row["ate_by_exact"] = row["without_outliers"]["ate_m"] / row["exact_closures"]["ate_m"]
@@ -40,7 +45,7 @@ def measure(data: Path, sequence: str, odometry: str, seed: int, shares: list[fl
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "back_end")
     parser.add_argument("data", type=Path, help="folder with kitti/ and trajectories/")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--sequence", action="append", help="may be repeated; default 00, 05, 06, 08, 09")
@@ -53,8 +58,7 @@ def main() -> None:
         for seed in range(options.seeds):
             rows.append(measure(options.data, sequence, options.odometry, seed, options.share or list(SHARES)))
             print(json.dumps(rows[-1]), flush=True)
-    report = {"machine": machine(), "commit": commit(), "config": CONFIG.model_dump(mode="json"), "rows": rows}
-    options.out.write_text(json.dumps(report, indent=1) + "\n")
+    common.write_report(options.out, {"config": CONFIG.model_dump(mode="json"), "rows": rows})
 
 
 if __name__ == "__main__":

@@ -1,22 +1,20 @@
 """Labels from shape on real scans of KITTI: against the truth of each class, and by the registrations they allow."""
 
-import json
-import math
 import time
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from segslam import geometry
 from segslam.config import Config
 from segslam.datasets import open_dataset
-from segslam.registration import PreparedScan
+from segslam.experiments.rows import Row
+from segslam.experiments.summary import figures, grouped
 from segslam.semantics import geometric_labels
-from segslam.types import GROUND_LABELS, Label, Points, Scan
-from tools.benchmarks.labels.trials import Trial, attempt, prepared, summary
+from segslam.semantics.late import made
+from segslam.types import GROUND_LABELS, Label, Points
+from tools.benchmarks import real_pairs
 
 CLASSES = {
     "ground": GROUND_LABELS,
@@ -25,16 +23,16 @@ CLASSES = {
     "vegetation": (Label.VEGETATION,),
     "trunk_or_pole": (Label.TRUNK, Label.POLE),
 }
-PREDICTED = (0, 20, 30, 4413)
-"""Scans that a network's labels are there for."""
+Figures = dict[str, Any]
 
 
 def class_agreement(data: Path, config: Config) -> dict[str, dict[str, float]]:
     """Intersection over union of each class over the points whose truth is known: of scans 0, 1 and 2, and of all."""
     counts: dict[str, dict[str, np.ndarray]] = {"all": {name: np.zeros(2) for name in CLASSES}}
     for scan in open_dataset(data / "kitti", sequence="00", frames="0:3"):
-        known = scan.labels != Label.UNLABELLED
-        labels, truth = geometric_labels(scan.points, config=config.geometric)[known], scan.labels[known]
+        true_labels = made(scan.labels)
+        known = true_labels != Label.UNLABELLED
+        labels, truth = geometric_labels(scan.points, config=config.geometric)[known], true_labels[known]
         counts[f"scan {scan.index}"] = {}
         for name, members in CLASSES.items():
             ours, theirs = np.isin(labels, members), np.isin(truth, members)
@@ -69,51 +67,30 @@ def speed(points: Points, config: Config, repeats: int = 21) -> dict[str, float]
     }
 
 
-def pairs_by_labels(data: Path, config: Config, num_yaws: int) -> dict[str, Any]:
+def pairs_by_labels(data: Path, config: Config, num_yaws: int) -> dict[str, Figures]:
     """The reference pairs at each yaw of a full circle, labels from shape; and, where there are any, a network's."""
-    rows = json.loads((data / "kitti" / "reference_pairs.json").read_text())
-    shape = _turned_pairs(rows, _scans(data, "none"), num_yaws, config, by_shape=True)
-    predicted_rows = [row for row in rows if row["source"] in PREDICTED and row["target"] in PREDICTED]
-    predicted = _turned_pairs(predicted_rows, _scans(data, "predicted_labels"), num_yaws, config, by_shape=False)
-    same = [trial for row in predicted_rows for trial in shape[row["source"], row["target"]]]
+    predicted = real_pairs.predicted_pairs(data)
+    both = set(map(tuple, predicted.pairs.tolist()))
+    shape = real_pairs.register_turned(data, real_pairs.reference_pairs(data), "geometric", config, num_yaws=num_yaws)
+    network = real_pairs.register_turned(data, predicted, "predicted_labels", config, num_yaws=num_yaws)
+    of_both = [row for row in shape if (row.source, row.target) in both]
     return {
-        "num_yaws": num_yaws,
-        "pairs": {f"{source}->{target}": summary(trials) for (source, target), trials in shape.items()},
-        "shape, all pairs": summary([trial for trials in shape.values() for trial in trials]),
-        "shape, pairs with predictions": summary(same),
-        "a network's, the same pairs": summary([trial for trials in predicted.values() for trial in trials]),
+        "shape, all pairs": summary(shape),
+        "shape, pairs with predictions": summary(of_both),
+        "a network's, the same pairs": summary(network),
     }
 
 
-def _scans(data: Path, labels: str) -> dict[int, Scan]:
-    return {scan.index: scan for scan in open_dataset(data / "kitti", sequence="00", labels=labels)}
+def summary(rows: Sequence[Row]) -> Figures:
+    """Figures of the refined poses, and of the coarse ones that led to them, over the successes."""
+    by_method = grouped(rows, lambda row: row.method)
+    found = figures(by_method[real_pairs.REFINED])
+    for name, method in (("coarse", real_pairs.COARSE), ("refined", real_pairs.REFINED)):
+        good = [row for row in by_method[method] if row.success]
+        found[f"{name}_m"] = _mean_and_worst([row.error_m or 0.0 for row in good])
+        found[f"{name}_deg"] = _mean_and_worst([row.error_deg or 0.0 for row in good])
+    return found
 
 
-def _turned_pairs(
-    rows: list[dict[str, Any]], scans: dict[int, Scan], num_yaws: int, config: Config, *, by_shape: bool
-) -> dict[tuple[int, int], list[Trial]]:
-    """The trials of each pair, the source turned by each yaw."""
-    ready = _preparer(scans, config, by_shape=by_shape)
-    trials: dict[tuple[int, int], list[Trial]] = {(row["source"], row["target"]): [] for row in rows}
-    for yaw in range(num_yaws):
-        T_turned_source = geometry.transform(geometry.yaw(2 * math.pi * yaw / num_yaws), np.zeros(3))
-        turned = cache(lambda index, T=T_turned_source: ready(index, T))
-        for row in rows:
-            T_true = np.array(row["T_target_source"]) @ geometry.inverse(T_turned_source)
-            source, target = turned(row["source"]), ready(row["target"], None)
-            trials[row["source"], row["target"]].append(attempt(source, target, T_true, config))
-    return trials
-
-
-def _preparer(
-    scans: dict[int, Scan], config: Config, *, by_shape: bool
-) -> Callable[[int, np.ndarray | None], PreparedScan]:
-    """Makes a scan ready, turned about its sensor or, once for all, as it is."""
-
-    def made(index: int, T_turned_source: np.ndarray) -> PreparedScan:
-        scan = scans[index]
-        points = geometry.apply(T_turned_source, scan.points.astype(np.float64)).astype(np.float32)
-        return prepared(points, None if by_shape else scan.labels, config)[0]
-
-    unturned = cache(lambda index: made(index, np.eye(4)))
-    return lambda index, T: unturned(index) if T is None else made(index, T)
+def _mean_and_worst(errors: Sequence[float]) -> tuple[float, float] | None:
+    return (round(float(np.mean(errors)), 4), round(max(errors), 4)) if errors else None

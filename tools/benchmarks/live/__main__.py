@@ -8,7 +8,6 @@ python -m tools.benchmarks.live SCANS --out DIR --every 1 --seconds 3600     the
 With --seconds the scans are sent forth and back until the time is over. Figures go to DIR/bench.json.
 """
 
-import argparse
 import csv
 import json
 import os
@@ -26,6 +25,8 @@ import numpy as np
 from segslam import geometry
 from segslam.datasets import Dataset, open_dataset
 from segslam.log import read_log
+from segslam.run.finished import read_run
+from tools.benchmarks import common
 from tools.benchmarks.live.sender import FolderSender, RosSender, Sender
 
 TOPIC = "/segslam_bench/points"
@@ -80,11 +81,11 @@ def run_live(dataset: Dataset, sender: Sender, words: list[str], every_s: float,
 def compared(live: Path, offline: Path) -> dict[str, Any]:
     """The two runs: closures that only one has, and the largest distance between poses of the same stamp."""
     closures = [closures_by_stamp(folder) for folder in (live, offline)]
-    trajectories = [read_log(folder / "log.mcap").result()[1] for folder in (live, offline)]
-    of_stamp = {int(stamp): T for stamp, T in zip(trajectories[1].stamp_ns, trajectories[1].T_world_lidar, strict=True)}
+    here, there = (read_run(folder).result.trajectory for folder in (live, offline))
+    of_stamp = {int(stamp): T for stamp, T in zip(there.stamp_ns, there.T_world_lidar, strict=True)}
     pairs = [
         (T, of_stamp[int(stamp)])
-        for stamp, T in zip(trajectories[0].stamp_ns, trajectories[0].T_world_lidar, strict=True)
+        for stamp, T in zip(here.stamp_ns, here.T_world_lidar, strict=True)
         if int(stamp) in of_stamp
     ]
     apart = [geometry.distance(geometry.inverse(one) @ other) for one, other in pairs]
@@ -112,7 +113,7 @@ def by_fifths(values: list[float]) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "live")
     parser.add_argument("data", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--every", type=float, required=True, help="seconds between two scans")
@@ -120,19 +121,18 @@ def main() -> None:
     parser.add_argument("--frames")
     parser.add_argument("--ros", choices=["reliable", "best_effort"])
     parser.add_argument("--offline", action="store_true")
-    parser.add_argument("--set", action="append", default=[], dest="settings")
+    common.add_settings(parser)
     chosen = parser.parse_args()
     os.environ.update(OWN_DOMAIN)
     chosen.out.mkdir(parents=True)
-    settings = [word for setting in chosen.settings for word in ("--set", setting)]
+    settings = [word for setting in chosen.set for word in ("--set", setting)]
     dataset = open_dataset(chosen.data, frames=chosen.frames, labels="none", vertical_angle_deg=0.0)
+    sender: Sender
     if chosen.ros:
         sender, source = RosSender(TOPIC, chosen.ros), ["--topic", TOPIC]
     else:
-        sender, source = (
-            FolderSender(chosen.out / "scans", keeps=100 if chosen.seconds else None),
-            [str(chosen.out / "scans")],
-        )
+        scans = chosen.out / "scans"
+        sender, source = FolderSender(scans, keeps=100 if chosen.seconds else None), [str(scans)]
     words = [*source, "--out", str(chosen.out / "live"), *settings]
     status, metrics, memory, num_sent = run_live(dataset, sender, words, chosen.every, chosen.seconds)
     steps = list(read_log(chosen.out / "live" / "log.mcap").steps(clouds=False))
@@ -155,9 +155,8 @@ def main() -> None:
         command = [sys.executable, "-m", "segslam", "map", str(chosen.out / "scans"), "--labels", "geometric"]
         subprocess.run([*command, "--out", str(chosen.out / "offline"), "--preset", "driving", *settings], check=True)
         figures["against_offline"] = compared(chosen.out / "live", chosen.out / "offline")
-    text = json.dumps(figures, indent=2)
-    (chosen.out / "bench.json").write_text(text + "\n")
-    print(text)
+    common.write_report(chosen.out / "bench.json", figures)
+    print(json.dumps(figures, indent=2))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ are made where they are needed and kept in DIR, some 1.5 MB each. The gates of `
 """
 
 import argparse
-import json
 from functools import cache
 from pathlib import Path
 
@@ -18,22 +17,16 @@ import numpy as np
 
 from segslam import keep_freed_memory
 from segslam.config import Config, load_config
-from segslam.experiments.provenance import commit, machine
+from segslam.experiments.variations import pair_trials
+from segslam.semantics.late import made
+from tools.benchmarks import common, real_pairs
+from tools.benchmarks.common import Row, markdown
 from tools.benchmarks.registration.ablation import Case, ablation
 from tools.benchmarks.registration.negatives import real_negatives
-from tools.benchmarks.registration.real import real_pairs
-from tools.benchmarks.registration.scans import (
-    BANDS_M,
-    PREDICTED,
-    WORLDS,
-    SimulatedPlace,
-    real_labels,
-    real_points,
-    reference_pairs,
-)
+from tools.benchmarks.registration.real import real
+from tools.benchmarks.registration.scans import BANDS_M, WORLDS, Labelled, SimulatedPlace, real_scan
 from tools.benchmarks.registration.simulated import scan_of, simulated
 from tools.benchmarks.registration.speed import many_correspondences, sizes, stages
-from tools.benchmarks.registration.trials import Row
 
 PARTS = ("real", "simulated", "negatives", "speed", "ablation")
 Tables = dict[str, list[Row]]
@@ -48,7 +41,7 @@ def places(options: argparse.Namespace) -> list[SimulatedPlace]:
 
 
 def real_part(options: argparse.Namespace, config: Config) -> Tables:
-    return {"Real pairs, the source turned": real_pairs(options.data, config, num_yaws=options.yaws)}
+    return {"Real pairs, the source turned": real(options.data, config, num_yaws=options.yaws)}
 
 
 def simulated_part(options: argparse.Namespace, config: Config) -> Tables:
@@ -66,18 +59,19 @@ def negatives_part(options: argparse.Namespace, config: Config) -> Tables:
 
 
 def speed_part(options: argparse.Namespace, config: Config) -> Tables:
-    network = cache(lambda index: (real_points(options.data, index), real_labels(options.data, index)))
-    real: list[Case] = [
-        (pair, network)
-        for pair in reference_pairs(options.data)
-        if pair.source in PREDICTED and pair.target in PREDICTED
-    ]
-    made = [case for place in places(options) for case in _cases(place, "given", config, options.sample)]
-    scans = [(f"00 {index}", network(index)) for index in PREDICTED]
+    @cache
+    def network(index: int) -> Labelled:
+        scan = real_scan(options.data, index, labels="predicted_labels")
+        return scan.points, made(scan.labels)
+
+    trials = pair_trials(real_pairs.predicted_pairs(options.data), None)
+    real_cases: list[Case] = [(trial, network) for trial in trials]
+    simulated_cases = [case for place in places(options) for case in _cases(place, "given", config, options.sample)]
+    scans = [(f"00 {index}", network(index)) for index in real_pairs.PREDICTED]
     return {
         "6,000 correspondences": many_correspondences(config, rng=np.random.default_rng(options.seed)),
-        "Stages, real pairs": stages(real, config),
-        "Stages, simulated pairs": stages(made, config),
+        "Stages, real pairs": stages(real_cases, config),
+        "Stages, simulated pairs": stages(simulated_cases, config),
         "Descriptions": sizes(scans, config),
     }
 
@@ -101,16 +95,8 @@ def _cases(
     return [(pair, scan) for band_m in bands_m for pair in place.pairs(band_m, sample)]
 
 
-def markdown(title: str, rows: list[Row]) -> str:
-    """A table of rows with the same keys."""
-    if not rows:
-        return f"## {title}\n\nnothing\n"
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *(map(str, row.values()) for row in rows)]
-    return f"## {title}\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "registration")
     parser.add_argument("data", type=Path)
     parser.add_argument("--cache", type=Path, required=True, help="simulated scans are kept here")
     parser.add_argument("--out", type=Path, required=True, help="a .json file; the tables go to .md beside it")
@@ -121,7 +107,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--every", type=int, default=4, help="of the courtyard's scans beside KITTI's")
     parser.add_argument("--yaws", type=int, default=24)
     parser.add_argument("--seed", type=int, default=11)
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    common.add_settings(parser)
     options = parser.parse_args()
     unknown = set(options.parts.split(",")) - set(PARTS)
     if unknown:
@@ -141,15 +127,15 @@ def main() -> None:
         "ablation": ablation_part,
     }
     asked = {key: str(value) for key, value in vars(options).items() if key not in ("data", "cache", "out")}
-    results = {"machine": machine(), "commit": commit(), "asked": asked, "tables": {}}
+    tables: Tables = {}
     for name in options.parts.split(","):
         for title, rows in parts[name](options, config).items():
-            results["tables"][title] = rows
+            tables[title] = rows
             print(markdown(title, rows), flush=True)
-    results["config"] = config.model_dump(mode="json", include={"segregator", "refine", "verify", "geometric"})
-    options.out.write_text(json.dumps(results, indent=2) + "\n")
-    tables = "\n".join(markdown(title, rows) for title, rows in results["tables"].items())
-    options.out.with_suffix(".md").write_text(f"# Registration ({asked}, commit {results['commit']})\n\n{tables}")
+    settings = config.model_dump(mode="json", include={"segregator", "refine", "verify", "geometric"})
+    common.write_report(options.out, {"asked": asked, "tables": tables, "config": settings})
+    text = "\n".join(markdown(title, rows) for title, rows in tables.items())
+    options.out.with_suffix(".md").write_text(f"# Registration ({asked})\n\n{text}")
 
 
 if __name__ == "__main__":

@@ -7,10 +7,12 @@ import numpy as np
 
 from segslam import segregator
 from segslam.config import Config, load_config
+from segslam.experiments.trials import Trial
 from segslam.types import Description, Label
-from tools.benchmarks.registration.scans import Labelled, Pair
+from tools.benchmarks.common import Row
+from tools.benchmarks.registration.attempts import error_of, percent
+from tools.benchmarks.registration.scans import Labelled
 from tools.benchmarks.registration.speed import timed
-from tools.benchmarks.registration.trials import SUCCESS_DEG, SUCCESS_M, Row, error_of, percent
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "as it is": (),
@@ -29,7 +31,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 LOST_SHARE = 0.7
 """Of the labels in both scans, in the harder half of the table."""
 
-Case = tuple[Pair, Callable[[int], Labelled]]
+Case = tuple[Trial, Callable[[int], Labelled]]
 
 
 def ablation(cases: list[Case], config: Config, *, seed: int) -> list[Row]:
@@ -47,14 +49,14 @@ def _measured(cases: list[Case], config: Config, seed: int) -> Row:
         described = cache(lambda scan, index, share=share: _described(scan(index), share, [seed, index], config))
         errors, cpu = [], []
         for pair, scan in cases:
-            source, target = described(scan, pair.source), described(scan, pair.target)
+            source, target = described(scan, pair.source.index), described(scan, pair.target.index)
             outcome = segregator.match(source, target, config=config.segregator)
             cpu.append(timed(lambda: segregator.match(source, target, config=config.segregator))[1])  # noqa: B023
             errors.append(error_of(outcome, pair.T_target_source))
-        good = [error for error in errors if error.within(SUCCESS_M, SUCCESS_DEG)]
+        good = [error for error in errors if error.success]
         row |= {
             f"percent{suffix}": percent([error in good for error in errors]),
-            f"mean_m{suffix}": round(float(np.mean([error.metres for error in good])), 3),
+            f"mean_m{suffix}": round(float(np.mean([error.translation_m for error in good])), 3),
             f"match_cpu_ms{suffix}": round(1e3 * float(np.median(cpu)), 1),
         }
     return row

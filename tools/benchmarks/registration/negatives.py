@@ -9,8 +9,9 @@ from segslam import geometry
 from segslam.config import Config
 from segslam.registration import register_prepared
 from segslam.types import Alignment
-from tools.benchmarks.registration.scans import by_shape, courtyard_points, kitti_pose, real_indices, real_points
-from tools.benchmarks.registration.trials import Row, error, preparer
+from tools.benchmarks.common import Row
+from tools.benchmarks.registration.attempts import error, preparer
+from tools.benchmarks.registration.scans import by_shape, courtyard_points, kitti_pose, real_indices, real_scan
 
 MEET_M = 60.0
 """Scans of KITTI 00 nearer than this share a street corner at least; they are no negatives."""
@@ -23,7 +24,7 @@ NUM_COURTYARD = 100
 
 def real_negatives(data: Path, config: Config, *, every: int) -> list[Row]:
     """A row for each kind of pair; of the courtyard's scans each `every`-th takes part."""
-    kitti = preparer(by_shape(partial(real_points, data), config), config)
+    kitti = preparer(by_shape(lambda index: real_scan(data, index).points, config), config)
     court = preparer(by_shape(partial(courtyard_points, data), config), config)
     indices = real_indices(data)
     within: Counter[str] = Counter()

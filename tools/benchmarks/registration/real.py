@@ -1,64 +1,57 @@
 """The real pairs whose pose is known to centimetres, the source turned by each yaw of a full circle."""
 
 import math
-from collections.abc import Callable
-from functools import cache, partial
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
 from segslam.config import Config
-from segslam.registration import PreparedScan, prepare_scan
-from segslam.semantics import geometric_labels
-from tools.benchmarks.registration.scans import Pair, are_predicted, real_labels, real_points, reference_pairs
-from tools.benchmarks.registration.trials import Row, Trial, attempt, percent
+from segslam.evaluation import PoseError
+from segslam.experiments import rows
+from segslam.experiments.summary import grouped
+from tools.benchmarks import real_pairs
+from tools.benchmarks.common import Row
 
 FAR_M = 20.0
 NEAR_BOUND, FAR_BOUND = (0.3, 1.0), (0.5, 2.0)
 """m, degrees that a coarse pose may be off, up to FAR_M and beyond."""
 REFINED_BOUND = (0.05, 0.2)
 
-Prepared = Callable[[int, float, bool], PreparedScan]
+
+def real(data: Path, config: Config, *, num_yaws: int) -> list[Row]:
+    """A row a pair and source of labels: shape for all pairs, a network where both scans have its labels."""
+    table: list[Row] = []
+    for labels, pairs in (
+        ("geometric", real_pairs.reference_pairs(data)),
+        ("predicted_labels", real_pairs.predicted_pairs(data)),
+    ):
+        done = real_pairs.register_turned(data, pairs, labels, config, num_yaws=num_yaws)
+        for (source, target), some in grouped(done, lambda row: (row.source, row.target)).items():
+            apart_m = float(np.linalg.norm((pairs.truth or {})[source, target][:3, 3]))
+            table.append({"pair": f"{source} -> {target}", "labels": labels} | _figures(some, apart_m))
+    return table
 
 
-def real_pairs(data: Path, config: Config, *, num_yaws: int) -> list[Row]:
-    """A row a pair. Labels are a network's where both scans have them, by shape elsewhere (of the turned points)."""
-    points_of = cache(partial(real_points, data))
-    labels_of = cache(partial(real_labels, data))
-
-    @cache
-    def prepared(index: int, turn_rad: float, predicted: bool) -> PreparedScan:
-        turn = geometry.transform(geometry.yaw(turn_rad), 0.0)
-        points = geometry.apply(turn, points_of(index).astype(np.float64)).astype(np.float32)
-        labels = labels_of(index) if predicted else geometric_labels(points, config=config.geometric)
-        return prepare_scan(points, labels, config=config)
-
-    turns = [2 * math.pi * k / num_yaws for k in range(num_yaws)]
-    pairs = sorted(reference_pairs(data), key=lambda pair: pair.source)
-    return [_row(pair, [_turned(pair, turn, prepared, config) for turn in turns]) for pair in pairs]
-
-
-def _turned(pair: Pair, turn_rad: float, prepared: Prepared, config: Config) -> Trial:
-    T_source_turned = geometry.transform(geometry.yaw(-turn_rad), 0.0)
-    predicted = are_predicted(pair)
-    source, target = prepared(pair.source, turn_rad, predicted), prepared(pair.target, 0.0, predicted)
-    return attempt(source, target, pair.T_target_source @ T_source_turned, config=config)
-
-
-def _row(pair: Pair, trials: list[Trial]) -> Row:
-    apart_m = geometry.distance(pair.T_target_source)
+def _figures(some: Sequence[rows.Row], apart_m: float) -> Row:
+    by_method = grouped(some, lambda row: row.method)
+    coarse = [_error(row) for row in by_method[real_pairs.COARSE]]
+    fine = [_error(row) for row in by_method[real_pairs.REFINED]]
     bound = NEAR_BOUND if apart_m <= FAR_M else FAR_BOUND
     return {
-        "pair": f"{pair.source} -> {pair.target}",
         "apart_m": round(apart_m, 1),
-        "labels": "network" if are_predicted(pair) else "shape",
-        "yaws": len(trials),
-        "coarse_percent": percent([trial.coarse.within(*bound) for trial in trials]),
-        "coarse_worst_m": round(max(trial.coarse.metres for trial in trials), 3),
-        "coarse_worst_deg": round(max(trial.coarse.degrees for trial in trials), 2),
-        "refined_percent": percent([trial.fine.within(*REFINED_BOUND) for trial in trials]),
-        "refined_worst_m": round(max(trial.fine.metres for trial in trials), 3),
-        "refined_worst_deg": round(max(trial.fine.degrees for trial in trials), 2),
-        "least_overlap": round(min(getattr(trial.outcome, "overlap", 0.0) for trial in trials), 2),
+        "yaws": len(fine),
+        "coarse_percent": round(100.0 * float(np.mean([error.within(*bound) for error in coarse])), 1),
+        "coarse_worst_m": round(max(error.translation_m for error in coarse), 3),
+        "coarse_worst_deg": round(max(error.rotation_deg for error in coarse), 2),
+        "refined_percent": round(100.0 * float(np.mean([error.within(*REFINED_BOUND) for error in fine])), 1),
+        "refined_worst_m": round(max(error.translation_m for error in fine), 3),
+        "refined_worst_deg": round(max(error.rotation_deg for error in fine), 2),
     }
+
+
+def _error(row: rows.Row) -> PoseError:
+    """Infinite where no pose was given."""
+    if row.error_m is None or row.error_deg is None:
+        return PoseError(math.inf, math.inf)
+    return PoseError(row.error_m, row.error_deg)

@@ -1,9 +1,7 @@
 """The scans that registration is measured on: real ones (KITTI, a courtyard), simulated ones with exact poses."""
 
 import hashlib
-import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -11,7 +9,9 @@ import numpy as np
 
 from segslam import geometry
 from segslam.config import Config
-from segslam.datasets import open_dataset
+from segslam.datasets.kitti import read_returns
+from segslam.experiments.job import open_once
+from segslam.experiments.trials import ScanVariant, Trial
 from segslam.semantics import geometric_labels
 from segslam.simulation import (
     Drive,
@@ -28,7 +28,8 @@ from segslam.simulation import (
 )
 from segslam.simulation.sensor import Sensor
 from segslam.simulation.world import World
-from segslam.types import Labels, Points, Transform
+from segslam.types import Labels, Points, Scan, Transform
+from tools.benchmarks import real_pairs
 
 Labelled = tuple[Points, Labels]
 
@@ -42,16 +43,6 @@ LISTED_M = {(8, 10): "8to10", (10, 15): "10to15"}
 BANDS_M = (*LISTED_M, (15, 20), (20, 30))
 MIN_GAP = 50
 """Scans between the two of a pair, the protocol of the paper's lists."""
-PREDICTED = (0, 20, 30, 4413)
-"""Real scans with a network's labels."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pair:
-    source: int
-    target: int
-    T_target_source: Transform
-    """True, or that of the reference."""
 
 
 class SimulatedPlace:
@@ -71,11 +62,12 @@ class SimulatedPlace:
         T_world_lidar = self._drive.T_world_lidar
         return float(np.linalg.norm(T_world_lidar[a, :2, 3] - T_world_lidar[b, :2, 3]))
 
-    def pair(self, source: int, target: int) -> Pair:
+    def pair(self, source: int, target: int) -> Trial:
         T_world_lidar = self._drive.T_world_lidar
-        return Pair(source, target, geometry.inverse(T_world_lidar[target]) @ T_world_lidar[source])
+        T_target_source = geometry.inverse(T_world_lidar[target]) @ T_world_lidar[source]
+        return Trial(self.name, ScanVariant(source), ScanVariant(target), T_target_source)
 
-    def pairs(self, band_m: tuple[int, int], count: int) -> list[Pair]:
+    def pairs(self, band_m: tuple[int, int], count: int) -> list[Trial]:
         """Up to `count` pairs of the paper's list for the band; where it has none, pairs cut by its protocol.
 
         Fewer are the first of more, so that scans made once serve again.
@@ -128,47 +120,28 @@ class SimulatedPlace:
         return swept.points.astype(np.float32), network_like(swept.points, swept.labels, config=wrong, rng=rng)
 
 
-def real_points(data: Path, index: int) -> Points:
-    """A scan of KITTI 00, corrected."""
-    return open_dataset(data / "kitti", sequence="00", labels="none", frames=f"{index}:{index + 1}")[0].points
-
-
-def real_labels(data: Path, index: int) -> Labels:
-    """A network's labels of one of the scans `PREDICTED`."""
-    return open_dataset(data / "kitti", sequence="00", labels="predicted_labels", frames=f"{index}:{index + 1}")[
-        0
-    ].labels
-
-
-def reference_pairs(data: Path) -> list[Pair]:
-    """The pairs of real scans whose pose is known to some centimetres."""
-    rows = json.loads((data / "kitti" / "reference_pairs.json").read_text())
-    return [Pair(row["source"], row["target"], np.array(row["T_target_source"])) for row in rows]
-
-
-def are_predicted(pair: Pair) -> bool:
-    """Whether both scans have a network's labels."""
-    return pair.source in PREDICTED and pair.target in PREDICTED
+def real_scan(data: Path, index: int, *, labels: str = "none") -> Scan:
+    """A scan of KITTI 00, corrected. With labels of a network (`predicted_labels`) where there are any."""
+    dataset, row_of_scan = open_once(real_pairs.kitti(data, labels))
+    return dataset[row_of_scan[index]]
 
 
 def kitti_pose(data: Path, source: int, target: int) -> Transform:
     """T_target_source by KITTI's own ground truth of 00, which errs by up to 1.6 m, more between scans far apart."""
-    reference = open_dataset(data / "kitti", sequence="00", labels="none").reference
-    rows = {int(index): row for row, index in enumerate(reference.scan_index)}
-    T_world_lidar = reference.T_world_lidar
-    return geometry.inverse(T_world_lidar[rows[target]]) @ T_world_lidar[rows[source]]
+    dataset, row_of_scan = open_once(real_pairs.kitti(data, "none"))
+    assert dataset.reference is not None
+    T_world_lidar = dataset.reference.T_world_lidar
+    return geometry.inverse(T_world_lidar[row_of_scan[target]]) @ T_world_lidar[row_of_scan[source]]
 
 
 def real_indices(data: Path) -> list[int]:
     """The real scans of KITTI 00 that there are."""
-    files = (data / "kitti" / "sequences" / "00" / "velodyne").glob("*.bin")
-    return sorted(int(file.stem) for file in files)
+    return sorted(open_once(real_pairs.kitti(data, "none"))[1])
 
 
 def courtyard_points(data: Path, index: int) -> Points:
     """A scan of the handheld recording, which has no labels."""
-    file = data / "courtyard" / "velodyne" / f"{index:06d}.bin"
-    return np.fromfile(file, np.float32).reshape(-1, 4)[:, :3]
+    return read_returns(data / "courtyard" / "velodyne" / f"{index:06d}.bin")[:, :3]
 
 
 def by_shape(points_of: Callable[[int], Points], config: Config) -> Callable[[int], Labelled]:

@@ -10,18 +10,9 @@ import numpy as np
 from segslam.config import Config
 from segslam.registration import PreparedScan, register_prepared
 from segslam.types import Alignment
-from tools.benchmarks.registration.scans import BANDS_M, Labelled, Pair, SimulatedPlace, by_shape
-from tools.benchmarks.registration.trials import (
-    RIGHT_DEG,
-    RIGHT_M,
-    SUCCESS_DEG,
-    SUCCESS_M,
-    Row,
-    Trial,
-    attempt,
-    percent,
-    preparer,
-)
+from tools.benchmarks.common import RIGHT_DEG, RIGHT_M, Row
+from tools.benchmarks.registration.attempts import Attempt, attempt, percent, preparer
+from tools.benchmarks.registration.scans import BANDS_M, Labelled, SimulatedPlace, by_shape
 
 NEGATIVE_M = 100.0
 """Scans farther apart share nothing within the range that is aligned."""
@@ -47,26 +38,21 @@ def simulated(
     tables = Tables([], [], [])
     for place in places:
         for labels in ("given", "shape"):
-            name: Row = {"place": place.name, "labels": labels}
+            name = {"place": place.name, "labels": labels}
             prepared = preparer(scan_of(place, labels, config), config)
             by_band = {band_m: place.pairs(band_m, sample) for band_m in BANDS_M}
-            trials = {band_m: _tried(pairs, prepared, config) for band_m, pairs in by_band.items()}
+            trials = {
+                band_m: [attempt(pair, prepared, config=config) for pair in pairs] for band_m, pairs in by_band.items()
+            }
             whole = [trial for some in trials.values() for trial in some]
-            seen = sorted(
-                {index for pairs in by_band.values() for pair in pairs for index in (pair.source, pair.target)}
-            )
+            scans = (scan for pairs in by_band.values() for pair in pairs for scan in (pair.source, pair.target))
+            seen = sorted({scan.index for scan in scans})
             negatives = _negatives(place, seen, num_negatives, prepared, config, rng)
             tables.success.extend(name | _success(band_m, some) for band_m, some in trials.items())
             tables.gates.append(name | _gates(whole, negatives))
             tables.information.append(name | _information(whole))
             print(tables.gates[-1], tables.information[-1], file=sys.stderr, flush=True)
     return tables
-
-
-def _tried(pairs: list[Pair], prepared: Callable[[int], PreparedScan], config: Config) -> list[Trial]:
-    return [
-        attempt(prepared(pair.source), prepared(pair.target), pair.T_target_source, config=config) for pair in pairs
-    ]
 
 
 def _negatives(
@@ -87,20 +73,20 @@ def _negatives(
     return outcomes
 
 
-def _success(band_m: tuple[int, int], trials: list[Trial]) -> Row:
-    good = [trial for trial in trials if trial.fine.within(SUCCESS_M, SUCCESS_DEG)]
+def _success(band_m: tuple[int, int], trials: list[Attempt]) -> dict[str, object]:
+    good = [trial for trial in trials if trial.fine.success]
     return {
         "apart_m": f"{band_m[0]}-{band_m[1]}",
         "pairs": len(trials),
-        "coarse_percent": percent([trial.coarse.within(SUCCESS_M, SUCCESS_DEG) for trial in trials]),
-        "accepted_percent": percent([trial.fine.within(SUCCESS_M, SUCCESS_DEG) for trial in trials]),
+        "coarse_percent": percent([trial.coarse.success for trial in trials]),
+        "accepted_percent": percent([trial.fine.success for trial in trials]),
         "accepted_wrong": sum(trial.wrong for trial in trials),
-        "fine_mean_m": round(float(np.mean([trial.fine.metres for trial in good])), 3) if good else None,
-        "fine_mean_deg": round(float(np.mean([trial.fine.degrees for trial in good])), 3) if good else None,
+        "fine_mean_m": round(float(np.mean([trial.fine.translation_m for trial in good])), 3) if good else None,
+        "fine_mean_deg": round(float(np.mean([trial.fine.rotation_deg for trial in good])), 3) if good else None,
     }
 
 
-def _gates(trials: list[Trial], negatives: Counter[str]) -> Row:
+def _gates(trials: list[Attempt], negatives: Counter[str]) -> dict[str, object]:
     return {
         "negatives": negatives.total(),
         "accepted": negatives["accepted"],
@@ -111,9 +97,9 @@ def _gates(trials: list[Trial], negatives: Counter[str]) -> Row:
     }
 
 
-def _information(trials: list[Trial]) -> Row:
+def _information(trials: list[Attempt]) -> dict[str, object]:
     """Squared errors by the information claimed, of right poses: 6 in the mean, 95 % below the bound, if it is true."""
-    coarse = np.array([trial.coarse_squared for trial in trials if trial.coarse.within(SUCCESS_M, SUCCESS_DEG)])
+    coarse = np.array([trial.coarse_squared for trial in trials if trial.coarse.success])
     fine = np.array([trial.fine_squared for trial in trials if trial.fine.within(RIGHT_M, RIGHT_DEG)])
     return {
         "coarse_poses": len(coarse),

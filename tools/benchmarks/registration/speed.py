@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from functools import partial
 from time import perf_counter, process_time
 
 import numpy as np
@@ -10,12 +11,13 @@ from segslam import refinement, segregator
 from segslam.config import Config
 from segslam.experiments.baselines import align_gicp, prepare_gicp
 from segslam.experiments.meter import measured
+from segslam.experiments.trials import Trial
 from segslam.registration import prepare_scan, register
-from segslam.types import Description, Label, Registration
+from segslam.types import Description, Label, Points, Registration
 from segslam.verification import gates
 from segslam.verification.free_space import observe_free_space
-from tools.benchmarks.registration.scans import Labelled, Pair
-from tools.benchmarks.registration.trials import Row
+from tools.benchmarks.common import Row
+from tools.benchmarks.registration.scans import Labelled
 
 BESIDE = "small_gicp"
 NUM_CLUSTERS = 78
@@ -24,7 +26,7 @@ Seconds = tuple[float, float]
 """By the wall, and of CPU in all threads, which other processes disturb less."""
 
 
-def stages(pairs: Iterable[tuple[Pair, Callable[[int], Labelled]]], config: Config) -> list[Row]:
+def stages(pairs: Iterable[tuple[Trial, Callable[[int], Labelled]]], config: Config) -> list[Row]:
     """A row a stage, over the pairs; labels are not in it.
 
     A cold pair is two scans prepared, matched, refined and verified. Beside it small_gicp prepares both and aligns
@@ -32,16 +34,16 @@ def stages(pairs: Iterable[tuple[Pair, Callable[[int], Labelled]]], config: Conf
     """
     seconds: dict[str, list[Seconds]] = {}
     for pair, scan in pairs:
-        for stage, taken in _timed_stages(scan(pair.source), scan(pair.target), config):
+        for stage, taken in _timed_stages(scan(pair.source.index), scan(pair.target.index), config):
             seconds.setdefault(stage, []).append(taken)
     beside = float(np.median([cpu for _, cpu in seconds[BESIDE]]))
     return [_row(stage, np.array(taken), beside) for stage, taken in seconds.items()]
 
 
 def _timed_stages(source: Labelled, target: Labelled, config: Config) -> Iterable[tuple[str, Seconds]]:
-    for scan in (source, target):
-        yield "describe", timed(lambda scan=scan: segregator.describe(*scan, config=config.segregator))
-        yield "surface and view", timed(lambda scan=scan: _surface_and_view(scan, config))
+    for points, labels in (source, target):
+        yield "describe", timed(partial(segregator.describe, points, labels, config=config.segregator))
+        yield "surface and view", timed(partial(_surface_and_view, points, config))
     one, other = (prepare_scan(*scan, config=config) for scan in (source, target))
     yield "match", timed(lambda: segregator.match(one.description, other.description, config=config.segregator))
     coarse = segregator.match(one.description, other.description, config=config.segregator)
@@ -57,9 +59,9 @@ def _timed_stages(source: Labelled, target: Labelled, config: Config) -> Iterabl
     yield BESIDE, timed(lambda: align_gicp(*(prepare_gicp(points) for points, _ in (source, target))))
 
 
-def _surface_and_view(scan: Labelled, config: Config) -> None:
-    refinement.make_surface(refinement.downsample(scan[0], config=config.refine), config=config.refine)
-    observe_free_space(scan[0])
+def _surface_and_view(points: Points, config: Config) -> None:
+    refinement.make_surface(refinement.downsample(points, config=config.refine), config=config.refine)
+    observe_free_space(points)
 
 
 def _cold(source: Labelled, target: Labelled, config: Config) -> None:
@@ -92,7 +94,7 @@ def sizes(scans: Iterable[tuple[str, Labelled]], config: Config) -> list[Row]:
     rows: list[Row] = []
     for name, scan in scans:
         usual, whole = (segregator.describe(*scan, config=one) for one in (config.segregator, always))
-        cpu = [timed(lambda scan=scan: segregator.describe(*scan, config=always))[1] for _ in range(5)]
+        cpu = [timed(partial(segregator.describe, *scan, config=always))[1] for _ in range(5)]
         rows.append(
             {
                 "scan": name,

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from segslam import keep_freed_memory
-from segslam.experiments.provenance import commit, machine
+from tools.benchmarks import common
 from tools.benchmarks.speed.growth import curves, drives, optimisation
 from tools.benchmarks.speed.latency import latency
 from tools.benchmarks.speed.start import start
@@ -25,7 +25,9 @@ from tools.benchmarks.speed.throughput import throughput
 PACKAGES = ("segslam", "kiss-icp", "numpy", "numba", "gtsam", "small-gicp", "mcap")
 DRIVE_SIZES = (1_000, 2_000, 5_000, 10_000)
 GRAPH_SIZES = (1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
-LARGE_GRAPH = {"num_poses": 100_000, "num_closures": 20_000, "false_share": 0.2}
+LARGE_GRAPH = (100_000, 20_000)
+"""Poses and closures."""
+FALSE_SHARE = 0.2
 
 
 def measures(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
@@ -39,7 +41,7 @@ def measures(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
         "latency": lambda: latency(*scans, labels=options.labels),
         "start": start,
         "growth": lambda: curves(GRAPH_SIZES) | {"drive": drives(DRIVE_SIZES)},
-        "large_graph": lambda: optimisation(**LARGE_GRAPH),
+        "large_graph": lambda: optimisation(*LARGE_GRAPH, false_share=FALSE_SHARE),
     }
 
 
@@ -63,7 +65,7 @@ def compared(now: dict[str, Any], before: dict[str, Any]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "speed")
     parser.add_argument("data", type=Path)
     parser.add_argument("--sequence", default="06")
     parser.add_argument("--frames", default="0:400", metavar="A:B")
@@ -79,8 +81,7 @@ def main() -> None:
     if unknown := set(options.only or ()) - set(parts):
         parser.error(f"no part {', '.join(sorted(unknown))}; known: {', '.join(parts)}")
     figures = {name: measure() for name, measure in parts.items() if name in (options.only or parts)}
-    conditions = {"machine": machine(), "commit": commit(), "packages": {name: version(name) for name in PACKAGES}}
-    options.out.write_text(json.dumps(conditions | figures, indent=2, allow_nan=False) + "\n")
+    common.write_report(options.out, {"packages": {name: version(name) for name in PACKAGES}} | figures)
     print(json.dumps(figures, indent=2))
     if options.against:
         print("\n".join(["figure, now, before, ratio", *compared(figures, json.loads(options.against.read_text()))]))

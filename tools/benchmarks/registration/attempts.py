@@ -9,38 +9,23 @@ import numpy as np
 
 from segslam import geometry, refinement, segregator
 from segslam.config import Config
-from segslam.evaluation import SUCCESS_DEG, SUCCESS_M
+from segslam.evaluation import PoseError
+from segslam.experiments.trials import Trial
 from segslam.registration import PreparedScan, Stopwatch, prepare_scan, register_prepared
 from segslam.types import Alignment, Registration, Rejected, Transform
+from tools.benchmarks.common import RIGHT_DEG, RIGHT_M
 from tools.benchmarks.registration.scans import Labelled
 
-RIGHT_M, RIGHT_DEG = 0.5, 2.0
-"""Chosen: a refined pose that is farther off has found another minimum; right ones are off by centimetres."""
-
-Row = dict[str, object]
-"""A line of a table."""
-
-
-@dataclass(frozen=True, slots=True)
-class Error:
-    metres: float
-    degrees: float
-
-    def within(self, metres: float, degrees: float) -> bool:
-        return self.metres < metres and self.degrees < degrees
-
-
-LOST = Error(math.inf, math.inf)
+LOST = PoseError(math.inf, math.inf)
 """Of a registration that was rejected."""
 
 
-def error(T_estimate: Transform, T_true: Transform) -> Error:
+def error(T_estimate: Transform, T_true: Transform) -> PoseError:
     """The paper's: of dT = T_estimate inverse(T_true)."""
-    T_error = T_estimate @ geometry.inverse(T_true)
-    return Error(geometry.distance(T_error), math.degrees(geometry.angle(T_error)))
+    return PoseError.of(T_estimate @ geometry.inverse(T_true))
 
 
-def error_of(outcome: Registration | Rejected, T_true: Transform) -> Error:
+def error_of(outcome: Registration | Rejected, T_true: Transform) -> PoseError:
     return LOST if isinstance(outcome, Rejected) else error(outcome.T_target_source, T_true)
 
 
@@ -55,15 +40,15 @@ def preparer(scan: Callable[[int], Labelled], config: Config) -> Callable[[int],
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trial:
+class Attempt:
     """A pair whose pose is known, put through everything."""
 
-    coarse: Error
+    coarse: PoseError
     """Of the best hypothesis, before anything is checked."""
-    refined: Error
+    refined: PoseError
     """Of the same, refined."""
     outcome: Alignment | Rejected
-    fine: Error
+    fine: PoseError
     """Of the pose accepted."""
     coarse_squared: float
     """Squared error of the best hypothesis by the information that it claims; NaN where there is none."""
@@ -78,7 +63,7 @@ class Trial:
     @property
     def wrong(self) -> bool:
         """Accepted, and not what the paper calls a success."""
-        return self.accepted and not self.fine.within(SUCCESS_M, SUCCESS_DEG)
+        return self.accepted and not self.fine.success
 
     @property
     def lost(self) -> bool:
@@ -86,7 +71,8 @@ class Trial:
         return not self.accepted and self.refined.within(RIGHT_M, RIGHT_DEG)
 
 
-def attempt(source: PreparedScan, target: PreparedScan, T_true: Transform, *, config: Config) -> Trial:
+def attempt(trial: Trial, prepared: Callable[[int], PreparedScan], *, config: Config) -> Attempt:
+    source, target, T_true = prepared(trial.source.index), prepared(trial.target.index), trial.T_target_source
     coarse = segregator.match(source.description, target.description, config=config.segregator)
     refined: Registration | Rejected = coarse
     if isinstance(coarse, Registration):
@@ -94,7 +80,7 @@ def attempt(source: PreparedScan, target: PreparedScan, T_true: Transform, *, co
     watch = Stopwatch()
     outcome = register_prepared(source, target, config=config, watch=watch)
     fine = outcome.fine if isinstance(outcome, Alignment) else outcome
-    return Trial(
+    return Attempt(
         coarse=error_of(coarse, T_true),
         refined=error_of(refined, T_true),
         outcome=outcome,
@@ -114,11 +100,3 @@ def _squared(found: Registration | Rejected, T_true: Transform) -> float:
 
 def percent(flags: list[bool]) -> float:
     return round(100.0 * float(np.mean(flags)), 1) if flags else math.nan
-
-
-def spread(seconds: list[float]) -> Row:
-    """Median and 95th percentile in ms."""
-    return {
-        "median_ms": round(1e3 * float(np.median(seconds)), 1),
-        "p95_ms": round(1e3 * float(np.percentile(seconds, 95)), 1),
-    }

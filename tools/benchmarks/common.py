@@ -1,0 +1,59 @@
+"""What the benchmarks have in common: their options, and the JSON and Markdown that they write."""
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam.evaluation import PoseError
+from segslam.experiments.provenance import commit, machine
+from segslam.types import Transform
+
+RIGHT_M, RIGHT_DEG = 0.5, 2.0
+"""Chosen: a refined pose that is farther off has found another minimum; right ones are off by centimetres."""
+
+Row = dict[str, Any]
+"""A line of a table."""
+
+
+def parser(doc: str | None, name: str) -> argparse.ArgumentParser:
+    """A parser that shows the documentation of the module; `name` is that of the benchmark."""
+    return argparse.ArgumentParser(
+        prog=f"python -m tools.benchmarks.{name}",
+        description=doc,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_settings(options: argparse.ArgumentParser) -> None:
+    """Add `--set`, whose values `load_config` takes as overrides."""
+    options.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="may be repeated")
+
+
+def write_report(file: Path, figures: Mapping[str, Any]) -> None:
+    """JSON of the figures after the machine and the commit they were measured on."""
+    report = {"machine": machine(), "commit": commit()} | dict(figures)
+    file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def markdown(title: str, rows: Sequence[Row]) -> str:
+    """A table of rows with the same keys."""
+    if not rows:
+        return f"## {title}\n\nnothing\n"
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(map(str, row.values())) for row in rows)]
+    return f"## {title}\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def is_right(T_error: Transform) -> bool:
+    """Whether the error of a refined pose is that of a right one."""
+    return PoseError.of(T_error).within(RIGHT_M, RIGHT_DEG)
+
+
+def draw_pairs(allowed: np.ndarray, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Up to `count` different (row, column) of a matrix of flags, at random among those that are true."""
+    sources, targets = np.nonzero(allowed)
+    rows = rng.choice(len(sources), min(count, len(sources)), replace=False)
+    return list(zip(sources[rows].tolist(), targets[rows].tolist(), strict=True))

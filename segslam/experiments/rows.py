@@ -127,7 +127,7 @@ class RowFile:
         try:
             yield
         except OSError as error:
-            raise WorkFailed(f"{self._file}: cannot be written ({reason(error)}); make room there") from error
+            raise WorkFailed(f"{self._file}: cannot be written ({reason(error)}); free space there") from error
 
 
 def write_rows(file: Path, rows: Sequence[Row]) -> None:

@@ -196,7 +196,7 @@ class LogWriter:
                 yield
         except OSError as error:
             raise WorkFailed(
-                f"{self._path}: cannot go on writing the log ({error.strerror}); make room on the disk; "
+                f"{self._path}: cannot go on writing the log ({error.strerror}); free space on the disk; "
                 "the log ends with the last complete step"
             ) from error
 

@@ -103,7 +103,7 @@ def room_for(folder: Path) -> Iterator[None]:
         cause = error if isinstance(error, OSError) else error.__cause__
         why = reason(cause) if isinstance(cause, OSError) else str(error)
         raise WorkFailed(
-            f"{folder}: cannot write the results ({why}); make room on the disk, then go on with --resume: "
+            f"{folder}: cannot write the results ({why}); free space on the disk, then go on with --resume: "
             "the log has all"
         ) from error
 

@@ -1,4 +1,4 @@
-"""Labelled street worlds, the LiDARs that drive through them, and KITTI-format sequences with exact truth."""
+"""Simulated labelled street scenes and LiDAR sensors; writes sequences in KITTI format with exact ground truth."""
 
 from segslam.simulation.drift import SweepError, sweep_errors
 from segslam.simulation.drive import drive_sweeps, simulate_drive

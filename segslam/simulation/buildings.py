@@ -1,15 +1,15 @@
-"""Buildings whose faces have relief, fences, and what stands on posts."""
+"""Meshes of buildings with structured facades, fences, street lamps and signs."""
 
 import numpy as np
 
 from segslam.simulation.mesh import Mesh, box, merge, mesh, placed, stem
 from segslam.types import Label, Vector
 
-STOREYS_M = (0.0, 0.9, 2.2, 3.6, 4.9, 6.4, 7.7)  # sills and lintels, floor by floor
+STOREYS_M = (0.0, 0.9, 2.2, 3.6, 4.9, 6.4, 7.7)  # heights of sills and lintels, alternating
 
 
 def building(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
-    """A house of 1-3 storeys, its front along x and facing -y; the origin is the middle of the front."""
+    """A house of 1-3 storeys. The front is along x and faces -y; the origin is the middle of the front."""
     storeys = rng.integers(1, 4)
     levels = np.array([-1.0, *STOREYS_M[1 : 2 * storeys + 1], STOREYS_M[2 * storeys] + 1.2])
     front = wall(rng, width_m, levels, relief=1.0)
@@ -23,15 +23,15 @@ def building(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
 
 
 def wall(rng: np.random.Generator, width_m: float, levels: Vector, *, relief: float) -> Mesh:
-    """A face along x at y = 0 seen from -y, cut into bays with windows, doors, oriels and recesses.
+    """A facade along x at y = 0, visible from -y, divided into bays with windows, doors, oriels and recesses.
 
-    `levels` (k,) are the heights between which panels lie, sills and lintels by turns; `relief` 0-1 is the share of
-    bays that depart from a plain window.
+    `levels` (k,): heights (m) of sills and lintels, alternating, between which the panels lie. `relief`: share of the
+    bays, 0 to 1, that differ from a plain window.
     """
     edges = _bays(rng, width_m)
     depth = np.zeros((len(levels) - 1, len(edges) - 1))
     kinds = rng.uniform(size=depth.shape[1])
-    depth[1::2, kinds > 0.35] = 0.18  # windows stand back in their reveals
+    depth[1::2, kinds > 0.35] = 0.18  # window panes are recessed
     oriel, door, passage = kinds < 0.12 * relief, kinds > 1 - 0.15 * relief, kinds > 1 - 0.06 * relief
     depth[:, oriel] -= rng.uniform(0.3, 0.9)
     depth[:2, door] = 0.35
@@ -46,7 +46,7 @@ def _bays(rng: np.random.Generator, width_m: float) -> Vector:
 
 
 def panels(edges: Vector, levels: Vector, depth: np.ndarray) -> Mesh:
-    """Upright panels (rows between levels, columns between edges), each `depth` behind y = 0, and their reveals."""
+    """Vertical panels (rows between levels, columns between edges), `depth` (m) behind y = 0, with their side faces."""
     rows, columns = np.indices(depth.shape)
     x0, x1 = edges[columns], edges[columns + 1]
     z0, z1 = levels[rows], levels[rows + 1]
@@ -63,12 +63,12 @@ def panels(edges: Vector, levels: Vector, depth: np.ndarray) -> Mesh:
 
 
 def _quads(*corners: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-    """(q, 4, 3) from four corners, each three arrays of one shape."""
+    """(q, 4, 3) quadrilaterals from four corners, each given as three coordinate arrays of the same shape."""
     return np.stack([np.stack(np.broadcast_arrays(*corner), axis=-1).reshape(-1, 3) for corner in corners], axis=1)
 
 
 def fence(rng: np.random.Generator, length_m: float) -> Mesh:
-    """Pickets along x between posts, 0.9-1.5 m tall."""
+    """A picket fence along x, 0.9-1.5 m tall."""
     height, pitch = rng.uniform(0.9, 1.5), rng.uniform(0.14, 0.24)
     pickets = [
         box(pitch * 0.6, 0.03, 0.05, height, Label.FENCE, at=(x, 0.0))
@@ -87,12 +87,12 @@ def lamp(rng: np.random.Generator) -> Mesh:
 
 
 def sign(rng: np.random.Generator) -> Mesh:
-    """A traffic sign on its post; the plate faces -x."""
+    """A traffic sign with its post; the plate faces -x."""
     height, width, tall = rng.uniform(2.1, 2.9), rng.uniform(0.45, 0.75), rng.uniform(0.45, 0.9)
     plate = box(0.02, width, height - tall, height, Label.TRAFFIC_SIGN, at=(-0.06, 0.0))
     return merge([stem((0.035, 0.035), (-0.2, height), Label.POLE, sides=6), plate])
 
 
 def clutter(rng: np.random.Generator) -> Mesh:
-    """A bin, a switch box or the like, of no class."""
+    """A bin, a switch box or a similar object without a class."""
     return box(rng.uniform(0.4, 1.2), rng.uniform(0.35, 0.7), 0.0, rng.uniform(0.8, 1.5), Label.UNLABELLED)

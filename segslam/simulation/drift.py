@@ -1,7 +1,8 @@
-"""What makes odometry drift: errors that change slowly from sweep to sweep and that nobody corrects.
+"""Slowly varying sensor errors, which cause odometry drift.
 
-Each is an Ornstein-Uhlenbeck process. Motion left over within a sweep smears it. A spinning head whose axis and encoder
-wander distorts it equally ahead and behind, which rotates the odometry with every metre, up or down and sideways.
+Each error is an Ornstein-Uhlenbeck process. Uncompensated motion within a sweep blurs the scan. A spinning head whose
+axis and encoder errors vary distorts the points ahead and behind in the same way: every metre of travel then adds a
+rotation error, vertical and horizontal.
 """
 
 from collections.abc import Iterator
@@ -16,21 +17,24 @@ from segslam.types import Points, Tangent, Vector
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepError:
-    """The errors of one sweep, all small."""
+    """Errors of one sweep; all are small."""
 
     motion: Tangent
-    """Over the whole sweep, not compensated."""
+    """Uncompensated motion during the whole sweep."""
     vertical_rad: float
-    """By which every point appears too low."""
+    """Angle by which every point appears too low."""
     azimuth_rad: float
-    """By which a point ahead appears too far left, one behind too far right, and one abeam in its place."""
+    """Azimuth error: points ahead appear too far left and points behind too far right; points abeam do not move."""
 
 
 NO_ERROR = SweepError(geometry.tangent(rotation_rad=0.0, translation_m=0.0), 0.0, 0.0)
 
 
 def sweep_errors(time_s: Vector, *, config: SensorConfig, rng: np.random.Generator) -> Iterator[SweepError]:
-    """The errors of the sweeps at these times (n,), which ascend; the first ones do not depend on how many follow."""
+    """The errors of the sweeps at the times (n,), ascending.
+
+    The errors of a sweep do not depend on the number of sweeps after it.
+    """
     motion_rng, wander_rng = rng.spawn(2)
     still = geometry.tangent(
         rotation_rad=np.radians(config.sweep_rotation_sigma_deg), translation_m=config.sweep_translation_sigma_m
@@ -42,7 +46,7 @@ def sweep_errors(time_s: Vector, *, config: SensorConfig, rng: np.random.Generat
 
 
 def _slow_noise(time_s: Vector, count: int, correlation_s: float, rng: np.random.Generator) -> np.ndarray:
-    """(n, count) Ornstein-Uhlenbeck processes of unit variance."""
+    """(n, count) samples of Ornstein-Uhlenbeck processes of unit variance."""
     kept = np.exp(-np.diff(time_s, prepend=time_s[:1]) / correlation_s)
     noise = rng.normal(size=(len(time_s), count))
     for row in range(1, len(noise)):
@@ -51,9 +55,9 @@ def _slow_noise(time_s: Vector, count: int, correlation_s: float, rng: np.random
 
 
 def distorted(points: Points, sweep_fraction: Vector, error: SweepError) -> Points:
-    """Points of the LiDAR frame as they come out of a sweep with errors, to first order in them.
+    """Points of the LiDAR frame displaced by the errors of a sweep, to first order in the errors.
 
-    `sweep_fraction` (n,): time of each point within the sweep, from -0.5 to 0.5; the pose is that of its middle.
+    `sweep_fraction` (n,): time of each point within the sweep, from -0.5 to 0.5. The sensor's pose refers to time 0.
     """
     a, b, c = error.motion[:3]
     turned = np.einsum("ij,kj->ik", points, np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]]))

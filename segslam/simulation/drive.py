@@ -1,4 +1,4 @@
-"""A drive through a simulated world: sweep after sweep, each fixed by the seed and its own number alone."""
+"""Sweeps along a drive through a simulated world. A sweep depends only on the seed and its own number."""
 
 from collections.abc import Collection, Iterator
 
@@ -15,7 +15,10 @@ from segslam.types import Scan, Vector
 def simulate_drive(
     T_world_lidar: Poses, time_s: Vector, *, seed: int = 0, config: SimulationConfig | None = None
 ) -> Iterator[Scan]:
-    """Labelled scans along level poses, `time_s` (n,) ascending; see `drive_sweeps` for intensity and instances too."""
+    """Labelled scans from level poses (n, 4, 4) at the times `time_s` (n,), ascending.
+
+    `drive_sweeps` also returns intensities and instances.
+    """
     config = config or SimulationConfig()
     world = build_world(T_world_lidar, time_s, config=config.world, seed=seed)
     for index, one in enumerate(drive_sweeps(world, T_world_lidar, time_s, config=config.sensor, seed=seed)):
@@ -31,9 +34,9 @@ def drive_sweeps(
     seed: int,
     only: Collection[int] | None = None,
 ) -> Iterator[Sweep]:
-    """The sweeps of a drive through a world, in its order; of these numbers alone if given.
+    """The sweeps of a drive through a world, in order; only the numbers in `only`, if given.
 
-    Every day has the same sensor and other noise.
+    The sensor is the same on each simulated day; its noise differs.
     """
     sensor = make_sensor(config, seed=seed)
     days = [world.day] if world.day else []

@@ -1,4 +1,4 @@
-"""Simulated sequences in KITTI's format, so that the reader of real data reads them back as the truth."""
+"""Simulated sequences in KITTI's format. The reader for real data recovers the exact points and poses."""
 
 import json
 import shutil
@@ -22,22 +22,23 @@ from segslam.trajectory import camera_from_lidar
 from segslam.types import SegslamError, Transform, WorkFailed
 
 SETTINGS_FILE = "simulation.json"
-KITTI_VERTICAL_ANGLE_DEG = 0.205  # what readers of KITTI's scans add to each vertical angle
+KITTI_VERTICAL_ANGLE_DEG = 0.205  # correction that readers of KITTI's scans apply to each vertical angle
 
 
 def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
-    """Make room for a sequence. One that is there is refused, or removed if it was simulated and may be overwritten.
+    """Create the folders of a sequence.
 
-    Raises SegslamError that names what is there: real data is never removed.
+    An existing sequence is removed if it was simulated and `overwrite` is set. Raises SegslamError, naming the folder,
+    otherwise; real data is never removed.
     """
     if Path(sequence).name != sequence or not sequence:
         raise SegslamError(f"--sequence {sequence}: must be a plain name such as 00")
     folder, poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
     there = next((path for path in (folder, poses) if path.exists()), None)
     if there is not None and not (folder / SETTINGS_FILE).is_file():
-        raise SegslamError(f"{there}: is there and was not simulated here; choose another folder or --sequence")
+        raise SegslamError(f"{there}: exists and was not simulated by segslam; choose another folder or --sequence")
     if there is not None and not overwrite:
-        raise SegslamError(f"{there}: is there already; choose another folder or --sequence, or pass --overwrite")
+        raise SegslamError(f"{there}: exists; choose another folder or --sequence, or pass --overwrite")
     try:
         if there is not None:
             shutil.rmtree(folder)
@@ -45,7 +46,7 @@ def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
         for part in (folder / "velodyne", folder / "labels", poses.parent):
             part.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SegslamError(f"{out}: cannot write there ({error}); choose another folder") from error
+        raise SegslamError(f"{out}: cannot be written ({error}); choose another folder") from error
 
 
 def write_drive(
@@ -59,12 +60,12 @@ def write_drive(
     num_frames: int | None = None,
     only: Collection[int] | None = None,
 ) -> Iterator[int]:
-    """Simulate the first scans of a drive (None: all) into a prepared folder; yields how many are complete.
+    """Write the first `num_frames` simulated scans (None: all) to a prepared folder; yields the number of scans done.
 
-    The streets are those of `drive`; the sensor takes the path `driven`, if given. Poses are in the frame of the first
-    pose of `drive` in either case, so that several drives through one town have their poses in one frame.
-    `only` leaves out all others of them, but not their times and poses. The world is that of the whole drive, so fewer
-    scans are the same scans. Settings and seed are kept beside them.
+    The streets follow `drive`; the sensor follows `driven` if it is given. In both cases poses are in the frame of the
+    first pose of `drive`, so that several drives through one town share one frame. If `only` is given, only these scans
+    are written, but the times and poses of all. The world is built for the whole drive, so a shorter simulation has
+    the same scans. The settings and the seed are written beside the scans.
     """
     settings = {"seed": seed, "config": config.model_dump(mode="json")}
     write_whole(out / "sequences" / sequence / SETTINGS_FILE, json.dumps(settings, indent=1) + "\n")
@@ -86,12 +87,12 @@ def write_sequence(
     numbers: Iterable[int] | None = None,
     T_world_origin: Transform | None = None,
 ) -> Iterator[int]:
-    """Write sweep after sweep into a prepared folder, yielding how many are complete.
+    """Write sweeps into a prepared folder; yields the number of scans done.
 
-    `numbers` are those of the scans, ascending; 0, 1, ... unless given. Times and poses have no gap up to the last.
-    Stopped at any moment, what is there is a shorter sequence: a scan appears whole, after its labels, time and pose.
-    Raises WorkFailed, with the number of scans, if the disk is full.
-    Poses are the camera's, in the frame of the camera of the first, or of a LiDAR at `T_world_origin`.
+    `numbers`: numbers of the scans, ascending; 0, 1, ... by default. Times and poses have no gaps up to the last scan.
+    If writing is interrupted, the folder holds a shorter but complete sequence: a scan is written after its labels,
+    time and pose. Raises WorkFailed, with the number of scans, if the disk is full.
+    Poses are those of the camera, in the frame of its first pose, or of the camera at the LiDAR pose `T_world_origin`.
     """
     folder = out / "sequences" / sequence
     write_whole(folder / "calib.txt", drive.calib)
@@ -113,7 +114,7 @@ def write_sequence(
                 done += 1
                 yield done
     except OSError as error:
-        raise WorkFailed(f"{folder}: stopped after {done} scans ({reason(error)}); make room there") from error
+        raise WorkFailed(f"{folder}: stopped after {done} scans ({reason(error)}); free space on the disk") from error
 
 
 def _write_scan(folder: Path, name: str, one: Sweep) -> None:
@@ -130,5 +131,5 @@ def _write_scan(folder: Path, name: str, one: Sweep) -> None:
 
 
 def uncorrected(points: np.ndarray) -> np.ndarray:
-    """Points with their vertical angles lowered by what readers of KITTI's scans add to them."""
+    """Points with their vertical angles lowered by the correction that readers of KITTI's scans apply."""
     return raise_beams(points, -KITTI_VERTICAL_ANGLE_DEG)

@@ -1,4 +1,4 @@
-"""True labels made as wrong as a segmentation network's: whole regions confused, edges smeared, nothing moves."""
+"""Label errors typical of segmentation networks: confused regions, blurred edges, no moving classes."""
 
 import numpy as np
 from pydantic import Field
@@ -6,7 +6,7 @@ from pydantic import Field
 from segslam.config import Section
 from segslam.types import Label, Labels, Points
 
-# What networks take each class for, most likely first.
+# Classes that networks confuse with each class, most likely first.
 CONFUSED_WITH: dict[Label, tuple[Label, ...]] = {
     Label.CAR: (Label.OTHER_VEHICLE, Label.TRUCK, Label.VEGETATION),
     Label.TRUCK: (Label.OTHER_VEHICLE, Label.BUILDING, Label.CAR),
@@ -29,24 +29,24 @@ STANDING = {
     Label.MOVING_BICYCLIST: Label.BICYCLIST,
     Label.MOVING_MOTORCYCLIST: Label.MOTORCYCLIST,
 }
-IMAGE = (64, 1024)  # rows over the elevations there are, columns over the circle: what networks work on
+IMAGE = (64, 1024)  # rows over the elevations in the scan, columns over the full circle: the usual network resolution
 
 
 class LabelErrorConfig(Section):
-    """How wrong. All zero leaves the labels as they are, but for the classes that move.
+    """Amount of each kind of label error. With all fields zero, only the moving classes change.
 
     The defaults, on simulated HDL-64E scans, leave an IoU of 0.90 for cars, 0.85 for buildings, 0.69 for trunks and
-    0.61 for poles: between what RangeNet++ and SPVNAS are known for on SemanticKITTI.
+    0.61 for poles: between those reported for RangeNet++ and SPVNAS on SemanticKITTI.
     """
 
-    regions: int = Field(10, ge=0, description="regions of a scan in which each class is taken for another one")
+    regions: int = Field(10, ge=0, description="regions of a scan in which each class is confused with another")
     region_radius_m: float = Field(1.0, gt=0, description="mean radius of a region (m)")
-    bleeding: float = Field(0.5, ge=0, le=1, description="share of the points at an edge that take the other label")
+    bleeding: float = Field(0.5, ge=0, le=1, description="share of the points at an edge that get the label across it")
     lost: float = Field(0.01, ge=0, le=1, description="share of all points that lose their label")
 
 
 def network_like(points: Points, labels: Labels, *, config: LabelErrorConfig, rng: np.random.Generator) -> Labels:
-    """The labels that a network might give to points (n, 3) of the LiDAR frame whose true labels are known."""
+    """Simulated network labels (n,) for points (n, 3) of the LiDAR frame with known true labels."""
     guessed = _standing(labels)
     for _ in range(config.regions if len(points) else 0):
         _confuse_region(guessed, points, config.region_radius_m, rng)
@@ -56,14 +56,14 @@ def network_like(points: Points, labels: Labels, *, config: LabelErrorConfig, rn
 
 
 def _standing(labels: Labels) -> Labels:
-    """Labels without moving classes, which a single scan cannot show."""
+    """Labels with each moving class replaced by its static class: a single scan does not show motion."""
     table = np.arange(len(Label), dtype=np.uint8)
     table[list(STANDING)] = list(STANDING.values())
     return table[labels]
 
 
 def _confuse_region(labels: Labels, points: Points, radius_m: float, rng: np.random.Generator) -> None:
-    """In place: around a random point each class becomes one it is often taken for; regions grow with the range."""
+    """In place: around a random point, each class becomes one it is often confused with. Regions grow with range."""
     centre = points[rng.integers(len(points))]
     radius = radius_m * rng.exponential() * (0.5 + np.linalg.norm(centre) / 30.0)
     rows = np.flatnonzero(np.linalg.norm(points - centre, axis=1) < radius)
@@ -75,7 +75,7 @@ def _confuse_region(labels: Labels, points: Points, radius_m: float, rng: np.ran
 
 
 def _bled(labels: Labels, points: Points, share: float, rng: np.random.Generator) -> Labels:
-    """Labels smeared over the edges of the range image, to the side and up or down by a pixel or two."""
+    """Labels blurred over the edges of the range image, horizontally and vertically by one or two pixels."""
     row, column = _pixels(points)
     image = np.full(IMAGE, Label.UNLABELLED, dtype=np.uint8)
     image[row, column] = labels

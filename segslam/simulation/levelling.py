@@ -1,7 +1,7 @@
-"""One height for each place: a measured trajectory made fit to build a street on.
+"""Corrects a measured trajectory so that each place has one height; streets can then be built along it.
 
-Real ground truth gives two visits of one place different heights, up to metres. Here heights change by the least change
-of slope that removes this, and each pose pitches with its new slope.
+The heights of two visits to one place differ in real ground truth, by up to metres. The correction removes the
+difference with the smallest change of slope; each pose is pitched to its new slope.
 """
 
 import numpy as np
@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 from segslam.trajectory import Poses
 from segslam.types import Vector
 
-STEP_M = 1.0  # chosen: heights are solved for at this spacing of the path
-REVISIT_M = 4.0  # chosen: two visits this near are on one road
-REVISIT_GAP_M = 30.0  # chosen: less travel than this between them is no second visit
-TIE_WEIGHT = 0.03  # chosen: visits of the 11 KITTI sequences then agree to some centimetres
-TENSION_M = 10.0  # chosen: keeps the raise from swinging beyond the gaps it closes
-MAX_SLOPE = 0.2  # chosen: above that of the streets of the data
+STEP_M = 1.0  # chosen: spacing along the path at which heights are solved for
+REVISIT_M = 4.0  # chosen: two visits nearer than this are on one road
+REVISIT_GAP_M = 30.0  # chosen: least travel between two visits of one place
+TIE_WEIGHT = 0.03  # chosen: the visits in the 11 KITTI sequences then agree to a few centimetres
+TENSION_M = 10.0  # chosen: prevents the correction from overshooting the differences it removes
+MAX_SLOPE = 0.2  # chosen: steeper than any street of the data
 
 
 def upright(T_world_lidar: Poses) -> Poses:
-    """The same drive in a world whose z is the mean up of the sensor, first position at the origin, heading kept."""
+    """The drive in a frame with z along the mean up direction of the sensor. It starts at the origin; yaw is kept."""
     up = T_world_lidar[:, :3, 2].mean(axis=0)
     up /= np.linalg.norm(up)
     axis = np.cross(up, [0.0, 0.0, 1.0])
@@ -35,7 +35,7 @@ def upright(T_world_lidar: Poses) -> Poses:
 
 
 def level(T_world_lidar: Poses) -> Poses:
-    """The drive with one height for each place; x, y and heading are untouched. Expects z to point up."""
+    """The drive with one height for each place; x, y and yaw are unchanged. z must point up."""
     positions = T_world_lidar[:, :3, 3]
     travel = _travel_m(positions)
     climb = np.concatenate([[0.0], np.cumsum(_plausible_climbs(positions, travel))])
@@ -48,16 +48,16 @@ def level(T_world_lidar: Poses) -> Poses:
 
 
 def _plausible_climbs(positions: np.ndarray, travel_m: Vector) -> Vector:
-    """(n - 1,) height gained from pose to pose, no steeper than a street: a standing car does not rise."""
+    """(n - 1,) height differences between consecutive poses, limited to MAX_SLOPE; zero where the car stands."""
     bound = MAX_SLOPE * np.diff(travel_m)
     return np.clip(np.diff(positions[:, 2]), -bound, bound)
 
 
 def _smoothest_raise(path: np.ndarray) -> Vector:
-    """(n,) raise r of a path of heights h, STEP_M between its rows, that gives each revisited place one height.
+    """(n,) correction r of the heights h of a path with rows STEP_M apart; each revisited place gets one height.
 
-    Minimises sum (r'' STEP_M^2)^2 + sum (r' STEP_M^2 / TENSION_M)^2 + ties sum (h_i + r_i - h_j - r_j)^2, where j is a
-    point between two rows of an earlier visit.
+    Minimises sum (r'' STEP_M^2)^2 + sum (r' STEP_M^2 / TENSION_M)^2 + TIE_WEIGHT sum (h_i + r_i - h_j - r_j)^2, where j
+    is a point, interpolated between two rows, of an earlier visit.
     """
     count = len(path)
     ties = _ties(path[:, :2])
@@ -66,12 +66,12 @@ def _smoothest_raise(path: np.ndarray) -> Vector:
     curvature = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(count - 2, count))
     tension = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)) * (STEP_M / TENSION_M)
     normal = curvature.T @ curvature + tension.T @ tension + TIE_WEIGHT * (ties.T @ ties)
-    anchored = normal + 1e-12 * diags_array(np.ones(count))  # a common raise of all changes nothing: keep it small
+    anchored = normal + 1e-12 * diags_array(np.ones(count))  # the cost ignores a common offset: keep it near zero
     return spsolve(anchored.tocsc(), -TIE_WEIGHT * (ties.T @ (ties @ path[:, 2])))
 
 
 def _ties(path_xy: np.ndarray) -> csr_array:
-    """(k, n) sparse: each row takes a point of the path minus the point of an earlier visit right beside it."""
+    """(k, n) sparse matrix: each row subtracts the point of an earlier visit from the point of the path beside it."""
     pairs = cKDTree(path_xy).query_pairs(REVISIT_M, output_type="ndarray").reshape(-1, 2)
     early, late = pairs[pairs[:, 1] - pairs[:, 0] > REVISIT_GAP_M / STEP_M].T
     step = path_xy[early + 1] - path_xy[early]
@@ -85,7 +85,7 @@ def _ties(path_xy: np.ndarray) -> csr_array:
 
 
 def _raised(T_world_lidar: Poses, heights: Vector, slope: Vector) -> Poses:
-    """Each pose at its height, and pitched about its own level left so that it climbs by `slope` more."""
+    """Each pose moved to its height and pitched about its left axis, so that the slope increases by `slope`."""
     forward = T_world_lidar[:, :3, 0]
     left = np.cross([0.0, 0.0, 1.0], forward)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
@@ -97,6 +97,6 @@ def _raised(T_world_lidar: Poses, heights: Vector, slope: Vector) -> Poses:
 
 
 def _travel_m(positions: np.ndarray) -> Vector:
-    """Travel in the plane; a standing car advances by a hair so that the values ascend."""
+    """Horizontal travel (m). A standing car advances by a tiny amount, so that the values ascend strictly."""
     steps = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-6))])

@@ -1,4 +1,4 @@
-"""Labelled triangle meshes and the solids that a street is built of. Units are metres, z is up."""
+"""Labelled triangle meshes and the solids that streets are built of. Units are metres; z is up."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from segslam.types import Label, Labels
 
 Triangles = Int[np.ndarray, "_ 3"]
 Instances = UInt16[np.ndarray, "_"]
-"""Numbers of things, 0 for none."""
+"""Numbers of the object instances; 0 for none."""
 Flags = Bool[np.ndarray, "_"]
 Polygon = Float[np.ndarray, "_ 2"]
 BOX_SIDES = np.array(
@@ -20,7 +20,7 @@ BOX_SIDES = np.array(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Triangles with a class, an instance (0: none) and whether they are of glass. Either side reflects."""
+    """Triangles, each with a class, an instance (0: none) and a flag for glass. Both sides of a triangle reflect."""
 
     vertices: Float[np.ndarray, "_ 3"]
     triangles: Triangles
@@ -30,7 +30,7 @@ class Mesh:
 
 
 def mesh(vertices: np.ndarray, triangles: np.ndarray, label: Label, *, glass: bool = False) -> Mesh:
-    """One thing of one class."""
+    """A mesh with one class and no instance."""
     count = len(triangles)
     return Mesh(
         np.asarray(vertices, dtype=np.float64),
@@ -42,7 +42,7 @@ def mesh(vertices: np.ndarray, triangles: np.ndarray, label: Label, *, glass: bo
 
 
 def merge(parts: Sequence[Mesh]) -> Mesh:
-    """All parts as one mesh; an empty mesh for none."""
+    """All parts as one mesh; an empty mesh if there are no parts."""
     if not parts:
         return mesh(np.empty((0, 3)), np.empty((0, 3)), Label.UNLABELLED)
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
@@ -56,14 +56,14 @@ def merge(parts: Sequence[Mesh]) -> Mesh:
 
 
 def placed(part: Mesh, x: float, y: float, z: float, *, yaw_rad: float = 0.0) -> Mesh:
-    """The mesh turned about z and then moved."""
+    """The mesh rotated about z, then translated."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turned = part.vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     return replace(part, vertices=turned + np.array([x, y, z]))
 
 
 def as_instance(part: Mesh, number: int, *, only: Sequence[Label] = tuple(Label)) -> Mesh:
-    """The mesh as one numbered thing, 1 to 65535 (and round again), on its triangles of the named classes."""
+    """The mesh with an instance number, wrapped to 1-65535, on its triangles of the given classes."""
     instance = (number - 1) % 65535 + 1
     return replace(part, instances=np.where(np.isin(part.labels, only), instance, 0).astype(np.uint16))
 
@@ -71,7 +71,7 @@ def as_instance(part: Mesh, number: int, *, only: Sequence[Label] = tuple(Label)
 def box(
     length: float, width: float, z0: float, z1: float, label: Label, *, at: tuple[float, float] = (0.0, 0.0)
 ) -> Mesh:
-    """A box without a floor, `length` along x and `width` along y, centred on `at`."""
+    """A box without bottom face, `length` along x and `width` along y, centred on `at`."""
     return frustum((length, width, 0.0), (length, width, 0.0), z0, z1, label, at=at)
 
 
@@ -85,7 +85,7 @@ def frustum(
     at: tuple[float, float] = (0.0, 0.0),
     glass: bool = False,
 ) -> Mesh:
-    """Two rectangles (length, width, shift along x) joined by walls, the upper one closed."""
+    """A frustum between two rectangles (length, width, shift along x), with walls and a top face."""
     rows = [
         (at[0] + shift + sx * length / 2, at[1] + sy * width / 2, z)
         for (length, width, shift), z in ((bottom, z0), (top, z1))
@@ -96,7 +96,7 @@ def frustum(
 
 
 def extruded(profile_xz: Polygon, width: float, label: Label) -> Mesh:
-    """A convex side view in x and z, drawn out to `width` along y, ends closed."""
+    """A convex profile in x and z, extruded to `width` along y, with closed ends."""
     count = len(profile_xz)
     near = np.column_stack([profile_xz[:, 0], np.full(count, -width / 2), profile_xz[:, 1]])
     far = near * [1.0, -1.0, 1.0]
@@ -116,7 +116,7 @@ def band(count: int, offset: int) -> Triangles:
 def stem(
     radii_m: Sequence[float], heights_m: Sequence[float], label: Label, *, lean: float = 0.0, sides: int = 8
 ) -> Mesh:
-    """A round upright thing: a radius at each height; `lean` is how far x shifts for each metre up."""
+    """A vertical round stem with a radius at each height. `lean`: shift of x for each metre of height."""
     angles = np.arange(sides) * (2 * np.pi / sides)
     circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(sides)])
     rings = [circle * r + [lean * h, 0.0, h] for r, h in zip(radii_m, heights_m, strict=True)]
@@ -125,7 +125,7 @@ def stem(
 
 
 def leaves(centres: np.ndarray, size_m: float, rng: np.random.Generator, label: Label = Label.VEGETATION) -> Mesh:
-    """A triangle of random attitude, some `size_m` across, about each centre: what a laser sees of foliage."""
+    """A randomly oriented triangle of about `size_m` around each centre; simulates foliage."""
     corners = rng.normal(scale=size_m / 2, size=(len(centres), 3, 3))
     vertices = (centres[:, None] + corners - corners.mean(axis=1, keepdims=True)).reshape(-1, 3)
     return mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), label)

@@ -1,4 +1,4 @@
-"""Parked cars at the kerb and in courts, some of which come or leave while the drive lasts."""
+"""Parked cars at the kerb and in courts, some of which arrive or leave during the drive."""
 
 import math
 from collections.abc import Iterator
@@ -13,19 +13,19 @@ from segslam.simulation.site import Frontage, Site, Spot, moved
 from segslam.simulation.world_settings import WorldConfig
 from segslam.types import Label
 
-KERB_M, SLOT_M = 4.4, 6.0  # chosen: from the street's middle to a parked car's; room that one takes along the street
+KERB_M, SLOT_M = 4.4, 6.0  # chosen: distance of a parked car from the street's centre line; its length along the street
 COURT_M, COURT_DEPTH_M, COURT_SLOT_M = (
     13.0,
     12.0,
     2.7,
-)  # chosen: the same across, in courts with cars nose to the street
-VACANT = 0.3  # chosen: share of the parking places that are empty on another day
+)  # chosen: the same for courts, where cars are parked perpendicular to the street
+VACANT = 0.3  # chosen: share of the parking places that are free on another day
 TRUCKS = 0.05  # chosen: share of the vehicles at the kerb
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ParkedCar:
-    """A vehicle, in the world, that stands `at` (x, y) while `start_s` <= time < `end_s`."""
+    """A vehicle parked at `at` (x, y; m, world) for `start_s` <= time < `end_s`."""
 
     mesh: Mesh
     at: tuple[float, float]
@@ -34,7 +34,7 @@ class ParkedCar:
 
     @property
     def changes(self) -> bool:
-        """Whether it comes or leaves at all."""
+        """True if the car arrives or leaves during the drive."""
         return math.isfinite(self.start_s) or math.isfinite(self.end_s)
 
 
@@ -47,12 +47,12 @@ def parked_cars(
     *,
     today: np.random.Generator | None = None,
 ) -> Iterator[ParkedCar]:
-    """The cars on one side of the streets; at `parked_cars_gone` of the places they differ from visit to visit.
+    """The cars on one side of the streets; in a share `parked_cars_gone` of the places they differ between visits.
 
-    `rng` draws the parking places and the cars of the first day, `today` those of another day at the same places.
+    `rng` draws the parking places and the cars of the first day; `today` draws the cars of another day at these places.
     """
     for spot, across in [*_kerb_spots(site, frontage, config, rng), *_court_spots(site, frontage, config, rng)]:
-        first_day = list(_cars_at(spot, across, site, route, config, rng))  # `rng` goes on the same way on every day
+        first_day = list(_cars_at(spot, across, site, route, config, rng))  # advances `rng` equally on every day
         if today is None:
             yield from first_day
         elif today.uniform() >= VACANT:
@@ -62,7 +62,7 @@ def parked_cars(
 def _cars_at(
     spot: Spot, across: bool, site: Site, route: Route, config: WorldConfig, rng: np.random.Generator
 ) -> Iterator[ParkedCar]:
-    """The cars that stand at one place, one after the other."""
+    """The successive cars at one place."""
     turn = (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(scale=0.03)
     for start, end in _stays(route, spot, config, rng):
         lorry = not across and rng.uniform() < TRUCKS
@@ -73,7 +73,7 @@ def _cars_at(
 def _kerb_spots(
     site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.Generator
 ) -> Iterator[tuple[Spot, bool]]:
-    """Places along the kerb, not across the street."""
+    """Parking places along the kerb, parallel to the street."""
     if config.cars <= 0:
         return
     free_m = max(100.0 / config.cars - SLOT_M, 0.1)
@@ -88,7 +88,7 @@ def _kerb_spots(
 def _court_spots(
     site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.Generator
 ) -> Iterator[tuple[Spot, bool]]:
-    """Places across the street, in paved courts that open the view between the houses."""
+    """Parking places perpendicular to the street, in paved courts between the houses."""
     for _ in range(rng.poisson(config.courts * len(frontage.at) / 100.0)):
         width = rng.uniform(9.0, 22.0)
         middle = site.outward(frontage, int(rng.integers(len(frontage.at))), COURT_M)
@@ -100,7 +100,7 @@ def _court_spots(
 
 
 def _stays(route: Route, spot: Spot, config: WorldConfig, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Who stands at one place, from when to when (s): one car throughout, or a change between two visits."""
+    """Periods (s) in which a car stands at one place: the whole drive, or two with a change between two visits."""
     changes = rng.uniform() < config.parked_cars_gone
     change = time_between_visits(route, spot.x, spot.y, rng) if changes else None
     if change is None:

@@ -1,4 +1,4 @@
-"""The way that a drive takes over the ground, and when."""
+"""The path of a drive on the ground, with times."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from scipy.spatial import cKDTree
 from segslam.trajectory import Poses
 from segslam.types import Points, Vector
 
-BEYOND_M = 60.0  # chosen: the street is seen this far past the ends of the drive
-APART_M = 15.0  # chosen: but not where it would come this near to another piece of the drive
-PASS_M = 12.0  # chosen: passing a place means coming this near to it
-VISIT_GAP_S = 5.0  # chosen: away for less is no second visit
+BEYOND_M = 60.0  # chosen: length of street added before the start and after the end of the drive
+APART_M = 15.0  # chosen: the added street ends where it comes this near to another part of the drive
+PASS_M = 12.0  # chosen: a place is visited when the sensor is this near
+VISIT_GAP_S = 5.0  # chosen: least time between two visits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Route:
-    """The road under a drive, a row a pose: where, when (s), and after how much travel in the plane (m)."""
+    """The road under a drive, one row per pose: position (m), time (s) and horizontal travel (m)."""
 
     at: Points
     time_s: Vector
@@ -24,14 +24,14 @@ class Route:
 
 
 def route_of(T_world_lidar: Poses, time_s: Vector, *, sensor_height_m: float) -> Route:
-    """The road right under the sensor."""
+    """The road below the sensor."""
     at = T_world_lidar[:, :3, 3] - np.array([0.0, 0.0, sensor_height_m])
     steps = np.linalg.norm(np.diff(at[:, :2], axis=0), axis=1)
     return Route(at, np.asarray(time_s, dtype=np.float64), np.concatenate([[0.0], np.cumsum(steps)]))
 
 
 def street_of(route: Route, T_world_lidar: Poses) -> Points:
-    """(n, 3) the route at steps of at most a metre, with the street going on straight before it and after it."""
+    """(n, 3) the route at steps of at most 1 m, with the street extended straight at both ends."""
     length = route.travel_m[-1]
     stations = np.linspace(0.0, length, int(np.ceil(length)) + 1)
     moving = np.concatenate([[True], np.diff(route.travel_m) > 1e-6])
@@ -42,7 +42,7 @@ def street_of(route: Route, T_world_lidar: Poses) -> Points:
 
 
 def _straight_on(driven: Points, end: np.ndarray, heading: np.ndarray) -> Points:
-    """Points a metre apart on from one end at its height, up to where the drive itself passes again."""
+    """Points 1 m apart that extend one end at constant height, up to the next other part of the drive."""
     reach = np.arange(1.0, BEYOND_M + 1.0)[:, None]
     points = end + np.hstack([reach * heading / np.linalg.norm(heading), np.zeros_like(reach)])
     elsewhere = driven[np.linalg.norm(driven[:, :2] - end[:2], axis=1) > APART_M]
@@ -54,7 +54,7 @@ def _straight_on(driven: Points, end: np.ndarray, heading: np.ndarray) -> Points
 
 
 def time_between_visits(route: Route, x: float, y: float, rng: np.random.Generator) -> float | None:
-    """A random moment (s) between two passes of a place, one after the other; None if it is passed but once."""
+    """A random time (s) between two consecutive visits of a place; None if there are fewer than two visits."""
     near = np.linalg.norm(route.at[:, :2] - [x, y], axis=1) < PASS_M
     moments = route.time_s[near]
     gaps = np.flatnonzero(np.diff(moments) > VISIT_GAP_S)

@@ -1,4 +1,4 @@
-"""Trees, bushes and hedges: origin on the ground."""
+"""Trees, bushes and hedges, with the origin on the ground."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from segslam.types import Label
 
 
 def tree(rng: np.random.Generator, *, scale: float | None = None) -> Mesh:
-    """A trunk of 2-4 m under a crown of leaves. `scale` (0 small to 1 large) is drawn unless given."""
+    """A tree with a trunk of 2-4 m and a crown of leaves. `scale`: 0 (small) to 1 (large); random by default."""
     size = rng.uniform() if scale is None else scale
     radius, clear = 0.10 + 0.16 * size, 2.0 + 1.6 * size
     spread, rise = 1.2 + 1.8 * size, 1.3 + 1.7 * size
@@ -29,7 +29,7 @@ def bush(rng: np.random.Generator, width_m: float, height_m: float) -> Mesh:
 
 
 def hedge(rng: np.random.Generator, length_m: float, width_m: float, height_m: float) -> Mesh:
-    """A clipped hedge along x, dense enough that few rays pass, its faces swelling and shrinking along it."""
+    """A clipped hedge along x with uneven faces, dense enough that few rays pass through."""
     count = int(60 * length_m * (height_m + width_m))
     along, across, up = rng.uniform(-0.5, 0.5, size=(3, count))
     across = np.sign(across) * np.abs(2 * across) ** 0.3 / 2  # most leaves near the two faces
@@ -40,7 +40,7 @@ def hedge(rng: np.random.Generator, length_m: float, width_m: float, height_m: f
 
 
 def _ball(rng: np.random.Generator, count: int, *, hollow: float) -> np.ndarray:
-    """Points within the unit ball, none nearer than `hollow` to its middle."""
+    """Points within the unit ball, at least `hollow` from its centre."""
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions * (rng.uniform(hollow**3, 1.0, size=(count, 1)) ** (1 / 3))

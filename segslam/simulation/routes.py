@@ -1,4 +1,4 @@
-"""A made-up drive through a few blocks, for those who have no trajectory at hand."""
+"""A generated drive through a few blocks, used if no trajectory is given."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -6,21 +6,21 @@ from scipy.ndimage import gaussian_filter1d
 from segslam.trajectory import Poses
 from segslam.types import Vector
 
-# Two blocks that share the street from (0, 0) to (40, 0): driven eastwards, then westwards after the eastern block, and
-# eastwards again after the western one. Then all starts over.
+# Two blocks that share the street from (0, 0) to (40, 0). It is driven eastwards, westwards after the eastern block,
+# and eastwards again after the western block. The round then repeats.
 CORNERS_M = ((0, 0), (40, 0), (40, 33), (74, 33), (74, 0), (0, 0), (-33, 0), (-33, -32), (0, -32), (0, 0))
 SHARED_M = 40.0
 STEP_M = 0.25
-LANE_M = 1.4  # chosen: the car keeps to the right of the street's middle
-TURN_M = 5.0  # chosen: corners are rounded by a Gaussian of this width
-SPEED_M_S, TURN_M_S2, PERIOD_S = 14.0, 5.0, 0.1  # chosen: fastest, and the sideways acceleration that slows a turn
+LANE_M = 1.4  # chosen: offset of the car to the right of the street's centre line
+TURN_M = 5.0  # chosen: width of the Gaussian that rounds the corners
+SPEED_M_S, TURN_M_S2, PERIOD_S = 14.0, 5.0, 0.1  # chosen: top speed; lateral acceleration that limits speed in turns
 
 
 def made_up_loop(num_frames: int = 0, *, scale: float = 1.0) -> tuple[Poses, Vector]:
-    """(T_world_lidar, seconds) of a drive at 10 Hz with a street driven in both directions and again in the first.
+    """Poses T_world_lidar (n, 4, 4) and times (n,) (s) of a drive at 10 Hz that revisits a street in both directions.
 
-    One round and the shared street once more, some 300 scans, or as many scans as asked for if that is more. `scale`
-    makes the blocks larger.
+    The drive is one round and the shared street again, about 300 scans, or `num_frames` scans if that is more. `scale`
+    enlarges the blocks.
     """
     corners = scale * np.array(CORNERS_M, dtype=float)
     ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
@@ -39,7 +39,7 @@ def made_up_loop(num_frames: int = 0, *, scale: float = 1.0) -> tuple[Poses, Vec
 
 
 def _seconds(path: np.ndarray) -> Vector:
-    """(n - 1,) time from point to point, slower where the path turns."""
+    """(n - 1,) time (s) from point to point, longer in turns."""
     steps = np.diff(path, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     turns = np.abs(np.gradient(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])))) / lengths
@@ -48,7 +48,7 @@ def _seconds(path: np.ndarray) -> Vector:
 
 
 def _rounded(street: np.ndarray) -> np.ndarray:
-    """The right lane of a closed street, corners rounded."""
+    """The right lane of a closed street, with rounded corners."""
     smooth = gaussian_filter1d(street, TURN_M / STEP_M, axis=0, mode="wrap")
     tangent = np.gradient(np.concatenate([smooth[-1:], smooth, smooth[:1]]), axis=0)[1:-1]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -56,12 +56,12 @@ def _rounded(street: np.ndarray) -> np.ndarray:
 
 
 def _height_m(xy: np.ndarray) -> Vector:
-    """Gentle hills, so that slopes are not nothing."""
+    """Height of gentle hills at each position."""
     return 0.8 * np.sin(xy[:, 0] / 31.0) + 0.6 * np.sin(xy[:, 1] / 23.0 + 0.7)
 
 
 def _poses(xy: np.ndarray, forward: np.ndarray) -> Poses:
-    """Poses upon the hills, x along the road."""
+    """Poses on the hills, with x along the road."""
     ahead = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     slope = _height_m(xy + ahead) - _height_m(xy)
     x = np.column_stack([ahead, slope])

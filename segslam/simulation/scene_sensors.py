@@ -1,4 +1,4 @@
-"""Sensors of many kinds: 16 to 128 beams, high and narrow fields of view, a pattern that never repeats."""
+"""LiDAR sensors of several kinds: 16 to 128 beams, high or narrow fields of view, a non-repetitive pattern."""
 
 import math
 
@@ -12,7 +12,7 @@ SENSORS = {
     "128": (128, (-22.5, 22.5), 360.0), "90 high": (64, (-45.0, 45.0), 360.0), "70 wide": (64, (-22.5, 22.5), 70.0),
     "non-repeating": (0, (-7.0, 52.0), 360.0),
 }  # fmt: skip
-"""Beams (0: random directions for each scan), lowest and highest elevation, and width of the view (degrees)."""
+"""Number of beams (0: random directions in each scan), lowest and highest elevation, horizontal view (degrees)."""
 NUM_AZIMUTH = 720
 NUM_DRAWN = 30_000
 MIN_RANGE_M, MAX_RANGE_M = 0.5, 100.0
@@ -22,7 +22,7 @@ DROPOUT = 0.02
 def scan_points(
     scene: Scene, sensor: str, T_world_lidar: Transform, *, noise_m: float, rng: np.random.Generator
 ) -> Points:
-    """One sweep, float32, in the sensor's frame, with noise of each range and lost returns."""
+    """One sweep (n, 3), float32, in the sensor's frame, with range noise and lost returns."""
     rays = _rays(sensor, rng)
     ranges = scene.cast(T_world_lidar, rays).range_m
     seen = (ranges > MIN_RANGE_M) & (ranges < MAX_RANGE_M) & (rng.random(len(rays)) > DROPOUT)

@@ -1,4 +1,4 @@
-"""Places beside the street, to test registration in: corridor, garage, tunnel, forest, parking lot, open square."""
+"""Scenes other than streets, for registration tests: corridor, garage, tunnel, forest, parking lot, open square."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,16 +17,16 @@ from segslam.types import Label, Points, Transform
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A place that stands still. `path` (n, 4) are positions (m) and headings (rad) of a sensor driven through it."""
+    """A static scene. `path` (n, 4): positions (m) and headings (rad) of a sensor driven through it."""
 
     mesh: Mesh
     path: np.ndarray
     max_shift_m: float
-    """How far apart two scans may be that still show the same things."""
+    """Largest distance between two scans that still show the same objects."""
     _rays: o3d.t.geometry.RaycastingScene
 
     def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
-        """What rays from the sensor's origin meet; `directions` (n, 3) are unit vectors in the LiDAR frame."""
+        """The first hits of rays from the sensor's origin; `directions` (n, 3): unit vectors in the LiDAR frame."""
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = T_world_lidar[:3, 3]
         rays[:, 3:] = directions.astype(np.float32) @ T_world_lidar[:3, :3].T.astype(np.float32)
@@ -39,8 +39,10 @@ def _scene(parts: Sequence[Mesh], path: np.ndarray, max_shift_m: float) -> Scene
 
 
 def corridor(seed: int, *, regular: bool = False, length_m: float = 60.0) -> Scene:
-    """2.4 m wide and 2.6 m high, with recessed doors: every 3 m if `regular`, at irregular distances otherwise, when
-    cupboards stand along the walls too."""
+    """A corridor 2.4 m wide and 2.6 m high with recessed doors.
+
+    The doors are 3 m apart if `regular`. Otherwise their distances are irregular, and cupboards stand along the walls.
+    """
     rng = np.random.default_rng(seed)
     parts = [_slab(0.0, length_m, -1.2, 1.2, 0.0, Label.OTHER_GROUND), _slab(0.0, length_m, -1.2, 1.2, 2.6)]
     parts += [_wall([(x, -1.6), (x, 1.6)], 2.6) for x in (0.0, length_m)]
@@ -71,7 +73,7 @@ def corridor(seed: int, *, regular: bool = False, length_m: float = 60.0) -> Sce
 
 
 def garage(seed: int, *, levels: int = 3) -> Scene:
-    """Levels 3 m apart with equal pillars and walls; other cars on each. The path runs through all levels."""
+    """Levels 3 m apart with the same pillars and walls, but different cars. The path runs through all levels."""
     rng = np.random.default_rng(seed)
     length, width = 64.0, 34.0
     parts, paths = [_slab(0.0, length, 0.0, width, 0.0, Label.OTHER_GROUND)], []
@@ -97,7 +99,7 @@ def garage(seed: int, *, levels: int = 3) -> Scene:
 
 
 def tunnel(seed: int, *, length_m: float = 240.0) -> Scene:
-    """10 m wide and 6 m high with niches, signs, lamps and cabinets at irregular distances."""
+    """A tunnel 10 m wide and 6 m high with niches, signs, lamps and cabinets at irregular distances."""
     rng = np.random.default_rng(seed)
     parts = [_slab(0.0, length_m, -5.0, 5.0, 0.0, Label.ROAD), _slab(0.0, length_m, -5.0, 5.0, 6.0)]
     for side in (-1.0, 1.0):
@@ -133,7 +135,7 @@ def forest(seed: int) -> Scene:
 
 
 def parking_lot(seed: int) -> Scene:
-    """Rows of equal cars 2.6 m apart, a third of the places free; lamps, a hedge, a building at one side."""
+    """Rows of identical cars 2.6 m apart, with a third of the places free; lamps, a hedge, a building at one side."""
     rng = np.random.default_rng(seed)
     equal = car(np.random.default_rng(7))
     parts = [_slab(-60.0, 160.0, -60.0, 110.0, 0.0, Label.PARKING)]
@@ -151,7 +153,7 @@ def parking_lot(seed: int) -> Scene:
 
 
 def square(seed: int) -> Scene:
-    """A paved square with nothing near: fronts 35 to 55 m away, a monument, lamps, a few trees."""
+    """An open paved square: facades at 35 to 55 m, a monument, lamps, a few trees."""
     rng = np.random.default_rng(seed)
     parts = [_slab(-90.0, 90.0, -90.0, 90.0, 0.0, Label.OTHER_GROUND)]
     corners = [(-52.0, -40.0), (48.0, -45.0), (55.0, 38.0), (8.0, 46.0), (-45.0, 41.0), (-52.0, -40.0)]
@@ -177,7 +179,7 @@ SCENES: dict[str, Callable[[int], Scene]] = {
 
 
 def pose(scene: Scene, row: int, rng: np.random.Generator, *, turned: bool = False) -> Transform:
-    """A sensor at a place of the path, off by some centimetres and degrees, or turned round."""
+    """A sensor pose at a row of the path, perturbed by centimetres and degrees; `turned`: rotated by 180 degrees."""
     x, y, z, heading = scene.path[row]
     side = rng.normal(scale=[0.15, 0.15, 0.03])
     tilt = geometry.exp(geometry.tangent(rotation_rad=np.radians(rng.normal(scale=[0.7, 0.7, 4.0])), translation_m=0.0))
@@ -194,7 +196,7 @@ def _slab(x0: float, x1: float, y0: float, y1: float, z: float, label: Label = L
 
 
 def _wall(line: Sequence[tuple[float, float]], height_m: float, label: Label = Label.BUILDING) -> Mesh:
-    """Upright along a line, from the ground up."""
+    """A vertical wall along a line, from the ground up."""
     count = len(line)
     flat = np.column_stack([np.array(line), np.zeros(count)])
     here = np.arange(count - 1)
@@ -210,7 +212,7 @@ def _lifted(part: Mesh, z: float) -> Mesh:
 
 
 def _ground(rng: np.random.Generator, size: float, step: float) -> Mesh:
-    """Uneven by some 10 cm, with tufts of grass."""
+    """Ground with bumps of about 10 cm and tufts of grass."""
     side = np.arange(-20.0, size + 20.0, step)
     x, y = np.meshgrid(side, side, indexing="ij")
     z = 0.12 * np.sin(x / 3.1) * np.cos(y / 4.3) + rng.normal(scale=0.04, size=x.shape)

@@ -1,4 +1,4 @@
-"""What a LiDAR makes of the world: where its beams point, what returns, and what is wrong with it."""
+"""Model of a LiDAR: beam directions, returned points, and sensor errors."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from segslam.types import Label, Labels, Points, Scan, Transform, Vector
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pattern:
-    """Where a sensor looks in one sweep, and how far it sees."""
+    """Beam directions of one sweep, and the maximum range."""
 
     elevations_deg: Vector
     num_azimuth: int
@@ -26,36 +26,36 @@ PATTERNS: dict[SensorName, Pattern] = {
     "os1-64": Pattern(np.linspace(22.5, -22.5, 64), 1024, 120.0, 0.8),
     "vlp16": Pattern(np.linspace(15.0, -15.0, 16), 1800, 100.0, 0.9),
 }
-# Mean and spread of the intensity by class, as on real HDL-64E scans of KITTI 00 with their true labels.
+# Mean and standard deviation of the intensity by class, from real HDL-64E scans of KITTI 00 with their true labels.
 INTENSITY = {
     Label.UNLABELLED: (0.28, 0.16), Label.CAR: (0.15, 0.18), Label.TRUCK: (0.2, 0.18), Label.ROAD: (0.21, 0.11),
     Label.PARKING: (0.30, 0.09), Label.SIDEWALK: (0.30, 0.08), Label.BUILDING: (0.43, 0.15), Label.FENCE: (0.29, 0.12),
     Label.VEGETATION: (0.33, 0.13), Label.TRUNK: (0.31, 0.14), Label.TERRAIN: (0.31, 0.12), Label.POLE: (0.20, 0.17),
     Label.TRAFFIC_SIGN: (0.6, 0.25), Label.MOVING_CAR: (0.15, 0.18),
 }  # fmt: skip
-SIGNAL = 35.0  # chosen: so strong that a road (0.2 bright, met flat) is seen to some 50 m, as on real scans
-GLASS_PASSES = 0.6  # chosen: share of rays that a car's window swallows
+SIGNAL = 35.0  # chosen: a road (reflectivity 0.2, normal incidence) is visible up to 50 m, as in real scans
+GLASS_PASSES = 0.6  # chosen: share of the rays that a car window does not return
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensor:
-    """One particular sensor, its lasting errors drawn. Rays run beam by beam from the top, n in all."""
+    """One sensor with fixed errors. Its n rays are ordered by beam, the top beam first."""
 
     pattern: Pattern
     config: SensorConfig
     directions: Points
-    """(n, 3) unit vectors in the LiDAR frame along which it really looks."""
+    """(n, 3) unit vectors of the true beam directions in the LiDAR frame."""
     reported: Points
     """(n, 3) reported beam directions."""
     range_error_m: Vector
     """(n,)"""
     sweep_fraction: Vector
-    """(n,) when in the sweep a ray is cast: -0.5 at its start, behind the car, to 0.5 at its end."""
+    """(n,) time of each ray within the sweep: -0.5 at the start, behind the car, to 0.5 at the end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """What one sweep returned; a row a point. `points` in the LiDAR frame, float64."""
+    """The points that one sweep returned, one row each. `points`: LiDAR frame, float64."""
 
     points: Points
     intensity: Vector
@@ -63,12 +63,12 @@ class Sweep:
     instances: Instances
 
     def scan(self, *, index: int, stamp_ns: int) -> Scan:
-        """The same without intensity and instances."""
+        """The sweep as a `Scan`, without intensities and instances."""
         return Scan(self.points, stamp_ns, index, self.labels)
 
 
 def make_sensor(config: SensorConfig, *, seed: int) -> Sensor:
-    """A sensor whose leftover beam errors are drawn from the seed."""
+    """A sensor whose residual beam errors are drawn with the seed."""
     pattern = PATTERNS[config.name]
     beams = len(pattern.elevations_deg)
     rng = np.random.default_rng([seed, 2])
@@ -101,7 +101,7 @@ def sweep(
     time_s: float = 0.0,
     error: SweepError = NO_ERROR,
 ) -> Sweep:
-    """One sweep from one pose, with the sensor's lasting errors and one of this sweep."""
+    """One sweep from one pose, with the sensor's fixed errors and the errors of this sweep."""
     hits = world.cast(T_world_lidar, sensor.directions, time_s=time_s)
     rows = np.flatnonzero(_returns(hits, sensor, rng))
     labels = hits.labels[rows]
@@ -112,7 +112,7 @@ def sweep(
 
 
 def _returns(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
-    """(n,) bool: enough light comes back. Bright, near, and squarely met surfaces answer best."""
+    """(n,) bool: whether enough light returns; more for bright and near surfaces and for small angles of incidence."""
     pattern = sensor.pattern
     seen = (hits.range_m > pattern.min_range_m) & (hits.range_m < pattern.max_range_m)
     with np.errstate(divide="ignore", over="ignore"):
@@ -122,7 +122,7 @@ def _returns(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray
 
 
 def _intensity(labels: Labels, rng: np.random.Generator) -> Vector:
-    """0 to 0.99 in steps of 0.01, by class."""
+    """Intensities by class, 0 to 0.99 in steps of 0.01."""
     drawn = MEAN_INTENSITY[labels] + SPREAD_INTENSITY[labels] * rng.standard_normal(len(labels), dtype=np.float32)
     return np.round(np.clip(drawn, 0.0, 0.99), 2)
 

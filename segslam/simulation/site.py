@@ -1,4 +1,4 @@
-"""The ground while it is built upon: what is taken, what is paved, and the sides of the streets."""
+"""The building site along a drive: occupied cells, paved areas, and the sides of the streets."""
 
 from dataclasses import dataclass
 
@@ -9,23 +9,23 @@ from segslam.simulation.mesh import Mesh, placed
 from segslam.simulation.terrain import CELL_M, Ground, middle_of_street
 from segslam.types import Label, Vector
 
-STREET_GAP_M = 7.0  # chosen: a path this near to an earlier piece of itself is the same street
-REACH_M = 15.0  # chosen: how much farther out than asked a place is sought
+STREET_GAP_M = 7.0  # chosen: a path nearer than this to an earlier part of itself is on the same street
+REACH_M = 15.0  # chosen: a free place is searched for this far beyond the requested distance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frontage:
-    """Points of one side of the streets, a metre apart: `at` (n, 2) in the street's middle, `outward` (n, 2) unit."""
+    """One side of the streets, as points 1 m apart: `at` (n, 2) on the centre line, `outward` (n, 2) unit vectors."""
 
     at: np.ndarray
     outward: np.ndarray
     heading_rad: Vector
-    """Of the street, with the side that is built on its left."""
+    """Heading of the street, with this side on its left."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spot:
-    """A place to stand: position, and the heading of the street beside it."""
+    """A place for an object: its position, and the heading of the street beside it."""
 
     x: float
     y: float
@@ -33,7 +33,7 @@ class Spot:
 
 
 def frontages(path: np.ndarray) -> tuple[Frontage, Frontage]:
-    """Left and right of the streets under a path (n, 3) with points a metre apart, each street once."""
+    """Left and right side of the streets along a path (n, 3) with points 1 m apart; each street occurs once."""
     middle = middle_of_street(path)
     normal = middle - path[:, :2]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
@@ -46,14 +46,14 @@ def frontages(path: np.ndarray) -> tuple[Frontage, Frontage]:
 
 
 class Site:
-    """The ground, and which cells of it are built upon."""
+    """The ground, and the cells on which objects stand."""
 
     def __init__(self, ground: Ground) -> None:
         self.ground = ground
         self._taken = np.zeros(ground.height_m.shape, dtype=bool)
 
     def claim(self, spot: Spot, length_m: float, width_m: float, *, clearance_m: float) -> bool:
-        """Take a rectangle, unless a piece of it is taken or nearer than the clearance to the driven path."""
+        """Occupy a rectangle; False if part of it is occupied, or nearer than the clearance to the driven path."""
         row, column = self._cells(spot, length_m, width_m)
         if self.ground.path_m[row, column].min() < clearance_m or self._taken[row, column].any():
             return False
@@ -61,13 +61,13 @@ class Site:
         return True
 
     def pave(self, spot: Spot, length_m: float, width_m: float, label: Label) -> None:
-        """Turn the terrain of a rectangle into another kind of ground; roads and sidewalks stay."""
+        """Change the class of the terrain in a rectangle; roads and sidewalks are unchanged."""
         row, column = self._cells(spot, length_m, width_m)
         soft = self.ground.labels[row, column] == Label.TERRAIN
         self.ground.labels[row[soft], column[soft]] = label
 
     def outward(self, frontage: Frontage, station: int, distance_m: float) -> Spot:
-        """The first place outward from a station that is `distance_m` from the middle of every street."""
+        """The first spot outward from a station that is `distance_m` away from the centre line of every street."""
         reach = distance_m + np.arange(0.0, REACH_M, CELL_M / 2)
         x, y = (frontage.at[station] + reach[:, None] * frontage.outward[station]).T
         row, column = self.ground.cells(x, y)
@@ -75,7 +75,7 @@ class Site:
         return Spot(float(x[step]), float(y[step]), float(frontage.heading_rad[station]))
 
     def stand(self, thing: Mesh, spot: Spot, *, turn_rad: float = 0.0) -> Mesh:
-        """The thing on the ground of a spot, its x along the street but for a turn."""
+        """The object placed on the ground of a spot, with its x axis along the street, rotated by `turn_rad`."""
         z = float(self.ground.height_at(np.array([spot.x]), np.array([spot.y]))[0])
         return placed(thing, spot.x, spot.y, z, yaw_rad=spot.heading_rad + turn_rad)
 
@@ -88,11 +88,11 @@ class Site:
 
 
 def _samples(size_m: float) -> Vector:
-    """From one end to the other in steps of less than a cell."""
+    """Positions from one end to the other, less than one cell apart."""
     return np.linspace(-size_m / 2, size_m / 2, int(size_m / CELL_M * 1.3) + 2)
 
 
 def moved(spot: Spot, *, along_m: float = 0.0, out_m: float = 0.0) -> Spot:
-    """A spot farther along the street or farther out from it."""
+    """A spot displaced along the street and away from it."""
     c, s = np.cos(spot.heading_rad), np.sin(spot.heading_rad)
     return Spot(spot.x + c * along_m - s * out_m, spot.y + s * along_m + c * out_m, spot.heading_rad)

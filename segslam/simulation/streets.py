@@ -1,4 +1,4 @@
-"""What stands along the streets but cars: lots with houses and gardens, then rows of trees, lamps and signs."""
+"""Objects along the streets, except cars: lots with houses and gardens, rows of trees, lamps and signs."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from segslam.simulation.site import Frontage, Site, moved
 from segslam.simulation.world_settings import WorldConfig
 from segslam.types import Label
 
-# Chosen: from the street's middle to the middle of a thing, or to a house's front.
+# Chosen: distances from the street's centre line to the centre of an object, or to the front of a house.
 LAMP_M, SIGN_M, TREE_M, HEDGE_M = 5.8, 6.2, 6.9, 7.9
 HOUSE_M, YARD_M, GARDEN_M, BACKDROP_M = (8.6, 13.0), (8.5, 12.0), (8.5, 18.0), (20.0, 50.0)
-# Chosen: how many bushes and trees a lot has before, instead of, and behind its house.
+# Chosen: mean number of bushes and trees on a lot in front of the house, in place of it, and behind it.
 YARD_SHRUBS, GARDEN_SHRUBS, BACKDROP_SHRUBS = 1.5, 8.0, 3.5
 
 Maker = Callable[[np.random.Generator], Mesh]
@@ -22,7 +22,7 @@ Maker = Callable[[np.random.Generator], Mesh]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lot:
-    """A piece of one side of the street, `width_m` wide about the station `middle` of its frontage."""
+    """A section of one side of the street, `width_m` wide, centred on the station `middle` of its frontage."""
 
     site: Site
     frontage: Frontage
@@ -31,7 +31,7 @@ class Lot:
 
 
 def furnish(site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.Generator) -> Iterator[Mesh]:
-    """Everything that stands on one side, in the world: houses first, then what finds room before them."""
+    """All objects on one side, in the world frame: houses first, then objects that fit in front of them."""
     for lot in _lots(site, frontage, rng):
         if rng.uniform() < config.built:
             yield from _house(lot, rng)
@@ -60,7 +60,7 @@ def _row(
     *,
     jitter: float,
 ) -> Iterator[Mesh]:
-    """Things at a mean spacing along the street, each moved by up to `jitter` spacings either way."""
+    """Objects at a mean spacing along the street, each displaced at random by up to `jitter` spacings."""
     if per_100m <= 0:
         return
     spacing = 100.0 / per_100m
@@ -73,12 +73,12 @@ def _row(
 
 
 def _equal_tree(_: np.random.Generator) -> Mesh:
-    """Always the same tree."""
+    """The same tree each time."""
     return plants.tree(np.random.default_rng(0), scale=0.5)
 
 
 def _lots(site: Site, frontage: Frontage, rng: np.random.Generator) -> Iterator[Lot]:
-    """Lot after lot of 9-24 m."""
+    """Consecutive lots, 9-24 m wide."""
     start = 0
     while start < len(frontage.at):
         width = int(rng.integers(9, 25))
@@ -87,7 +87,7 @@ def _lots(site: Site, frontage: Frontage, rng: np.random.Generator) -> Iterator[
 
 
 def _house(lot: Lot, rng: np.random.Generator) -> Iterator[Mesh]:
-    """A building with a paved way to its door, some wall to wall with the next."""
+    """A building with a paved path to its door; some adjoin the next building."""
     depth, wide = rng.uniform(8.0, 12.0), lot.width_m - max(0.0, rng.uniform(-1.5, 3.0))
     spot = lot.site.outward(lot.frontage, lot.middle, rng.uniform(*HOUSE_M))
     if lot.site.claim(moved(spot, out_m=depth / 2 + 0.5), wide, depth, clearance_m=6.5):
@@ -97,7 +97,7 @@ def _house(lot: Lot, rng: np.random.Generator) -> Iterator[Mesh]:
 
 
 def _closure(lot: Lot, config: WorldConfig, rng: np.random.Generator) -> Iterator[Mesh]:
-    """A hedge or a fence between lot and sidewalk, if any."""
+    """A hedge, a fence or nothing between lot and sidewalk."""
     kind, length = rng.uniform(), lot.width_m - rng.uniform(1.0, 5.0)
     spot = lot.site.outward(lot.frontage, lot.middle, HEDGE_M)
     if kind < config.hedged + config.fenced and lot.site.claim(spot, length, 0.8, clearance_m=4.5):
@@ -108,7 +108,7 @@ def _closure(lot: Lot, config: WorldConfig, rng: np.random.Generator) -> Iterato
 
 
 def _shrubs(lot: Lot, mean: float, distance_m: tuple[float, float], rng: np.random.Generator) -> Iterator[Mesh]:
-    """Bushes, and a tree in four, anywhere at these distances from the street's middle."""
+    """Bushes, and one tree for three of them, at random distances in this range from the street's centre line."""
     for _ in range(rng.poisson(mean)):
         away = rng.uniform(-0.5, 0.5) * lot.width_m
         station = int(np.clip(lot.middle + away, 0, len(lot.frontage.at) - 1))

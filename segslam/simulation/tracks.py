@@ -1,4 +1,4 @@
-"""Where a simulated car goes: along a KITTI trajectory, made level, or round a made-up loop."""
+"""Trajectories of the simulated car: a levelled KITTI trajectory, or a generated loop."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from segslam.trajectory import Poses, lidar_from_camera, read_poses
 from segslam.types import SegslamError, Transform, Vector
 
 PERIOD_S = 0.1
-# The camera looks along the LiDAR's x; nominal mounting of KITTI's car.
+# The camera looks along the x axis of the LiDAR: nominal mounting of KITTI's car.
 NOMINAL_CALIB = (
     "".join(
         f"P{camera}: 718.856 0 607.1928 {shift} 0 718.856 185.2157 0 0 0 1 0\n"
@@ -24,7 +24,7 @@ NOMINAL_CALIB = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """`T_world_lidar` (n, 4, 4) level, z up; `time_s` (n,) ascending; `calib` the text of calib.txt."""
+    """`T_world_lidar` (n, 4, 4): level poses, z up. `time_s` (n,): ascending. `calib`: content of calib.txt."""
 
     T_world_lidar: Poses
     time_s: Vector
@@ -32,15 +32,15 @@ class Drive:
 
 
 def made_up_drive(num_frames: int = 0, *, scale: float = 1.0) -> Drive:
-    """The made-up loop with KITTI's nominal calibration: one round, or more if it takes more to fill so many scans.
+    """The generated loop with KITTI's nominal calibration: one round, or several if `num_frames` needs more.
 
-    `scale` makes the blocks larger.
+    `scale` enlarges the blocks.
     """
     return Drive(*made_up_loop(num_frames, scale=scale), NOMINAL_CALIB)
 
 
 def in_lane(drive: Drive, *, left_m: float = 0.0, reverse: bool = False) -> Drive:
-    """The same streets driven `left_m` to the left of the first drive's path, or from its end to its start."""
+    """A drive along the same streets, `left_m` to the left of the first path, or in the opposite direction."""
     T_world_lidar, time_s = drive.T_world_lidar, drive.time_s
     if reverse:
         T_world_lidar = T_world_lidar[::-1] @ geometry.transform(geometry.yaw(np.pi), np.zeros(3))
@@ -49,11 +49,11 @@ def in_lane(drive: Drive, *, left_m: float = 0.0, reverse: bool = False) -> Driv
 
 
 def read_drive(poses_file: Path, *, sequence: str) -> Drive:
-    """The drive of a KITTI pose file (camera frame), made level.
+    """The drive of a KITTI pose file (camera frame), levelled.
 
-    calib.txt and times.txt are sought beside the file, then in ../sequences/NAME for the file's own name, then for
-    `sequence`; without calib the nominal one is used, without times 10 Hz.
-    Raises SegslamError that names the file if one is broken.
+    calib.txt and times.txt are searched beside the file, then in ../sequences/NAME where NAME is the name of the file,
+    then in ../sequences/`sequence`. Defaults: nominal calibration, 10 Hz.
+    Raises SegslamError, naming the file, if one of them is invalid.
     """
     T_world_camera = read_poses(poses_file, format="kitti").T_a_b
     calib_file, times_file = (_beside(poses_file, name, sequence) for name in ("calib.txt", "times.txt"))
@@ -65,14 +65,14 @@ def read_drive(poses_file: Path, *, sequence: str) -> Drive:
 
 
 def _beside(poses_file: Path, name: str, sequence: str) -> Path | None:
-    """The named file of the sequence that a pose file belongs to, if there is one."""
+    """The file `name` of the sequence that a pose file belongs to; None if there is none."""
     sequences = poses_file.parent.parent / "sequences"
     folders = (poses_file.parent, sequences / poses_file.stem, sequences / sequence)
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
 def parse_calib(text: str, *, source: str) -> Transform:
-    """T_camera_lidar, the line `Tr`. Raises SegslamError that names the source."""
+    """T_camera_lidar from the line `Tr`. Raises SegslamError, naming the source."""
     for line in text.splitlines():
         name, _, values = line.partition(":")
         if name.strip() in ("Tr", "Tr_velo_to_cam"):
@@ -84,7 +84,7 @@ def parse_calib(text: str, *, source: str) -> Transform:
 
 
 def _numbers(text: str) -> Vector:
-    """The numbers of a line; empty if one is none."""
+    """The numbers in a line; empty if one of the words is not a number."""
     try:
         return np.array([float(word) for word in text.split()])
     except ValueError:
@@ -102,7 +102,7 @@ def _times(path: Path, count: int) -> Vector:
     try:
         times = np.loadtxt(path, ndmin=1)
     except (OSError, ValueError) as error:
-        raise SegslamError(f"{path}: cannot read the times ({error}); give a number of seconds a line") from error
+        raise SegslamError(f"{path}: cannot read the times ({error}); write one number of seconds per line") from error
     if len(times) < count or not (np.diff(times) > 0).all():
-        raise SegslamError(f"{path}: needs {count} ascending times for as many poses, holds {len(times)}")
+        raise SegslamError(f"{path}: expected {count} ascending times, one per pose; found {len(times)}")
     return times[:count]

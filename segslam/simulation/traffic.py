@@ -11,14 +11,14 @@ from segslam.simulation.path import Route
 from segslam.simulation.world_settings import WorldConfig
 from segslam.types import Label
 
-LANE_M = 2.7  # chosen: oncoming traffic passes this far to the left of the path
-ONCOMING = 0.75  # chosen: share of the cars; the others go ahead of the sensor
-SAFE_M = 5.5  # chosen: a moving car this near to the sensor would be inside it and is left out
+LANE_M = 2.7  # chosen: offset of oncoming traffic to the left of the path
+ONCOMING = 0.75  # chosen: share of oncoming cars; the others drive ahead of the sensor
+SAFE_M = 5.5  # chosen: a moving car nearer than this would contain the sensor and is omitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingCar:
-    """A car on the route, `lateral_m` to its left: at `start_m` along it at time 0, then at `speed` (m/s, signed)."""
+    """A car, `lateral_m` to the left of the route. It is at travel `start_m` at time 0; `speed` (m/s) is signed."""
 
     mesh: Mesh
     start_m: float
@@ -27,7 +27,7 @@ class MovingCar:
 
 
 def moving_cars(route: Route, config: WorldConfig, rng: np.random.Generator) -> list[MovingCar]:
-    """Oncoming cars and cars ahead, each of which meets the sensor at a random moment of the drive."""
+    """Oncoming cars and cars ahead, each of which meets the sensor at a random time of the drive."""
     count = rng.poisson(config.moving_cars * route.travel_m[-1] / 100.0)
     return [_moving_car(route, rng) for _ in range(count)]
 
@@ -44,7 +44,7 @@ def _moving_car(route: Route, rng: np.random.Generator) -> MovingCar:
 def meshes_at(
     cars: Sequence[MovingCar], route: Route, *, time_s: float, near_xy: np.ndarray, view_m: float
 ) -> Iterator[Mesh]:
-    """The moving cars where they are at a time, within `view_m` of a point and not on top of it."""
+    """The moving cars at a time, within `view_m` of a position and not too near to it."""
     for number, car in enumerate(cars, start=1):
         travel = car.start_m + car.speed * time_s
         if not 1.0 < travel < route.travel_m[-1] - 1.0:
@@ -58,5 +58,5 @@ def meshes_at(
 
 
 def _on_route(route: Route, travel_m: float) -> np.ndarray:
-    """(3,) where the route is after so much travel."""
+    """(3,) position on the route after a distance of travel."""
     return np.array([np.interp(travel_m, route.travel_m, route.at[:, axis]) for axis in range(3)])

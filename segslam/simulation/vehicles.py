@@ -1,11 +1,11 @@
-"""Cars and trucks of varied make: x forward, origin on the ground under the middle."""
+"""Cars and trucks of varying shape; x points forward, the origin is on the ground below the centre."""
 
 import numpy as np
 
 from segslam.simulation.mesh import Mesh, box, extruded, frustum, merge
 from segslam.types import Label
 
-CAR_KINDS = (  # share, length, width, height, of the hood and the boot in lengths: ranges (m)
+CAR_KINDS = (  # share; ranges of length, width, height (m); ranges of hood and boot as shares of the length
     (0.40, (3.6, 4.1), (1.62, 1.75), (1.42, 1.55), (0.22, 0.28), (0.00, 0.04)),  # hatchback
     (0.25, (4.3, 4.9), (1.70, 1.85), (1.38, 1.48), (0.24, 0.30), (0.14, 0.20)),  # saloon
     (0.20, (4.4, 4.9), (1.72, 1.90), (1.45, 1.75), (0.22, 0.28), (0.00, 0.03)),  # estate
@@ -14,7 +14,7 @@ CAR_KINDS = (  # share, length, width, height, of the hood and the boot in lengt
 
 
 def car(rng: np.random.Generator, label: Label = Label.CAR) -> Mesh:
-    """A car with hood, glazed cabin and wheels, 3.6-5.6 m long; the same numbers drawn give the same car."""
+    """A car with hood, glass windows and wheels, 3.6-5.6 m long; it depends on the state of `rng` only."""
     shares = np.array([kind[0] for kind in CAR_KINDS])
     _, *ranges = CAR_KINDS[rng.choice(len(CAR_KINDS), p=shares)]
     length, width, height, hood, boot = (rng.uniform(*bounds) for bounds in ranges)
@@ -52,7 +52,7 @@ def truck(rng: np.random.Generator) -> Mesh:
 
 
 def _wheels(length: float, width: float, label: Label) -> Mesh:
-    """Four short blocks: what is seen of wheels from outside."""
+    """Four short boxes, the visible parts of the wheels."""
     return merge(
         [
             box(0.6, 0.2, 0.0, 0.3, label, at=(sx * length * 0.31, sy * (width / 2 - 0.12)))

@@ -1,4 +1,4 @@
-"""A labelled street world that rays can be cast into: one scene that stands still, and cars that come and go."""
+"""A labelled street world for ray casting: one static scene, and moving or parked cars."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
@@ -17,24 +17,24 @@ from segslam.simulation.world_settings import WorldConfig
 from segslam.trajectory import Poses
 from segslam.types import Label, Labels, Points, Transform, Vector
 
-VIEW_M = 100.0  # chosen: what changes is seen this far
+VIEW_M = 100.0  # chosen: moving and parked cars are visible up to this distance
 NUMBERED = (Label.CAR, Label.TRUCK, Label.TRUNK, Label.POLE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """What each ray met first. `range_m` is infinite where it met nothing; the rest means nothing there."""
+    """The first hit of each ray. `range_m` is infinite for rays without a hit; their other fields are undefined."""
 
     range_m: Vector
     labels: Labels
     instances: Instances
     cos_incidence: Vector
-    """Of the angle between the ray and the surface's normal, 0 to 1."""
+    """Cosine of the angle between the ray and the surface normal, 0 to 1."""
     glass: Flags
 
 
 class World:
-    """Streets along one drive. Made by `build_world`; the same arguments make the same world."""
+    """Streets along one drive, made by `build_world`. Equal arguments make equal worlds."""
 
     def __init__(
         self, ground: Ground, static: Mesh, route: Route, parked: list[ParkedCar], moving: list[MovingCar], day: int
@@ -48,11 +48,13 @@ class World:
         self._moving = moving
 
     def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
-        """What rays from the sensor's origin meet; `directions` (n, 3) are unit vectors in the LiDAR frame."""
+        """The first hits of rays from the sensor's origin; `directions` (n, 3) are unit vectors in the LiDAR frame."""
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = T_world_lidar[:3, 3]
         R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
-        np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # beats BLAS's threads
+        np.einsum(
+            "ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:]
+        )  # faster than BLAS
         hits = _relabelled(cast_mesh(self._scene, self.static, rays), self.ground, rays)
         for thing in self._changing(time_s, T_world_lidar[:2, 3]):
             _put_nearer(hits, thing, rays)
@@ -66,10 +68,10 @@ class World:
 
 
 def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> World:
-    """Streets along a drive whose poses are level (`levelling.level`), z up, `time_s` (n,) ascending.
+    """Streets along a drive with level poses (`levelling.level`), z up; `time_s` (n,) ascending.
 
-    Every pose of the drive stands `config.sensor_height_m` above its road; no thing stands on any piece of the path.
-    On another `config.day` the same streets have other parked and moving cars.
+    Every pose is `config.sensor_height_m` above the road, and no static object stands on the path. On another
+    `config.day` the streets are the same, but parked and moving cars differ.
     """
     rng = np.random.default_rng([seed, 1])
     route = route_of(T_world_lidar, time_s, sensor_height_m=config.sensor_height_m)
@@ -92,12 +94,12 @@ def _numbered_cars(cars: list[ParkedCar]) -> list[ParkedCar]:
 
 
 def _numbered(things: list[Mesh]) -> list[Mesh]:
-    """Each thing with its own number on its triangles of classes that are counted, as SemanticKITTI's instances."""
+    """Meshes with one instance number each, on triangles of the classes that have instances in SemanticKITTI."""
     return [as_instance(thing, number, only=NUMBERED) for number, thing in enumerate(things, start=1)]
 
 
 def scene_of(part: Mesh) -> o3d.t.geometry.RaycastingScene:
-    """A mesh made ready for rays."""
+    """A ray casting scene of a mesh."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(_tensor(part.vertices, np.float32), _tensor(part.triangles, np.uint32))
     return scene
@@ -108,7 +110,7 @@ def _tensor(values: np.ndarray, dtype: type) -> o3d.core.Tensor:
 
 
 def cast_mesh(scene: o3d.t.geometry.RaycastingScene, part: Mesh, rays: np.ndarray) -> Hits:
-    """What rays (n, 6; float32 origin and direction) meet first of a mesh; `scene` is `scene_of(part)`."""
+    """The first hits of rays (n, 6; float32 origin and direction) on a mesh; `scene` is `scene_of(part)`."""
     answer = scene.cast_rays(_tensor(rays, np.float32))
     range_m = answer["t_hit"].numpy()
     hit = np.where(np.isfinite(range_m), answer["primitive_ids"].numpy(), 0)
@@ -117,7 +119,7 @@ def cast_mesh(scene: o3d.t.geometry.RaycastingScene, part: Mesh, rays: np.ndarra
 
 
 def _relabelled(hits: Hits, ground: Ground, rays: np.ndarray) -> Hits:
-    """Terrain as what it is at each point: road, sidewalk, ..."""
+    """Hits of terrain with the class of the ground at each point: road, sidewalk, ..."""
     rows = np.flatnonzero((hits.labels == Label.TERRAIN) & np.isfinite(hits.range_m))
     at = rays[rows, :2] + hits.range_m[rows, None] * rays[rows, 3:5]
     labels = hits.labels.copy()
@@ -126,7 +128,7 @@ def _relabelled(hits: Hits, ground: Ground, rays: np.ndarray) -> Hits:
 
 
 def _put_nearer(hits: Hits, thing: Mesh, rays: np.ndarray) -> None:
-    """In place, ray by ray: what of a thing is met before what was met so far. Only rays that pass near it are cast."""
+    """In place: replace hits by nearer hits on a mesh. Only rays that pass near it are cast."""
     low, high = thing.vertices.min(axis=0), thing.vertices.max(axis=0)
     away = (low + high) / 2 - rays[0, :3]
     distance, radius = float(np.linalg.norm(away)), float(np.linalg.norm(high - low)) / 2

@@ -47,4 +47,4 @@ def write_whole(file: Path, content: bytes | str) -> None:
 
 def cannot_write(file: Path, error: OSError) -> WorkFailed:
     """The exception for a file that cannot be written."""
-    return WorkFailed(f"{file}: cannot be written ({reason(error)}); make room there, or name another place")
+    return WorkFailed(f"{file}: cannot be written ({reason(error)}); free space there, or name another file")

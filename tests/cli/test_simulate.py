@@ -47,7 +47,7 @@ def test_it_follows_a_pose_file(tmp_path):
         (("--poses", "missing.txt"), "missing.txt"),
         (("--seed", -1), "seed"),
         (("--set", "world.cars=99"), "world.cars"),
-        (("--set", "world.castles=1"), "known there: cars, trees"),
+        (("--set", "world.castles=1"), "known keys: cars, trees"),
         (("--set", "cars=3"), "world.key=value"),
     ],
 )

@@ -66,7 +66,7 @@ def test_a_full_disk_stops_with_the_file_named_and_the_log_still_opens(steps: li
             written.append(step)
 
     with LogWriter(path, config=CONFIG) as log, largest_file(60_000):
-        with pytest.raises(WorkFailed, match=r"log\.mcap: cannot go on writing the log .* make room"):
+        with pytest.raises(WorkFailed, match=r"log\.mcap: cannot go on writing the log .* free space"):
             write_all()
         with pytest.raises(SegslamError, match="closed"):
             log.write(steps[0])

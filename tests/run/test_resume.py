@@ -148,7 +148,7 @@ def test_a_full_disk_ends_with_status_2_and_the_run_goes_on_when_there_is_room(
     out = tmp_path / "run"
     with largest_file(int(0.7 * _size(whole / "log.mcap"))):
         assert run("map", kitti, "--out", out, *OPTIONS, *SETTINGS) == 2
-    assert "make room on the disk" in capsys.readouterr().err
+    assert "free space on the disk" in capsys.readouterr().err
     _resumed_as_whole(kitti, whole, out)
 
 

@@ -133,7 +133,7 @@ def test_real_data_is_never_replaced(tmp_path):
     scan = tmp_path / "sequences/00/velodyne/000000.bin"
     scan.parent.mkdir(parents=True)
     scan.write_bytes(b"real")
-    with pytest.raises(SegslamError, match="was not simulated here"):
+    with pytest.raises(SegslamError, match="was not simulated by segslam"):
         prepare_folder(tmp_path, "00", overwrite=True)
     assert scan.read_bytes() == b"real"
 

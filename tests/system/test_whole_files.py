@@ -126,7 +126,7 @@ def test_a_simulation_on_a_full_disk_ends_with_whole_scans_and_says_how_to_begin
             assert run("simulate", tmp_path / str(number), "--frames", 2, "--sensor", "vlp16", "--quiet") == 2
         line = one_line(capsys)
         assert "standard output" not in line
-        assert "make room there" in line
+        assert "free space there" in line
         files = [file for file in (tmp_path / str(number)).rglob("*") if file.is_file()]
         assert not [file for file in files if file.suffix in (".part", ".label", ".bin")]
     assert "stopped after 0 scans (No space left on device)" in line

@@ -52,9 +52,7 @@ class World:
         rays = np.empty((len(directions), 6), dtype=np.float32)
         rays[:, :3] = T_world_lidar[:3, 3]
         R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
-        np.einsum(
-            "ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:]
-        )  # faster than BLAS
+        np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # faster than BLAS
         hits = _relabelled(cast_mesh(self._scene, self.static, rays), self.ground, rays)
         for thing in self._changing(time_s, T_world_lidar[:2, 3]):
             _put_nearer(hits, thing, rays)

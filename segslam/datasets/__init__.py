@@ -1,4 +1,4 @@
-"""Scans from files, one reader a family of data, behind one Protocol."""
+"""Readers of scans from files and recordings, with one interface."""
 
 from pathlib import Path
 
@@ -22,21 +22,22 @@ def open_dataset(
     intensities: bool = False,
     vertical_angle_deg: float | None = None,
 ) -> Dataset:
-    """The scans of a folder or recording, read one by one when asked for.
+    """Open a folder or recording; its scans are read when they are accessed.
 
-    `dataset` is the kind of data (`kitti`, or a name of kiss_icp's readers), found from the folder where it can be;
-    `labels` a source as `auto`, `none`, `geometric` or a folder; `frames` the scans as `A:B` by number, B not included;
-    `topic` that of the points in a recording with several. Scans have `intensities` only if these are asked for, and
-    known. Their points are raised by `vertical_angle_deg`; None: by 0.205 degrees for data in KITTI's layout, whose
-    points lie too low by that, and not for other data. Raises SegslamError that names the file and the remedy.
+    `dataset`: kind of data (`kitti`, or a name of one of kiss_icp's readers), by default detected. `labels`: `auto`,
+    `none`, `geometric`, `network:MODEL.onnx` or a folder. `frames`: numbers of the scans as `A:B`, B excluded. `topic`:
+    point cloud topic of a recording with several. Scans have `intensities` only if requested and known.
+    `vertical_angle_deg`: correction added to the elevation of all points; by default 0.205 degrees for data in KITTI's
+    layout, whose points are too low by this angle, and 0 for other data. Raises SegslamError, naming the file and the
+    remedy.
     """
     folder = Path(data).expanduser()
     if not folder.exists():
-        raise SegslamError(f"{folder}: no such file or folder; name the folder with sequences/ or with the scans")
+        raise SegslamError(f"{folder}: no such file or folder; give the folder with sequences/ or with the scans")
     try:
         if dataset == "kitti" or (dataset is None and is_kitti(folder)):
             if topic:
-                raise SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); leave the option out")
+                raise SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); omit the option")
             return open_kitti(
                 folder,
                 sequence=sequence,

@@ -1,4 +1,4 @@
-"""One scan from one file: .bin, .npy, .ply, .pcd."""
+"""Single scans from files: .bin, .npy, .ply, .pcd."""
 
 from pathlib import Path
 
@@ -11,12 +11,12 @@ from segslam.types import Points, SegslamError, Vector
 
 
 def read_cloud(file: Path) -> Points:
-    """The points of a file, as stored: .bin (float32 x y z intensity), .npy (n, 3 or more), .ply, .pcd.
+    """Points (n, 3) of a file, as stored: .bin (float32 x y z intensity), .npy (n, 3 or more), .ply, .pcd.
 
-    Raises SegslamError (BadScan for a broken .bin) that names the file.
+    Raises SegslamError (BadScan for an invalid .bin), naming the file.
     """
     if not file.is_file():
-        raise SegslamError(f"{file}: no such file; name a scan (.bin, .npy, .ply, .pcd)")
+        raise SegslamError(f"{file}: no such file; give a scan (.bin, .npy, .ply, .pcd)")
     match file.suffix:
         case ".bin":
             return read_returns(file)[:, :3]
@@ -24,13 +24,13 @@ def read_cloud(file: Path) -> Points:
             return _read_npy(file)[:, :3]
         case ".ply" | ".pcd":
             return _read_by_open3d(file)
-    raise SegslamError(f"{file}: {file.suffix or 'no ending'} is no known format; give .bin, .npy, .ply or .pcd")
+    raise SegslamError(f"{file}: unknown format {file.suffix or '(no extension)'}; give .bin, .npy, .ply or .pcd")
 
 
 def read_intensities(file: Path) -> Vector | None:
-    """The intensity of each point of a file that `read_cloud` reads; None if it has none.
+    """Intensities (n,) of a file that `read_cloud` reads; None if it has none.
 
-    It is the fourth column of .bin and .npy, and of .ply and .pcd a field of one of the usual names.
+    They are the fourth column of .bin and .npy files, and a field with one of the usual names in .ply and .pcd files.
     """
     if file.suffix == ".bin":
         return read_returns(file)[:, 3]
@@ -46,7 +46,7 @@ def _read_npy(file: Path) -> Float64[np.ndarray, "_ _"]:
     except (OSError, ValueError, EOFError) as error:
         raise SegslamError(f"{file}: cannot be read ({error}); save an array by numpy.save") from error
     if values.ndim != 2 or values.shape[1] < 3 or values.dtype.kind not in "fiu":
-        raise SegslamError(f"{file}: holds {values.dtype} of shape {values.shape}; expected (n, 3) numbers, x y z")
+        raise SegslamError(f"{file}: contains {values.dtype} of shape {values.shape}; expected (n, 3) numbers, x y z")
     return values.astype(np.float64)
 
 

@@ -1,7 +1,7 @@
-"""KITTI odometry (Geiger et al. 2012) and all that is written like it: scans, calibration, times, true poses, labels.
+"""KITTI odometry (Geiger et al. 2012) and data of the same layout: scans, calibration, times, true poses, labels.
 
-A scan's number is that of its file, and its row in times.txt and in the poses; numbers may be missing. The poses are
-the left camera's, in the frame of the first one; they leave this file as the LiDAR's.
+The number of a scan is that of its file. It is also its row in times.txt and in the poses; numbers may be missing. Pose
+files hold poses of the left camera in the frame of the first; this module returns LiDAR poses.
 """
 
 from collections.abc import Iterator
@@ -19,18 +19,18 @@ from segslam.trajectory import lidar_from_camera, read_poses
 from segslam.types import BadScan, Indices, Scan, SegslamError, Trajectory, Transform
 
 VERTICAL_ANGLE_DEG = 0.205
-"""Angle by which the points of KITTI's scans lie too low; value as in KISS-ICP (Vizzo et al., RA-L 2023)."""
-EVERY = 11  # prime, so that the sampled rows start at each of 3 or 5 columns equally often
+"""Angle by which the points of KITTI's scans are too low; value of KISS-ICP (Vizzo et al., RA-L 2023)."""
+EVERY = 11  # prime: the sampled rows start equally often at each of 3 or 5 columns
 FEWEST_COMPARED = 300
 ALIKE = 0.15
-"""Chosen: share of their spread by which quantiles of columns of one distribution differ at most, for 300 rows."""
+"""Chosen: largest difference of quantiles, as a share of their range, between 300 samples of one distribution."""
 LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
-"""What calib.txt calls T_camera_lidar: in KITTI's odometry, object and tracking benchmark."""
+"""Names of T_camera_lidar in calib.txt, in KITTI's odometry, object and tracking benchmarks."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiSequence:
-    """The selected scans of one drive, a row each."""
+    """The selected scans of one drive, one row per scan."""
 
     name: str
     scan_files: tuple[Path, ...]
@@ -45,19 +45,19 @@ class KittiSequence:
 
     @property
     def is_sequential(self) -> bool:
-        """Never: each scan has a file."""
+        """False: each scan has its own file."""
         return False
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The name of each scan's file, without its ending."""
+        """Name of each scan's file, without extension."""
         return tuple(file.stem for file in self.scan_files)
 
     def __len__(self) -> int:
         return len(self.scan_files)
 
     def __getitem__(self, row: int) -> Scan:
-        """The scan, its vertical angle corrected. Raises BadScan if the file or its labels cannot be used."""
+        """The scan, with corrected vertical angles. Raises BadScan if the file or its labels cannot be used."""
         file = self.scan_files[row]
         returns = read_returns(file)
         points, intensities = returns[:, :3], returns[:, 3]
@@ -76,7 +76,7 @@ class KittiSequence:
 
 
 def is_kitti(data: Path) -> bool:
-    """Whether the folder holds KITTI sequences, or is one."""
+    """True if the folder contains KITTI sequences, or is one."""
     return (data / "sequences").is_dir() or _is_sequence(data)
 
 
@@ -90,9 +90,9 @@ def open_kitti(
     intensities: bool = False,
     vertical_angle_deg: float | None = None,
 ) -> KittiSequence:
-    """The sequence `sequence` of a folder with `sequences/`, or the one that the folder itself is.
+    """The sequence `sequence` of a folder with `sequences/`, or the folder itself if it is a sequence.
 
-    Raises SegslamError that names what is missing: the sequence, its scans, its calibration or its times.
+    Raises SegslamError if the sequence, its scans, its calibration or its times are missing.
     """
     folder, poses_file = _find_sequence(data, sequence)
     files, numbers = _numbered_scans(folder / "velodyne")
@@ -115,27 +115,27 @@ def open_kitti(
 
 
 def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
-    """x, y, z, intensity of a velodyne file, as stored. Raises BadScan if it is broken."""
+    """(n, 4) x, y, z, intensity of a velodyne file, as stored. Raises BadScan if it is invalid."""
     try:
         content = file.read_bytes()
     except OSError as error:
         raise BadScan(f"{file}: cannot read the scan ({error})") from error
     if len(content) % 16:
         raise BadScan(
-            f"{file}: {len(content)} bytes are no multiple of 16 (float32 x y z intensity): truncated, or not of 4 "
-            "values a point; fetch the file again, or convert it"
+            f"{file}: {len(content)} bytes are not a multiple of 16 (float32 x y z intensity): truncated, or not 4 "
+            "values per point; copy the file again, or convert it"
         )
     returns = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
     if _mixes_columns(returns):
         raise BadScan(
-            f"{file}: its four columns have one distribution, so it has another number of values a point than x y z "
-            "intensity, such as x y z; convert it, for example to .ply"
+            f"{file}: its four columns have the same distribution, so it does not have 4 values per point (x y z "
+            "intensity) but, for example, x y z; convert it, for example to .ply"
         )
     return returns
 
 
 def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
-    """Whether the file holds 3 or 5 values a point: each of them then falls into every column by turns."""
+    """True if the file has 3 or 5 values per point: each value then occurs in every column in turn."""
     some = returns[::EVERY]
     some = some[np.isfinite(some).all(axis=1)]
     if len(some) < FEWEST_COMPARED:
@@ -146,17 +146,17 @@ def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
 
 
 def read_calibration(file: Path) -> Transform:
-    """T_camera_lidar of a calib.txt. Raises SegslamError if the file or the entry is missing or broken."""
+    """T_camera_lidar of a calib.txt. Raises SegslamError if the file or the entry is missing or invalid."""
     try:
         lines = file.read_text(encoding="ascii").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{file}: cannot read the calibration ({error}); KITTI's calib.txt belongs there") from error
+        raise SegslamError(f"{file}: cannot read the calibration ({error}); put KITTI's calib.txt there") from error
     for number, line in enumerate(lines, start=1):
         key, _, values = line.replace(":", " ", 1).strip().partition(" ")
         if key in LIDAR_KEYS:
             return _rigid(values.split(), f"{file}:{number}")
     raise SegslamError(
-        f"{file}: no line begins with any of {', '.join(LIDAR_KEYS)}; add KITTI's line `Tr:`, 12 numbers"
+        f"{file}: no line begins with any of {', '.join(LIDAR_KEYS)}; add KITTI's line `Tr:` with 12 numbers"
     )
 
 
@@ -166,7 +166,7 @@ def _rigid(texts: list[str], place: str) -> Transform:
     except ValueError as error:
         raise SegslamError(f"{place}: expected 12 numbers, a 3x4 matrix by rows ({error})") from error
     if not np.isfinite(matrix).all():
-        raise SegslamError(f"{place}: every number must be finite")
+        raise SegslamError(f"{place}: all numbers must be finite")
     return geometry.transform(geometry.nearest_rotation(matrix[:, :3]), matrix[:, 3])
 
 
@@ -175,7 +175,7 @@ def _is_sequence(folder: Path) -> bool:
 
 
 def _find_sequence(data: Path, sequence: str) -> tuple[Path, Path]:
-    """The sequence's folder and where its true poses would be."""
+    """Folder of the sequence, and file of its true poses, which may be missing."""
     if not (data / "sequences").is_dir() and _is_sequence(data):
         folder = data.resolve()
         return folder, folder.parent.parent / "poses" / f"{folder.name}.txt"
@@ -190,10 +190,10 @@ def _find_sequence(data: Path, sequence: str) -> tuple[Path, Path]:
 def _numbered_scans(velodyne: Path) -> tuple[list[Path], Indices]:
     files = [file for file in velodyne.glob("*.bin") if not file.name.startswith(".")]
     if not files:
-        raise SegslamError(f"{velodyne}: no .bin file there; put KITTI's scans there, 000000.bin and so on")
+        raise SegslamError(f"{velodyne}: contains no .bin file; put KITTI's scans there, 000000.bin and so on")
     misnamed = [file for file in files if not file.stem.isdecimal()]
     if misnamed:
-        raise SegslamError(f"{misnamed[0]}: the name is no scan number; rename the file, for example 000000.bin")
+        raise SegslamError(f"{misnamed[0]}: the name is not a scan number; rename the file, for example 000000.bin")
     files.sort(key=lambda file: int(file.stem))
     return files, np.array([int(file.stem) for file in files])
 

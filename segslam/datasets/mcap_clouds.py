@@ -1,4 +1,4 @@
-"""ROS 2 point clouds of an MCAP file, message by message."""
+"""ROS 2 point clouds of an MCAP file, read in order."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -14,13 +14,13 @@ MESSAGE = "sensor_msgs/msg/PointCloud2"
 
 
 class McapClouds:
-    """Read in order. Takes the place of kiss_icp's reader, which fails on what mcap-ros2-support 0.6 decodes.
+    """Reader of the clouds on one topic; replaces kiss_icp's reader, which fails with mcap-ros2-support 0.6.
 
-    Raises ValueError if the file has no index or no such topic, ImportError if the package that decodes is missing.
+    Raises ValueError if the file has no index or no such topic, ImportError if the decoding package is missing.
     """
 
     read_point_cloud: Callable[[Any], Any]
-    """Message -> points and times; to be set."""
+    """Converts a message to points and times; must be set."""
 
     def __init__(self, file: Path, topic: str) -> None:
         try:
@@ -36,7 +36,7 @@ class McapClouds:
         return self._num_clouds
 
     def __getitem__(self, index: int) -> Any:
-        """The next cloud, whichever is asked for."""
+        """The next cloud, whatever the index."""
         schema, channel, message = next(self._messages)
         self._seconds = message.log_time / 1e9
         decode = self._decoders.decoder_for(channel.message_encoding, schema)
@@ -45,11 +45,11 @@ class McapClouds:
         return self.read_point_cloud(decode(message.data))
 
     def reset(self) -> None:
-        """Start again."""
+        """Restart at the first message."""
         self._messages = self._read()
 
     def get_frames_timestamps(self) -> list[float]:
-        """When the last cloud was logged, in seconds."""
+        """Log time of the last cloud, in seconds."""
         return [self._seconds]
 
     def _read(self) -> Iterator[tuple[Any, Any, Any]]:
@@ -62,7 +62,7 @@ def _topic_and_count(file: Path, wanted: str) -> tuple[str, int]:
     with file.open("rb") as stream, suppress(McapError):
         summary = make_reader(stream).get_summary()
     if summary is None or summary.statistics is None:
-        raise ValueError("the file has no index, as after a crash; `mcap recover` makes one")
+        raise ValueError("the file has no index, for example after a crash; `mcap recover` adds one")
     counts = {
         channel.topic: summary.statistics.channel_message_counts.get(channel.id, 0)
         for channel in summary.channels.values()
@@ -71,5 +71,5 @@ def _topic_and_count(file: Path, wanted: str) -> tuple[str, int]:
     found = [topic for topic in counts if topic == wanted or not wanted]
     if len(found) != 1:
         known = ", ".join(f"--topic {topic}" for topic in sorted(counts)) or "none"
-        raise ValueError(f"name one topic of {MESSAGE}; there are: {known}")
+        raise ValueError(f"give one topic of type {MESSAGE}; the file has: {known}")
     return found[0], counts[found[0]]

@@ -1,8 +1,8 @@
 """Ouster recordings: a pcap of the sensor's UDP packets, and the JSON metadata of the same session beside it.
 
-kiss_icp's reader needs one certain release of ouster-sdk, which has wheels for Python 3.11 and 3.12 alone and pins
-rosbags, kiss-icp and numpy to versions that cannot be installed beside ours. The packets are documented in Ouster's
-firmware manual, "Lidar Data" and "Coordinate Frames and XYZ Calculation".
+kiss_icp's reader requires one release of ouster-sdk, which supports Python 3.11 and 3.12 only and requires versions
+of rosbags, kiss-icp and numpy that conflict with those of this package. The packet format is documented in Ouster's
+firmware manual, sections "Lidar Data" and "Coordinate Frames and XYZ Calculation".
 """
 
 import json
@@ -19,7 +19,7 @@ from segslam.types import Points, Vector
 
 
 class _Channel(NamedTuple):
-    """What a packet holds of each beam: its (first) range ahead of the rest, and the reflectivity that goes with it."""
+    """Format of the data per beam in a packet: the first range, and its reflectivity."""
 
     num_bytes: int
     range_type: str
@@ -48,14 +48,14 @@ CHANNELS = {
     "RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8, "u1", 2),
     "FUSA_RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8, "u1", 2),
 }
-"""By the name of the packet's profile."""
+"""By profile name."""
 HEADER_BYTES = FOOTER_BYTES = 32
-"""Around the columns of a packet, but in the legacy profile."""
+"""Bytes around the columns of a packet, except in the legacy profile."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Sensor:
-    """The metadata, from either of their two layouts."""
+    """The sensor's metadata, from either of the two layouts."""
 
     profile: str
     port: int | None
@@ -64,7 +64,7 @@ class _Sensor:
     altitude_rad: np.ndarray
     azimuth_rad: np.ndarray
     beam_origin_mm: float
-    """Of the beams before the axis they turn about."""
+    """Distance of the beam origins in front of their axis of rotation."""
     T_sensor_lidar_mm: np.ndarray
 
     @property
@@ -86,10 +86,10 @@ class _Sensor:
 
 
 class OusterFrames:
-    """The frames of a recording: points in the sensor's frame with their times. Takes the place of kiss_icp's reader.
+    """The frames of a recording: points in the sensor's frame with their times. Replaces kiss_icp's reader.
 
-    Raises ValueError if the file is no pcap or the metadata do not describe its packets, FileNotFoundError if there
-    are none.
+    Raises ValueError if the file is not a pcap or the metadata do not match its packets, FileNotFoundError if there are
+    no metadata.
     """
 
     def __init__(self, file: Path) -> None:
@@ -98,15 +98,15 @@ class OusterFrames:
             self._content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self._frames = self._find_frames()
         self.stamp_ns = 0
-        """Of the first column of the last frame read."""
+        """Stamp of the first column of the last frame read."""
         self.intensities = np.empty(0)
-        """The sensor's reflectivity, of each point of the last frame read."""
+        """Reflectivity of each point of the last frame read, in the sensor's unit."""
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __getitem__(self, index: int) -> tuple[Points, Vector]:
-        """(n, 3) points (m) of the beams that returned, and n times (s) after the first column."""
+        """(n, 3) points (m) of the beams that returned, and (n,) times (s) since the first column."""
         columns = np.concatenate([self._columns(payload) for payload in self._frames[index]])
         columns = columns[(columns["status"] & 1).astype(bool)]
         if len(columns) == 0:
@@ -124,11 +124,11 @@ class OusterFrames:
         return points_mm * 1e-3, times[column]
 
     def get_frames_timestamps(self) -> list[float]:
-        """When the last frame read began, in seconds of the sensor's clock."""
+        """Start of the last frame read, in seconds of the sensor's clock."""
         return [self.stamp_ns * 1e-9]
 
     def _find_frames(self) -> list[list[list[slice]]]:
-        """Payloads by frame: a new one begins where the number of the column falls back by more than half a turn."""
+        """Payloads by frame. A frame starts where the column number decreases by more than half a revolution."""
         sensor = self._sensor
         frames: list[list[list[slice]]] = []
         last = sensor.columns_per_frame
@@ -148,7 +148,7 @@ class OusterFrames:
 
     @cached_property
     def _rays_and_origins(self) -> tuple[np.ndarray, np.ndarray]:
-        """(columns, beams, 3): a point (mm) in the sensor's frame is its range (mm) times the ray, plus the origin."""
+        """(columns, beams, 3) each: a point (mm) of the sensor's frame is its range (mm) times ray plus origin."""
         sensor = self._sensor
         encoder = 2 * np.pi * (1 - np.arange(sensor.columns_per_frame) / sensor.columns_per_frame)[:, None]
         heading = encoder - sensor.azimuth_rad
@@ -166,12 +166,12 @@ class OusterFrames:
 
 
 def _metadata_of(file: Path) -> Path:
-    """The JSON file beside it whose name begins like the recording's, or the only one there is."""
+    """The JSON file in the same folder whose name starts like the recording's, or the only JSON file."""
     beside = sorted(file.resolve().parent.glob("*.json"))
     alike = [path for path in beside if path.stem.startswith(file.stem) or file.stem.startswith(path.stem)]
     found = alike or beside
     if len(found) != 1 and file.with_suffix(".json") not in found:
-        raise FileNotFoundError(f"the sensor's metadata are missing: put them beside it as {file.stem}.json")
+        raise FileNotFoundError(f"the sensor's metadata are missing: put them beside the recording as {file.stem}.json")
     return found[0] if len(found) == 1 else file.with_suffix(".json")
 
 
@@ -196,7 +196,7 @@ def _read_sensor(file: Path) -> _Sensor:
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:
-    """The keys of all sections: older metadata have none."""
+    """The keys of all sections in one mapping; older metadata have no sections."""
     inner = [_flat(value) for value in values.values() if isinstance(value, dict)]
     flat = {key: value for key, value in values.items() if not isinstance(value, dict)}
     for section in inner:

@@ -1,4 +1,4 @@
-"""UDP datagrams of a pcap file, as tcpdump and Wireshark write it."""
+"""UDP datagrams of a pcap file as written by tcpdump and Wireshark."""
 
 import mmap
 import struct
@@ -11,10 +11,10 @@ BYTE_ORDERS = {
     b"\xa1\xb2\xc3\xd4": ">",
     b"\xa1\xb2\x3c\x4d": ">",
 }
-"""By the file's first bytes, with stamps in micro- or nanoseconds."""
+"""Byte order and stamp resolution by the first bytes of the file."""
 PCAPNG = b"\x0a\x0d\x0d\x0a"
 LINK_HEADER_BYTES = {0: 4, 1: 14, 101: 0, 113: 16, 276: 20}
-"""Loopback, Ethernet, raw IP, and Linux's two cooked captures."""
+"""Header size by link type: loopback, Ethernet, raw IP, and both Linux cooked captures."""
 ETHERNET, VLAN_TAG = 1, 0x8100
 IPV4, UDP = 4, 17
 UDP_HEADER_BYTES = 8
@@ -24,18 +24,18 @@ Content = bytes | mmap.mmap
 
 @dataclass(slots=True)
 class _Fragments:
-    """One datagram that the network split, as places in the file."""
+    """A datagram that was split into IP fragments, as positions in the file."""
 
     missing_bytes: int = 0
-    """Counted down from 0 until the first fragment, which knows the length, is seen."""
+    """Remaining bytes: negative until the first fragment, which contains the length, is found."""
     pieces: dict[int, slice] = field(default_factory=dict)
 
 
 def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Iterator[list[slice]]:
-    """Where the payloads of this length, sent to this port (None: any), lie in the file, in order of arrival.
+    """Positions of the payloads of this length, sent to this port (None: any), in order of arrival.
 
-    Each is one slice, or several that follow one another where the network split it. Incomplete ones are left out.
-    Raises ValueError if the file is no pcap, or of a kind of link that is not known.
+    A payload is one slice, or several if the datagram was fragmented. Incomplete datagrams are skipped.
+    Raises ValueError if the file is not a pcap, or has an unknown link type.
     """
     waiting: dict[bytes, _Fragments] = {}
     wanted_bytes = num_bytes + UDP_HEADER_BYTES
@@ -53,7 +53,7 @@ def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Itera
             if not more:
                 yield [slice(header_end, end)]
                 continue
-        key = content[start + 12 : start + 20] + content[start + 4 : start + 6]  # from, to, number of the datagram
+        key = content[start + 12 : start + 20] + content[start + 4 : start + 6]  # source, destination, datagram number
         fragments = waiting.setdefault(key, _Fragments())
         fragments.pieces[offset] = slice(header_end, end)
         fragments.missing_bytes += (num_bytes if offset == 0 else 0) - (end - header_end)
@@ -63,14 +63,14 @@ def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Itera
 
 
 def _ip_packets(content: Content) -> Iterator[tuple[int, int]]:
-    """First byte and end of every whole IPv4 packet."""
+    """First byte and end of every complete IPv4 packet."""
     order = BYTE_ORDERS.get(content[:4])
     if order is None:
-        remedy = "; convert it by `editcap -F pcap IN OUT`" if content[:4] == PCAPNG else ""
+        remedy = "; convert it with `editcap -F pcap IN OUT`" if content[:4] == PCAPNG else ""
         raise ValueError(f"this is not the classic pcap format{remedy}")
     (link,) = struct.unpack_from(order + "I", content, 20)
     if link not in LINK_HEADER_BYTES:
-        raise ValueError(f"captured on a link of kind {link}; known: {', '.join(map(str, LINK_HEADER_BYTES))}")
+        raise ValueError(f"unknown link type {link}; known: {', '.join(map(str, LINK_HEADER_BYTES))}")
     record = 24
     while record + 16 <= len(content):
         (captured,) = struct.unpack_from(order + "I", content, record + 8)
@@ -80,6 +80,6 @@ def _ip_packets(content: Content) -> Iterator[tuple[int, int]]:
             start += 4
         if start + 20 > min(record, len(content)) or content[start] >> 4 != IPV4:
             continue
-        end = start + int.from_bytes(content[start + 2 : start + 4], "big")  # a frame may be padded
+        end = start + int.from_bytes(content[start + 2 : start + 4], "big")  # the frame may be padded
         if end <= min(record, len(content)):
             yield start, end

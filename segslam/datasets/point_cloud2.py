@@ -1,4 +1,4 @@
-"""ROS's PointCloud2 messages as points and times, in step with each other."""
+"""Points and times of ROS's PointCloud2 messages."""
 
 from typing import Any
 
@@ -7,26 +7,26 @@ import numpy as np
 from segslam.types import Points, Vector
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time")
-"""What drivers (Ouster, Velodyne, Hesai, Robosense, Livox) call the time of a point, in whatever unit."""
+"""Names that drivers (Ouster, Velodyne, Hesai, Robosense, Livox) use for the time of a point, in any unit."""
 INTENSITY_FIELDS = ("intensity", "reflectivity", "signal")
-"""What drivers and programs call the strength of a return; the first that there is counts."""
+"""Names that drivers and programs use for the intensity; the first that exists is used."""
 KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""sensor_msgs/PointField's numbers."""
+"""Types of sensor_msgs/PointField by number."""
 
 
 class CloudReader:
-    """Takes the place of kiss_icp's function, which puts times out of step where a cloud holds a NaN."""
+    """Replaces kiss_icp's function, which misaligns points and times if a cloud contains a NaN."""
 
     def __init__(self) -> None:
         self.stamp_ns = 0
-        """Of the last message's header; 0 if it had none."""
+        """Stamp in the last message's header; 0 if there was none."""
         self.intensities: Vector | None = None
-        """Of the last message's points; None if it had none."""
+        """Intensities of the last message's points; None if there were none."""
 
     def __call__(self, message: Any) -> tuple[Points, Vector]:
-        """Points and times of a message, a row for each point, NaN where nothing returned; no times if it has none.
+        """Points (n, 3) and times (n,) of a message; NaN for beams without return; no times if it has none.
 
-        Raises KeyError, TypeError or ValueError for a message that contradicts itself or has no x, y, z.
+        Raises KeyError, TypeError or ValueError for an inconsistent message or one without x, y, z.
         """
         stamp = message.header.stamp
         self.stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
@@ -39,7 +39,7 @@ class CloudReader:
 
 
 def _rows(message: Any) -> np.ndarray:
-    """(height, width) points with the fields of the message."""
+    """(height, width) structured array with the fields of the message."""
     order = ">" if message.is_bigendian else "<"
     dtype = np.dtype(
         {

@@ -1,6 +1,6 @@
-"""All other recordings, through kiss_icp's readers: folders of clouds, rosbag, mcap, pcap and the data sets it names.
+"""Recordings read through kiss_icp's readers: folders of clouds, rosbag, mcap, pcap and other data sets.
 
-A scan's number is its place in the recording.
+The number of a scan is its position in the recording.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ from segslam.types import BadScan, Indices, Scan, SegslamError, Trajectory, Vect
 
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
 READ_IN_ORDER = ("mcap", "rosbag")
-"""Recordings that are read message by message: the reader gives the next scan, whichever is asked for."""
+"""Kinds of recordings that are read in order: the reader returns the next scan, whatever the index."""
 LOADER_ERRORS = (
     ArithmeticError,
     AssertionError,
@@ -49,11 +49,11 @@ LOADER_ERRORS = (
     TypeError,
     ValueError,
 )
-"""What readers end in when data are missing or broken."""
+"""Exceptions that readers raise for missing or invalid data."""
 
 
 class Recording:
-    """The selected scans of a recording. Where it is read in order, going back starts it again."""
+    """The selected scans of a recording. If it can only be read in order, going back restarts it."""
 
     T_camera_lidar = None
 
@@ -124,17 +124,17 @@ class Recording:
             raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
 
     def _intensities(self, file: Path, num_points: int) -> Vector | None:
-        """Of the scan read last, where they are wanted and known."""
+        """Intensities of the scan read last, if requested and known."""
         if not self._has_intensities and self.labels.network is None:
             return None
         known = self._clouds.intensities if self.is_sequential else getattr(self._loader, "intensities", None)
         if known is None and not self.is_sequential:
-            with contextlib.suppress(BadScan):  # a .bin file of another layout than KITTI's
+            with contextlib.suppress(BadScan):  # a .bin file with another layout than KITTI's
                 known = read_intensities(file)
         return known if known is not None and len(known) == num_points else None
 
     def _go_to(self, index: int) -> None:
-        """Read over what lies before, where a recording can only be read in order."""
+        """Skip the scans before `index`, if the recording can only be read in order."""
         if not self.is_sequential:
             return
         if index < self._next:
@@ -142,12 +142,12 @@ class Recording:
             self._next = 0
         while self._next < index:
             self._next += 1
-            with contextlib.suppress(*LOADER_ERRORS):  # a broken scan that nobody asked for
+            with contextlib.suppress(*LOADER_ERRORS):  # an invalid scan that is not selected
                 self._loader[self._next - 1]
         self._next += 1
 
     def _stamp_ns(self, index: int) -> int:
-        """Of the scan, which has been read: some readers know it only then."""
+        """Stamp of the scan that was read last; some readers know it only then."""
         if self._stamps is not None:
             return int(self._stamps[index])
         stamp_ns = self._clouds.stamp_ns or getattr(self._loader, "stamp_ns", 0)
@@ -159,7 +159,7 @@ class Recording:
         return round(float(np.squeeze(seconds)) * 1e9)
 
     def _file(self, index: int) -> Path:
-        """The file of a scan; in recordings of many scans a name made of its number."""
+        """The file of a scan; a name with its number for recordings of many scans."""
         files = getattr(self._loader, "scan_files", None)
         return Path(str(files[index])) if files is not None else self._source / f"{index:06d}"
 
@@ -187,9 +187,9 @@ def open_recording(
     intensities: bool = False,
     vertical_angle_deg: float = 0.0,
 ) -> Recording:
-    """A recording by the name of its kind in kiss_icp, or by what the file or folder looks like.
+    """A recording by the name of its kind in kiss_icp, or by detecting the kind from the file or folder.
 
-    Raises SegslamError with the reader's own complaint if it cannot be opened, or holds no scan.
+    Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan.
     """
     from kiss_icp.datasets import available_dataloaders, dataset_factory
 
@@ -198,14 +198,14 @@ def open_recording(
         raise SegslamError(f"--dataset {kind}: no such kind of data; known: {', '.join(kinds)}")
     kind = kind or _kind_of(data)
     if topic and kind not in READ_IN_ORDER:
-        raise SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); leave the option out")
+        raise SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); omit the option")
     source = _scans_folder(data) if kind == "generic" else data
     if kind == "generic":
         _check_one_kind(source)
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of kiss_icp's sources, which it parses to find its readers
+            warnings.simplefilter("ignore")  # warnings about kiss_icp's sources, which it parses to find its readers
             if kind == "mcap":
                 loader: Any = McapClouds(source, topic)
             elif kind == "ouster":
@@ -216,12 +216,12 @@ def open_recording(
     except LOADER_ERRORS as error:
         if isinstance(error, SystemExit) and kind == "generic":
             raise SegslamError(
-                f"{source}: its first scan has no points x y z that can be read; fetch the file again, or remove it"
+                f"{source}: its first scan has no readable points x y z; copy the file again, or remove it"
             ) from error
         complaint = " ".join(said.getvalue().split()) if isinstance(error, SystemExit) else _reason(error)
         raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset") from error
     if num_scans == 0:
-        raise SegslamError(f"{data}: holds no scan that the reader for {kind} data finds; see --dataset")
+        raise SegslamError(f"{data}: the reader for {kind} data finds no scan in it; see --dataset")
     return Recording(
         kind,
         source,
@@ -243,7 +243,7 @@ def _kind_of(data: Path) -> str:
         return "generic"
     raise SegslamError(
         f"{data}: found neither sequences/ nor velodyne/ (KITTI), nor clouds (.bin .ply .pcd ...), nor a rosbag, .mcap "
-        "or .pcap; name the folder that holds them, or the kind by --dataset"
+        "or .pcap; give the folder that contains them, or the kind by --dataset"
     )
 
 
@@ -259,7 +259,7 @@ def _has_clouds(folder: Path) -> bool:
 
 
 def _check_one_kind(folder: Path) -> None:
-    """Raises SegslamError for scans of several formats: the first would be read, and the others taken for broken."""
+    """Raises SegslamError for scans of several formats: only the first format would be read."""
     from kiss_icp.datasets import supported_file_extensions
 
     counts = {
@@ -269,11 +269,11 @@ def _check_one_kind(folder: Path) -> None:
     found = {suffix: count for suffix, count in counts.items() if count}
     if len(found) > 1:
         listed = ", ".join(f"{suffix} {count}" for suffix, count in found.items())
-        raise SegslamError(f"{folder}: {len(found)} kinds of scans ({listed}); put each kind into a folder of its own")
+        raise SegslamError(f"{folder}: {len(found)} kinds of scans ({listed}); put each kind into its own folder")
 
 
 def _beside(source: Path) -> Path:
-    """Where the times, poses and labels of a folder of scans are looked for."""
+    """Folder in which the times, poses and labels of a folder of scans are searched."""
     return source.resolve().parent if source.resolve().name == "velodyne" else source
 
 
@@ -288,5 +288,5 @@ def _whole_stamps(times_file: Path, num_scans: int) -> Indices | None:
 
 def _reason(error: BaseException) -> str:
     if "positions" in str(error):
-        return "it has no x y z"
+        return "no fields x y z"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -1,29 +1,31 @@
-"""Times of the points within a sweep, as shares of the sweep's period, from the units and origins that drivers use."""
+"""Times of the points as fractions of the sweep, from the various units and origins that drivers use."""
 
 import numpy as np
 
 from segslam.types import Vector
 
 UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
-"""Seconds, as Velodyne's driver writes; micro- and nanoseconds, as Hesai's, Livox' and Ouster's do."""
+"""Seconds (driver of Velodyne), microseconds and nanoseconds (Hesai, Livox, Ouster)."""
 PERIODS_S = (0.05, 0.1, 0.2)
-"""Rotating LiDARs turn at 20, 10 or 5 Hz."""
+"""Periods of rotating LiDARs: 20, 10 or 5 Hz."""
 LONGEST_SEAM = 0.29
-"""Chosen: largest share of a period without a return at either end of the sweep. Above it, 15 Hz reads as 10 Hz."""
+"""Chosen: largest fraction of a period without returns at either end of the sweep.
+
+Above it, 15 Hz is taken for 10 Hz.
+"""
 LEAST_SHARE = 0.5
-"""Chosen: times between 0 and 1 that span this are shares; no LiDAR turns as slowly as twice in a second."""
+"""Chosen: times between 0 and 1 that span this are fractions; no LiDAR turns as slowly as twice per second."""
 JITTER = 0.02
-"""Chosen: tolerance of a period, as a share."""
+"""Chosen: relative tolerance of a period."""
 
 
 def sweep_times(times: np.ndarray, num_points: int, stamp_s: float | None = None) -> Vector:
-    """Time of each point: 0 at the start of the sweep, 1 at its end.
+    """Time (n,) of each point: 0 at the start of the sweep, 1 at its end.
 
-    `times` (n,) count from the start of the sweep, to its end (negative), or absolutely, where `stamp_s` is the start;
-    or they are such shares already.
-    The scale is the period of the sensor, if one fits, so that a sweep without returns at its start or end is not
-    stretched; otherwise the first and last point mark the sweep. Empty where times are missing, not one for each
-    point, not finite or all equal.
+    `times` (n,) may count from the start of the sweep, up to its end (negative), or absolutely with the start
+    `stamp_s`; or they are fractions already. They are divided by the period of the sensor if a usual one fits, so
+    that a sweep without returns at its start or end is not stretched; otherwise by their span. Empty if times are
+    missing, not finite, all equal, or not one per point.
     """
     if len(times) != num_points or num_points == 0 or not np.isfinite(times).all() or np.ptp(times) == 0:
         return np.empty(0)

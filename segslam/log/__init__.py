@@ -1,4 +1,4 @@
-"""The MCAP log of a run: steps into a file, a file back into steps."""
+"""The MCAP log of a run: writing steps to a file, and reading them."""
 
 from segslam.log.output import is_being_written
 from segslam.log.reader import RunLog, read_log

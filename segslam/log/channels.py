@@ -1,4 +1,4 @@
-"""The channels of a log: each topic with its encoding and schema, for a file or a live connection."""
+"""Channels of a log: each topic with its encoding and schema, for a file or a live connection."""
 
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ PROTOBUF_TOPICS: dict[str, Any] = {
 
 
 class Channel(NamedTuple):
-    """A topic and how its messages are encoded."""
+    """A topic and the encoding of its messages."""
 
     topic: str
     encoding: str

@@ -1,12 +1,12 @@
-"""A keyframe's points, every one of them, in some 3 bytes each: segslam.KeyframePoints (protobuf).
+"""Compact encoding of all points of a keyframe, about 3 bytes per point: segslam.KeyframePoints (protobuf).
 
-Coordinates are whole multiples of `resolution_m`. Each is written as its difference from the point before (a scan's
-points follow the beam, so they are near each other), folded to be non-negative (0, -1, 1, -2 become 0, 1, 2, 3), and
-split into planes: the lowest byte of every x, the second byte of every x, and so on to the fourth byte of every z.
-Bytes of one kind side by side compress well, interleaved floats do not.
+Coordinates are integer multiples of `resolution_m`. Each is stored as the difference from the previous point, which is
+small because the points follow the beams; mapped to non-negative numbers (0, -1, 1, -2 become 0, 1, 2, 3); and split
+into planes: the lowest byte of every x, the second byte of every x, and so on to the fourth byte of every z. Planes of
+similar bytes compress well; interleaved floats do not.
 
-Intensities, of a run that keeps them, take a byte each: 255 times the root of their share of the greatest of the cloud.
-The noise of a photon count grows with its root, so no more is lost of faint returns beside a reflector than of others.
+Intensities, if kept, take one byte each: 255 times the square root of their ratio to the maximum of the cloud. The
+noise of a photon count grows with its square root, so the relative loss is the same for weak and strong returns.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from segslam.types import Keyframe, Labels, Points, Vector
 
 
 def _message_class() -> type[Message]:
-    """Built here rather than generated: seven fields need no compiler, and no version of one."""
+    """Built at run time: seven fields do not justify a compiler and its version."""
     kinds = {
         "resolution_m": FieldDescriptorProto.TYPE_DOUBLE,
         "num_points": FieldDescriptorProto.TYPE_UINT32,
@@ -48,7 +48,7 @@ KeyframePoints = _message_class()
 
 
 def keyframe_points(keyframe: Keyframe, *, resolution_m: float) -> Message:
-    """The points in their order; coordinates that are no multiples of `resolution_m` go to the nearest."""
+    """The message of a keyframe; coordinates are rounded to multiples of `resolution_m`."""
     points = keyframe.points
     steps = np.ascontiguousarray(np.rint(points.T.astype(np.float64) / resolution_m), dtype=np.int32)
     differences = np.diff(steps, axis=1, prepend=np.int32(0))
@@ -64,7 +64,7 @@ def keyframe_points(keyframe: Keyframe, *, resolution_m: float) -> Message:
 
 
 def points_and_labels(message: Message) -> tuple[Points, Labels]:
-    """Points (float32) and labels, as they were written. Raises ValueError if the message contradicts itself."""
+    """Points (float32) and labels as written. Raises ValueError for an inconsistent message."""
     planes = np.frombuffer(message.folded_difference_planes, np.uint8).reshape(3, 4, message.num_points)
     folded = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<u4")[..., 0]
     differences = (folded >> 1).astype(np.int32) ^ -(folded & 1).astype(np.int32)
@@ -73,7 +73,7 @@ def points_and_labels(message: Message) -> tuple[Points, Labels]:
 
 
 def intensities(message: Message) -> Vector | None:
-    """The intensity of each point (float32), to the byte; None if they were not kept."""
+    """Intensity of each point (float32), to one byte; None if intensities were not kept."""
     if not message.intensity_roots:
         return None
     shares = (np.frombuffer(message.intensity_roots, np.uint8) / 255) ** 2
@@ -81,12 +81,12 @@ def intensities(message: Message) -> Vector | None:
 
 
 def place_of(message: Message) -> dict[str, bytes | None]:
-    """The field `place` of the keyframe; None in logs of older versions."""
+    """The field `place` of the keyframe; None in older logs."""
     return {"place": message.place or None}
 
 
 def _roots(intensities: Vector) -> dict[str, object]:
-    """The two fields; what is no number, or negative, is 0."""
+    """The two fields; 0 for intensities that are negative or not finite."""
     known = np.maximum(np.nan_to_num(intensities.astype(np.float64), posinf=0.0), 0.0)
     greatest = known.max(initial=0.0)
     roots = np.rint(255 * np.sqrt(known / (greatest or 1.0))).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""MCAP files as they come: whole, cut in mid-record by a kill or a full disk, or damaged by a power failure."""
+"""Reading of MCAP files, complete, truncated (process killed, disk full) or damaged (power failure)."""
 
 import struct
 from collections.abc import Iterator
@@ -18,13 +18,13 @@ from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError
 
 _DAMAGE = (ValueError, struct.error, McapError, ZstdError, RuntimeError)
-"""What reading damaged data raises: a wrong checksum, a short field, data that zstd or lz4 cannot decompress."""
+"""Exceptions on damaged data: a wrong checksum, a short field, data that zstd or lz4 cannot decompress."""
 _RECORD_HEAD = struct.Struct("<BQ")
-"""Opcode and length, before each record."""
+"""Opcode and length at the start of each record."""
 
 
 class CutError(Exception):
-    """The file ends, or makes no sense, from this byte on."""
+    """The file ends or is damaged at this byte."""
 
     def __init__(self, offset: int) -> None:
         super().__init__(f"byte {offset}")
@@ -32,7 +32,7 @@ class CutError(Exception):
 
 
 class Span(NamedTuple):
-    """Bytes of a file."""
+    """A range of bytes in a file."""
 
     offset: int
     size: int
@@ -46,13 +46,13 @@ class Stored(NamedTuple):
     data: bytes
     channel_id: int
     chunk: "Span"
-    """Where in the file the chunk is that holds it."""
+    """Position of the chunk that contains the message."""
 
 
 def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
-    """Each message in the order of the file. Raises CutError at a cut, after what is whole before it.
+    """Each message in the order of the file. Raises CutError at a cut, after the complete messages before it.
 
-    Of a file with an index, those before the last chunk that holds a message of the topic `since_last` are left out.
+    With `since_last`, and if the file has an index, reading starts at the last chunk with a message of this topic.
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
@@ -74,7 +74,7 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
 
 
 def messages_within(records: bytes) -> Iterator[tuple[int, bytes]]:
-    """Channel and data of each message in a run of whole records. Raises CutError if they are damaged."""
+    """Channel and data of each message in a sequence of complete records. Raises CutError if they are damaged."""
     offset = 0
     while offset < len(records):
         opcode, length = _RECORD_HEAD.unpack_from(records, offset)
@@ -99,7 +99,7 @@ def metadata(path: Path) -> dict[str, dict[str, str]]:
 
 
 def count(path: Path, topic: str) -> int:
-    """How many messages a topic has: by the index where the file has one, or else by reading."""
+    """Number of messages of a topic, from the index if there is one, otherwise by reading the file."""
     with path.open("rb") as stream:
         summary = _summary(stream)
         if summary is not None and summary.statistics is not None:
@@ -113,23 +113,23 @@ def count(path: Path, topic: str) -> int:
 
 
 def _summary(stream: IO[bytes]) -> Summary | None:
-    """The index at the end of a file; None where there is none, or it is damaged."""
+    """The index at the end of a file; None if it is missing or damaged."""
     with suppress(*_DAMAGE):
         return make_reader(stream).get_summary()
     return None
 
 
 def _last_chunk_with(topic: str, summary: Summary) -> int:
-    """Offset of the last chunk that holds a message of a topic; 0 if none does."""
+    """Offset of the last chunk with a message of a topic; 0 if there is none."""
     ids = {channel.id for channel in summary.channels.values() if channel.topic == topic}
     holding = (chunk for chunk in summary.chunk_indexes if ids & chunk.message_index_offsets.keys())
     return max((chunk.chunk_start_offset for chunk in holding), default=0)
 
 
 def _records(stream: IO[bytes], start: int = 0) -> Iterator[tuple[int, int, bytes]]:
-    """Offset, opcode and body of each record of a file, from that at `start` on, to the end of its data.
+    """Offset, opcode and body of each record of a file, starting at `start`, up to the end of the data section.
 
-    Raises CutError for a record that is not whole, and for a file that is not MCAP.
+    Raises CutError for an incomplete record, and for a file that is not MCAP.
     """
     stream.seek(0)
     if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -140,7 +140,7 @@ def _records(stream: IO[bytes], start: int = 0) -> Iterator[tuple[int, int, byte
         if len(head) < _RECORD_HEAD.size:
             raise CutError(offset)
         opcode, length = _RECORD_HEAD.unpack(head)
-        if opcode not in set(Opcode):  # after a power failure: a page that was never written reads as zeros
+        if opcode not in set(Opcode):  # after a power failure, pages that were not written read as zeros
             raise CutError(offset)
         body = stream.read(length)
         if len(body) < length:

@@ -1,4 +1,4 @@
-"""What a viewer shows of a run, step by step, in Foxglove's own messages."""
+"""Visualisation of a run, step by step, as Foxglove messages."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -42,26 +42,26 @@ REJECTED_COLORS = {
     RejectReason.NO_PLACE: "#aec7e8ff",
     RejectReason.UNCONFIRMED: "#ff9896ff",
 }
-"""Cold colours for what failed early, warm ones for what failed late."""
+"""Cold colours for candidates rejected early, warm colours for those rejected late."""
 
 PATH_GROWTH = 1.05
-"""Chosen: a path is written again when it has grown by this factor, so that all its versions together stay linear in
-its length (some 20 times the last one) and a viewer that jumps in time finds one at most 5 % too short."""
+"""Chosen: a path is written again when it has grown by this factor. The size of all versions together is then
+linear in its length (about 20 times the last), and a viewer that jumps in time shows at least 95 % of the path."""
 
 VIEW_GRID_M = 2.0**-5
-"""Chosen: points to look at are rounded to 3 cm, in binary, which halves their size after compression."""
+"""Chosen: displayed points are rounded to 3 cm (a binary fraction), which halves their compressed size."""
 
 MAP_KEYFRAMES = 500
-"""Chosen: of a longer drive every second keyframe is in the map to look at, or every third, and so on."""
+"""Chosen: in longer drives, every second keyframe is in the displayed map, or every third, and so on."""
 MAP_RANGE_M, MAP_VOXEL_M = 40.0, 0.2
 
 Topical = tuple[str, Message]
 CloudOf = Callable[[int], tuple[Points, Labels]]
-"""Points of a keyframe, in its frame, and their labels."""
+"""Function from the id of a keyframe to its points, in its frame, and their labels."""
 
 
 class Drawing:
-    """Follows the steps of a run and turns each into messages by topic."""
+    """Converts the steps of a run to messages by topic."""
 
     def __init__(self, config: LogConfig) -> None:
         self._config = config
@@ -71,7 +71,10 @@ class Drawing:
         self._num_on_path = 0
 
     def draw(self, step: Step, *, path: bool = True) -> Iterator[Topical]:
-        """The messages of the next step; those of an estimate that grow with the drive only if `path`."""
+        """The messages of the next step.
+
+        Those of an estimate whose size grows with the drive are omitted without `path`.
+        """
         yield (
             schema.TRANSFORMS,
             foxglove.frame_transform(step.T_odom_lidar, parent=schema.ODOM, child=schema.LIDAR, stamp_ns=step.stamp_ns),
@@ -85,7 +88,7 @@ class Drawing:
         yield from self._attempts(step.attempts, step.stamp_ns)
 
     def draw_estimate(self, estimate: GraphEstimate, *, stamp_ns: int, path: bool = True) -> Iterator[Topical]:
-        """Where odom lies now and, if `path`, the corrected path and the closures."""
+        """Pose of odom in world and, if `path`, the corrected path and the closures."""
         self._T_world_keyframe = estimate.T_world_keyframe
         last = max(estimate.T_world_keyframe)
         self._T_world_odom = estimate.T_world_keyframe[last] @ geometry.inverse(self._T_odom_keyframe[last])
@@ -96,13 +99,16 @@ class Drawing:
             yield schema.GRAPH, self._graph(estimate, stamp_ns)
 
     def draw_map(self, estimate: GraphEstimate, cloud: CloudOf, *, stamp_ns: int) -> Iterator[Topical]:
-        """One cloud of the whole drive in world. `cloud` gives the points of a keyframe, in its frame, and labels."""
+        """One cloud of the whole drive in world.
+
+        `cloud` returns the points of a keyframe, in its frame, and their labels.
+        """
         points, labels = map_points(estimate.T_world_keyframe, cloud, view_every=self._config.view_every)
         if len(points):
             yield map_message(points, labels, stamp_ns=stamp_ns)
 
     def _odom_in_world(self, stamp_ns: int) -> Topical:
-        """Wanted at every step: viewers interpolate, and a correction would begin before the step that made it."""
+        """Written at every step: viewers interpolate, and would otherwise start a correction too early."""
         return schema.TRANSFORMS, foxglove.frame_transform(
             self._T_world_odom, parent=schema.WORLD, child=schema.ODOM, stamp_ns=stamp_ns
         )
@@ -149,14 +155,17 @@ class Drawing:
         return foxglove.scene([foxglove.entity("closures", lines, about, frame=schema.WORLD, stamp_ns=stamp_ns)])
 
     def _position(self, keyframe_id: int) -> Vector:
-        """In world, by the last estimate, or by odometry since."""
+        """Position in world, by the last estimate and the odometry since."""
         if keyframe_id in self._T_world_keyframe:
             return self._T_world_keyframe[keyframe_id][:3, 3]
         return (self._T_world_odom @ self._T_odom_keyframe[keyframe_id])[:3, 3]
 
 
 def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, *, view_every: int) -> tuple[Points, Labels]:
-    """Some points of at most `MAP_KEYFRAMES` to twice as many keyframes in world, without what moves; and labels."""
+    """Some points (n, 3), in world, of between `MAP_KEYFRAMES` and twice as many keyframes, and their labels.
+
+    Moving classes are omitted.
+    """
     every = 1 + len(T_world_keyframe) // MAP_KEYFRAMES
     some = slice(None, None, view_every)
     parts = [(np.empty((0, 3)), np.empty(0, np.uint8))]
@@ -171,12 +180,12 @@ def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, *, vie
 
 
 def map_message(points: Points, labels: Labels, *, stamp_ns: int) -> Topical:
-    """A cloud in world as the map to look at."""
+    """The message of the displayed map, a cloud in world."""
     return schema.MAP, foxglove.point_cloud(points, labels, frame=schema.WORLD, stamp_ns=stamp_ns)
 
 
 def ground_truth(reference: Trajectory, *, stamp_ns: int) -> Topical:
-    """The true path, from the origin of world on."""
+    """The true path, moved to start at the origin of world."""
     T_first_true = geometry.inverse(reference.T_world_lidar[0])
     path = (T_first_true @ T_true_lidar for T_true_lidar in reference.T_world_lidar)
     return schema.GROUND_TRUTH, foxglove.poses_in_frame(path, frame=schema.WORLD, stamp_ns=stamp_ns)
@@ -189,7 +198,7 @@ def weight_color(weight: float) -> str:
 
 
 def numbers_and_words(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """What of a record is short enough to read on a click: its numbers and texts, keys joined by dots, no arrays."""
+    """Metadata of a record to show on a click: numbers and texts with dotted keys, without arrays."""
     flat: dict[str, str] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):

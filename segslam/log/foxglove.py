@@ -1,4 +1,4 @@
-"""Foxglove's own messages, made of records and read back: transforms, point clouds, poses, lines."""
+"""Conversion between records and Foxglove messages: transforms, point clouds, poses, lines."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -38,7 +38,7 @@ _IDENTITY = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 
 
 def frame_transform(T_parent_child: Transform, *, parent: str, child: str, stamp_ns: int) -> FrameTransform:
-    """Where frame `child` is in `parent`."""
+    """Message with the pose of frame `child` in frame `parent`."""
     pose = _pose(T_parent_child)
     return FrameTransform(
         timestamp=_timestamp(stamp_ns),
@@ -50,7 +50,7 @@ def frame_transform(T_parent_child: Transform, *, parent: str, child: str, stamp
 
 
 def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) -> PointCloud:
-    """Points as float32, with their labels and the colours of these."""
+    """Message with points as float32, their labels, and the colours of the labels."""
     rows = np.empty(len(points), _POINT)
     rows["xyz"], rows["label"] = points, labels
     rows["rgba"][:, :3], rows["rgba"][:, 3] = of_classes(labels), 255
@@ -65,7 +65,7 @@ def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) ->
 
 
 def poses_in_frame(T_frame_each: Iterable[Transform], *, frame: str, stamp_ns: int) -> PosesInFrame:
-    """A path; `transforms` gives back its poses to the last digits of float64."""
+    """Message with a path; `transforms` recovers its poses to float64 precision."""
     stack = np.array(list(T_frame_each)).reshape(-1, 4, 4)
     return PosesInFrame(timestamp=_timestamp(stamp_ns), frame_id=frame, poses=_poses(stack))
 
@@ -81,7 +81,7 @@ def transforms(poses: PosesInFrame) -> list[Transform]:
 
 
 def line(points: Sequence[Vector], colors: Sequence[str], *, width_px: float = 2.0) -> LinePrimitive:
-    """Segments between each two points, one colour (#rrggbbaa) a segment, as wide at any distance."""
+    """Line segments between pairs of points, with one colour (#rrggbbaa) per segment; constant width on screen."""
     return LinePrimitive(
         type=LinePrimitive.LINE_LIST,
         thickness=width_px,
@@ -95,7 +95,7 @@ def line(points: Sequence[Vector], colors: Sequence[str], *, width_px: float = 2
 def entity(
     identity: str, lines: LinePrimitive, metadata: Mapping[str, str], *, frame: str, stamp_ns: int
 ) -> SceneEntity:
-    """Lines that stay until another entity of the same identity replaces them; the metadata shows on a click."""
+    """Lines that remain until an entity of the same identity replaces them; a click shows the metadata."""
     return SceneEntity(
         timestamp=_timestamp(stamp_ns),
         frame_id=frame,
@@ -106,7 +106,7 @@ def entity(
 
 
 def scene(entities: Iterable[SceneEntity]) -> SceneUpdate:
-    """What is drawn, as one message."""
+    """One message with all entities."""
     return SceneUpdate(entities=entities)
 
 

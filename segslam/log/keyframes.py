@@ -1,4 +1,4 @@
-"""The keyframes of a log: all but their points in memory, the points read from the file when they are asked for."""
+"""The keyframes of a log: everything except their points in memory; points are read from the file when used."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from segslam.types import Keyframe, Labels, Points, SegslamError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedKeyframe:
-    """A keyframe without its points, and where these are in the file."""
+    """A keyframe without its points, and their position in the file."""
 
     keyframe: Keyframe
     chunk: Span
@@ -19,7 +19,7 @@ class RecordedKeyframe:
 
 
 class RecordedKeyframes:
-    """The keyframes by their number. It serves as `segslam.keyframes.Clouds` of a finished run."""
+    """Keyframes by id; the `segslam.keyframes.Clouds` of a finished run."""
 
     def __init__(self, path: Path, kept: Sequence[RecordedKeyframe]) -> None:
         self._path = path
@@ -29,11 +29,11 @@ class RecordedKeyframes:
         return len(self._kept)
 
     def __getitem__(self, keyframe_id: int) -> Keyframe:
-        """A keyframe, with no points."""
+        """A keyframe, without points."""
         return self._kept[keyframe_id].keyframe
 
     def keep(self, keyframe: Keyframe) -> None:
-        """Raises TypeError: a recorded drive does not grow."""
+        """Raises TypeError: keyframes cannot be added to a recorded drive."""
         raise TypeError(f"keyframe {keyframe.id}: the log {self._path} is read only")
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
@@ -48,4 +48,4 @@ class RecordedKeyframes:
                     return points_and_labels(KeyframePoints.FromString(data))
         except (OSError, CutError) as error:
             raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
-        raise SegslamError(f"{self._path}: keyframe {keyframe_id} has gone from the log; leave the file alone")
+        raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")

@@ -1,4 +1,4 @@
-"""How a run was made: the metadata of its log."""
+"""Metadata of a log: how its run was made."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from segslam.types import Transform
 
 CPU_INFO = Path("/proc/cpuinfo")
 PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
-"""Whose versions a log records: those that its figures depend on."""
+"""Packages whose versions a log records, because results depend on them."""
 
 
 def metadata(
@@ -47,7 +47,7 @@ def _command() -> str:
 
 
 def _processor() -> str:
-    """As Linux names it; elsewhere as Python does."""
+    """Name of the processor from Linux; on other systems, from Python."""
     if CPU_INFO.is_file():
         for line in CPU_INFO.read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -58,5 +58,5 @@ def _processor() -> str:
 def _version(package: str) -> str:
     try:
         return version(package)
-    except PackageNotFoundError:  # open3d has other distributions of the same import
+    except PackageNotFoundError:  # open3d is also distributed under other names
         return "not installed"

@@ -1,4 +1,4 @@
-"""A file under MCAP's writer that holds whole parts only, whatever happens while one is written."""
+"""Output file for MCAP's writer that contains complete parts only, also after a failure."""
 
 import fcntl
 import os
@@ -12,11 +12,11 @@ from segslam.system.interrupts import interrupts_wait
 class Output:
     """Unbuffered stream with the methods that MCAP's writer uses: write, tell, flush.
 
-    After a failure nothing is left to be written later. While it is open nobody else can write the file.
+    After a failure no data is pending. While it is open, no other process can write the file.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises OSError if the file cannot be written, or another process does."""
+        """Raises OSError if the file cannot be written, or another process writes it."""
         self._raw = path.open("a+b", buffering=0)
         fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._raw.truncate(0)
@@ -24,40 +24,40 @@ class Output:
 
     @property
     def closed(self) -> bool:
-        """As of any stream."""
+        """True after `close`."""
         return self._raw.closed
 
     def write(self, data: bytes) -> int:
-        """Write all of the data: a raw file may take less."""
+        """Write all data; a single write to a raw file may be partial."""
         rest = memoryview(data)
         while rest:
             rest = rest[self._raw.write(rest) :]
         return len(data)
 
     def read(self, offset: int, size: int) -> bytes:
-        """What was written there."""
+        """Bytes written earlier."""
         return os.pread(self._raw.fileno(), size, offset)
 
     def tell(self) -> int:
-        """Bytes written so far."""
+        """Number of bytes written."""
         return self._raw.tell()
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """No effect: the stream is unbuffered."""
 
     def close(self) -> None:
-        """As of any stream."""
+        """Close the file."""
         self._raw.close()
 
     def sync(self) -> None:
-        """Wait until all is on the disk, where a power failure leaves it."""
+        """Wait until all data is on the disk and survives a power failure."""
         os.fsync(self._raw.fileno())
 
     @contextmanager
     def whole(self) -> Iterator[None]:
-        """What is written within comes to the file whole, or not at all. Ctrl-C waits for its end.
+        """Context manager that writes its data completely or not at all. Ctrl-C takes effect at its end.
 
-        On any exception, such as the OSError of a full disk, the file is cut back to what was before and closed.
+        On any exception, such as the OSError of a full disk, the file is truncated to its previous size and closed.
         """
         size = self.tell()
         with interrupts_wait():
@@ -70,7 +70,7 @@ class Output:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether an `Output` is open on the file, in any process."""
+    """True if any process has an `Output` open on the file."""
     with path.open("rb") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)

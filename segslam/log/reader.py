@@ -1,4 +1,4 @@
-"""An MCAP log back into the steps that made it, up to the cut where it was cut."""
+"""Reads the steps of a run from an MCAP log, up to the end of its complete part."""
 
 import json
 import logging
@@ -25,40 +25,40 @@ logger = logging.getLogger(__name__)
 
 NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
 Parts = Mapping[str, bytes]
-"""Topic -> the latest message on it."""
+"""The latest message of each topic."""
 Encoded = TypeVar("Encoded")
 Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True, slots=True)
 class RunLog:
-    """A log that was opened: how its run was made, and access to its steps."""
+    """An open log: metadata of the run, and access to its steps."""
 
     path: Path
     config: Config
     """The effective settings of the run."""
     run: Mapping[str, str]
-    """schema_version, dataset, python, platform, T_camera_lidar (JSON) where there is one."""
+    """schema_version, dataset, python, platform, and T_camera_lidar (JSON) if known."""
     packages: Mapping[str, str]
     """Package -> version."""
     options: Mapping[str, str]
-    """What was chosen beside the settings, such as where labels come from."""
+    """Options beside the settings, such as the source of the labels."""
 
     @property
     def T_camera_lidar(self) -> Transform | None:  # noqa: N802  (a transform)
-        """The calibration, for KITTI."""
+        """Calibration of KITTI data; None for other data."""
         return np.array(json.loads(self.run["T_camera_lidar"])) if "T_camera_lidar" in self.run else None
 
     def num_steps(self) -> int:
-        """The complete steps in the log."""
+        """Number of complete steps in the log."""
         return container.count(self.path, schema.STEP)
 
     def steps(self, *, clouds: bool = True) -> Iterator[Step]:
-        """The steps in the order in which they were made, read as they are asked for.
+        """The steps in order, read when they are requested.
 
-        Without `clouds`, in a quarter of the time, keyframes come with no points.
-        A cut or damaged log gives its complete steps up to there, and a warning with their number.
-        Raises SegslamError where the file does not hold what this version writes.
+        Without `clouds`, keyframes have no points, and reading takes a quarter of the time.
+        A truncated or damaged log yields its complete steps and logs a warning with their number.
+        Raises SegslamError if the content is not in the format of this version.
         """
         num_steps = 0
         parts: dict[str, bytes] = {}
@@ -67,18 +67,18 @@ class RunLog:
                 parts[topic] = data
                 if topic == schema.STEP:
                     if not clouds and schema.KEYFRAME in parts:
-                        parts[schema.KEYFRAME] = b""  # the encoding of no points
+                        parts[schema.KEYFRAME] = b""  # encodes zero points
                     yield self._decoded(_step, parts)
                     num_steps += 1
                     parts.clear()
         except CutError as cut:
             size = self.path.stat().st_size
             logger.warning(
-                "%s: cut or damaged at byte %d of %d: kept the %d steps before", self.path, cut.offset, size, num_steps
+                "%s: cut or damaged at byte %d of %d: kept the first %d steps", self.path, cut.offset, size, num_steps
             )
 
     def reference(self) -> Trajectory | None:
-        """The true poses of the scans, where they are known."""
+        """The true poses of the scans, if known."""
         with suppress(CutError):
             for topic, data in self._messages():
                 if topic == schema.REFERENCE:
@@ -88,19 +88,19 @@ class RunLog:
         return None
 
     def result(self) -> tuple[GraphEstimate, Trajectory] | None:
-        """The last estimate and the trajectory of every scan; None if the run did not get there."""
+        """The last estimate and the pose of every scan; None if the run did not finish."""
         parts = self._ending()
         return (self._decoded(_estimate, parts), self._decoded(_trajectory, parts[schema.RESULT])) if parts else None
 
     def late_loops(self) -> tuple[LoopAttempt, ...]:
-        """Loops tried after the last scan, if the run got there."""
+        """Loops tried after the last scan; empty if the run did not finish."""
         parts = self._ending()
         if schema.LATE_LOOPS not in parts:
             return ()
         return self._decoded(_late_loops, parts[schema.LATE_LOOPS]).attempts
 
     def _ending(self) -> Parts:
-        """The messages of the result; empty if the run did not get there."""
+        """The messages of the result; empty if the run did not finish."""
         parts: dict[str, bytes] = {}
         with suppress(CutError):
             for topic, data in self._messages(since_last=schema.TRAJECTORY):
@@ -110,7 +110,7 @@ class RunLog:
         return {}
 
     def keyframes(self) -> "RecordedKeyframes":
-        """The keyframes of the complete steps, and access to their points. Raises SegslamError as `steps` does."""
+        """The keyframes of the complete steps, with access to their points. Raises SegslamError as `steps` does."""
         kept: list[RecordedKeyframe] = []
         parts: dict[str, bytes] = {}
         cloud: container.Stored | None = None
@@ -137,8 +137,8 @@ class RunLog:
         for message in container.messages(self.path, since_last=since_last):
             if message.topic in own and not _is_readable(message.schema.data, own.pop(message.topic)):
                 raise SegslamError(
-                    f"{self.path}: its {message.schema.name} is not what this version reads; "
-                    f"use segslam {self.packages.get('segslam', 'of its time')}, which wrote it"
+                    f"{self.path}: its {message.schema.name} has another format than this version reads; "
+                    f"use segslam {self.packages.get('segslam', 'of that time')}, which wrote it"
                 )
             yield message
 
@@ -146,26 +146,26 @@ class RunLog:
         try:
             return decode(encoded)
         except (KeyError, ValueError, TypeError, DecodeError) as error:
-            raise SegslamError(f"{self.path}: not as segslam writes it ({error!r}); map the data again") from error
+            raise SegslamError(f"{self.path}: not written by segslam ({error!r}); map the data again") from error
 
 
 def read_log(path: Path) -> RunLog:
-    """Open the log of a run, finished or cut. Raises SegslamError if there is none, or of another schema version."""
+    """Open the log of a run, complete or not. Raises SegslamError if it is missing or has another schema version."""
     remedy = "give the log.mcap of a run"
     try:
         metadata = container.metadata(path)
     except OSError as error:
         raise SegslamError(f"{path}: cannot read the log ({error.strerror}); {remedy}") from error
     except CutError as cut:
-        raise SegslamError(f"{path}: no log of segslam, or cut in its first bytes; {remedy}") from cut
+        raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}") from cut
     run = metadata.get(schema.RUN_METADATA, {})
     if schema.CONFIG_METADATA not in metadata or "schema_version" not in run:
-        raise SegslamError(f"{path}: an MCAP file, but no log of segslam; {remedy}")
+        raise SegslamError(f"{path}: an MCAP file, but not a log of segslam; {remedy}")
     packages = metadata.get(schema.PACKAGES_METADATA, {})
     if run["schema_version"] != str(schema.VERSION):
         raise SegslamError(
-            f"{path}: a log of schema version {run['schema_version']}, this version reads {schema.VERSION}; "
-            f"use segslam {packages.get('segslam', 'of its time')}, which wrote it"
+            f"{path}: a log of schema version {run['schema_version']}, but this version reads {schema.VERSION}; "
+            f"use segslam {packages.get('segslam', 'of that time')}, which wrote it"
         )
     config = config_from_yaml(metadata[schema.CONFIG_METADATA]["yaml"], f"{path} (settings)")
     options = metadata.get(schema.OPTIONS_METADATA, {})
@@ -202,7 +202,7 @@ def _recorded_keyframe(found: tuple[Parts, container.Stored]) -> RecordedKeyfram
 
 
 def _estimate(parts: Parts) -> GraphEstimate:
-    """From the /estimate message and the /trajectory before it."""
+    """The estimate from an /estimate message and the /trajectory before it."""
     values = json.loads(parts[schema.ESTIMATE])
     poses = transforms(PosesInFrame.FromString(parts[schema.TRAJECTORY]))
     T_world_keyframe = dict(zip(values["keyframe_ids"], poses, strict=True))

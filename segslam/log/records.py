@@ -1,13 +1,13 @@
-"""Records as JSON with a JSON Schema, and back without loss: Python's JSON keeps every digit of a float64.
+"""Lossless conversion of records to JSON with a JSON Schema, and back. Python's JSON keeps all digits of a float64.
 
-Each record becomes an object with a key for each of its fields: the records of `segslam.types` define the format. What
-is bulky travels in binary messages beside the JSON, which leaves it out: see `BULK`. The rest keeps to what Foxglove's
-schema parser knows, which is neither arrays in arrays nor alternatives:
+Each record becomes an object with one key per field: the records of `segslam.types` define the format. Large fields are
+in separate binary messages and omitted from the JSON: see `BULK`. Foxglove's schema parser supports neither nested
+arrays nor alternatives, therefore:
 
 - an array of numbers is a flat list, row by row;
-- a field that is None is left out, and a field with a default may be: logs of older versions are read without it;
-- one of several records is an object with one key, the record's name;
-- a mapping with tuples for keys is a list of objects with a `key` and a `value`.
+- a field that is None is omitted, and a field with a default may be missing, as in logs of older versions;
+- one of several records is an object with one key, the name of the record;
+- a mapping with tuples as keys is a list of objects with a `key` and a `value`.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,33 +24,36 @@ from segslam.types import GraphEstimate, Keyframe, Step
 
 Json = dict[str, Any]
 Bulk = Mapping[type, Mapping[str, Any]]
-"""Values of the fields that the JSON leaves out, by record."""
+"""Values of the fields that the JSON omits, by record."""
 
 BULK: Mapping[type, frozenset[str]] = {
     Step: frozenset({"estimate"}),
     Keyframe: frozenset({"points", "labels", "intensities", "place"}),
     GraphEstimate: frozenset({"T_world_keyframe"}),
 }
-"""Fields that the JSON leaves out."""
+"""Fields that the JSON omits."""
 
 _NUMBERS_AND_TEXTS = {bool: "boolean", int: "integer", float: "number", str: "string"}
 
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """How values of one type are written and read."""
+    """Encoder, decoder and schema of one type."""
 
     encode: Callable[[Any], Any]
-    """Value -> what `json` writes."""
+    """Converts a value to objects that `json` can write."""
     decode: Callable[[Any, Bulk], Any]
-    """What `json` read -> value. Raises ValueError, TypeError or KeyError if it is none, or the bulk is missing."""
+    """Converts objects that `json` read to a value.
+
+    Raises ValueError, TypeError or KeyError for invalid or missing data.
+    """
     schema: Json
-    """JSON Schema of what `encode` makes."""
+    """JSON Schema of the encoded values."""
 
 
 @cache
 def codec(hint: Any) -> Codec:
-    """How values of the type `hint`, a record or the type of a record's field, are written and read."""
+    """The codec of a type: a record, or the type of one of its fields."""
     origin, arguments = get_origin(hint), get_args(hint)
     if is_dataclass(hint):
         return _record(hint)
@@ -98,7 +101,7 @@ def _record(record: Any) -> Codec:
 
 
 def _array(hint: Any) -> Codec:
-    """Of the shape that the hint names; at most one dimension may be free."""
+    """Codec of an array with the shape in the type hint; at most one dimension is variable."""
     sizes = hint.dim_str.split()
     shape = [int(size) if size.isdigit() else -1 for size in sizes]
     dtype, kind = (np.float64, "number") if "float64" in hint.dtypes else (np.int64, "integer")
@@ -110,7 +113,7 @@ def _array(hint: Any) -> Codec:
 
 
 def _one_of(hints: tuple[Any, ...]) -> Codec:
-    """A record or None, which the record around it leaves out; or one of several records."""
+    """Codec of a record or None, which is omitted; or of one of several records."""
     records = {hint.__name__: codec(hint) for hint in hints if hint is not NoneType}
     if len(records) == 1:
         return next(iter(records.values()))

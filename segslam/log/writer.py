@@ -1,4 +1,4 @@
-"""Steps into an MCAP file that can be read up to its last complete step at any moment."""
+"""Writes the steps of a run to an MCAP file that is readable up to its last complete step at any time."""
 
 import json
 import resource
@@ -35,25 +35,25 @@ from segslam.types import (
 )
 
 POSES_PER_KEYFRAME = 50
-"""Chosen: of estimates, so many poses are logged for each keyframe of a run, in some 4 kB, so that a log grows with the
-drive; each of them whole, until closures times keyframes outgrow it: then every second estimate, and so on."""
+"""Chosen: number of logged poses of estimates per keyframe, about 4 kB each, so that the log grows with the drive
+only. All estimates are logged until the limit is reached; then every second estimate, and so on."""
 CHUNK_BYTES = 4 * 2**20
-"""Above the largest step by far: a chunk ends with its step, which makes a step complete or absent."""
+"""Larger than any step: a chunk ends with its step, so that a step is complete or missing."""
 
 _STATM = Path("/proc/self/statm")
 
 Encoded = tuple[str, bytes]
 """Topic and data of a message."""
 Mirror = Callable[[str, bytes, int], None]
-"""Is given topic, data and stamp (ns) of each message, once it is in the file."""
+"""Called with topic, data and stamp (ns) of each message after it is written."""
 
 
 class LogWriter:
     """Writes the steps of a run as they come; a context manager.
 
-    Each step is handed to the operating system as one compressed chunk with a checksum, before `write` returns: a slow
-    disk slows the run and nothing gathers in memory. A full or failing disk raises WorkFailed and leaves a file that
-    ends with the last complete step. Ctrl-C waits until a step is complete.
+    Each step is passed to the operating system as one compressed chunk with a checksum before `write` returns: a slow
+    disk delays the run, and memory does not grow. A full or failing disk raises WorkFailed and leaves a file that ends
+    with the last complete step. Ctrl-C takes effect after a step is complete.
     """
 
     def __init__(
@@ -67,10 +67,10 @@ class LogWriter:
         options: Mapping[str, str] = MappingProxyType({}),
         mirror: Mirror | None = None,
     ) -> None:
-        """`reference` holds true poses and `T_camera_lidar` the calibration, for KITTI: a replay has nothing else.
+        """`reference`: true poses; `T_camera_lidar`: calibration of KITTI data. A replay has no other source for both.
 
-        `options` are what was chosen beside the settings, and must be chosen again when the run is resumed.
-        `mirror` is given each message that is written.
+        `options` are options beside the settings, which must be the same when the run is resumed.
+        `mirror` is called with each message that is written.
         """
         self._mirror = mirror
         self._path = path
@@ -80,7 +80,7 @@ class LogWriter:
         self._num_poses = 0
         self._newest: Keyframe | None = None
         self._steps_of_keyframes: dict[int, tuple[int, int]] = {}
-        """Where in the file the step of each keyframe is, and its size."""
+        """Position in the file, and size, of the step of each keyframe."""
         try:
             self._output = Output(path)
         except OSError as error:
@@ -102,23 +102,23 @@ class LogWriter:
             self._steps_of_keyframes[step.keyframe.id] = written
 
     def keep(self, keyframe: Keyframe) -> None:
-        """Hold the newest keyframe until its step is written: `Clouds` of segslam.keyframes."""
+        """Keep the newest keyframe in memory until its step is written: `Clouds` of segslam.keyframes."""
         self._newest = keyframe
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
-        """Points and labels of a keyframe, read back from the file."""
+        """Points and labels of a keyframe, read from the file."""
         if self._newest is not None and self._newest.id == keyframe_id:
             return self._newest.points, self._newest.labels
         offset, size = self._steps_of_keyframes[keyframe_id]
         for channel_id, data in messages_within(self._output.read(offset, size)):
             if channel_id == self._channels[schema.KEYFRAME]:
                 return points_and_labels(KeyframePoints.FromString(data))
-        raise SegslamError(f"{self._path}: keyframe {keyframe_id} has gone from the log; leave the file alone")
+        raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
 
     def write_result(
         self, estimate: GraphEstimate, trajectory: Trajectory, late_loops: tuple[LoopAttempt, ...] = ()
     ) -> None:
-        """Add the final estimate, the pose of every scan that follows from it, and loops tried after the last scan."""
+        """Write the final estimate, the pose of every scan, and loops tried after the last scan."""
         drawn = self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns)
         whole_map = self._drawing.draw_map(estimate, self.cloud, stamp_ns=self._stamp_ns)
         messages = [*_serialised(whole_map), *_serialised(drawn), _estimate_message(estimate)]
@@ -127,7 +127,7 @@ class LogWriter:
         self._write([*messages, (schema.RESULT, _json(Trajectory, trajectory))], stamp_ns=self._stamp_ns)
 
     def move(self, path: Path) -> None:
-        """Take the place of the file `path`, which is there until all that was written here is safely on the disk."""
+        """Replace the file `path`, after all data written here is safely on the disk."""
         try:
             self._output.sync()
             self._path.replace(path)
@@ -136,7 +136,7 @@ class LogWriter:
         self._path = path
 
     def close(self) -> None:
-        """Write the index. Without it the log can be read as well, only not searched."""
+        """Write the index. A log without index is readable, but slower to search."""
         if not self._output.closed:
             with self._whole():
                 self._mcap.finish()
@@ -151,7 +151,7 @@ class LogWriter:
         self.close()
 
     def _step_messages(self, step: Step) -> Iterator[Encoded]:
-        """Writes the step last; its presence means that its other messages are complete."""
+        """The messages of a step. The step itself is last: it marks the others as complete."""
         logs_estimate = step.estimate is not None and self._affords(len(step.estimate.T_world_keyframe))
         yield from _serialised(self._drawing.draw(step, path=logs_estimate))
         if (rss_mb := _rss_mb()) is not None:
@@ -163,17 +163,17 @@ class LogWriter:
         yield schema.STEP, _json(Step, step)
 
     def _affords(self, num_poses: int) -> bool:
-        """Whether the estimates logged may have so many poses more; counted if so."""
+        """True if the logged estimates may contain this many more poses; counts them if so."""
         if self._num_poses + num_poses > POSES_PER_KEYFRAME * num_poses:
             return False
         self._num_poses += num_poses
         return True
 
     def _write(self, messages: Iterable[Encoded], *, stamp_ns: int) -> tuple[int, int]:
-        """Where it went in the file, and its size."""
+        """Position in the file, and size."""
         if stamp_ns < 0:
-            raise SegslamError(f"{self._path}: stamp {stamp_ns} ns is before 0; shift the stamps of the scans")
-        encoded = list(messages)  # before anything is written: what cannot be encoded leaves no half of a step
+            raise SegslamError(f"{self._path}: stamp {stamp_ns} ns is negative; shift the stamps of the scans")
+        encoded = list(messages)  # before writing: an encoding error must not leave half a step
         self._stamp_ns = stamp_ns
         with self._whole():
             offset = self._output.tell()
@@ -188,21 +188,21 @@ class LogWriter:
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
-        """As `Output.whole`, with the failure of the disk put into words."""
+        """As `Output.whole`, with a message for a disk failure."""
         if self._output.closed:
-            raise SegslamError(f"{self._path}: the log is closed; open another to write more")
+            raise SegslamError(f"{self._path}: the log is closed; open another log to write more")
         try:
             with self._output.whole():
                 yield
         except OSError as error:
             raise WorkFailed(
-                f"{self._path}: cannot go on writing the log ({error.strerror}); free space on the disk; "
+                f"{self._path}: cannot continue writing the log ({error.strerror}); free space on the disk; "
                 "the log ends with the last complete step"
             ) from error
 
 
 def _register_channels(mcap: Writer) -> dict[str, int]:
-    """Topic -> channel; every topic is in the file from the start, with its schema."""
+    """Channel by topic; all topics and their schemas are written at the start of the file."""
     schema_ids: dict[str, int] = {}
     found: dict[str, int] = {}
     for topic, encoding, name, schema_encoding, description in channels():

@@ -1,7 +1,8 @@
-"""Keyframes and their poses to one clean map: a cloud, a picture from above, an occupancy grid.
+"""One clean map from keyframes and their poses: a point cloud, a top-view image, an occupancy grid.
 
-Two passes: the keyframes once, into voxels by tile and a picture of what each saw, both on disk; then tile after tile,
-without what moved, into the files. Memory holds some of the keyframes and one tile, however long the drive.
+There are two passes. The first sorts the points of all keyframes into voxels by tile, and stores a range image of each
+keyframe, both on disk. The second removes moving objects tile by tile and writes the files. Memory holds some keyframes
+and one tile, whatever the length of the drive.
 """
 
 import shutil
@@ -30,27 +31,27 @@ KINDS: dict[str, type[MapFile]] = {
     ".png": Picture,
     ".yaml": Grid,
 }
-"""By the ending of a file's name."""
+"""Writers by file extension."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapSummary:
-    """What a map was made of."""
+    """Contents of a map."""
 
     num_keyframes: int
     num_points: int
-    """In the map: a voxel each."""
+    """Voxels in the map."""
     num_moving_points: int
     """Number of points of moving classes that were removed."""
     num_voxels_seen_through: int
-    """Voxels that were left out because other keyframes saw through them."""
+    """Number of voxels removed because other keyframes saw through them."""
 
 
 def check_names(files: Sequence[Path]) -> None:
     """Raises SegslamError for a file with an unknown extension, or one that needs a missing package."""
     for file in files:
         if file.suffix.lower() not in KINDS:
-            raise SegslamError(f"{file}: unknown kind of map; its name has to end in {', '.join(KINDS)}")
+            raise SegslamError(f"{file}: unknown kind of map; its name must end in {', '.join(KINDS)}")
         if KINDS[file.suffix.lower()] is LasCloud:
             check_las(file)
 
@@ -66,12 +67,12 @@ def write_map(
     config: MapConfig,
     show: Callable[[Iterator[Part], int], Iterator[Part]] = _unseen,
 ) -> MapSummary:
-    """Make the map of keyframes, each with its T_world_keyframe, and write it to each of the files, one at least.
+    """Make the map of the keyframes, each with its T_world_keyframe, and write it to one or more files.
 
-    The extension selects what is written: .ply, .pcd, .las, .laz the cloud, .png the map from above, .yaml with a
-    .pgm beside it the occupancy grid. Files appear when they are whole. `show` is given the parts that are written and
-    their number, to show the progress. Raises SegslamError for another ending, for a folder that is not there, or if no
-    keyframe has a point, and OSError where the disk is full.
+    The extension selects the format: .ply, .pcd, .las, .laz: point cloud; .png: top view; .yaml, with a .pgm beside it:
+    occupancy grid. Files are written atomically. `show` receives the parts while they are written, and their number, to
+    show progress. Raises SegslamError for another extension, a missing folder, or if no keyframe has a point; raises
+    OSError if the disk is full.
     """
     check_names(files)
     for file in files:
@@ -95,7 +96,7 @@ def write_map(
 
 
 def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scratch: Path, config: MapConfig) -> int:
-    """Write the parts to all files, in a scratch folder until they are whole; the number of points."""
+    """Write the parts to all files, in a scratch folder until they are complete; returns the number of points."""
     folders = [scratch / str(number) for number in range(len(files))]
     for folder in folders:
         folder.mkdir(parents=True)

@@ -1,6 +1,6 @@
-"""The map by odometry alone beside the corrected map: where loop closing changed most, walls seen twice fall together.
+"""The map from odometry alone beside the corrected map, with a detail of the place where loop closing changed most.
 
-Each pixel counts the points that stand in it, as seen from above: a sharp map has bright lines, a smeared one has haze.
+Each pixel counts the points in it, in top view: walls are sharp lines in an accurate map and blurred in another.
 """
 
 from collections.abc import Iterable, Mapping
@@ -17,23 +17,23 @@ from segslam.points import within_range
 from segslam.types import GROUND_LABELS, GraphEstimate, Keyframe, Label, Points, Transform
 
 MOST_PIXELS = 900
-"""Chosen: of the longer side of a panel."""
+"""Chosen: largest number of pixels along the longer side of a panel."""
 FINEST_M = 0.1
-"""Chosen: edge of a pixel at least, about the error of a keyframe's pose."""
+"""Chosen: smallest size of a pixel, about the error of a keyframe's pose."""
 REACH_M = 40.0
-"""Chosen: points farther from their keyframe are not drawn; far points are sparse and add haze to both maps."""
+"""Chosen: points farther from their keyframe are not drawn; they are sparse and blur both maps."""
 DETAIL_M = 30.0
-"""Chosen: half of the width of the detail at least."""
+"""Chosen: smallest half width of the detail."""
 TRUSTED = 0.5
-"""Weight from which the optimiser kept a closure."""
+"""Closures with at least this weight are kept by the optimiser."""
 BEFORE, AFTER, BACKGROUND = "#E69F00", "#56B4E9", "#10141a"
 
 
 class BeforeAfter:
-    """Keyframes go in one by one; then the picture is drawn."""
+    """Draws the figure from keyframes added one by one."""
 
     def __init__(self, T_odom_keyframe: Mapping[int, Transform], estimate: GraphEstimate) -> None:
-        """The poses of all keyframes by odometry, and by the last estimate."""
+        """Takes the poses of all keyframes by odometry, and the last estimate."""
         first = min(T_odom_keyframe)
         T_world_odom = estimate.T_world_keyframe[first] @ geometry.inverse(T_odom_keyframe[first])
         poses = {keyframe_id: T_world_odom @ T for keyframe_id, T in T_odom_keyframe.items()}
@@ -55,7 +55,7 @@ class BeforeAfter:
                     panels[number].add(placed)
 
     def draw(self) -> bytes:
-        """The picture, a PNG: the whole maps above, and below them the place that changed most, if a loop closed."""
+        """The figure as a PNG: the whole maps above, the detail of the largest change below, if there are closures."""
         rows = [panels for panels in (self._whole, self._detail) if panels]
         heights = [panels[0].height_per_width for panels in rows]
         layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
@@ -74,7 +74,7 @@ class BeforeAfter:
 
 
 class _Density:
-    """Counts of points in the pixels of a window."""
+    """Number of points in each pixel of a window."""
 
     def __init__(self, window: Window) -> None:
         west, east, south, north = self._window = window
@@ -84,26 +84,26 @@ class _Density:
         self.height_per_width = height_m / width_m
 
     def add(self, points: Points) -> None:
-        """Count points of the world."""
+        """Count points (n, 3) of the world."""
         column, row = ((points[:, :2] - [self._window[0], self._window[2]]) // self._pixel_m).astype(np.int64).T
         rows, columns = self._counts.shape
         seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         np.add.at(self._counts, (row[seen], column[seen]), 1)
 
     def brightest(self) -> float:
-        """Count that few pixels exceed."""
+        """A count that few pixels exceed."""
         counted = self._counts[self._counts > 0]
         return float(np.percentile(counted, 99)) if len(counted) else 1.0
 
     def show(self, axes: Axes, brightest: float) -> None:
-        """Draw the counts, as the logarithm."""
+        """Draw the logarithm of the counts."""
         west, east, south, north = self._window
         image = np.log1p(self._counts) / np.log1p(brightest)
         extent = (west, east, south, north)
         axes.imshow(image, origin="lower", extent=extent, cmap="bone", vmin=0.0, vmax=1.0, interpolation="antialiased")
 
     def frame(self, axes: Axes) -> None:
-        """Limits, a scale bar, no ticks."""
+        """Set the axis limits and add a scale bar; no ticks."""
         west, east, south, north = self._window
         axes.set(xlim=(west, east), ylim=(south, north), xticks=[], yticks=[], facecolor=BACKGROUND)
         scale_bar(axes, east - west, color="white")
@@ -112,7 +112,7 @@ class _Density:
 def most_changed(
     before: Mapping[int, Transform], after: Mapping[int, Transform], loops: Iterable[tuple[int, int]]
 ) -> tuple[int, int] | None:
-    """The loop (source, target) whose two ends moved most against each other; None without loops."""
+    """The loop (source, target) whose relative pose changed most; None without loops."""
 
     def moved_m(loop: tuple[int, int]) -> float:
         T_before, T_after = (geometry.inverse(poses[loop[1]]) @ poses[loop[0]] for poses in (before, after))
@@ -127,7 +127,7 @@ def _around(xy: np.ndarray, margin_m: float) -> Window:
 
 
 def _detail(poses: Mapping[int, Transform], loop: tuple[int, int]) -> Window:
-    """Around both ends of a loop, as wide as two to one."""
+    """A window around both ends of a loop, twice as wide as high."""
     ends = np.array([poses[keyframe_id][:2, 3] for keyframe_id in loop])
     (x, y), apart_m = ends.mean(axis=0), float(np.linalg.norm(ends[0] - ends[1]))
     half_m = DETAIL_M + min(apart_m, DETAIL_M)

@@ -1,4 +1,4 @@
-"""Which voxels last: not those that other keyframes saw through more often than they saw them."""
+"""Removal of moving objects: voxels that more keyframes see through than observe."""
 
 from collections.abc import Iterable
 
@@ -11,10 +11,11 @@ from segslam.types import GROUND_LABELS, Labels, Mask, Points, Transform
 
 
 def moved(points: Points, labels: Labels, views: Iterable[tuple[np.ndarray, Transform]], *, config: MapConfig) -> Mask:
-    """Which points stood for a while only. `views` are pictures of keyframes, each with T_view_points.
+    """(n,) bool: whether each point belongs to an object that has moved.
 
-    A point that at least `min_views` saw through, and more than confirmed it, has moved; so has one in whose
-    neighbourhood most have. The ground stays: rays that graze it pass close above it.
+    `views`: range images of keyframes, each with its T_view_points. A point has moved if at least `min_views`
+    keyframes, and more than observed it, see through it; or if most of its neighbours have moved. Points of the ground
+    never move: rays at grazing incidence pass close above them.
     """
     stays = np.isin(labels, np.array(GROUND_LABELS, np.uint8))
     votes = np.zeros((len(points), 2), np.uint32)
@@ -27,7 +28,7 @@ def moved(points: Points, labels: Labels, views: Iterable[tuple[np.ndarray, Tran
 
 
 def _among_moved(points: Points, has_moved: Mask, stays: Mask, radius_m: float) -> Mask:
-    """Points that may move and have more moved neighbours than others; those of the ground do not count."""
+    """Points that may move and have more moved than other neighbours; points of the ground do not count."""
     doubtful = np.flatnonzero(~stays & ~has_moved)
     among = np.zeros(len(points), bool)
     if not has_moved.any() or not len(doubtful):
@@ -37,5 +38,5 @@ def _among_moved(points: Points, has_moved: Mask, stays: Mask, radius_m: float) 
     doubtful = doubtful[np.isfinite(nearest_m)]
     num_moved = moved_tree.query_ball_point(points[doubtful], radius_m, return_length=True)
     others = cKDTree(points[~stays & ~has_moved]).query_ball_point(points[doubtful], radius_m, return_length=True)
-    among[doubtful] = num_moved > others - 1  # itself
+    among[doubtful] = num_moved > others - 1  # a point is not its own neighbour
     return among

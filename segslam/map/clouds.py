@@ -1,4 +1,4 @@
-"""Clouds that are written piece by piece: PLY, PCD, and LAS or LAZ."""
+"""Point cloud files written piece by piece: PLY, PCD, LAS and LAZ."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,9 +14,9 @@ from segslam.types import Label, SegslamError
 PLY_ROW = [("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")]
 PCD_ROW = [("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")]
 INTENSITY = [("intensity", "<f4")]
-"""Last of a row, where intensities are known."""
+"""Last column, if intensities are known."""
 HEADER_BYTES = 512
-"""Bytes reserved for the header, which is written last because it has the number of points."""
+"""Bytes reserved for the header, which is written last because it contains the number of points."""
 LAS_SCALE_M = 0.001
 ASPRS_OF_LABEL = {
     Label.ROAD: 11,
@@ -28,11 +28,11 @@ ASPRS_OF_LABEL = {
     Label.VEGETATION: 5,
     Label.TRUNK: 5,
 }
-"""Classes of the LAS 1.4 specification, table 17: 2 ground, 5 high vegetation, 6 building, 11 road; else 1, none."""
+"""Classes of the LAS 1.4 specification, table 17: 2 ground, 5 high vegetation, 6 building, 11 road; else 1."""
 
 
 class PlyCloud:
-    """Binary PLY: x y z in float32 metres, red green blue, label (SemanticKITTI's learning id), intensity if known."""
+    """Binary PLY: x y z (float32, m), red green blue, label (SemanticKITTI learning id), intensity if known."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._stream = _begin(file)
@@ -63,7 +63,7 @@ class PlyCloud:
 
 
 class PcdCloud:
-    """Binary PCD 0.7: x y z in float32 metres, rgb as PCL packs it, label, intensity if known."""
+    """Binary PCD 0.7: x y z (float32, m), rgb packed as in PCL, label, intensity if known."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._stream = _begin(file)
@@ -99,13 +99,13 @@ class PcdCloud:
 
 
 class LasCloud:
-    """LAS 1.4, point format 7, compressed where the name ends in .laz: millimetres, colours, classes of ASPRS.
+    """LAS 1.4, point format 7, in millimetres, with colours and ASPRS classes; compressed if the name ends in .laz.
 
-    `user_data` holds the label (SemanticKITTI's learning id); intensities are spread over 16 bits, as LAS asks.
+    `user_data` holds the label (SemanticKITTI learning id). Intensities are scaled to 16 bits, as LAS requires.
     """
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
-        import laspy  # type: ignore[import-untyped]  # an extra: nothing else needs it
+        import laspy  # type: ignore[import-untyped]  # an optional package
 
         self._laspy = laspy
         header = laspy.LasHeader(version="1.4", point_format=7)
@@ -130,7 +130,7 @@ class LasCloud:
 
 
 def check_las(file: Path) -> None:
-    """Raises SegslamError if the packages that LAS and LAZ need are not there."""
+    """Raises SegslamError if the packages for LAS and LAZ are missing."""
     missing = [name for name in ("laspy", "lazrs") if find_spec(name) is None]
     if missing:
         raise SegslamError(f"{file}: LAS and LAZ need extra packages: {how_to_install('las')}; .ply and .pcd do not")
@@ -143,7 +143,7 @@ def _begin(file: Path) -> BinaryIO:
 
 
 def _end(stream: BinaryIO, lines: list[str], *, filler: str, last: str) -> None:
-    """Write the header into its room, a comment filling what is left of it, and close the file."""
+    """Write the header into the reserved bytes, padded with a comment, and close the file."""
     text = "".join(f"{line}\n" for line in lines)
     spaces = HEADER_BYTES - len(text) - len(filler) - len(last) - 2
     stream.seek(0)

@@ -1,4 +1,4 @@
-"""Colours of a map by heights or intensities."""
+"""Colours of a map by height or intensity."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from segslam.types import Vector
 
 
 def scale_of(span: tuple[float, float], *, steps: int = 6) -> list[tuple[float, str]]:
-    """Numbers from the end of a span to its start, with the colour that `of_numbers` gives them."""
+    """(text, colour) of evenly spaced values from the end of a span to its start, as `of_numbers` colours them."""
     values = np.linspace(span[1], span[0], steps)
     return [
         (float(value), f"#{r:02x}{g:02x}{b:02x}")
@@ -16,7 +16,7 @@ def scale_of(span: tuple[float, float], *, steps: int = 6) -> list[tuple[float, 
 
 
 def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:
-    """Colours from dark violet at the span's start and below to yellow at its end and above."""
+    """Colours (n, 3) from dark violet, at the start of the span and below, to yellow, at its end and above."""
     from matplotlib import colormaps
 
     low, high = span

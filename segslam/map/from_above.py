@@ -1,4 +1,4 @@
-"""How pictures of a map from above are drawn: one pixel a pixel, with a scale bar."""
+"""Drawing of top-view images: one image pixel per map pixel, with a scale bar."""
 
 import io
 import math
@@ -15,13 +15,13 @@ from segslam.types import Points
 DPI = 100
 PATH = "#d62728"
 LEGEND_PX, LEAST_PX = 190, 700
-"""Chosen: width of the strip of the legend, and of the map at least."""
+"""Chosen: width of the legend, and smallest width of the map."""
 
 
 def drawn_map(
     image: np.ndarray, window: Window, *, path_m: Points, title: str, marks: Iterable[tuple[str, str]]
 ) -> bytes:
-    """A map from above as a PNG: (rows, columns, 3) colours, a path and a scale bar over them, a legend beside."""
+    """A PNG of a map in top view: an image (rows, columns, 3), a path, a scale bar, and a legend beside it."""
     height, width = image.shape[:2]
     zoom = max(1.0, LEAST_PX / width)
     share = zoom * width / (zoom * width + LEGEND_PX)
@@ -40,7 +40,7 @@ def drawn_map(
 
 
 def scale_bar(axes: Axes, width_m: float, *, color: str, size: float = 11.0) -> None:
-    """A bar of a round length, at most a quarter of the width that is shown, in the lower left corner."""
+    """Draw a bar of a round length, at most a quarter of the shown width, in the lower left corner."""
     length_m = round_length_m(width_m / 4)
     share = length_m / width_m
     left, low = 0.03, 0.035
@@ -52,20 +52,20 @@ def scale_bar(axes: Axes, width_m: float, *, color: str, size: float = 11.0) -> 
 
 
 def round_length_m(longest_m: float) -> float:
-    """1, 2 or 5 times a power of ten, as long as possible."""
+    """The largest length of 1, 2 or 5 times a power of ten below the limit."""
     power = 10.0 ** math.floor(math.log10(longest_m))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= longest_m * (1 + 1e-9))
 
 
 def draw_path(axes: Axes, path_m: Points | Sequence[Points], *, color: str, width: float) -> None:
-    """A trajectory and its start; (n, 3) positions in order."""
+    """Draw a trajectory, (n, 3) positions in order, and its start."""
     xy = np.asarray(path_m)[:, :2]
     axes.plot(*xy.T, color=color, linewidth=width, solid_joinstyle="round")
     axes.plot(*xy[0], "o", color=color, markersize=3 + 2 * width, markeredgecolor="white", markeredgewidth=0.8)
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG of `DPI`; the same for the same data."""
+    """The figure as a PNG at `DPI`; equal data give equal bytes."""
     image = io.BytesIO()
     figure.savefig(image, format="png", dpi=DPI, metadata={"Software": None})
     return image.getvalue()

@@ -1,4 +1,4 @@
-"""The keyframes of a map, on disk: first all come in, then the clean voxels of one tile after the other go out."""
+"""Keyframes of a map on disk: all keyframes are added, then the clean voxels are read tile by tile."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,10 +19,10 @@ from segslam.types import Keyframe, Label, Labels, SegslamError, Transform, Vect
 
 
 class Gathered:
-    """Voxels, and what each keyframe saw."""
+    """Voxels by tile, and a range image of each keyframe."""
 
     def __init__(self, scratch: Path, config: MapConfig) -> None:
-        """`scratch` is an empty folder, which the caller removes."""
+        """`scratch`: an empty folder, which the caller removes."""
         self._config = config
         self._tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
         self._views = Views(scratch / "views", spread_m=config.voxel_m)
@@ -35,22 +35,22 @@ class Gathered:
 
     @property
     def num_keyframes(self) -> int:
-        """How many keyframes came in."""
+        """Number of keyframes added."""
         return len(self._places)
 
     @property
     def num_tiles(self) -> int:
-        """How many parts there will be."""
+        """Number of parts that `parts` yields."""
         return len(self._tiles)
 
     def add(self, keyframe: Keyframe, T_world_keyframe: Transform) -> None:
-        """Add a keyframe: its near points of static classes, and its whole view.
+        """Add a keyframe: the near points of static classes as voxels, and all points as a range image.
 
-        Raises SegslamError if it has no intensities and the colours are to show them.
+        Raises SegslamError if the map is coloured by intensity and the keyframe has none.
         """
         if keyframe.intensities is None and self._config.color == "intensity":
             raise SegslamError(
-                f"map.color=intensity: keyframe {keyframe.id} has no intensities; they are kept only in runs mapped "
+                f"map.color=intensity: keyframe {keyframe.id} has no intensities; runs contain them only if mapped "
                 "with `--set map.color=intensity`; or use map.color=class or height"
             )
         self._has_intensities &= keyframe.intensities is not None
@@ -66,7 +66,7 @@ class Gathered:
         self._places.append(T_world_keyframe[:3, 3])
 
     def extent(self) -> Extent | None:
-        """Of the tiles that have voxels; None if there are none."""
+        """Extent of the tiles that have voxels; None if there are none."""
         tiles = list(self._tiles)
         if not tiles:
             return None
@@ -78,7 +78,7 @@ class Gathered:
         )
 
     def parts(self) -> Iterator[Part]:
-        """The clean voxels of each tile, in the order that `MapFile` names."""
+        """The clean voxels of each tile, in the order that `MapFile` requires."""
         for tile in self._tiles:
             voxels = self._tiles.voxels(tile)
             gone = moved(voxels["point"], voxels["label"], self._views_of(tile), config=self._config)
@@ -98,11 +98,11 @@ class Gathered:
                 return colors.of_numbers(intensities, span=self._span())
 
     def _span(self) -> tuple[float, float]:
-        """Ends of the scale of colours."""
+        """Values at both ends of the colour scale."""
         return self._tiles.intensity_span() if self._config.color == "intensity" else self._tiles.height_span_m()
 
     def _views_of(self, tile: Tile) -> Iterator[tuple[np.ndarray, Transform]]:
-        """What each keyframe near a tile saw, and T_keyframe_tile."""
+        """The range image of each keyframe near a tile, and T_keyframe_tile."""
         T_world_tile = geometry.transform(np.eye(3), corner(tile))
         for number, place in enumerate(self._places):
             if distance_m(tile, place) < self._config.view_range_m:

@@ -1,8 +1,8 @@
-"""A 2D occupancy grid for ROS's map_server: `NAME.yaml` beside `NAME.pgm`.
+"""A 2D occupancy grid for ROS's map_server: `NAME.yaml` with `NAME.pgm`.
 
-A cell is occupied where enough voxels stand between two heights above the ground. It is free where the ground was seen
-and nothing stands on it, or where the ray of a keyframe passed over it, and else unknown. Rows of tiles are written as
-they are complete, so that memory holds one.
+A cell is occupied if enough voxels are between two heights above the ground. A cell is free if ground is observed there
+and nothing stands on it, or if a ray of a keyframe to the ground passed over it. All other cells are unknown. Memory
+holds one row of tiles.
 """
 
 from pathlib import Path
@@ -17,18 +17,18 @@ from segslam.map.tiles import TILE_M, corner
 from segslam.types import GROUND_LABELS
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
-"""Values of map_server's `trinary` mode; 205 lies between its two thresholds."""
+"""Values of the mode `trinary` of map_server; 205 lies between its two thresholds."""
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 
 
 class Grid:
-    """Writes the grid; `file` is the .yaml."""
+    """Writes the grid; `file` is the .yaml file."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._file = file
         self._extent = extent
         self._config = config
-        self._cells = round(TILE_M / config.cell_m)  # of a tile's edge
+        self._cells = round(TILE_M / config.cell_m)  # along the edge of a tile
         columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
         self._band = np.full((self._cells, columns * self._cells), UNKNOWN, np.uint8)
         self._row = extent.north
@@ -78,7 +78,7 @@ class Grid:
         return self._filled_along_rays(seen, part)
 
     def _filled_along_rays(self, cells: np.ndarray, part: Part) -> np.ndarray:
-        """Unknown cells that a keyframe's ray to the ground passed over become free."""
+        """Set unknown cells to free if a keyframe's ray to the ground passed over them."""
         rows, columns = np.nonzero(cells == UNKNOWN)
         centres = corner(part.tile)[:2] + (np.column_stack([columns, rows]) + 0.5) * (TILE_M / self._cells)
         free = np.zeros(len(centres), bool)

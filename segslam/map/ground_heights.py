@@ -1,4 +1,4 @@
-"""Height of the ground beneath points of a square."""
+"""Height of the ground below points."""
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -9,9 +9,9 @@ GROUND_CELL_M = 2.0
 
 
 def ground_heights(points: Points, ground: Points, side_m: float) -> Vector:
-    """Height of the ground (m) beneath each point: the lowest of `ground` in its cell, or in the nearest that has any.
+    """Height (n,) of the ground (m) below each point: the lowest point of `ground` in its cell, or in the nearest cell.
 
-    Both lie within a square of `side_m`, x and y from its corner.
+    All points lie within a square of `side_m`, with x and y measured from its corner.
     """
     size = round(side_m / GROUND_CELL_M)
     lowest = np.full((size, size), np.inf)

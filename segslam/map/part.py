@@ -1,4 +1,4 @@
-"""What the writers of a map are given: its extent first, then part after part."""
+"""Input of the map writers: the extent of the map, then its parts."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,47 +11,47 @@ from segslam.semantics.class_colors import Colors
 from segslam.types import Labels, Points, Vector
 
 Window = tuple[float, float, float, float]
-"""West, east, south and north end of a picture (m)."""
+"""West, east, south and north end of an image (m)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extent:
-    """Which tiles a map may have: columns from `west` to `east`, rows from `south` to `north`, those included."""
+    """Range of tiles of a map: columns `west` to `east`, rows `south` to `north`, all included."""
 
     west: int
     east: int
     south: int
     north: int
     brightest: float | None
-    """No voxel's intensity is above it; None if intensities are not known."""
+    """Upper bound of the intensities; None if intensities are unknown."""
     path_m: Points
-    """Positions of the keyframes in the world, in order."""
+    """Positions of the keyframes in the world, in order (m)."""
     span: tuple[float, float]
-    """Of the heights or intensities that the colours show, the ends of the scale."""
+    """Both ends of the colour scale, for heights or intensities."""
     sights: Sights
-    """Free space as the keyframes saw it."""
+    """Free space observed by the keyframes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """The clean voxels of one tile; `points` (n, 3) float64 in metres of the world."""
+    """The clean voxels of one tile; `points` (n, 3) float64 in the world (m)."""
 
     tile: Tile
     points: Points
     labels: Labels
     intensities: Vector
-    """Means of the sensor's own numbers; 0 if they are not known."""
+    """Mean intensity in the sensor's unit; 0 if unknown."""
     colors: Colors
 
 
 class MapFile(Protocol):
-    """A file of a map while it is written. Parts come row by row, the northernmost first, each from west to east."""
+    """A map file while it is written. Parts come by rows from north to south, each row from west to east."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
-        """Begin a file."""
+        """Open the file."""
 
     def add(self, part: Part) -> None:
-        """Write the points of a part, or keep what is needed of them."""
+        """Write the points of a part, or store the data needed of them."""
 
     def close(self) -> None:
         """Complete the file."""

@@ -1,4 +1,4 @@
-"""A map from above, as a PNG: shaded by height, with the trajectory, a scale bar and a legend."""
+"""Top view of a map as a PNG: shaded by height, with the trajectory, a scale bar and a legend."""
 
 from pathlib import Path
 
@@ -12,19 +12,19 @@ from segslam.map.tiles import TILE_M, corner
 from segslam.semantics.class_colors import COLORS
 
 MAX_SIDE = 4000
-"""Pixels of the longer side at most; the memory that a picture takes is bounded by it."""
+"""Largest number of pixels along the longer side; limits the memory."""
 MARGIN_M = 4.0
 BACKGROUND = 255
 SHADED_M = 3.0
-"""Chosen: heights are shaded against the mean around them, in a square of this size."""
+"""Chosen: the shading of a height is relative to the mean height in a square of this size."""
 GAP_PX = 1.5
-"""Chosen: pixels beside a known one, the diagonal ones too, are filled."""
+"""Chosen: a pixel is filled if one of its 8 neighbours is known."""
 RELIEF_M, CONTRAST = 1.5, 0.35
-"""Chosen: a difference of heights that is shaded strongly, and how strongly."""
+"""Chosen: height difference with strong shading, and strength of the shading."""
 
 
 class Picture:
-    """North (y) is up, and what is highest hides the rest."""
+    """Top view with north (y) up; the highest point of a pixel is visible."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._file = file
@@ -38,8 +38,8 @@ class Picture:
         self._labels: set[int] = set()
 
     def add(self, part: Part) -> None:
-        """Draw a part into its square of the picture."""
-        order = np.argsort(part.points[:, 2], kind="stable")  # what is written last stays
+        """Draw a part into its area of the image."""
+        order = np.argsort(part.points[:, 2], kind="stable")  # the last assignment to a pixel remains
         inside = (part.points[order] - corner(part.tile))[:, :2] / TILE_M * self._pixels
         column, row = np.clip(inside.astype(np.int64), 0, self._pixels - 1).T
         top = (self._extent.north - part.tile[1]) * self._pixels
@@ -50,18 +50,18 @@ class Picture:
         self._labels |= set(np.unique(part.labels).tolist())
 
     def close(self) -> None:
-        """Write the picture."""
+        """Write the image."""
         rows, columns = self._seen()
         colors, height_m = closed(self._image[rows, columns], self._height_m[rows, columns])
         image = shaded(colors, height_m, SHADED_M * self._pixels / TILE_M)
-        from segslam.map.from_above import drawn_map  # matplotlib takes a while to import
+        from segslam.map.from_above import drawn_map  # importing matplotlib takes long
 
         titles = {"class": "class", "height": "height (m)", "intensity": "intensity"}
         window, path_m = self._window(rows, columns), self._extent.path_m
         self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=titles[self._color], marks=self._marks()))
 
     def _seen(self) -> tuple[slice, slice]:
-        """Rows and columns of the picture that have points, with a margin."""
+        """Rows and columns of the image that have points, with a margin."""
         margin = round(MARGIN_M * self._pixels / TILE_M)
         known = np.isfinite(self._height_m)
         ends = []
@@ -83,14 +83,14 @@ class Picture:
         )
 
     def _marks(self) -> list[tuple[str, str]]:
-        """Text and colour of the classes that the map has, or of numbers along the scale."""
+        """Text and colour of each class in the map, or of values along the colour scale."""
         if self._color == "class":
             return [(label.name.lower().replace("_", " "), COLORS[label]) for label in COLORS if label in self._labels]
         return [(f"{value:.3g}", color) for value, color in scale_of(self._extent.span)]
 
 
 def closed(image: np.ndarray, height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and heights with the gaps between points filled: a pixel takes those of a known one beside it."""
+    """Colours and heights with gaps between points filled from a known neighbouring pixel."""
     away, nearest = distance_transform_edt(np.isnan(height_m), return_indices=True)
     fill = away < GAP_PX
     rows, columns = (place[fill] for place in nearest)
@@ -100,9 +100,9 @@ def closed(image: np.ndarray, height_m: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def shaded(image: np.ndarray, height_m: np.ndarray, window: float) -> np.ndarray:
-    """Colours (rows, columns, 3) made lighter where they stand above their surroundings, darker where below.
+    """Colours (rows, columns, 3), brighter above and darker below the mean height of the surroundings.
 
-    `height_m` is NaN where nothing is known; `window` is the size of the surroundings in pixels.
+    `height_m` is NaN for unknown pixels; `window` is the size of the surroundings in pixels.
     """
     known = np.isfinite(height_m)
     size = max(round(window), 3)

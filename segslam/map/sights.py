@@ -1,6 +1,6 @@
-"""How far each keyframe saw the ground in each direction with nothing standing before it: space that is free.
+"""Free range of each keyframe: distance, by direction, up to which it sees the ground and no obstacle.
 
-Beams meet the ground in rings; between two rings nothing returns, yet the ray to the outer one passed over it.
+Beams hit the ground in rings. There are no points between two rings, but the ray to the outer ring passed over the gap.
 """
 
 from collections.abc import Iterator
@@ -14,13 +14,13 @@ from segslam.map.tiles import Tile, distance_m
 from segslam.types import GROUND_LABELS, Label, Labels, Points, Vector
 
 NUM_DIRECTIONS = 720
-"""Chosen: half a degree, a cell of 0.2 m at 23 m."""
+"""Chosen: steps of half a degree; one step is a cell of 0.2 m at 23 m."""
 REACH_M = 40.0
-"""Chosen: beyond it beams graze the ground and rings are too far apart to be sure of what lies between."""
+"""Chosen: at larger ranges, grazing beams leave gaps between rings that may hide obstacles."""
 
 
 class Sights:
-    """The free range of each keyframe by direction in the world."""
+    """The free range of each keyframe, by direction in the world."""
 
     def __init__(self, config: MapConfig) -> None:
         self._low_m, self._high_m = config.obstacle_m
@@ -28,12 +28,12 @@ class Sights:
         self._free_m: list[Vector] = []
 
     def add(self, points: Points, labels: Labels, place: Vector) -> None:
-        """Points of a keyframe in the world, and where it was taken."""
+        """Add a keyframe: its points (n, 3) in the world, and its position."""
         self._places.append(place[:2])
         self._free_m.append(free_range_m(points - place, labels, low_m=self._low_m, high_m=self._high_m))
 
     def free(self, tile: Tile, places: Float[np.ndarray, "_ 2"]) -> Iterator[np.ndarray]:
-        """For each keyframe near a tile, which of the places lie within its free range."""
+        """For each keyframe near a tile: whether each of the places (n, 2) is within its free range."""
         for place, free_m in zip(self._places, self._free_m, strict=True):
             if distance_m(tile, place) >= REACH_M:
                 continue
@@ -42,9 +42,9 @@ class Sights:
 
 
 def free_range_m(points: Points, labels: Labels, *, low_m: float, high_m: float) -> Vector:
-    """(NUM_DIRECTIONS,) how far the ground is free in each direction, in metres. Points are relative to the sensor.
+    """(NUM_DIRECTIONS,) free range (m) in each direction. Points (n, 3) are relative to the sensor.
 
-    Something stands there if it reaches from `low_m` to `high_m` above the ground; what may move does not count.
+    An obstacle has points from `low_m` to `high_m` above the ground; points of moving classes do not count.
     """
     near = np.abs(points[:, :2]).max(axis=1, initial=0.0) < REACH_M
     near &= labels < Label.MOVING_CAR

@@ -1,7 +1,7 @@
-"""The world in square tiles on disk, so that memory holds a few of their voxels however long the drive.
+"""Voxels in square tiles on disk.
 
-Points of many keyframes are gathered, merged to voxels and appended to the file of their tile; a tile is read back in
-pieces. What is on disk grows with the drive, what is in memory with the surface within one tile.
+Points of several keyframes are collected, merged to voxels and appended to the file of their tile. Tiles are read in
+pieces. The files grow with the length of the drive; memory depends only on the surface within one tile.
 """
 
 import math
@@ -15,24 +15,24 @@ from segslam.map.voxels import MAX_HEIGHT_M, VOXEL, merged
 from segslam.types import Indices, Labels, Points, Vector
 
 TILE_M = 32.0
-"""Chosen: some 100,000 voxels of 0.2 m in a street."""
+"""Chosen: about 100,000 voxels of 0.2 m in a street."""
 GATHERED = 1_000_000
-"""Points that are merged before they go to disk, and voxels that are read at once."""
+"""Number of points merged before writing, and of voxels read at once."""
 HEIGHTS_M = np.arange(-MAX_HEIGHT_M, MAX_HEIGHT_M + 0.5, 0.5)
 INTENSITIES = np.append(0.0, 2.0 ** np.arange(-10.0, 16.1, 0.125))
-"""Steps of 9 %, from a thousandth of 1 to the most that 16 bits hold: sensors have scales of their own."""
+"""Steps of 9 % from 0.001 to the largest value of 16 bits, for intensities in any unit."""
 SHARES = 0.01, 0.99
-"""Of the voxels, between which the colours differ: a few outliers do not take them all."""
+"""Share of the voxels, at both ends, that the colour scale ignores as outliers."""
 
 Tile = tuple[int, int]
 """Column (along x) and row (along y)."""
 
 
 class Tiles:
-    """Voxels by tile."""
+    """Voxels, stored by tile."""
 
     def __init__(self, folder: Path, *, voxel_m: float) -> None:
-        """In a new folder, which the caller removes."""
+        """`folder` is created; the caller removes it."""
         folder.mkdir()
         self._folder = folder
         self._voxel_m = voxel_m
@@ -41,10 +41,10 @@ class Tiles:
         self._known: set[Tile] = set()
         self._heights, self._intensities = Histogram(HEIGHTS_M), Histogram(INTENSITIES)
         self.brightest = 0.0
-        """No voxel's intensity is above it."""
+        """Upper bound of the intensities of the voxels."""
 
     def add(self, points: Points, labels: Labels, intensities: Vector) -> None:
-        """Points of the world, float64 rows in metres; those more than 2 km above or below its origin are left out."""
+        """Add points (n, 3) of the world, float64 (m). Points more than 2 km above or below the origin are ignored."""
         near = np.abs(points[:, 2]) < MAX_HEIGHT_M
         self._gathered.append((points[near], labels[near], intensities[near]))
         self._num_gathered += int(near.sum())
@@ -52,7 +52,7 @@ class Tiles:
             self.flush()
 
     def flush(self) -> None:
-        """Write what is gathered."""
+        """Write the collected points to disk."""
         if not self._num_gathered:
             return
         points, labels, intensities = (np.concatenate(parts) for parts in zip(*self._gathered, strict=True))
@@ -69,12 +69,12 @@ class Tiles:
         return len(self._known)
 
     def __iter__(self) -> Iterator[Tile]:
-        """Tiles with voxels, the northernmost row first, each from west to east: the order of a picture's pixels."""
+        """Tiles that have voxels, by rows from north to south, each row from west to east."""
         self.flush()
         return iter(sorted(self._known, key=lambda tile: (-tile[1], tile[0])))
 
     def voxels(self, tile: Tile) -> np.ndarray:
-        """VOXEL rows of a tile, one a cell."""
+        """The VOXEL rows of a tile, one per cell."""
         voxels = np.empty(0, VOXEL)
         with self._file(tile).open("rb") as stream:
             while len(piece := np.fromfile(stream, VOXEL, GATHERED)):
@@ -82,11 +82,11 @@ class Tiles:
         return voxels
 
     def height_span_m(self) -> tuple[float, float]:
-        """Heights that 1 and 99 % of the voxels written lie below, to half a metre."""
+        """Heights (m) below which 1 and 99 % of the written voxels lie, to 0.5 m."""
         return self._heights.span(*SHARES)
 
     def intensity_span(self) -> tuple[float, float]:
-        """Intensities that 1 and 99 % of the voxels written have less than, to 9 %."""
+        """Intensities below which those of 1 and 99 % of the written voxels lie, to 9 %."""
         return self._intensities.span(*SHARES)
 
     def _append(self, tile: Tile, voxels: np.ndarray) -> None:
@@ -102,19 +102,19 @@ class Tiles:
 
 
 def corner(tile: Tile) -> np.ndarray:
-    """Where the tile begins, (x, y, 0) in metres of the world."""
+    """Corner (x, y, 0) of the tile in the world (m)."""
     return np.array([tile[0] * TILE_M, tile[1] * TILE_M, 0.0])
 
 
 def distance_m(tile: Tile, place: np.ndarray) -> float:
-    """From a place to the nearest of a tile, seen from above; 0 within."""
+    """Horizontal distance from a place to the nearest point of a tile; 0 within it."""
     low = corner(tile)[:2]
     outside = np.maximum(np.maximum(low - place[:2], place[:2] - low - TILE_M), 0.0)
     return math.hypot(*outside)
 
 
 def _groups(tiles: np.ndarray) -> Iterator[tuple[Tile, Indices]]:
-    """Each different tile, and the rows that it is in."""
+    """Each distinct tile, and its rows."""
     order = np.lexsort(tiles.T)
     starts = np.flatnonzero(np.append(True, np.any(np.diff(tiles[order], axis=0), axis=1)))
     for rows in np.split(order, starts[1:]):

@@ -1,9 +1,10 @@
-"""What keyframes saw through: a voxel where others' rays passed on their way to something farther does not last.
+"""Visibility: which points of the map other keyframes see through.
 
-Each keyframe leaves a picture of how far it saw in each direction. A place is then asked of all keyframes near it:
-those that measured a return there confirm it, those whose return lies well behind saw through it, and those whose
-return lies before it know nothing. This is visibility as in Pomerleau et al., "Long-term 3D map maintenance in dynamic
-environments" (ICRA 2014), by pictures as in Kim and Kim, "Remove, then Revert" (IROS 2020).
+Each keyframe has a range image: the range of the nearest point in each direction. A map point is compared with the
+range images of all keyframes near it. A keyframe confirms the point if its range is similar, sees through the point
+if its range is clearly larger, and gives no information if its range is smaller. Visibility as in Pomerleau et al.,
+"Long-term 3D map maintenance in dynamic environments" (ICRA 2014); range images as in Kim and Kim, "Remove, then
+Revert" (IROS 2020).
 """
 
 import math
@@ -15,41 +16,41 @@ from segslam.system.kernels import kernel
 from segslam.types import Points
 
 CELL_RAD = math.radians(0.5)
-"""Chosen: beams of a 64-beam sensor lie 0.4 degrees apart."""
+"""Chosen: the beams of a 64-beam sensor are 0.4 degrees apart."""
 NUM_COLUMNS = 720
 NUM_ROWS = 180
 """45 degrees down to 45 degrees up."""
 STEP_M = 0.01
 NOTHING = 65535
-"""Value of a direction without a return, which is unknown. Ranges are multiples of STEP_M, at most 655 m."""
+"""Value of a pixel without points, i.e. unknown. Ranges are multiples of STEP_M, at most 655 m."""
 MIN_RANGE_M = 1.0
 MAX_SPREAD_CELLS = 12
-"""A near point stands for at most so many cells to each side."""
+"""Largest number of pixels that a near point covers to each side."""
 
 
 class Views:
-    """The pictures of all keyframes, on disk."""
+    """The range images of all keyframes, on disk."""
 
     def __init__(self, file: Path, *, spread_m: float) -> None:
-        """A point stands for all directions within `spread_m` of it: keyframes are thinned."""
+        """A point covers all directions within `spread_m` of it, because keyframes are downsampled."""
         self._file = file
         self._spread_m = spread_m
         file.touch()
 
     def add(self, points: Points) -> None:
-        """Points of the next keyframe, in its own frame."""
+        """Add the points (n, 3) of the next keyframe, in its own frame."""
         with self._file.open("ab") as stream:
             view(points.astype(np.float32), self._spread_m).tofile(stream)
 
     def __getitem__(self, number: int) -> np.ndarray:
-        """(NUM_ROWS, NUM_COLUMNS) uint16, of the keyframe that was added as number 0, 1, ..."""
+        """(NUM_ROWS, NUM_COLUMNS) uint16, the range image of the keyframe added as number 0, 1, ..."""
         cells = NUM_ROWS * NUM_COLUMNS
         return np.fromfile(self._file, np.uint16, cells, offset=2 * cells * number).reshape(NUM_ROWS, NUM_COLUMNS)
 
 
 @kernel("UniTuple(float64, 3)(float64, float64, float64)")
 def _direction(x, y, z):
-    """Row and column, as fractions, and distance."""
+    """Row and column, as fractions, and range."""
     across = math.sqrt(x * x + y * y)
     row = math.atan2(z, across) / CELL_RAD + NUM_ROWS / 2
     column = (math.atan2(y, x) + math.pi) / CELL_RAD
@@ -58,7 +59,7 @@ def _direction(x, y, z):
 
 @kernel("uint16[:, :](float32[:, :], float64)")
 def view(points, spread_m):
-    """The nearest return in each direction, in STEP_M; each point counts for all cells within `spread_m` of it."""
+    """Range image in units of STEP_M; each point covers all pixels within `spread_m` of it."""
     nearest = np.full((NUM_ROWS, NUM_COLUMNS), NOTHING, np.uint16)
     for x, y, z in points:
         row, column, distance = _direction(x, y, z)
@@ -74,9 +75,9 @@ def view(points, spread_m):
 
 @kernel("void(float32[:, :], float64[:, :], uint16[:, :], float64[:], uint32[:, :])")
 def count_votes(points, T_view_points, nearest, limits, votes):
-    """Add one view's word on each point: column 0 of `votes` counts who confirms it, column 1 who saw through it.
+    """Add the votes of one range image to `votes`: confirmations in column 0, views through a point in column 1.
 
-    `limits`: farthest point asked about (m), and how far, in metres and per metre, a return may lie from the point.
+    `limits`: largest distance of a point from the keyframe (m); tolerance of its range, constant (m) and per metre.
     """
     T = T_view_points
     for i in range(len(points)):

@@ -1,4 +1,4 @@
-"""Voxels of one tile: a mean point and intensity, how many points they stand for, and the class of most of them."""
+"""Voxels of one tile: mean point and intensity, number of points, and most frequent class."""
 
 import numpy as np
 
@@ -6,17 +6,17 @@ from segslam.points import hash_keys
 from segslam.types import Indices
 
 VOXEL = np.dtype([("point", "<f4", 3), ("count", "<u4"), ("label", "u1"), ("intensity", "<f4")])
-"""`point` in metres: x and y from the tile's corner, z of the world."""
+"""`point` (m): x and y from the corner of the tile, z in the world."""
 NUM_LABELS = 32
-"""More than there are classes."""
+"""Larger than the number of classes."""
 MAX_HEIGHT_M = 2000.0
-"""Of any point, above or below the start."""
+"""Largest height of a point, above or below the origin."""
 
 
 def merged(voxels: np.ndarray, voxel_m: float) -> np.ndarray:
-    """VOXEL rows with those of one cell made one: their mean by count, and the class with most points.
+    """VOXEL rows, merged to one row per cell: means weighted by count, and the class with the most points.
 
-    Of classes with as many points the one with the lowest id. Cells are in the order in which they first occur.
+    Ties between classes are resolved to the smallest id. Cells are in the order of their first occurrence.
     """
     keys = _cell_keys(voxels["point"], voxel_m)
     cells = _numbered(keys)
@@ -40,14 +40,14 @@ def _cell_keys(points: np.ndarray, voxel_m: float) -> Indices:
 
 
 def _numbered(keys: Indices) -> Indices:
-    """0, 1, ... for each key in the order in which they first occur."""
+    """0, 1, ... for each key, in the order of first occurrence."""
     _, first = hash_keys(keys)
     is_first = first == np.arange(len(keys))
     return (np.cumsum(is_first) - 1)[first]
 
 
 def _commonest_labels(cells: Indices, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(num_cells,) uint8."""
+    """(num_cells,) uint8 label with the largest weight in each cell."""
     pairs = cells * NUM_LABELS + labels
     numbers = _numbered(pairs)
     counts = np.bincount(numbers, weights)

@@ -1,4 +1,4 @@
-"""The pose of each scan in the frame of the first: by KISS-ICP, or as given."""
+"""Odometry: the pose of each scan in the frame of the first, by KISS-ICP or from a given trajectory."""
 
 from segslam.odometry.apart import OdometryApart
 from segslam.odometry.given import GivenOdometry

@@ -1,4 +1,4 @@
-"""KISS-ICP in a process of its own: it holds Python's lock while it aligns, and other work would wait."""
+"""KISS-ICP in a separate process, because it holds Python's global lock while it aligns a scan."""
 
 import multiprocessing
 import signal
@@ -15,14 +15,14 @@ from segslam.system.memory import keep_freed_memory
 from segslam.types import Points, SegslamError, Transform
 
 MOST_SHARED = 2**18
-"""Points of a sweep that two processes hand over in memory they share, 6 MB; a larger sweep goes through the pipe."""
+"""Points that the two processes exchange in shared memory, 6 MB; larger sweeps are sent through the pipe."""
 
 
 class OdometryApart(KissOdometry):
-    """As `KissOdometry`; while a scan is aligned, the thread that asks waits with Python's lock released.
+    """`KissOdometry` in a separate process; while it aligns a scan, other threads of this process run.
 
-    Its process starts at once; close it, or leave its `with`, when no more scans follow. Every method raises
-    SegslamError if the process has ended. The process imports the script that is run, as all spawned ones do: a script
+    Its process starts at once. Call `close`, or leave the `with` block, after the last scan. Every method raises
+    SegslamError if the process has ended. The process imports the main script, as with every spawned process: a script
     that uses this class needs `if __name__ == "__main__":`.
     """
 
@@ -37,15 +37,15 @@ class OdometryApart(KissOdometry):
         self.close()
 
     def close(self) -> None:
-        """End the process; nothing is lost."""
+        """End the process; no results are lost."""
         self._apart.close()
 
 
 class _AlignerApart:
-    """A `KissAligner` in another process: points go there, poses come back. It has one request at a time."""
+    """A `KissAligner` in another process, which handles one request at a time."""
 
     def __init__(self, config: OdometryConfig) -> None:
-        context = multiprocessing.get_context("spawn")  # a fork would take along the locks of other threads
+        context = multiprocessing.get_context("spawn")  # a fork would copy locks held by other threads
         self._pipe, theirs = context.Pipe()
         shared = _room_for_points(context)
         self._shared = _as_points(shared)
@@ -54,7 +54,7 @@ class _AlignerApart:
         theirs.close()
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
-        """T_odom_lidar of the next sweep, `gap` intervals after the one before."""
+        """T_odom_lidar of the next sweep, `gap` intervals after the previous one."""
         return self._asked(gap, points)
 
     def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
@@ -68,7 +68,7 @@ class _AlignerApart:
         self._exchange((list(scans), T_odom_lidar, T_before_lidar))
 
     def _asked(self, known: Transform | float, points: Points | None) -> Transform:
-        """The pose of the sweep: the one given or, after a gap, the one it is found at."""
+        """The pose from the other process; `known` is the pose of the sweep, or the gap before it."""
         sent: Points | int | None = points
         if points is not None and len(points) <= len(self._shared):
             self._shared[: len(points)] = points
@@ -91,13 +91,13 @@ class _AlignerApart:
     def _ended(self) -> SegslamError:
         self._process.join(timeout=1.0)
         return SegslamError(
-            f"the odometry's process has ended (exit code {self._process.exitcode}; -9 is often want of memory); "
-            "go on by `segslam map --resume`"
+            f"the odometry process has ended (exit code {self._process.exitcode}; -9 is often a lack of memory); "
+            "continue with `segslam map --resume`"
         )
 
 
 def _room_for_points(context: SpawnContext) -> Any:
-    """Memory that two processes share; none where the system grants none, as where files may not be that large."""
+    """Memory shared by two processes; None if the system does not grant it."""
     try:
         return context.RawArray("d", 3 * MOST_SHARED)
     except OSError:
@@ -105,19 +105,18 @@ def _room_for_points(context: SpawnContext) -> Any:
 
 
 def _as_points(shared: Any) -> Points:
-    """The shared memory as rows of float64 coordinates; no row where there is none."""
+    """The shared memory as rows of float64 coordinates; no rows without shared memory."""
     return np.empty((0, 3)) if shared is None else np.frombuffer(shared).reshape(-1, 3)
 
 
 def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
-    """Until the other side closes: points with a gap are aligned, points with a pose restored; the pose is answered.
+    """Answer requests with a pose until the other side closes the pipe.
 
-    Three things are the arguments of `follow`.
-
-    The points come themselves, or their number where they are in the shared memory.
+    Points with a gap are aligned, points with a pose are restored, three values are the arguments of `follow`. Points
+    are sent themselves or, if they are in the shared memory, as their number.
     """
     keep_freed_memory()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the other side, which then closes
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and then closes the pipe
     aligner = KissAligner(config)
     shared_points = _as_points(shared)
     try:

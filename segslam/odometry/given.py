@@ -1,4 +1,4 @@
-"""The pose of each scan as another odometry gave it."""
+"""Odometry from a given trajectory."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -13,25 +13,25 @@ from segslam.types import BadScan, Points, Scan, Trajectory, Transform
 
 
 class GivenOdometry:
-    """The poses of another odometry, moved so that the first scan asked for has the identity."""
+    """The poses of a given trajectory, relative to the pose of the first registered scan."""
 
     is_from_scans = False
 
     def __init__(
         self, trajectory: Trajectory, config: OdometryConfig, *, match: Literal["scan_index", "stamp"] = "scan_index"
     ) -> None:
-        """`match`: a scan's row is found by its number, or by the nearest stamp within `config.stamp_tolerance_s`."""
+        """`match`: find the row of a scan by its number, or by the nearest stamp within `config.stamp_tolerance_s`."""
         self._config = config
         self._trajectory = trajectory
         self._rows = {int(scan_index): row for row, scan_index in enumerate(trajectory.scan_index)}
         self._row = self._row_of_scan if match == "scan_index" else self._row_of_stamp
         self._T_odom_given: Transform | None = None
-        """Moves the trajectory to the odometry's frame."""
+        """Transform from the frame of the trajectory to the odometry's frame."""
         self._T_given_last = np.eye(4)
         self._T_odom_last = np.eye(4)
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
-        """The pose and the kept points of a scan. Raises BadScan if it has no pose or no point within range."""
+        """The pose and the cropped points of a scan. Raises BadScan if it has no pose, or no point within range."""
         T_given_lidar = self._trajectory.T_world_lidar[self._row(scan)]
         T_odom_given = geometry.inverse(T_given_lidar) if self._T_odom_given is None else self._T_odom_given
         T_odom_lidar = T_odom_given @ T_given_lidar
@@ -42,7 +42,7 @@ class GivenOdometry:
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
     def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan], *, since: Followed | None = None) -> None:
-        """Go on after the scans that were given these poses; the first of them is read, with `scan_of`."""
+        """Continue after the scans with these poses (n, 4, 4); only the first scan is read, with `scan_of`."""
         row = 0 if since is None else since[0]
         T_given_lidar = self._trajectory.T_world_lidar[self._row(scan_of(row))]
         T_first_given = geometry.inverse(T_given_lidar)
@@ -53,15 +53,15 @@ class GivenOdometry:
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
-        """Go on from another pose of the last scan."""
+        """Continue from another pose of the last scan."""
         self._T_odom_given = T_odom_lidar @ geometry.inverse(self._T_given_last)
         self._T_odom_last = T_odom_lidar
 
     def _row_of_scan(self, scan: Scan) -> int:
         if scan.index not in self._rows:
             raise BadScan(
-                f"scan {scan.index}: the odometry given has no pose for it "
-                f"(it has {_span(self._trajectory.scan_index)}); leave the scan out or give a longer trajectory"
+                f"scan {scan.index}: the given odometry has no pose for it "
+                f"(it has {_span(self._trajectory.scan_index)}); omit the scan or give a longer trajectory"
             )
         return self._rows[scan.index]
 
@@ -70,9 +70,9 @@ class GivenOdometry:
         row = int(np.argmin(apart_ns)) if len(apart_ns) else -1
         if row < 0 or apart_ns[row] > self._config.stamp_tolerance_s * 1e9:
             raise BadScan(
-                f"scan {scan.index}: the odometry given has no pose within {self._config.stamp_tolerance_s} s of its "
+                f"scan {scan.index}: the given odometry has no pose within {self._config.stamp_tolerance_s} s of its "
                 f"stamp {scan.stamp_ns} ns (it has {_span(self._trajectory.stamp_ns)}); "
-                "leave the scan out, correct the stamps or raise odometry.stamp_tolerance_s"
+                "omit the scan, correct the stamps or raise odometry.stamp_tolerance_s"
             )
         return row
 

@@ -1,4 +1,4 @@
-"""KISS-ICP (Vizzo et al., RA-L 2023), by its authors' package."""
+"""KISS-ICP (Vizzo et al., RA-L 2023), using the package of its authors."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
@@ -17,14 +17,14 @@ from segslam.types import Points, Scan, Transform
 
 @runtime_checkable
 class Aligner(Protocol):
-    """Aligns sweep after sweep with a local map of those before; here or in another process."""
+    """Aligns consecutive sweeps with a local map of the previous ones, in this process or in another."""
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
-        """T_odom_lidar of the next sweep, from its points, float64, `gap` intervals after the one before."""
+        """T_odom_lidar of the next sweep from its points (n, 3), float64, `gap` intervals after the previous one."""
         ...
 
     def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
-        """As if the next sweep had been aligned there; without points where all have left the local map since."""
+        """Set the state after aligning a sweep at this pose; `points`: None if the local map has dropped them all."""
         ...
 
     def follow(
@@ -35,7 +35,7 @@ class Aligner(Protocol):
 
 
 class KissAligner:
-    """KISS-ICP's own. Several threads add up in any order: poses repeat to 1e-9 m, on one to the bit."""
+    """KISS-ICP's aligner. Its threads sum in any order: poses repeat to 1e-9 m, with one thread exactly."""
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
@@ -44,7 +44,7 @@ class KissAligner:
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
-        """As `Odometry.follow`: nothing is left of the state before."""
+        """As `Odometry.follow`: the previous state is discarded."""
         self._kiss = kiss = KissICP(_kiss_config(self._config))
         for T_odom_scan, points in scans:
             kiss.local_map.update(points.astype(np.float64), T_odom_scan)
@@ -52,9 +52,10 @@ class KissAligner:
         kiss.last_delta = np.array(T_before_lidar)
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
-        """T_odom_lidar of the next sweep, from its points, float64.
+        """T_odom_lidar of the next sweep from its points (n, 3), float64.
 
-        KISS-ICP predicts by the last motion, here scaled to `gap` intervals and after that back to one.
+        KISS-ICP predicts with the last motion; here it is scaled to `gap` intervals, and back to one interval
+        afterwards.
         """
         kiss = self._kiss
         kiss.last_delta = geometry.scaled(kiss.last_delta, gap)
@@ -63,7 +64,7 @@ class KissAligner:
         return np.array(kiss.last_pose)
 
     def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
-        """As if the next sweep had been aligned there; without points where all have left the local map since."""
+        """Set the state after aligning a sweep at this pose; `points`: None if the local map has dropped them all."""
         kiss = self._kiss
         if points is not None:
             kiss.local_map.update(kiss.voxelize(points)[1], T_odom_lidar)
@@ -74,7 +75,7 @@ class KissAligner:
 
 
 class KissOdometry:
-    """Scan to local map: the scan made ready, and a pose from the aligner, KISS-ICP's in this process unless given."""
+    """Scan-to-map odometry: deskews and crops scans and aligns them, by default with KISS-ICP in this process."""
 
     is_from_scans = True
 
@@ -84,9 +85,9 @@ class KissOdometry:
         self._T_odom_last = self._T_last_lidar = np.eye(4)
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
-        """The pose and the kept points of the next scan, in order of time, `gap` intervals after the one before.
+        """The pose and the cropped points of the next scan, in order of time, `gap` intervals after the previous one.
 
-        Raises BadScan, and forgets the scan, if none of its points is within range.
+        Raises BadScan, and ignores the scan, if none of its points is within range.
         """
         points, labels, intensities = deskew_scan(scan, self._T_last_lidar, self._config)
         T_odom_lidar = self._aligner.align(points, gap)
@@ -95,10 +96,10 @@ class KissOdometry:
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
     def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan], *, since: Followed | None = None) -> None:
-        """The state, to the bit, that registering the scans of these poses has left. `scan_of` reads the scan of a row.
+        """Set the exact state after registering scans with these poses (n, 4, 4). `scan_of` reads the scan of a row.
 
-        Read are those that can have left points in the local map: it forgets what lies farther than its range, so a
-        scan taken at twice the range from the last, and all before it, have nothing in it.
+        Only scans that can have points in the local map are read: the map drops points beyond its range, so all scans
+        up to the last one that is more than twice this range away are skipped.
         """
         done = 0
         if since is not None:
@@ -117,7 +118,7 @@ class KissOdometry:
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
-        """Go on from another pose of the last scan, with a local map of these scans alone."""
+        """Continue from another pose of the last scan, with a local map of these scans alone."""
         self._aligner.follow(scans, T_odom_lidar, T_before_lidar)
         self._T_odom_last, self._T_last_lidar = T_odom_lidar, T_before_lidar
 
@@ -127,13 +128,13 @@ class KissOdometry:
 
 
 def _since(T_odom_last: Transform, T_odom_lidar: Transform) -> Transform:
-    """The motion, inverted as by KISS-ICP: the same bits."""
+    """The relative motion, inverted as in KISS-ICP: bitwise equal results."""
     T_last_lidar: Transform = np.linalg.inv(T_odom_last) @ T_odom_lidar
     return T_last_lidar
 
 
 def _kiss_config(config: OdometryConfig) -> KISSConfig:
-    """Every section is given: KISS-ICP would read a missing one from the environment."""
+    """The configuration of KISS-ICP with all sections: it would read missing ones from the environment."""
     return KISSConfig(
         data=DataConfig(max_range=config.max_range_m, min_range=config.min_range_m, deskew=False),
         mapping=MappingConfig(voxel_size=config.voxel_size_m),

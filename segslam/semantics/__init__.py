@@ -1,4 +1,4 @@
-"""Where labels come from."""
+"""Point labels from files, from geometry or from a neural network."""
 
 from segslam.semantics.geometric import geometric_labels
 

@@ -1,4 +1,4 @@
-"""Square cells seen from above."""
+"""Square grid cells in the x-y plane."""
 
 import numpy as np
 
@@ -6,9 +6,9 @@ from segslam.types import IndexPairs, Points, Vector
 
 
 def cells_above(points: Points, cell_m: float, *, border: int) -> tuple[IndexPairs, Vector, tuple[int, int]]:
-    """The cell of each point, the corner of the grid (m, a whole number of cells), and the grid's shape.
+    """The cell (n, 2) of each point, the corner of the grid (m), and the number of rows and columns.
 
-    The grid holds all points and `border` empty cells around them, so that neighbourhoods that wide never leave it.
+    The grid contains all points and a margin of `border` empty cells.
     """
     whole = [np.floor(points[:, axis] / cell_m) for axis in (0, 1)]
     first = np.array([column.min() if len(points) else 0.0 for column in whole]) - border

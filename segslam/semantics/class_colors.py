@@ -1,4 +1,4 @@
-"""A colour for each class, the same in maps, logs and viewers."""
+"""Colours of the classes, the same in maps, logs and viewers."""
 
 import numpy as np
 from jaxtyping import UInt8
@@ -27,10 +27,10 @@ COLORS = {
     Label.POLE: "#f4e58c",
     Label.TRAFFIC_SIGN: "#ff4f3f",
 }
-"""Of what a map keeps; own choice, kinds of ground in violet and green, vehicles in blue."""
+"""Chosen, for the classes that maps contain: ground in violet and green, vehicles in blue."""
 
 Colors = UInt8[np.ndarray, "_ 3"]
-"""Red, green, blue."""
+"""Red, green and blue, one row per point."""
 
 
 def of_classes(labels: Labels) -> Colors:

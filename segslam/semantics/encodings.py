@@ -1,8 +1,8 @@
-"""The three numberings of SemanticKITTI's classes that label files are met in, and which of them a file uses.
+"""The three encodings of SemanticKITTI's classes in label files, and their detection.
 
-`raw`: the ids of the data set's annotation (Behley et al. 2019), 0-99 and 252-259. `learning`: the 19 classes of its
-benchmark as 1-19, 0 = unlabelled, and 20-25 for what moves. `learning-0`: predictions without the unlabelled class, so
-each one less, 0-18.
+`raw`: the ids of the annotation (Behley et al. 2019), 0-99 and 252-259. `learning`: the 19 classes of the benchmark
+as 1-19, 0 = unlabelled, and 20-25 for moving classes. `learning-0`: predictions without the unlabelled class, i.e.
+the learning ids minus one, 0-18.
 """
 
 from typing import Literal, get_args
@@ -13,16 +13,14 @@ from jaxtyping import Int, Integer
 from segslam.types import Label, Labels, SegslamError
 
 Ids = Integer[np.ndarray, "_"]
-"""Ids as a file holds them, one a point."""
+"""Class ids as a file stores them, one per point."""
 Histogram = Int[np.ndarray, "_"]
-"""Points of each id: `np.bincount` of ids."""
+"""Number of points of each id: `np.bincount` of the ids."""
 Encoding = Literal["raw", "learning", "learning-0"]
 ENCODINGS: tuple[Encoding, ...] = get_args(Encoding)
 
-UNKNOWN = 255  # in the tables below: no such id
-RAW: dict[
-    Label, tuple[int, ...]
-] = {  # the benchmark's `learning_map`, from the class that counts to the ids that go into it
+UNKNOWN = 255  # entry of the tables below for ids that do not exist
+RAW: dict[Label, tuple[int, ...]] = {  # the `learning_map` of the benchmark, inverted: class -> raw ids
     Label.UNLABELLED: (0, 1, 52, 99),
     Label.CAR: (10,),
     Label.BICYCLE: (11,),
@@ -51,27 +49,27 @@ RAW: dict[
     Label.MOVING_TRUCK: (258,),
 }
 RAW_OF_LABEL = np.array([RAW[label][0] for label in Label], dtype=np.uint32)
-"""The raw id to write for each label; buses, road markings and the like are written as what they were merged into."""
+"""The raw id that is written for each label; merged classes such as buses are written as the class they merge into."""
 
 RARE = (Label.BICYCLE, Label.MOTORCYCLE, Label.BICYCLIST, Label.MOTORCYCLIST)
 RARE_MAX_SHARE = (
     0.02  # chosen: together they have 0.1 % of the data set's points, and under 0.1 % of each real scan tried
 )
-ROAD_MIN_SHARE = 0.02  # chosen: the real scans of KITTI 00 have 20 to 28 % of it
+ROAD_MIN_SHARE = 0.02  # chosen: the real scans of KITTI 00 contain 20 to 28 %
 
 
 def to_labels(ids: Ids, encoding: Encoding) -> Labels:
-    """The labels of ids. Raises SegslamError for an id that the encoding does not have."""
+    """The labels of ids. Raises SegslamError for an id that the encoding does not contain."""
     table = _TABLES[encoding]
     labels = table[np.minimum(ids, len(table) - 1)]
     unknown = labels == UNKNOWN
     if unknown.any():
-        raise SegslamError(f"id {ids[unknown][0]} is none of the encoding {encoding}; give the right one by --encoding")
+        raise SegslamError(f"id {ids[unknown][0]} is not in the encoding {encoding}; give the right one by --encoding")
     return labels
 
 
 def to_ids(labels: Labels, encoding: Encoding) -> Ids:
-    """The ids of labels, as a file holds them. Raises SegslamError for a label that the encoding does not have."""
+    """The ids of labels, as a file stores them. Raises SegslamError for a label that the encoding does not contain."""
     if encoding == "raw":
         return RAW_OF_LABEL[labels]
     if encoding == "learning":
@@ -80,17 +78,17 @@ def to_ids(labels: Labels, encoding: Encoding) -> Ids:
     if missing.any():
         name = Label(labels[missing][0]).name.lower()
         raise SegslamError(
-            f"the encoding {encoding} has no id for {name} ({missing.sum()} points); take raw or learning"
+            f"the encoding {encoding} has no id for {name} ({missing.sum()} points); use raw or learning"
         )
     return labels.astype(np.uint32) - 1
 
 
 def detect_encoding(num_points_of_id: Histogram) -> Encoding:
-    """The encoding that ids seen in some scans can only be in; `num_points_of_id` counts the points of each id.
+    """The only encoding that fits the ids of some scans; `num_points_of_id` counts the points of each id.
 
-    An id may belong to one encoding only. Where all of them belong to several, the scene decides: an encoding is out if
-    it turns more than 2 % of the points into two-wheelers, or leaves less than 2 % for the road. Raises SegslamError,
-    with the reason, if not exactly one encoding remains.
+    An encoding is excluded if it does not contain all ids. If several remain, an encoding is also excluded if more than
+    2 % of the points would be two-wheelers, or less than 2 % road. Raises SegslamError, with the reason, unless exactly
+    one encoding remains.
     """
     ids = np.flatnonzero(num_points_of_id)
     possible = [encoding for encoding in ENCODINGS if _has_all(encoding, ids)]
@@ -114,8 +112,8 @@ def _looks_like_a_street(num_points_of_id: Histogram, encoding: Encoding) -> boo
 def _why_undecided(ids: Ids) -> str:
     fitting = [encoding for encoding in ENCODINGS if _has_all(encoding, ids)]
     if not fitting:
-        return "no encoding has all of them"
-    return f"they fit {' and '.join(fitting)}, and the share of road and two-wheelers speaks for no single one"
+        return "no encoding contains all of them"
+    return f"they fit {' and '.join(fitting)}, and the shares of road and two-wheelers do not decide between these"
 
 
 def _has_all(encoding: Encoding, ids: Ids) -> bool:
@@ -124,7 +122,7 @@ def _has_all(encoding: Encoding, ids: Ids) -> bool:
 
 
 def _table(label_of_id: dict[int, Label]) -> Labels:
-    """Label of each id; UNKNOWN where there is none, and in one more row at the end for all ids beyond."""
+    """Label of each id; UNKNOWN for missing ids. The last row stands for all larger ids."""
     table = np.full(max(label_of_id) + 2, UNKNOWN, dtype=np.uint8)
     for value, label in label_of_id.items():
         table[value] = label

@@ -1,6 +1,6 @@
-"""Labels from shape alone: ground, poles, small solids, cars, walls, and the rough rest.
+"""Labels from geometry alone: ground, poles, small solid objects, cars, walls, and other objects.
 
-They serve to find the same things again from elsewhere, so that they are repeatable matters more than what they mean.
+Loop closing needs labels that are the same in every scan of a place; whether the class is correct matters less.
 """
 
 import numpy as np
@@ -15,16 +15,16 @@ from segslam.semantics.walls import on_walls
 from segslam.types import Label, Labels, Mask, Points, Vector
 
 COLUMN_M = 0.1
-"""Chosen: a post is some cells wide, and neighbouring points on it are rarely farther apart within 40 m."""
+"""Chosen: a post is some cells wide, and points on it are rarely farther apart at ranges below 40 m."""
 
 
 def geometric_labels(points: Points, *, config: GeometricLabelsConfig) -> Labels:
-    """A class for each point of a scan in the LiDAR frame, from shape alone. It does not depend on the points' order.
+    """A class for each point (n, 3) of a scan in the LiDAR frame, independent of the order of the points.
 
-    ROAD for the ground, POLE for thin upright things, TRUNK for small solids (young trees, bushes, signs), both only
-    within a band of heights so that their centres keep still; CAR for boxes of that size, BUILDING for walls,
-    VEGETATION for what else stands above the ground. UNLABELLED where points are not finite or out of range. The
-    sensor may lean.
+    ROAD: ground. POLE: thin vertical objects. TRUNK: small solid objects (young trees, bushes, signs). Poles and trunks
+    are limited to a band of heights, so that their centres are repeatable. CAR: boxes of the size of a car.
+    BUILDING: walls. VEGETATION: all other objects above the ground. UNLABELLED: points that are not finite or out of
+    range. The sensor may be tilted by up to 40 degrees.
     """
     labels = np.full(len(points), Label.UNLABELLED, np.uint8)
     usable = within_range(points, 0.0, config.max_range_m)
@@ -46,7 +46,7 @@ def _labels_of_level(level: Points, config: GeometricLabelsConfig) -> Labels:
 
 
 def _poles(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
-    """POLE for the points of thin upright things, VEGETATION for the rest."""
+    """POLE for the points of thin vertical objects, VEGETATION for the others."""
     low, high = config.band_m
     slice_m = (high - low) / NUM_SLICES
     ring = round(config.pole_clear_m / COLUMN_M)
@@ -69,7 +69,7 @@ def _poles(points: Points, heights: Vector, config: GeometricLabelsConfig) -> La
 
 
 def _solids(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
-    """TRUNK and CAR for the points of pieces of that size, VEGETATION for the rest."""
+    """TRUNK and CAR for the points of segments of these sizes, VEGETATION for the others."""
     in_band = _within(heights, config.band_m)
     found = pieces(points, heights, in_band)
     is_trunk = (found.top_m >= config.trunk_min_m) & (found.length_m <= config.trunk_max_m)
@@ -81,21 +81,21 @@ def _solids(points: Points, heights: Vector, config: GeometricLabelsConfig) -> L
 
 
 def _walls(points: Points, heights: Vector, config: GeometricLabelsConfig) -> Labels:
-    """BUILDING for points on vertical faces, VEGETATION for the rest."""
+    """BUILDING for points on vertical surfaces, VEGETATION for the others."""
     walls = on_walls(points, heights, thickness_m=config.wall_thickness_m, min_top_m=config.wall_min_top_m)
     return np.where(walls, np.uint8(Label.BUILDING), np.uint8(Label.VEGETATION))
 
 
 def _most_seen(found: Pieces, suitable: Mask, config: GeometricLabelsConfig) -> Mask:
-    """The suitable pieces with most points, at most `max_things`, or more where the last are equal."""
+    """The suitable segments with the most points: at most `max_things`, or more if the last ones have equal counts."""
     counts = np.sort(found.num_points[suitable])
     least = max(config.min_points, counts[-config.max_things]) if len(counts) > config.max_things else config.min_points
     return suitable & (found.num_points >= least)
 
 
 def _labelled(found: Pieces, chosen: Mask, eligible: Mask, label: Label) -> Labels:
-    """`label` for the eligible points that stand in a chosen piece, VEGETATION for the rest."""
-    in_chosen = np.append(chosen, False)[found.of_point]  # points in no piece have the number -1
+    """`label` for the eligible points of the chosen segments, VEGETATION for the others."""
+    in_chosen = np.append(chosen, False)[found.of_point]  # points without a segment have the number -1
     return np.where(in_chosen & eligible, np.uint8(label), np.uint8(Label.VEGETATION))
 
 

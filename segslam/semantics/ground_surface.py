@@ -1,8 +1,8 @@
-"""The ground of one scan: which way is up, and how high each point stands above it.
+"""The ground of one scan: its vertical direction, and the height of each point above it.
 
-The surface under the sensor is followed outwards cell by cell: each cell looks for its lowest points near the height
-that its neighbours nearer to the sensor expect, so that other levels, roofs and reflections below the road are
-passed by.
+The ground is traced outwards from below the sensor, cell by cell. The height of a cell is that of its lowest points
+near the height predicted from the neighbours nearer to the sensor. Other storeys, roofs and reflections below the
+road are thereby ignored.
 """
 
 from functools import cache
@@ -14,20 +14,21 @@ from segslam.system.kernels import kernel
 from segslam.types import Indices, Points, Rotation, Vector
 
 MAX_TILT_DEG = 40.0
-"""Chosen: the sensor in the hand of the courtyard recording leans up to 33 degrees."""
+"""Chosen: the hand-held sensor of the courtyard recording is tilted by up to 33 degrees."""
 LEVEL_RADIUS_M = 15.0
-"""Chosen: the ground this near decides which way is up."""
+"""Chosen: the vertical direction is estimated from the ground within this radius."""
 LEVEL_BIN_M = 0.2
-"""Chosen: ground within such a layer votes for the same plane."""
+"""Chosen: thickness of a layer whose points count for the same plane."""
 MIN_LEVEL_CELLS = 10
 SURFACE_M = 0.15
-"""Chosen: the lowest points of a cell, this deep, make its height."""
+"""Chosen: the height of a cell is the mean of its lowest points within this height."""
 
 
 def upright(points: Points) -> Rotation:
-    """R_level_lidar: the smallest turn that makes the widest nearly horizontal surface below the sensor level.
+    """R_level_lidar: the smallest rotation that makes the largest nearly horizontal surface below the sensor level.
 
-    Points are finite. Searches tilts up to 40 degrees; the identity where fewer than 10 square metres are seen there.
+    The points (n, 3) must be finite. Tilts up to 40 degrees are searched. Returns the identity if less than 10 square
+    metres of such a surface are visible.
     """
     lowest = _lowest_of_cells(points, LEVEL_RADIUS_M)
     if len(lowest) < MIN_LEVEL_CELLS:
@@ -42,15 +43,15 @@ def upright(points: Points) -> Rotation:
 
 
 def turned(points: Points, R_a_b: Rotation) -> Points:
-    """Points of b in a, float64. Unlike a product of matrices, each row comes out the same wherever it stands."""
+    """Points of frame b in frame a, float64. Unlike with a matrix product, equal rows give exactly equal results."""
     return np.column_stack([_along(points, row) for row in R_a_b])
 
 
 def heights_above_ground(points: Points, *, cell_m: float, max_range_m: float, max_slope: float) -> Vector:
-    """Height of each point above the ground below it (m), for points in a level frame, the sensor at the origin.
+    """Height (n,) of each point above the ground (m), for points in a level frame with the sensor at the origin.
 
-    Points farther than `max_range_m` in x or y are measured from the nearest cell of the border. Where no ground was
-    seen it goes on as high as it was on the way there from the sensor.
+    Points farther than `max_range_m` in x or y use the nearest cell of the border. Cells without visible ground
+    take the height of their neighbours nearer to the sensor.
     """
     half = int(np.ceil(max_range_m / cell_m))
     cells = np.clip(np.floor(points[:, :2] / cell_m).astype(np.int64) + half, 0, 2 * half - 1)
@@ -68,7 +69,7 @@ def _along(points: Points, direction: np.ndarray) -> Vector:
 
 @kernel("float64[:, :](float64[:, ::1], float64)")
 def _lowest_of_cells(points, radius_m):
-    """The lowest point of each square metre within a radius of the sensor; of equals the first by x, then y."""
+    """The lowest point of each square metre within a radius of the sensor; ties are resolved by x, then y."""
     half = int(np.ceil(radius_m))
     lowest = np.full((4 * half * half, 3), np.inf)
     for k in range(len(points)):
@@ -83,7 +84,7 @@ def _lowest_of_cells(points, radius_m):
 
 
 def _most_voted_plane(points: Points) -> tuple[np.ndarray, float]:
-    """Normal and height along it of the plane below the sensor near which most points lie."""
+    """Unit normal of the plane below the sensor with the most points, and its height along the normal."""
     normals = _upward_normals()
     votes = _votes(points, normals, LEVEL_BIN_M, int(LEVEL_RADIUS_M / LEVEL_BIN_M))
     best, depth = np.unravel_index(int(np.argmax(votes)), votes.shape)
@@ -92,7 +93,7 @@ def _most_voted_plane(points: Points) -> tuple[np.ndarray, float]:
 
 @kernel("int64[:, ::1](float64[:, :], float64[:, ::1], float64, int64)")
 def _votes(points, normals, bin_m, num_bins):
-    """How many points lie in each bin of depth below the sensor, along each normal; none in the bin it touches."""
+    """Number of points in each bin of depth below the sensor, for each normal. Bins above the sensor stay empty."""
     votes = np.zeros((len(normals), num_bins), np.int64)
     for n in range(len(normals)):
         x, y, z = normals[n]
@@ -105,7 +106,7 @@ def _votes(points, normals, bin_m, num_bins):
 
 @cache
 def _upward_normals() -> Points:
-    """Unit vectors within MAX_TILT_DEG of z, some 4 degrees apart, the least tilted first."""
+    """Unit vectors within MAX_TILT_DEG of z, about 4 degrees apart, in the order of their tilt."""
     step = np.radians(4.0)
     normals = [(0.0, 0.0, 1.0)]
     for tilt in np.arange(step, np.radians(MAX_TILT_DEG) + step / 2, step):
@@ -115,7 +116,7 @@ def _upward_normals() -> Points:
 
 
 def _plane(points: Points) -> tuple[np.ndarray, float]:
-    """Upward unit normal and height along it of the plane through points, by least squares."""
+    """Upward unit normal of the least-squares plane through points, and its height along the normal."""
     mean = points.mean(axis=0)
     normal = np.linalg.eigh(np.cov(points.T))[1][:, 0]
     normal = normal if normal[2] > 0 else -normal
@@ -124,7 +125,7 @@ def _plane(points: Points) -> tuple[np.ndarray, float]:
 
 @kernel("UniTuple(int64[::1], 2)(int64[::1], int64)")
 def _grouped(group, num_groups):
-    """Rows sorted by group, by counting, and where each group starts (num_groups + 1 values)."""
+    """Rows sorted by group (counting sort), and the start of each group (num_groups + 1 values)."""
     starts = np.zeros(num_groups + 1, np.int64)
     for k in range(len(group)):
         starts[group[k] + 1] += 1
@@ -139,13 +140,13 @@ def _grouped(group, num_groups):
 
 @cache
 def _outward(half: int) -> Indices:
-    """Cells of the grid by distance from the sensor, nearest first; the same for every scan."""
+    """Cells of the grid by distance from the sensor, nearest first."""
     squared = (2 * np.arange(-half, half) + 1) ** 2
     return np.argsort((squared[:, None] + squared).ravel(), kind="stable")
 
 
 def _start_height(z: Vector, starts: Indices, half: int, cell_m: float) -> float:
-    """Height of the ground at the sensor: the 10th percentile of what lies below it within 8 m; -1.7 m if nothing."""
+    """Height of the ground at the sensor: 10th percentile of the points below it within 8 m; -1.7 m without points."""
     reach = min(int(8.0 / cell_m), half)
     rows = 2 * half * np.arange(half - reach, half + reach) + half
     near = [z[first:last] for first, last in zip(starts[rows - reach], starts[rows + reach], strict=True)]
@@ -159,7 +160,7 @@ def _follow(z, starts, outward, height_below_sensor, half, cell_m, max_slope):
     """Ground height of each cell, (2 half, 2 half)."""
     side = 2 * half
     height = np.full((side, side), np.nan)
-    gap = np.zeros((side, side))  # cells since ground was last seen on the way here
+    gap = np.zeros((side, side))  # cells since ground was last observed on the way here
     for flat in outward:
         i, j = flat // side, flat % side
         expected, reach = _expected(height, gap, i, j, half)
@@ -177,7 +178,7 @@ def _follow(z, starts, outward, height_below_sensor, half, cell_m, max_slope):
 
 @kernel("UniTuple(float64, 2)(float64[:, ::1], float64[:, ::1], int64, int64, int64)")
 def _expected(height, gap, i, j, half):
-    """Mean height of the neighbours nearer to the sensor, those that saw ground first, and the least of their gaps."""
+    """Mean height of the neighbours nearer to the sensor, preferably observed ones, and the smallest of their gaps."""
     side = 2 * half
     distance = (2 * (i - half) + 1) ** 2 + (2 * (j - half) + 1) ** 2
     total, weight, least_gap = 0.0, 0.0, np.inf
@@ -195,12 +196,12 @@ def _expected(height, gap, i, j, half):
 
 @kernel("float64(float64[::1], float64, float64)")
 def _lowest_surface(z, low, high):
-    """Mean height of the lowest SURFACE_M that are occupied between two bounds; NaN where nothing is."""
+    """Mean height of the lowest occupied SURFACE_M between two bounds; NaN if there are no points."""
     lowest = np.inf
     for value in z:
         if low < value < high:
             lowest = min(lowest, value)
-    total_um, count = 0, 0  # whole micrometres: such sums do not depend on the points' order
+    total_um, count = 0, 0  # integer micrometres: the sum does not depend on the order of the points
     for value in z:
         if lowest <= value < min(lowest + SURFACE_M, high):
             total_um += round(value * 1e6)
@@ -210,7 +211,7 @@ def _lowest_surface(z, low, high):
 
 @kernel("float64[::1](float64[:, ::1], float64[:, ::1], int64, float64)")
 def _interpolate(points, surface, half, cell_m):
-    """Bilinear height of the surface below each point."""
+    """Height of the surface below each point, bilinear."""
     heights = np.empty(len(points))
     last = 2 * half - 1
     for k in range(len(points)):

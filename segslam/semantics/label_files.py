@@ -1,4 +1,4 @@
-"""Labels from files: SemanticKITTI's `.label` format, one file a scan with the scan's name, in any of the encodings."""
+"""Labels from `.label` files (SemanticKITTI): one file per scan, named like the scan, in any of the encodings."""
 
 import logging
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from segslam.types import BadScan, Label, Labels, Mask, Points, ScanLabels, Segs
 logger = logging.getLogger(__name__)
 
 NETWORK = "network:"
-FILES_LOOKED_AT = 8  # chosen: number of files that the encoding is detected from, spread over the drive
+FILES_LOOKED_AT = 8  # chosen: number of files, spread over the drive, from which the encoding is detected
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +27,9 @@ class LabelFiles:
     encoding: Encoding
 
     def read(self, name: str, num_points: int) -> Labels:
-        """The labels of the scan `name`, all UNLABELLED if it has no file.
+        """The labels of the scan `name`; all UNLABELLED if it has no file.
 
-        Raises BadScan if the file is broken, has not `num_points` labels, or ids that its encoding does not have.
+        Raises BadScan if the file is invalid, does not have `num_points` labels, or has ids outside its encoding.
         """
         file = self.folder / f"{name}.label"
         return read_labels(file, num_points, self.encoding) if file.exists() else unlabelled(num_points)
@@ -37,18 +37,19 @@ class LabelFiles:
 
 @dataclass(frozen=True, slots=True)
 class LabelSource:
-    """Where the labels of a drive come from."""
+    """The source of the labels of a drive: files, a network, or none."""
 
     files: LabelFiles | None
     geometric: bool
-    """Scans that no file labels are to be labelled by shape, when they become keyframes."""
+    """True if scans without a label file are labelled by geometry when they become keyframes."""
     network: Network | None = None
 
     def read(self, name: str, points: Points, intensities: Vector | None = None) -> ScanLabels:
-        """The labels of the scan `name`, points and intensities as its file holds them; all UNLABELLED if none knows.
+        """The labels of the scan `name`; all UNLABELLED if there is no source for it.
 
-        A network's are made when they are called for, which raises SegslamError as `Network.labels`; it is given zeros
-        for intensities that are not known. Raises BadScan as `LabelFiles`.
+        `points` and `intensities` are in the order of the scan file. The labels of a network are computed when they are
+        first used; that call raises SegslamError like `Network.labels`, and zeros replace unknown intensities. Raises
+        BadScan like `LabelFiles.read`.
         """
         if self.network:
             if intensities is None:
@@ -60,11 +61,11 @@ class LabelSource:
 
 
 def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelSource:
-    """What `--labels` names: `auto`, `none`, `geometric`, `network:MODEL.onnx`, or a folder of `.label` files.
+    """Open the value of `--labels`: `auto`, `none`, `geometric`, `network:MODEL.onnx`, or a folder of `.label` files.
 
-    `beside` is the folder that relative ones start from, and where `auto` looks for `labels/`; without it, `auto` is
-    `geometric`. Raises SegslamError for a folder that is missing or labels none of the scans, for files whose
-    encoding is neither given nor detectable, and for a network that `open_network` refuses.
+    Relative folders start at `beside`, where `auto` looks for `labels/`; without such a folder, `auto` is `geometric`.
+    Raises SegslamError for a folder that is missing or labels none of the scans, for files whose encoding is neither
+    given nor detectable, and for a network that `open_network` rejects.
     """
     if source in ("none", "geometric"):
         return LabelSource(None, geometric=source == "geometric")
@@ -76,33 +77,33 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
         return LabelSource(_open_folder(beside / "labels", scan_names, encoding), geometric=True)
     folder = beside / Path(source).expanduser()
     if not folder.is_dir():
-        raise SegslamError(f"--labels {source}: no folder {folder}; name one, or auto, none, geometric, network:MODEL")
+        raise SegslamError(f"--labels {source}: no folder {folder}; give one, auto, none, geometric or network:MODEL")
     if not _labelled(folder, scan_names):
         raise SegslamError(
-            f"{folder}: no .label file for any of the {len(scan_names)} scans; they are named like the scans"
+            f"{folder}: no .label file for any of the {len(scan_names)} scans; label files are named like the scans"
         )
     return LabelSource(_open_folder(folder, scan_names, encoding), geometric=False)
 
 
 def read_ids(file: Path) -> Ids:
-    """The class ids of a `.label` file: its lower 16 bits, the upper are instances. Raises BadScan if it is broken."""
+    """The class ids of a `.label` file: the lower 16 bits; the upper are instances. Raises BadScan if it is invalid."""
     try:
         content = file.read_bytes()
     except OSError as error:
         raise BadScan(f"{file}: cannot read the labels ({error})") from error
     if len(content) % 4:
-        raise BadScan(f"{file}: {len(content)} bytes are no multiple of 4 (uint32): truncated; fetch the file again")
+        raise BadScan(f"{file}: {len(content)} bytes are not a multiple of 4 (uint32): truncated; copy the file again")
     return np.frombuffer(content, dtype="<u4") & 0xFFFF
 
 
 def read_labels(file: Path, num_points: int, encoding: Encoding) -> Labels:
-    """The labels of a scan of `num_points`.
+    """The labels of a scan of `num_points` points.
 
-    Raises BadScan if the file is missing, broken or of another length, or has ids that the encoding does not have.
+    Raises BadScan if the file is missing or invalid, has another number of labels, or ids outside the encoding.
     """
     ids = read_ids(file)
     if len(ids) != num_points:
-        raise BadScan(f"{file}: {len(ids)} labels for {num_points} points; labels and scan are not of one sweep")
+        raise BadScan(f"{file}: {len(ids)} labels for {num_points} points; the labels are those of another scan")
     try:
         return to_labels(ids, encoding)
     except SegslamError as error:
@@ -110,9 +111,9 @@ def read_labels(file: Path, num_points: int, encoding: Encoding) -> Labels:
 
 
 def write_labels(file: Path, labels: Labels, kept: Mask | None, encoding: Encoding) -> None:
-    """Write the labels of a scan; where its points are only some of its file's, the others are unlabelled.
+    """Write the labels of a scan. Points of the scan file that are not `kept` become unlabelled.
 
-    Raises SegslamError, naming the file, for a label that the encoding does not have, and if it cannot be written.
+    Raises SegslamError, naming the file, for a label that the encoding does not contain, and on a write error.
     """
     if kept is not None:
         whole = unlabelled(len(kept))
@@ -136,14 +137,14 @@ def encoding_of(files: Sequence[Path]) -> Encoding:
 
 
 def unlabelled(num_points: int) -> Labels:
-    """No knowledge of any point."""
+    """UNLABELLED for each point."""
     return np.full(num_points, Label.UNLABELLED, dtype=np.uint8)
 
 
 @cache
 def _warn_of_zeros() -> None:
-    """Once, not for every scan."""
-    logger.warning("the data hold no intensities that can be read; the network is given zeros for them")
+    """Warn once, not for every scan."""
+    logger.warning("the data contain no readable intensities; the network receives zeros instead")
 
 
 def _labelled(folder: Path, scan_names: Sequence[str]) -> list[str]:
@@ -158,13 +159,13 @@ def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | N
 
 
 def _spread(folder: Path, names: list[str]) -> list[Path]:
-    """Files to detect the encoding from, spread over the drive."""
+    """Files from which the encoding is detected, spread over the drive."""
     rows = np.unique(np.linspace(0, len(names) - 1, FILES_LOOKED_AT).astype(int))
     return [folder / f"{names[row]}.label" for row in rows]
 
 
 def _histogram(file: Path) -> Histogram:
-    """Points of each id; none for a broken file, which is its own scan's failure when that is read."""
+    """Number of points of each id; empty for an invalid file, which is reported when its scan is read."""
     try:
         ids = read_ids(file)
     except BadScan:

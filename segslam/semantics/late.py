@@ -1,15 +1,15 @@
-"""Labels that are made only when they are asked for: a network costs more than all else, and few scans are kept."""
+"""Labels that are computed on first use: a network is slow, and only keyframes need labels."""
 
 from segslam.types import Labels, Mask, ScanLabels
 
 
 def made(labels: ScanLabels) -> Labels:
-    """The labels, which are made now if they were not before."""
+    """The labels, computed now if necessary."""
     return labels() if callable(labels) else labels
 
 
 def of_rows(labels: ScanLabels, rows: Mask) -> ScanLabels:
-    """The labels of some rows; late labels stay late."""
+    """The labels of some rows; labels that are computed on first use stay so."""
     if callable(labels):
         return lambda: labels()[rows]
     return labels[rows]

@@ -1,6 +1,6 @@
-"""Labels from a network: any range-image model in ONNX format, run by onnxruntime. The only importer of onnxruntime.
+"""Labels from any range-image network in ONNX format, run by onnxruntime. No other module imports onnxruntime.
 
-A YAML file beside the model, with the same name, defines its inputs and outputs.
+A YAML file beside the model, with the same name, describes its inputs and outputs.
 """
 
 import re
@@ -21,7 +21,7 @@ LabelImage = UInt8[np.ndarray, "_ _"]
 
 
 class Network:
-    """A model that labels scans. Its input and output were tried once when it was opened, so that they fit."""
+    """A network that labels scans. Its input and output shapes were checked with an empty image when it was opened."""
 
     def __init__(self, model: Path, settings: NetworkSettings, session: Any) -> None:
         self.settings = settings
@@ -31,10 +31,10 @@ class Network:
         self._label_of_class = np.array([int(label) for label in settings.classes], np.uint8)
 
     def labels(self, points: Points, intensities: Vector) -> Labels:
-        """The label of each point (n, 3) of a scan in the LiDAR frame, as its file holds it.
+        """The label (n,) of each point (n, 3) of a scan in the LiDAR frame, in the order of its file.
 
-        UNLABELLED where a point is not finite or at the origin. Raises SegslamError for class ids beyond the classes
-        that the settings name, and for outputs that are not numbers.
+        UNLABELLED for points that are not finite or at the origin. Raises SegslamError for class ids beyond the classes
+        of the settings, and for outputs that are not finite.
         """
         labels = np.full(len(points), Label.UNLABELLED, np.uint8)
         usable = within_range(points, 0.0, np.inf)
@@ -46,17 +46,17 @@ class Network:
         return labels
 
     def label_image(self, image: np.ndarray) -> LabelImage:
-        """(height, width) labels of an input (1, channels, height, width) float32."""
+        """(height, width) labels for an input (1, channels, height, width) float32."""
         from onnxruntime.capi import onnxruntime_pybind11_state as errors
 
         try:
             output = self._session.run(None, {self._input: image})[0]
         except (errors.Fail, errors.InvalidArgument, errors.RuntimeException) as error:
-            raise SegslamError(f"{self._model}: fails on {_shape(image.shape)} numbers ({_brief(error)})") from error
+            raise SegslamError(f"{self._model}: fails on an input {_shape(image.shape)} ({_brief(error)})") from error
         return self._label_of_class[self._class_image(output)]
 
     def _class_image(self, output: np.ndarray) -> np.ndarray:
-        """(height, width) class ids of the first output: ids as they are, the largest logit else."""
+        """(height, width) class ids of the first output: ids as given, or the class with the largest logit."""
         size = (self.settings.height, self.settings.width)
         if output.dtype.kind in "iu":
             self._check_output(output, "class ids", [(1, *size), (1, 1, *size), size])
@@ -70,7 +70,7 @@ class Network:
             return ids
         self._check_output(output, "logits", [(1, len(self._label_of_class), *size)])
         if not np.isfinite(output).all():
-            raise SegslamError(f"{self._model}: gave logits that are no numbers; export it again in float32")
+            raise SegslamError(f"{self._model}: returned logits that are not finite; export it again in float32")
         return output[0].argmax(axis=0)
 
     def _check_output(self, output: np.ndarray, what: str, allowed: list[tuple[int, ...]]) -> None:
@@ -80,10 +80,10 @@ class Network:
 
 
 def open_network(model: Path) -> Network:
-    """The network of an .onnx file and its `settings_file`, tried on an empty image.
+    """The network of an .onnx file with its `settings_file`, checked on an empty image.
 
-    Raises SegslamError for a file that is missing or broken, and where the two contradict each other, with both
-    numbers; also if onnxruntime is not installed.
+    Raises SegslamError if a file is missing or invalid, if onnxruntime is not installed, and if model and settings
+    contradict each other (with both values).
     """
     if not model.is_file():
         raise SegslamError(f"{model}: no such file; give the model as network:MODEL.onnx")
@@ -104,7 +104,7 @@ def _session(model: Path) -> Any:
         raise SegslamError(f"--labels network: needs a package ({error}): {how_to_install('network')}") from error
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # errors, which are raised anyway
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave the cores to the other stages
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave the cores to others
     broken = (errors.Fail, errors.InvalidGraph, errors.InvalidProtobuf, errors.NotImplemented, errors.RuntimeException)
     try:
         return onnxruntime.InferenceSession(model, options, providers=onnxruntime.get_available_providers())
@@ -113,24 +113,22 @@ def _session(model: Path) -> Any:
 
 
 def _remedy(error: Exception) -> str:
-    """For a model that cannot be loaded. Weights may lie in a file of their own, which the error names."""
+    """The remedy for a model that cannot be loaded, such as one whose weights are in a separate file."""
     outside = re.search(r'External data path does not exist: "([^"]+)"', str(error))
     if outside is None:
         return "export it again"
     name = Path(outside[1]).name
-    return (
-        f"its weights are in a file of their own, {name}: put it beside the model, or export with external_data=False"
-    )
+    return f"its weights are in a separate file, {name}: put it beside the model, or export with external_data=False"
 
 
 def _check_input(session: Any, model: Path, wanted: tuple[int, ...]) -> None:
-    """Raises SegslamError unless the model takes one float32 image of that shape; sizes that it leaves open fit all."""
+    """Raises SegslamError unless the model takes one float32 image of that shape. Open dimensions fit any size."""
     inputs = session.get_inputs()
     if len(inputs) != 1 or inputs[0].type != "tensor(float)":
         found = ", ".join(f"{each.name}: {each.type}" for each in inputs)
         raise SegslamError(
-            f"{model}: takes the inputs {found}; expected a single one of float32, tensor(float); wrap "
-            "a network that takes more, as docs/network_labels.md shows"
+            f"{model}: takes the inputs {found}; expected a single input of type float32, tensor(float); wrap "
+            "a network with several inputs as docs/network_labels.md shows"
         )
     shape = inputs[0].shape
     fits = len(shape) == len(wanted) and all(

@@ -1,7 +1,7 @@
-"""Settings that networks ship: `arch_cfg.yaml` and `data_cfg.yaml` of lidar-bonnetal (Milioto et al., IROS 2019).
+"""Import of network settings: `arch_cfg.yaml` and `data_cfg.yaml` of lidar-bonnetal (Milioto et al., IROS 2019).
 
-SalsaNext, CENet, SqueezeSegV3, MINet and 3D-MiniNet descend from it and use its files. Classes are matched by their
-names, never by their numbers, which differ between data sets.
+SalsaNext, CENet, SqueezeSegV3, MINet and 3D-MiniNet use the same files. Classes are matched by name, because their
+numbers differ between data sets.
 """
 
 from pathlib import Path
@@ -13,7 +13,7 @@ from segslam.types import Label, SegslamError
 
 ARCH, DATA = "arch_cfg.yaml", "data_cfg.yaml"
 NO_CUTOFF_M = 1e6
-"""Written as 0 in their files."""
+"""Stored as 0 in these files."""
 MERGED = {
     "unlabeled": Label.UNLABELLED,
     "outlier": Label.UNLABELLED,
@@ -25,14 +25,14 @@ MERGED = {
     "moving-bus": Label.MOVING_OTHER_VEHICLE,
     "moving-on-rails": Label.MOVING_OTHER_VEHICLE,
 }
-"""Classes of SemanticKITTI that its benchmark merges into others."""
+"""Classes of SemanticKITTI that its benchmark merges into other classes."""
 LABEL_OF_NAME = {label.name.lower().replace("_", "-"): label for label in Label} | MERGED
 
 
 def _check_channels(values: tuple[float, ...]) -> tuple[float, ...]:
     if len(values) != 5:
         raise ValueError(
-            f"{len(values)} numbers; expected 5, of range, x, y, z and signal: networks that take surface normals too "
+            f"{len(values)} numbers; expected 5, for range, x, y, z and signal: networks that need surface normals "
             "are not supported"
         )
     return values
@@ -78,7 +78,7 @@ class _Post(BaseModel):
 
 
 class Architecture(BaseModel):
-    """What is read of an `arch_cfg.yaml`; its other keys are about training."""
+    """The keys of an `arch_cfg.yaml` that are used; the others concern training."""
 
     dataset: _Dataset
     post: _Post
@@ -97,7 +97,7 @@ class Architecture(BaseModel):
         }
 
     def _votes(self) -> dict[str, Any]:
-        """Without votes a point has the class of its pixel."""
+        """The settings of the vote; without a vote, a point has the class of its pixel."""
         parameters = self.post.KNN.params
         if not self.post.KNN.use or isinstance(parameters, bool):
             return {"window": 1, "neighbours": 1}
@@ -110,7 +110,7 @@ class Architecture(BaseModel):
 
 
 class ClassMap(BaseModel):
-    """What is read of a `data_cfg.yaml`: which raw id each output is, and the name of that id."""
+    """The keys of a `data_cfg.yaml` that are used: the raw id of each output, and the name of each raw id."""
 
     labels: dict[int, str]
     learning_map_inv: dict[int, int]
@@ -118,17 +118,17 @@ class ClassMap(BaseModel):
     def classes(self) -> list[Label]:
         """The label of each output, in order.
 
-        Raises SegslamError if an output has no raw id, its raw id no name, or the name is none of SemanticKITTI's.
+        Raises SegslamError if an output has no raw id, a raw id no name, or SemanticKITTI no class of that name.
         """
         outputs = range(len(self.learning_map_inv))
         missing = [output for output in outputs if self.learning_map_inv.get(output) not in self.labels]
         if missing:
-            raise SegslamError(f"output {missing[0]} has no entry in learning_map_inv, or its id no name in labels")
+            raise SegslamError(f"output {missing[0]} has no entry in learning_map_inv, or its id has no name in labels")
         return [_label(self.labels[self.learning_map_inv[output]]) for output in outputs]
 
 
 def is_architecture(values: Any) -> bool:
-    """Whether the content of a YAML file is that of an `arch_cfg.yaml`."""
+    """True if the content of a YAML file is that of an `arch_cfg.yaml`."""
     return isinstance(values, dict) and isinstance(values.get("dataset"), dict) and "sensor" in values["dataset"]
 
 
@@ -141,7 +141,7 @@ def _label(name: str) -> Label:
     label = LABEL_OF_NAME.get(name.strip().lower().replace(" ", "-").replace("_", "-"))
     if label is None:
         raise SegslamError(
-            f"{name} is no class of SemanticKITTI; write a YAML file beside the model, with `import: {ARCH}` and the "
+            f"{name} is not a class of SemanticKITTI; write a YAML file beside the model with `import: {ARCH}` and the "
             "label of each output under `classes:`"
         )
     return label

@@ -1,4 +1,4 @@
-"""What a network expects of its input and means by its output: the YAML file beside the model."""
+"""Settings of a network: format of its input and meaning of its output, from the YAML file beside the model."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -16,42 +16,42 @@ Model = TypeVar("Model", bound=BaseModel)
 
 def _check_odd(value: int) -> int:
     if value % 2 == 0:
-        raise ValueError("a window has a middle: write an odd number")
+        raise ValueError("the side of a window must be an odd number")
     return value
 
 
 class VoteSettings(Section):
-    """The vote of neighbouring pixels on the class of a point; defaults as in RangeNet++ (Milioto et al. 2019)."""
+    """Voting of neighbouring pixels on the class of a point; defaults of RangeNet++ (Milioto et al. 2019)."""
 
-    window: Annotated[int, AfterValidator(_check_odd)] = Field(5, ge=1, le=15, description="pixels along a side")
-    neighbours: int = Field(5, ge=1, description="pixels that vote: those nearest in range")
-    sigma_px: float = Field(1.0, gt=0, description="of the Gaussian that favours pixels near by in the image (pixels)")
-    cutoff_m: float = Field(1.0, gt=0, description="a pixel farther off in range, so weighted, has no vote (m)")
+    window: Annotated[int, AfterValidator(_check_odd)] = Field(5, ge=1, le=15, description="window side (pixels)")
+    neighbours: int = Field(5, ge=1, description="number of voting pixels, the nearest ones in range")
+    sigma_px: float = Field(1.0, gt=0, description="sigma of the Gaussian weight by distance in the image (pixels)")
+    cutoff_m: float = Field(1.0, gt=0, description="largest weighted range difference of a voting pixel (m)")
 
 
 class ImageSettings(Section):
-    """Size of a range image. Its columns go clockwise from behind the sensor, its rows down from the top."""
+    """Size of a range image. Columns go clockwise, starting behind the sensor; rows go from top to bottom."""
 
     field_of_view_deg: tuple[float, float] = Field(description="elevation of the lowest and highest row (degrees)")
-    height: int = Field(ge=1, description="rows of the image: beams")
-    width: int = Field(ge=1, description="columns of the image: the full circle")
+    height: int = Field(ge=1, description="rows of the image, one per beam")
+    width: int = Field(ge=1, description="columns of the image, for the full circle")
 
 
 class NetworkSettings(ImageSettings):
-    """Settings of one model: its image, and the meaning of its outputs."""
+    """Settings of one model: its input image and the meaning of its outputs."""
 
     azimuth_deg: tuple[float, float] = Field(
-        (-180.0, 180.0), description="azimuth of the image's edges (degrees); only the full circle is supported"
+        (-180.0, 180.0), description="azimuth of the left and right edge (degrees); must be the full circle"
     )
     channels: tuple[Channel, ...] = Field(
         ("range", "x", "y", "z", "intensity"),
         min_length=1,
-        description="in the order of the input; mask is 1 where a point is",
+        description="input channels in order; mask is 1 for pixels with a point",
     )
-    mean: tuple[float, ...] = Field(description="of each channel, subtracted")
-    std: tuple[Annotated[float, Field(gt=0)], ...] = Field(description="of each channel, divided by")
+    mean: tuple[float, ...] = Field(description="value subtracted from each channel")
+    std: tuple[Annotated[float, Field(gt=0)], ...] = Field(description="value by which each channel is divided")
     classes: tuple[LabelName, ...] = Field(
-        min_length=2, description="label of each output class, by name or learning id, in the order of the output"
+        min_length=2, description="label of each output class, by name or learning id, in the order of the outputs"
     )
     votes: VoteSettings = VoteSettings()
 
@@ -59,12 +59,12 @@ class NetworkSettings(ImageSettings):
     def _fits_together(self) -> "NetworkSettings":
         low, high = self.field_of_view_deg
         if not -90 <= low < high <= 90:
-            raise ValueError(f"field_of_view_deg: write the lowest elevation, then the highest, not {low}, {high}")
+            raise ValueError(f"field_of_view_deg: give the lowest elevation, then the highest, not {low}, {high}")
         if sorted(self.azimuth_deg) != [-180, 180]:
             left, right = self.azimuth_deg
             raise ValueError(
-                f"azimuth_deg: {left:g} to {right:g}; an image has to show the full circle from straight behind, -180 "
-                "to 180: places are met again from all sides, so labels of a part of each scan are not enough"
+                f"azimuth_deg: {left:g} to {right:g}; the image must show the full circle, -180 to 180: loop closing "
+                "needs labels in all directions"
             )
         for name in ("mean", "std"):
             count = len(getattr(self, name))
@@ -74,16 +74,16 @@ class NetworkSettings(ImageSettings):
 
 
 def settings_file(model: Path) -> Path:
-    """The YAML file of a model; without one, the `arch_cfg.yaml` in its folder."""
+    """The YAML file of a model; if there is none, the `arch_cfg.yaml` in the folder of the model."""
     own, published = model.with_suffix(".yaml"), model.with_name(ARCH)
     return published if published.is_file() and not own.exists() else own
 
 
 def read_settings(file: Path) -> NetworkSettings:
-    """The settings of a model's YAML file, or of the files that its repository ships.
+    """The settings from a model's YAML file, or from the files published with it.
 
-    `import: arch_cfg.yaml` takes that file and the `data_cfg.yaml` beside it; other keys replace what they give.
-    Raises SegslamError that names file and key for whatever is wrong.
+    `import: arch_cfg.yaml` reads that file and the `data_cfg.yaml` beside it; other keys override their values.
+    Raises SegslamError, naming file and key, for invalid settings.
     """
     values = _read_yaml(file)
     if is_architecture(values):
@@ -102,7 +102,7 @@ def _imported(architecture: Path, given: dict[str, Any]) -> dict[str, Any]:
     file = class_map_file(architecture)
     if not file.is_file():
         raise SegslamError(
-            f"{file}: no such file; {architecture.name} does not name the classes: copy the network's "
+            f"{file}: no such file; {architecture.name} does not contain the classes: copy the network's "
             "config/labels/semantic-kitti.yaml there"
         )
     class_map = _checked(ClassMap, _read_yaml(file), file)
@@ -121,7 +121,7 @@ def _read_yaml(file: Path) -> Any:
             "that were published with it"
         ) from error
     except yaml.YAMLError as error:
-        raise SegslamError(f"{file}: no valid YAML ({' '.join(str(error).split())})") from error
+        raise SegslamError(f"{file}: not valid YAML ({' '.join(str(error).split())})") from error
 
 
 def _checked(model: type[Model], values: Any, file: Path) -> Model:

@@ -1,6 +1,6 @@
-"""A scan as an image of the sensor's own view: what convolutional networks for LiDAR take.
+"""Range images: a scan projected to an image around the sensor, the input of convolutional LiDAR networks.
 
-As in Milioto et al., "RangeNet++: Fast and Accurate LiDAR Semantic Segmentation", IROS 2019, eq. (1).
+Milioto et al., "RangeNet++: Fast and Accurate LiDAR Semantic Segmentation", IROS 2019, eq. (1).
 """
 
 import math
@@ -13,28 +13,28 @@ from segslam.semantics.network_settings import ImageSettings, NetworkSettings
 from segslam.types import Indices, Points, Vector
 
 EMPTY = -1
-"""No point falls on this pixel."""
+"""Value of a pixel without a point."""
 
 
 class Projection(NamedTuple):
-    """Where the points of a scan fall. `rows`, `columns` and `ranges_m` have an entry for each point."""
+    """The pixel of each point of a scan. `rows`, `columns` and `ranges_m` have one entry per point."""
 
     rows: Indices
     columns: Indices
     ranges_m: Vector
     nearest: Int[np.ndarray, "_ _"]
-    """(height, width) the point on each pixel, the nearest of several, or EMPTY."""
+    """(height, width) index of the nearest point in each pixel, or EMPTY."""
 
     def image_ranges_m(self) -> Float[np.ndarray, "_ _"]:
-        """(height, width) range of each pixel, infinite where there is none."""
+        """(height, width) range of each pixel, infinite for empty pixels."""
         return np.append(self.ranges_m, np.inf)[self.nearest]
 
 
 def project(points: Points, *, settings: ImageSettings) -> Projection:
-    """The pixels of points (n, 3) of the LiDAR frame, finite and off the origin.
+    """The pixels of points (n, 3) of the LiDAR frame. Points must be finite and not at the origin.
 
-    The first column is straight behind, columns go clockwise as seen from above. Points above or below the field of
-    view fall on its first or last row.
+    The first column is behind the sensor; columns go clockwise as seen from above. Points above or below the field of
+    view are assigned to the first or last row.
     """
     ranges_m = np.linalg.norm(points, axis=1)
     low, high = np.radians(settings.field_of_view_deg)
@@ -45,14 +45,14 @@ def project(points: Points, *, settings: ImageSettings) -> Projection:
     rows, columns = rows.astype(np.int64), columns.astype(np.int64)
     nearest = np.full((settings.height, settings.width), EMPTY, np.int64)
     far_first = np.argsort(-ranges_m, kind="stable")
-    nearest[rows[far_first], columns[far_first]] = far_first  # of equal pixels the last assignment stays
+    nearest[rows[far_first], columns[far_first]] = far_first  # the last assignment to a pixel remains
     return Projection(rows, columns, ranges_m, nearest)
 
 
 def network_input(
     points: Points, intensities: Vector, projection: Projection, *, settings: NetworkSettings
 ) -> Float32[np.ndarray, "1 _ _ _"]:
-    """(1, channels, height, width), each channel normalised; pixels without a point are exactly 0 in all of them."""
+    """(1, channels, height, width), with each channel normalised; all channels are 0 in pixels without a point."""
     x, y, z = points.T
     source = {
         "range": projection.ranges_m,

@@ -1,6 +1,6 @@
-"""How good labels are: intersection over union with the truth, as SemanticKITTI has it (Behley et al., ICCV 2019).
+"""Quality of labels: intersection over union (IoU) as in SemanticKITTI (Behley et al., ICCV 2019).
 
-Scored are points whose true class is known. Moving things count as the class of what moves.
+Only points with a known true class count. Moving classes count as their static class.
 """
 
 import numpy as np
@@ -9,11 +9,11 @@ from jaxtyping import Int
 from segslam.types import GROUND_LABELS, Label, Labels
 
 Confusion = Int[np.ndarray, "20 20"]
-"""Points by true class (row) and by label (column), classes as learning ids 0 to 19; row 0 is empty."""
+"""Number of points by true class (row) and label (column), as learning ids 0 to 19; row 0 is empty."""
 
 NUM_CLASSES = 20
 STILL = np.arange(len(Label), dtype=np.uint8)
-"""The class of each label, of moving labels that of the thing that moves."""
+"""Class of each label; moving classes map to their static class."""
 for _label in list(Label)[NUM_CLASSES:]:
     STILL[_label] = Label[_label.name.removeprefix("MOVING_")]
 GROUPS = {
@@ -23,25 +23,25 @@ GROUPS = {
     "vegetation": (Label.VEGETATION,),
     "trunk_or_pole": (Label.TRUNK, Label.POLE),
 }
-"""Groups of classes that loop closing distinguishes."""
+"""Groups of classes that matter for loop closing."""
 
 
 def confusion(labels: Labels, truth: Labels) -> Confusion:
-    """How often each label was given to each true class."""
+    """Number of points for each pair of true class and label."""
     known = truth != Label.UNLABELLED
     pairs = STILL[truth[known]].astype(np.int64) * NUM_CLASSES + STILL[labels[known]]
     return np.bincount(pairs, minlength=NUM_CLASSES**2).reshape(NUM_CLASSES, NUM_CLASSES)
 
 
 def class_scores(counts: Confusion) -> dict[str, float]:
-    """Intersection over union of each class that the truth or the labels have, the most frequent first."""
+    """IoU of each class that occurs in the ground truth or in the labels, the most frequent first."""
     present = [label for label in list(Label)[1:NUM_CLASSES] if counts[label].sum() + counts[:, label].sum()]
     present.sort(key=lambda label: -counts[label].sum())
     return {label.name.lower(): _score(counts, (label,)) for label in present}
 
 
 def group_scores(counts: Confusion) -> dict[str, float]:
-    """The same for the groups of classes that loop closing distinguishes."""
+    """IoU of the groups of classes that matter for loop closing."""
     return {
         name: _score(counts, members)
         for name, members in GROUPS.items()
@@ -50,7 +50,7 @@ def group_scores(counts: Confusion) -> dict[str, float]:
 
 
 def largest_confusions(counts: Confusion, count: int) -> list[tuple[Label, Label, float]]:
-    """True class, label given in its place, and their share of all points; the most frequent first."""
+    """(true class, label, share of all points) of the most frequent confusions."""
     wrong = counts * (1 - np.eye(NUM_CLASSES, dtype=np.int64))
     largest = np.argsort(-wrong, axis=None, kind="stable")[:count]
     rows, columns = np.unravel_index(largest, wrong.shape)

@@ -1,4 +1,4 @@
-"""Pieces of what stands on the ground, seen from above, and how large each is."""
+"""Segments of the objects above the ground, as connected cells of the x-y plane, and their sizes."""
 
 from dataclasses import dataclass
 
@@ -10,36 +10,36 @@ from segslam.system.kernels import kernel
 from segslam.types import Indices, Mask, Points, Vector
 
 CELL_M = 0.3
-"""Chosen: things nearer to each other than this are one piece."""
+"""Chosen: objects nearer to each other than this form one segment."""
 NO_PIECE = -1
 EIGHT_NEIGHBOURS = np.ones((3, 3), bool)
 RECTANGLE_STEP_DEG = 5.0
-"""Chosen: the short side of a car comes out at most 20 cm too long."""
+"""Chosen: angle steps for which the short side of a car is overestimated by at most 20 cm."""
 _ANGLES = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
 DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pieces:
-    """Connected cells seen from above. All but `of_point` have a row a piece and count only points that make it."""
+    """Segments of connected cells. All fields but `of_point` have one row per segment, from its chosen points."""
 
     of_point: Indices
-    """The piece that a point stands in, NO_PIECE if in none; also of points that did not help to make it."""
+    """(n,) segment of each point, also of points that were not chosen; NO_PIECE if it has none."""
     num_points: Indices
     top_m: Vector
-    """Height above the ground of the highest point."""
+    """Height of the highest point above the ground."""
     length_m: Vector
-    """Longer side of the rectangle of least area around its points, seen from above."""
+    """Longer side of the smallest-area bounding rectangle in the x-y plane."""
     width_m: Vector
 
 
 def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
-    """The pieces that the chosen points of a level cloud make."""
+    """The segments of the chosen points of a level cloud."""
     cells, _, shape = cells_above(points, CELL_M, border=1)
     occupied = np.zeros(shape, bool)
     occupied[cells[chosen, 0], cells[chosen, 1]] = True
     grid, num_pieces = label(occupied, structure=EIGHT_NEIGHBOURS)
-    of_point = grid[cells[:, 0], cells[:, 1]].astype(np.int64) + NO_PIECE  # they are numbered from 1 on, 0 is empty
+    of_point = grid[cells[:, 0], cells[:, 1]].astype(np.int64) + NO_PIECE  # labels start at 1; 0 is the background
     num_points = np.bincount(of_point[chosen], minlength=num_pieces)
     top_m = np.full(num_pieces, -np.inf)
     np.maximum.at(top_m, of_point[chosen], heights[chosen])
@@ -49,7 +49,7 @@ def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
 
 @kernel("float64[:, ::1](float64[:, ::1], int64[::1], boolean[::1], int64, float64[:, ::1])")
 def _tightest_rectangles(points, piece, chosen, num_pieces, directions):
-    """(num_pieces, 2) longer and shorter side (m) of the rectangle of least area around each piece, from above."""
+    """(num_pieces, 2) longer and shorter side (m) of the smallest-area bounding rectangle of each segment."""
     low = np.full((num_pieces, len(directions), 2), np.inf)
     high = np.full((num_pieces, len(directions), 2), -np.inf)
     for k in range(len(points)):

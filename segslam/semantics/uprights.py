@@ -1,9 +1,9 @@
-"""Thin upright things, found in a grid of vertical columns.
+"""Detection of thin vertical objects in a grid of vertical columns.
 
-A column is a square cell seen from above; what it holds at each height is one bit of a mask, so that whole
-neighbourhoods are joined by `or`. That a pole is what has free space all around is the idea of occupancy-grid
-extractors (Schaefer, Büscher, Vertens, Luft, Burgard, "Long-term urban vehicle localization using pole landmarks
-extracted from 3-D lidar scans", ECMR 2019).
+A column is a square cell of the x-y plane. A bit mask holds its occupied height slices, so that neighbourhoods are
+combined by bitwise operations. A pole is an object with free space all around, as in occupancy-grid pole extractors
+(Schaefer, Büscher, Vertens, Luft, Burgard, "Long-term urban vehicle localization using pole landmarks extracted from
+3-D lidar scans", ECMR 2019).
 """
 
 import numpy as np
@@ -15,12 +15,12 @@ NUM_SLICES = 16
 
 @kernel("boolean[::1](int64[:, ::1], int64[::1], UniTuple(int64, 2), int64, int64, int64, float64)")
 def on_thin_uprights(cells, slices, shape, core, ring, min_slices, min_share):
-    """(n,) bool: which points belong to something thin, tall and free-standing.
+    """(n,) bool: whether each point belongs to a thin, tall, free-standing object.
 
-    A point lies in column `cells[k]` of a grid of that shape, at height `slices[k]`. Around each occupied column
-    the slices occupied within `core` cells are joined, and those occupied between `core` and `ring` cells away are
-    taken off. What is left must span `min_slices` and be `min_share` of what was there. Points outside the grid, or of
-    a slice below 0 or from NUM_SLICES on, take no part. Columns nearer than `ring` cells to the border are passed by.
+    Point k lies in column `cells[k]` of a grid of the given shape, in height slice `slices[k]`. For each occupied
+    column: combine the slices occupied within `core` cells, and remove those occupied between `core` and `ring` cells
+    away. The remaining slices must span `min_slices` and be a share `min_share` of the slices before removal. Points
+    outside the grid or the slices 0 to NUM_SLICES - 1 are ignored, as are columns within `ring` cells of the border.
     """
     masks, thin = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
     for k in range(len(cells)):
@@ -52,7 +52,7 @@ def _takes_part(cell, slice_index, shape):
 
 @kernel("int64[:, ::1](int64, int64)")
 def _disc(radius, inner_radius):
-    """Offsets of the cells farther than `inner_radius` and at most `radius` cells from the middle."""
+    """Offsets of the cells farther than `inner_radius` and at most `radius` cells from the centre."""
     offsets = np.empty(((2 * radius + 1) ** 2, 2), np.int64)
     count = 0
     for a in range(-radius, radius + 1):
@@ -74,7 +74,7 @@ def _joined(masks, offsets, i, j):
 
 @kernel("int64(uint16[:, ::1], int64[:, ::1], int64, int64, int64, float64)")
 def _left_clear(masks, offsets, i, j, held, min_count):
-    """The bits of `held` that no column around has; none if they are fewer than `min_count`."""
+    """The bits of `held` that no surrounding column contains; 0 if fewer than `min_count` remain."""
     clear = held
     for n in range(len(offsets)):
         taken = clear & masks[i + offsets[n, 0], j + offsets[n, 1]]
@@ -96,7 +96,7 @@ def _count(mask):
 
 @kernel("int64(int64)")
 def _span(mask):
-    """From the lowest to the highest bit set, both included."""
+    """Number of bits from the lowest to the highest set bit, both included."""
     first, last = NUM_SLICES, -1
     for bit in range(NUM_SLICES):
         if mask >> bit & 1:

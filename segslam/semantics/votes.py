@@ -1,9 +1,9 @@
-"""From labels of pixels to labels of points: the pixels around a point, near it in range, vote.
+"""Labels of points from labels of pixels: k-nearest-neighbour voting in the range image.
 
-Milioto et al., "RangeNet++: Fast and Accurate LiDAR Semantic Segmentation", IROS 2019, algorithm 1. The point itself
-may be hidden behind the one that its pixel shows, and edges in the image bleed onto what lies behind.
+Milioto et al., "RangeNet++: Fast and Accurate LiDAR Semantic Segmentation", IROS 2019, algorithm 1. Voting is needed
+because several points share a pixel, and because networks blur edges in the image.
 
-Differs from the paper: the image goes on from its last column to its first.
+Differs from the paper: the image wraps around at its last column.
 """
 
 import numpy as np
@@ -16,10 +16,10 @@ from segslam.types import Label, Labels
 
 
 def point_labels(image: UInt8[np.ndarray, "_ _"], projection: Projection, *, settings: VoteSettings) -> Labels:
-    """The label that most voters give each point, of equals the smaller; UNLABELLED pixels do not vote.
+    """The majority label of each point; the smallest of equals. UNLABELLED pixels do not vote.
 
-    Voters are the `neighbours` pixels of the window nearest to the point in range, the distance weighted by nearness
-    in the image and within the cutoff. The point's own pixel counts as being at its range.
+    The voters of a point are the `neighbours` pixels of the window with the smallest weighted range differences, as far
+    as these are at most `cutoff_m`. The range difference of the point's own pixel is 0.
     """
     return _vote(
         np.ascontiguousarray(image, dtype=np.uint8),
@@ -35,7 +35,7 @@ def point_labels(image: UInt8[np.ndarray, "_ _"], projection: Projection, *, set
 
 
 def window_weights(side: int, sigma_px: float) -> Float[np.ndarray, "side side"]:
-    """One less a Gaussian of unit sum around the middle: what is near in the image seems nearer in range."""
+    """Weights of range differences: 1 minus a Gaussian of unit sum, so that pixels near in the image are preferred."""
     offsets = np.arange(side) - side // 2
     bell = np.exp(-0.5 * (offsets / sigma_px) ** 2)
     return 1.0 - np.outer(bell, bell) / bell.sum() ** 2

@@ -1,4 +1,4 @@
-"""Vertical faces: where points lie along one line seen from above, high enough."""
+"""Detection of vertical surfaces: points along one line in the x-y plane that reach high enough."""
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -8,19 +8,19 @@ from segslam.system.kernels import kernel
 from segslam.types import Mask, Points, Vector
 
 CELL_M = 0.6
-"""Chosen, as what follows, by the IoU of buildings on the real KITTI scans 0-2 (`tools/benchmarks/labels`)."""
+"""Chosen, like the next constants, by the IoU of buildings on the real KITTI scans 0-2 (`tools/benchmarks/labels`)."""
 LAYER_M = 2.0
 NUM_LAYERS = 5
 MIN_LENGTH_M = 0.3
-"""Least standard deviation along the line."""
+"""Smallest standard deviation along the line."""
 MIN_POINTS = 8
 
 
 def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: float) -> Mask:
-    """Which points lie on a vertical face, in a level frame.
+    """(n,) bool: whether each point lies on a vertical surface, for points in a level frame.
 
-    A face is judged in voxels, each with the 8 around it: the standard deviation of the points across their line is
-    below `thickness_m`, and something there stands higher than `min_top_m` above the ground.
+    Each voxel is tested with its 8 neighbours: the standard deviation of the points perpendicular to their line must be
+    below `thickness_m`, and one of the points must be higher than `min_top_m` above the ground.
     """
     cells, corner, shape = cells_above(points, CELL_M, border=1)
     layers = np.clip(heights / LAYER_M, 0, NUM_LAYERS - 1).astype(np.int64)
@@ -37,9 +37,9 @@ def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: 
     "UniTuple(int64, 3))"
 )
 def _moments(points, layers, cells, corner, shape):
-    """The number of each occupied voxel, -1 elsewhere, and for each the sums of 1, x, y, xx, xy, yy over its points.
+    """Index of each occupied voxel (-1 elsewhere), and the sums of 1, x, y, xx, xy, yy over the points of each voxel.
 
-    Sums of whole millimetres do not depend on the points' order.
+    The sums are in integer millimetres and do not depend on the order of the points.
     """
     voxel = np.full(shape, -1, np.int32)
     moments = np.zeros((len(layers), 6), np.int64)
@@ -63,7 +63,7 @@ def _moments(points, layers, cells, corner, shape):
 
 @kernel("boolean[::1](int32[:, :, ::1], int64[:, ::1], boolean[:, ::1], float64, float64)")
 def _walls(voxel, moments, tall, thickness_mm, min_length_mm):
-    """Whether each voxel is part of a face. Its surroundings never leave the grid, whose border is empty."""
+    """True for each voxel that is part of a vertical surface. Neighbours are within the grid, whose border is empty."""
     walls = np.zeros(len(moments), np.bool_)
     total = np.zeros(6, np.int64)
     for layer in range(voxel.shape[0]):

@@ -218,7 +218,7 @@ def test_odometry_that_dies_leaves_a_finished_run_and_is_told(tmp_path: Path) ->
                 os.kill(pid, signal.SIGKILL)
         status, metrics = command.ended()
     assert status == 2
-    assert "odometry's process has ended" in command.told
+    assert "the odometry process has ended" in command.told
     assert metrics["num_scans"] >= 1
     assert (run / "report.html").is_file()
 

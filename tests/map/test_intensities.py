@@ -112,7 +112,7 @@ def test_a_log_without_them_says_how_it_would_have_them(tmp_path: Path, capsys: 
     without = make_run(tmp_path / "run").folder
     assert run("export", without, tmp_path / "map.ply", *BY_INTENSITY, "--quiet") == 2
     (message,) = capsys.readouterr().err.splitlines()
-    assert "no intensities; they are kept only in runs mapped with `--set map.color=intensity`" in message
+    assert "no intensities; runs contain them only if mapped with `--set map.color=intensity`" in message
     assert not (tmp_path / "map.ply").exists()
 
 

@@ -192,7 +192,7 @@ def test_the_grid_is_free_in_the_yard_occupied_at_its_walls_and_unknown_beyond(t
 
 
 def test_a_name_that_is_no_maps_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match=r"map\.stl: unknown kind of map; its name has to end in \.ply, \.pcd"):
+    with pytest.raises(SegslamError, match=r"map\.stl: unknown kind of map; its name must end in \.ply, \.pcd"):
         write_map(placed_keyframes(), [tmp_path / "map.stl"], config=CONFIG)
 
 

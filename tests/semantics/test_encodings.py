@@ -52,7 +52,7 @@ def test_learning_ids_stay_and_predictions_move_up_by_one() -> None:
 
 @pytest.mark.parametrize(("value", "encoding"), [(7, "raw"), (26, "learning"), (19, "learning-0"), (65535, "raw")])
 def test_id_of_no_class_is_named(value: int, encoding: Encoding) -> None:
-    with pytest.raises(SegslamError, match=f"id {value} is none of the encoding {encoding}"):
+    with pytest.raises(SegslamError, match=f"id {value} is not in the encoding {encoding}"):
         to_labels(np.array([0, value]), encoding)
 
 
@@ -84,5 +84,5 @@ def test_ambiguous_ids_are_asked_about_with_the_reason(points_of_id: dict[int, i
 
 
 def test_ids_of_no_encoding_are_refused() -> None:
-    with pytest.raises(SegslamError, match=r"ids: 7, 40\): no encoding has all of them"):
+    with pytest.raises(SegslamError, match=r"ids: 7, 40\): no encoding contains all of them"):
         detect_encoding(_histogram({7: 5, 40: 5}))

@@ -81,7 +81,7 @@ def test_truncated_labels_are_refused(tmp_path: Path) -> None:
 
 def test_id_of_another_encoding_is_the_scans_failure(tmp_path: Path) -> None:
     _write(tmp_path, "000000", [10, 40])
-    with pytest.raises(BadScan, match=r"000000\.label: id 40 is none of the encoding learning"):
+    with pytest.raises(BadScan, match=r"000000\.label: id 40 is not in the encoding learning"):
         LabelFiles(tmp_path, "learning").read("000000", 2)
 
 
@@ -93,7 +93,7 @@ def test_a_broken_file_does_not_keep_the_others_from_telling_the_encoding(tmp_pa
 
 
 def test_missing_folder_and_unknown_source_are_named(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match=r"--labels predicted: no folder .*predicted; name one, or auto"):
+    with pytest.raises(SegslamError, match=r"--labels predicted: no folder .*predicted; give one, auto"):
         open_labels("predicted", beside=tmp_path, scan_names=NAMES, encoding=None)
 
 

@@ -104,7 +104,7 @@ def _made(**options: Any) -> Callable[[Path], Path]:
             _made(channels=["range", "x", "y", "z"], mean=[0] * 4, std=[1] * 4),
             r"takes an image of 1 x 5 x 16 x 90, but net\.yaml makes one of 1 x 4 x 16 x 90",
         ),
-        (_made(input_shape=(1, 5, "h", "w"), weights=np.full((3, 5), np.nan)), r"logits that are no numbers"),
+        (_made(input_shape=(1, 5, "h", "w"), weights=np.full((3, 5), np.nan)), r"logits that are not finite"),
         (_made(ids=True, id_offset=7), r"gave class id 7, but net\.yaml names 3 classes, ids 0 to 2"),
         (_made(ids=True, id_offset=-1), r"gave class id -1, but net\.yaml names 3 classes"),
         (_made(azimuth_deg=[-45, 45]), r"net\.yaml: .*azimuth_deg: -45 to 45; .*full circle"),

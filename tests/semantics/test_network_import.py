@@ -147,7 +147,7 @@ def _with(architecture: dict[str, Any], classes: Any = None) -> Callable[[Path],
         (_with({"dataset": {"sensor": {}}}), r"arch_cfg\.yaml: dataset\.sensor\.fov_up: Field required"),
         (
             _with(_architecture(), {"labels": {4: "people"}, "learning_map_inv": {0: 4}}),
-            r"data_cfg\.yaml: people is no class of SemanticKITTI; .*`import: arch_cfg\.yaml`",
+            r"data_cfg\.yaml: people is not a class of SemanticKITTI; .*`import: arch_cfg\.yaml`",
         ),
         (_with(_architecture(), {"labels": NAMES, "learning_map_inv": {1: 10}}), r"data_cfg\.yaml: output 0 has no"),
         (_with(_architecture(), {"labels": NAMES}), r"data_cfg\.yaml: learning_map_inv: Field required"),

@@ -24,7 +24,7 @@ def transform(rotation: Rotation, translation: Triple) -> Transform:
 
 
 def apply(T_a_b: Transform, points_b: Points) -> Points:
-    """Points of b, in a."""
+    """Points (n, 3) of frame b in frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
@@ -35,7 +35,7 @@ def inverse(T_a_b: Transform) -> Transform:
 
 
 def yaw(angle_rad: float) -> Rotation:
-    """A turn about z, counter-clockwise seen from above."""
+    """A rotation about z, counter-clockwise seen from above."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -49,7 +49,7 @@ def level(up: Direction) -> Rotation:
 
 
 def tangent(*, rotation_rad: Triple, translation_m: Triple) -> Tangent:
-    """A tangent from its named halves; a scalar is used for all three axes. Also for standard deviations."""
+    """A tangent from its two halves; a scalar applies to all three axes. Also used for standard deviations."""
     return np.concatenate([np.broadcast_to(np.asarray(half, dtype=float), 3) for half in (rotation_rad, translation_m)])
 
 
@@ -66,7 +66,7 @@ def log(T_a_b: Transform) -> Tangent:
 
 
 def scaled(T_a_b: Transform, factor: float) -> Transform:
-    """The motion at the same twist over `factor` times the time; as it is, to the bit, for a factor of 1."""
+    """The motion with the same twist over `factor` times the time; exactly `T_a_b` for a factor of 1."""
     return T_a_b if factor == 1.0 else exp(factor * log(T_a_b))
 
 
@@ -109,7 +109,7 @@ def _left_jacobian(phi: np.ndarray) -> Rotation:
     theta = float(np.linalg.norm(phi))
     x, y, z = phi
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    if theta < 1e-4:  # series: the closed form loses digits here, the next term is below 1e-17
+    if theta < 1e-4:  # series: the closed form loses precision here; the next term is below 1e-17
         return np.eye(3) + cross / 2.0 + cross @ cross / 6.0
     a = (1.0 - math.cos(theta)) / theta**2
     b = (theta - math.sin(theta)) / theta**3

@@ -11,7 +11,7 @@ from segslam.types import Covariances, Indices, Points
 EMPTY = -1
 """Value of an empty slot of a hash table, and row of a key that is not in the table."""
 MAX_CELLS = 2**62
-"""Largest number of voxels that int64 keys can count."""
+"""Largest number of voxels that int64 keys can number."""
 
 
 class Neighbours(NamedTuple):
@@ -48,9 +48,9 @@ def canonical_order(points: Points) -> Indices:
 
 
 def voxel_first(points: Points, voxel_m: float) -> Indices:
-    """Indices, ascending, of the first point in each occupied voxel; points that are not finite are in none.
+    """Indices, ascending, of the first point in each occupied voxel; points that are not finite are ignored.
 
-    Raises ValueError if voxel_m <= 0, or if the points spread over more voxels than there are numbers for.
+    Raises ValueError if voxel_m <= 0, or if the points span more voxels than int64 keys can number.
     """
     rows = np.flatnonzero(is_finite(points))
     keys, _ = _cell_keys(points.take(rows, axis=0), voxel_m)
@@ -58,9 +58,9 @@ def voxel_first(points: Points, voxel_m: float) -> Indices:
 
 
 def voxel_means(points: Points, voxel_m: float) -> Points:
-    """The mean of the finite points of each occupied voxel, float64, voxels in the order of x, y, z.
+    """Mean (m, 3), float64, of the finite points in each occupied voxel; voxels are ordered by x, y, z.
 
-    It does not depend on the order of float32 points: their sums are exact, but for coordinates below 1e-5 m.
+    The result does not depend on the order of float32 points: their sums are exact, except below 1e-5 m.
     Raises ValueError as `voxel_first` does.
     """
     points = points.compress(is_finite(points), axis=0)
@@ -74,7 +74,7 @@ def voxel_means(points: Points, voxel_m: float) -> Points:
 
 
 def group_means(rows: np.ndarray, group: Indices, num_groups: int) -> np.ndarray:
-    """Mean row of each group, float64; every group has a row at least."""
+    """Mean row of each group, float64; every group must have a row."""
     sums = [np.bincount(group, weights=column, minlength=num_groups) for column in rows.T]
     return np.column_stack(sums) / np.bincount(group, minlength=num_groups)[:, None]
 
@@ -92,9 +92,9 @@ def patch_covariances(points: Points, neighbours: Neighbours) -> Covariances:
 
 
 def normals(points: Points, covariances: Covariances) -> Points:
-    """Normal of each point: the direction of least variance around it, towards the sensor at the origin.
+    """Normal (n, 3) of each point: direction of least variance in its patch, towards the sensor at the origin.
 
-    Zero if that direction is not unique: duplicates, points on a line along an axis.
+    Zero if this direction is not unique, as for duplicates or points on a line along an axis.
     """
     directions = _least_directions(covariances)
     away = np.einsum("ij,ij->i", directions, points) > 0
@@ -102,10 +102,10 @@ def normals(points: Points, covariances: Covariances) -> Points:
 
 
 def _cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]:
-    """A number for each point's cell, and how far it grows from a cell to the next in x and in y; in z it is 1.
+    """A number for each point's cell floor(p / cell_m), and its increments to the next cell in x and in y (in z: 1).
 
-    The cell of a point is floor(p / cell_m). Numbers grow with x, then y, then z, and leave room around the points, so
-    that neighbouring cells have numbers of their own.
+    The numbers ascend with x, then y, then z. A margin around the points ensures that all neighbouring cells have
+    distinct numbers.
     """
     if cell_m <= 0:
         raise ValueError(f"voxel_m or radius_m must be above 0, got {cell_m}")
@@ -115,7 +115,7 @@ def _cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]
     lows = [column.min() - 1 for column in columns]
     extent = [int(column.max() - low) + 2 for column, low in zip(columns, lows, strict=True)]
     if math.prod(extent) > MAX_CELLS:
-        raise ValueError(f"points spread over {extent} cells of {cell_m} m; drop far points or enlarge the cells")
+        raise ValueError(f"points span {extent} cells of {cell_m} m; remove far points or enlarge the cells")
     x, y, z = ((column - low).astype(np.int64) for column, low in zip(columns, lows, strict=True))
     return (x * extent[1] + y) * extent[2] + z, (extent[1] * extent[2], extent[2])
 
@@ -129,7 +129,7 @@ def _home(key, size):
 def hash_keys(keys):
     """An open-addressing table for `find_key`, and for each row the first row with the same key.
 
-    A slot of the table holds the first row of its key, or EMPTY.
+    A slot of the table contains the first row of its key, or EMPTY.
     """
     size = 16
     while size < 2 * len(keys):
@@ -157,7 +157,7 @@ def find_key(table, keys, key):
 
 @kernel("int64[:, :](int64[:], int64, int64, int64)")
 def _nearby_columns(keys, key, stride_x, stride_y):
-    """(9, 2) first and last + 1 row, in sorted keys, of the cells around a cell; three of them lie above each other."""
+    """(9, 2) first and last + 1 row, in sorted keys, of the cells around a cell, in columns of three along z."""
     bounds = np.empty((9, 2), np.int64)
     for column in range(9):
         middle = key + (column // 3 - 1) * stride_x + (column % 3 - 1) * stride_y
@@ -168,7 +168,7 @@ def _nearby_columns(keys, key, stride_x, stride_y):
 
 @kernel("Tuple((int64[:], int64[:], int32[:]))(float64[:, :], int64[:], int64, int64, int64[:], float64)")
 def _neighbours(points, keys, stride_x, stride_y, row_of, squared_radius):
-    """Points and keys are sorted by key; `row_of` gives the row that each had before."""
+    """Neighbours of points sorted by key; `row_of` contains the original row of each point."""
     starts, ends = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     rows = np.empty(64 * len(points) + 1, np.int32)
     bounds = np.empty((9, 2), np.int64)
@@ -215,7 +215,7 @@ def _patch_covariances(points, starts, ends, rows):
 
 @kernel("float64(float64[:, :])")
 def _least_eigenvalue(a):
-    """Of a symmetric matrix, in closed form (Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961)."""
+    """Smallest eigenvalue of a symmetric matrix (Smith, "Eigenvalues of a symmetric 3 x 3 matrix", CACM 1961)."""
     mean = (a[0, 0] + a[1, 1] + a[2, 2]) / 3.0
     squared = 2.0 * (a[0, 1] ** 2 + a[0, 2] ** 2 + a[1, 2] ** 2)
     for i in range(3):
@@ -235,9 +235,9 @@ def _least_eigenvalue(a):
 
 @kernel("float64[:, :](float64[:, :, :])")
 def _least_directions(matrices):
-    """Unit eigenvector of the least eigenvalue of each symmetric matrix, the sign as it comes; zero if it is not one.
+    """Unit eigenvector of the smallest eigenvalue of each symmetric matrix, with any sign; zero if it is not unique.
 
-    It is normal to the rows of A - lambda I, of which two at least differ: their longest cross product.
+    It is perpendicular to all rows of A - lambda I, and computed as the longest cross product of two of them.
     """
     directions = np.zeros((len(matrices), 3))
     for index in range(len(matrices)):

@@ -78,7 +78,7 @@ def test_a_voxel_without_size_is_refused(voxel_m: float) -> None:
 
 
 def test_points_spread_over_too_many_voxels_are_refused() -> None:
-    with pytest.raises(ValueError, match="drop far points or enlarge"):
+    with pytest.raises(ValueError, match="remove far points or enlarge"):
         voxel_first(np.array([[0.0, 0, 0], [1e30, 1e30, 1e30]]), 0.1)
 
 

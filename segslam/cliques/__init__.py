@@ -1,4 +1,4 @@
-"""The largest sets of vertices that are all joined to each other, and adjacency as bits."""
+"""Maximum cliques, and graphs as adjacency bits."""
 
 from segslam.cliques.bits import Bits, pack_rows
 from segslam.cliques.search import CliqueSearch, maximum_cliques

@@ -1,4 +1,4 @@
-"""Adjacency as bits: what consistency graphs and the clique search share."""
+"""Adjacency matrices as bits, shared by consistency graphs and the clique search."""
 
 import numpy as np
 from jaxtyping import Bool, UInt64
@@ -10,7 +10,7 @@ Bits = UInt64[np.ndarray, "_ _"]
 
 
 def pack_rows(joined: Bool[np.ndarray, "n n"]) -> Bits:
-    """The adjacency of n vertices as bits; nobody is joined to itself."""
+    """The adjacency of n vertices as bits; the diagonal is cleared."""
     num = len(joined)
     padded = np.zeros((num, (num + 63) // 64 * 64), bool)
     padded[:, :num] = joined & ~np.eye(num, dtype=bool)
@@ -19,7 +19,7 @@ def pack_rows(joined: Bool[np.ndarray, "n n"]) -> Bits:
 
 @kernel("uint64(uint64)")
 def count_bits(word):
-    """How many bits are set, added up in fields of 2, 4 and 8 bits."""
+    """Number of set bits, summed in fields of 2, 4 and 8 bits."""
     word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -28,13 +28,13 @@ def count_bits(word):
 
 @kernel("int64(uint64)")
 def lowest_bit(word):
-    """Position of the lowest bit set; `word` is not 0."""
+    """Position of the lowest set bit; `word` must not be 0."""
     return np.int64(count_bits((word & (~word + np.uint64(1))) - np.uint64(1)))
 
 
 @kernel("uint64(uint64[::1])")
 def pack_flags(eights):
-    """One word from 64 bytes of 0 or 1, eight at a time: the product gathers the lowest bits in its highest byte."""
+    """One word from 64 bytes of 0 or 1, eight at a time: a product collects the lowest bits in its highest byte."""
     word = np.uint64(0)
     for k in range(8):
         word |= ((eights[k] * np.uint64(0x0102040810204080)) >> np.uint64(56)) << np.uint64(8 * k)
@@ -43,7 +43,7 @@ def pack_flags(eights):
 
 @kernel("int64(uint64[::1], int64[::1])")
 def members(row, out):
-    """Writes the positions of the bits set in `row`, ascending, and returns how many."""
+    """Writes the positions of the set bits of `row`, ascending, to `out`, and returns their number."""
     count = 0
     for w in range(len(row)):
         word = row[w]
@@ -56,7 +56,7 @@ def members(row, out):
 
 @kernel("int64[:, ::1](uint64[:, ::1])")
 def pairs(adjacency):
-    """Joined vertices i < j, a row each, in ascending order."""
+    """(n, 2) adjacent vertices i < j, in ascending order."""
     count = len(adjacency)
     degrees = np.int64(0)
     for i in range(count):
@@ -75,7 +75,7 @@ def pairs(adjacency):
 
 @kernel("void(uint64[:, ::1], int64[:, ::1])")
 def part(adjacency, parted):
-    """Takes away the edges between the vertices of each row."""
+    """Removes the edges between the two vertices of each row."""
     for row in range(len(parted)):
         i, j = parted[row]
         adjacency[i, j >> 6] &= ~(np.uint64(1) << np.uint64(j & 63))

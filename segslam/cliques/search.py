@@ -1,6 +1,6 @@
 """Maximum cliques by branch and bound on bitsets.
 
-Vertices are taken in degeneracy order, each with its later neighbours only, and dropped by core number (Rossi,
+Vertices are processed in degeneracy order, each with its later neighbours only, and pruned by core number (Rossi,
 Gleich, Gebremedhin, "Parallel maximum clique algorithms with applications to network analysis", SISC 2015). Each such
 neighbourhood is searched with greedy colouring as the upper bound (San Segundo, Rodriguez-Losada, Jimenez, "An exact
 bit-parallel algorithm for the maximum clique problem", C&OR 2011).
@@ -14,7 +14,7 @@ from segslam.cliques.bits import Bits, count_bits, lowest_bit, members
 from segslam.system.kernels import kernel
 from segslam.types import Indices
 
-_FLOOR, _SIZE, _FOUND, _NODES = range(4)  # what `state` holds: only larger cliques count; size and number of those kept
+_FLOOR, _SIZE, _FOUND, _NODES = range(4)  # in `state`: size to exceed, size and number of found cliques, visited nodes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,15 +23,15 @@ class CliqueSearch:
 
     cliques: tuple[Indices, ...]
     proved: bool
-    """That none is larger: false if the search was stopped at its bound of nodes, with the best so far."""
+    """True if no larger clique exists; False if the search stopped at its limit of nodes."""
 
 
 def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> CliqueSearch:
-    """Up to `max_cliques` cliques of the greatest size.
+    """Up to `max_cliques` cliques of the maximum size.
 
-    Fewer than that are all there are, so that the set does not depend on how vertices are numbered; the order is that
-    of the search, the same on every run. `max_nodes` bounds the work of finding the size, and again that of listing;
-    if it stops either, at least one clique is given.
+    If fewer are returned, they are all that exist, so the set does not depend on the numbering of the vertices; the
+    order is deterministic. `max_nodes` limits the search for the size, and separately the listing; at least one clique
+    is returned if either stops.
     """
     if len(adjacency) == 0:
         return CliqueSearch((), True)
@@ -45,13 +45,13 @@ def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> Cli
 
 @kernel("UniTuple(int64[::1], 2)(uint64[:, ::1])")
 def degeneracy_order(adjacency):
-    """Vertices as repeatedly taken with the fewest neighbours left, and the core number of each vertex."""
+    """Vertices in the order of repeated removal of a vertex of smallest degree; the core number of each vertex."""
     count = len(adjacency)
     neighbours = np.empty(count, np.int64)
     degree = np.empty(count, np.int64)
     for v in range(count):
         degree[v] = members(adjacency[v], neighbours)
-    starts = np.zeros(count + 1, np.int64)  # of the vertices of each degree in `order`
+    starts = np.zeros(count + 1, np.int64)  # start of the vertices of each degree in `order`
     for v in range(count):
         starts[degree[v] + 1] += 1
     for k in range(count):
@@ -66,7 +66,7 @@ def degeneracy_order(adjacency):
         v = order[step]
         for k in range(members(adjacency[v], neighbours)):
             u = neighbours[k]
-            if degree[u] > degree[v]:  # swap u to the front of its degree, then that front moves past it
+            if degree[u] > degree[v]:  # swap u to the front of its degree, then move that front past it
                 front = max(starts[degree[u]], step + 1)
                 other = order[front]
                 order[front], order[place[u]] = u, other
@@ -78,7 +78,7 @@ def degeneracy_order(adjacency):
 
 @kernel("uint64[:, ::1](uint64[:, ::1], int64[::1])")
 def _induced(adjacency, vertices):
-    """The adjacency among some vertices, renumbered as listed."""
+    """The adjacency among some vertices, renumbered in their order."""
     count = len(vertices)
     local = np.zeros((count, (count + 63) // 64), np.uint64)
     for i in range(count):
@@ -93,10 +93,10 @@ def _induced(adjacency, vertices):
 
 @kernel("Tuple((int64, int64[::1], int64[::1]))(uint64[:, ::1], uint64[::1], int64, int64, int64[::1], int64[::1])")
 def _colour(adjacency, candidates, spare, top, branches, bounds):
-    """Pushes the candidates that could begin a clique of more than `spare`, each with a bound of its size.
+    """Pushes the candidates that may start a clique of more than `spare` vertices, each with a bound of its size.
 
-    The candidates are split into independent sets one after the other; a clique among the first k sets has at most k
-    members. Those of the first `spare` sets need no branch of their own.
+    The candidates are split into independent sets one after the other; a clique in the first k sets has at most k
+    vertices. Candidates in the first `spare` sets need no branch of their own.
     """
     words = len(candidates)
     uncoloured = candidates.copy()
@@ -125,7 +125,7 @@ def _colour(adjacency, candidates, spare, top, branches, bounds):
 
 @kernel("void(int64[::1], int64[:, ::1], int64[::1])")
 def _keep(clique, found, state):
-    """Into a room for one it comes in place of the smaller one there, and raises the floor."""
+    """Store a clique. With space for only one, it replaces the smaller clique and raises the floor."""
     state[_SIZE] = len(clique)
     if len(found) == 1:
         state[_FLOOR], state[_FOUND] = len(clique), 0
@@ -136,14 +136,14 @@ def _keep(clique, found, state):
 
 @kernel("void(uint64[:, ::1], int64, int64[::1], int64[:, ::1], int64[::1], int64)")
 def _search_neighbourhood(adjacency, root, names, found, state, max_nodes):
-    """Adds to `found` the cliques of `root` and some of its neighbours; `names` are theirs in the whole graph."""
+    """Adds to `found` the cliques of `root` and some of its neighbours; `names`: their numbers in the whole graph."""
     count, words = adjacency.shape
-    candidates = np.zeros((count + 1, words), np.uint64)  # by depth: adjacent to all that were chosen above it
+    candidates = np.zeros((count + 1, words), np.uint64)  # by depth: vertices adjacent to all chosen so far
     for k in range(count):
         candidates[0, k >> 6] |= np.uint64(1) << np.uint64(k & 63)
     clique = np.empty(count + 1, np.int64)
     clique[0] = root
-    starts = np.zeros(count + 2, np.int64)  # by depth: where its branches begin on the stack
+    starts = np.zeros(count + 2, np.int64)  # by depth: start of its branches on the stack
     branches, bounds = np.empty(2 * count + 1, np.int64), np.empty(2 * count + 1, np.int64)
     depth = 0
     if count == 0:
@@ -178,7 +178,7 @@ def _search_neighbourhood(adjacency, root, names, found, state, max_nodes):
 
 @kernel("int64[::1](uint64[:, ::1], int64)")
 def _greedy_clique(adjacency, start):
-    """A clique grown from one vertex by whichever candidate leaves the most candidates."""
+    """A clique grown from one vertex; each step adds the candidate that keeps the most candidates."""
     count, words = adjacency.shape
     clique, rows = np.empty(count, np.int64), np.empty(count, np.int64)
     clique[0], size = start, 1
@@ -202,10 +202,10 @@ def _greedy_clique(adjacency, start):
 
 @kernel("Tuple((int64[:, ::1], boolean))(uint64[:, ::1], int64[::1], int64[::1], int64, int64, int64)")  # fmt: skip
 def _search(adjacency, order, core_numbers, floor, room, max_nodes):
-    """Cliques larger than `floor`, a row each, and whether the search came to its end.
+    """Cliques larger than `floor`, one per row, and whether the search was completed.
 
-    With room for one, each clique found raises the floor, so that the last is a largest one. With room for more they
-    all have the size floor + 1, which must be the greatest there is.
+    With `room` for one, each clique found raises the floor, so the last one is a maximum clique. With room for more,
+    all cliques have the size floor + 1, which must be the maximum size.
     """
     count = len(adjacency)
     found = np.empty((room, core_numbers.max() + 1), np.int64)
@@ -223,7 +223,7 @@ def _search(adjacency, order, core_numbers, floor, room, max_nodes):
                     later[num_later] = u
                     num_later += 1
         if num_later >= state[_FLOOR]:
-            state[_NODES] += num_later  # what making this neighbourhood costs, in nodes
+            state[_NODES] += num_later  # cost of building this neighbourhood, in nodes
             candidates = later[:num_later]
             _search_neighbourhood(_induced(adjacency, candidates), v, candidates, found, state, max_nodes)
         if state[_NODES] >= max_nodes or (room > 1 and state[_FOUND] == room):

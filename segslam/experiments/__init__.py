@@ -1,1 +1,1 @@
-"""The paper's experiments, and the methods they compare."""
+"""Benchmarks of registration methods: the experiments of the Segregator paper, and recognition of places."""

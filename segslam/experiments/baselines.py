@@ -1,7 +1,7 @@
-"""Registration methods of other libraries, each with the settings that its authors give for LiDAR scans.
+"""Registration methods of other libraries, with the settings that their authors recommend for LiDAR scans.
 
-`prepare_*` makes of one scan's points what can be made once; `align_*` aligns two scans so prepared. All on one thread
-where the library lets it choose.
+`prepare_*` computes the data of one scan that can be reused; `align_*` aligns two prepared scans. Methods run on one
+thread if the library allows it.
 """
 
 from typing import Any
@@ -19,15 +19,18 @@ VGICP_VOXEL_M = 1.0
 GICP_NEIGHBOURS = 10
 """small_gicp's defaults (Koide, JOSS 2024), for outdoor LiDAR."""
 GICP_ITERATIONS = 64
-"""Of its author's fast_gicp, which the paper ran. small_gicp's 20 stop two of three pairs 4 m apart on their way."""
+"""Value of the author's fast_gicp, used in the paper.
+
+With small_gicp's 20, two of three pairs 4 m apart do not converge.
+"""
 KISS_MIN_POINTS = 100
-"""Chosen: KISS-Matcher 1.0.2 ends the process at a dozen points."""
+"""Chosen: KISS-Matcher 1.0.2 terminates the process with about a dozen points."""
 KISS_VOXEL_M = 0.3
-"""KISS-Matcher's own voxel for outdoor scans (Lim et al., ICRA 2025)."""
+"""Voxel size that KISS-Matcher's authors use outdoors (Lim et al., ICRA 2025)."""
 
 
 class GicpScan:
-    """A thinned cloud with covariances, its search tree and its voxel map. Travels between processes as its points."""
+    """A downsampled cloud with covariances, search tree and voxel map. It is pickled as its points."""
 
     def __init__(self, thinned: Points) -> None:
         self.cloud = small_gicp.PointCloud(thinned)
@@ -41,7 +44,7 @@ class GicpScan:
 
 
 def prepare_gicp(points: Points) -> GicpScan:
-    """small_gicp's preprocessing."""
+    """Preprocessing of small_gicp."""
     return GicpScan(small_gicp.voxelgrid_sampling(points.astype(np.float64), GICP_VOXEL_M, 1).points()[:, :3])
 
 
@@ -66,13 +69,13 @@ def align_vgicp(source: GicpScan, target: GicpScan) -> Estimate | Rejected:
 
 
 def prepare_points(points: Points) -> Points:
-    """The points as they are, for a method that does all in one call."""
+    """The points, unchanged, for methods without a preparation step."""
     return points.astype(np.float32)
 
 
 def align_kiss_matcher(source: Points, target: Points) -> Estimate | Rejected:
-    """KISS-Matcher on the whole scans, the ground included."""
-    import kiss_matcher  # optional: extra `bench`
+    """KISS-Matcher on the whole scans, including the ground."""
+    import kiss_matcher  # optional package: extra `bench`
 
     if min(len(source), len(target)) < KISS_MIN_POINTS:
         return Rejected(RejectReason.TOO_FEW_POINTS, f"{len(source)} and {len(target)} points")
@@ -89,5 +92,5 @@ def align_kiss_matcher(source: Points, target: Points) -> Estimate | Rejected:
 
 def _small_gicp_outcome(found: Any, source: GicpScan) -> Estimate | Rejected:
     if found.num_inliers == 0:
-        return Rejected(RejectReason.REFINEMENT_DIVERGED, "no pairs of points")
+        return Rejected(RejectReason.REFINEMENT_DIVERGED, "no point pairs")
     return Estimate(found.T_target_source, num_correspondences=source.cloud.size(), num_inliers=int(found.num_inliers))

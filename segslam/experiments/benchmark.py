@@ -1,4 +1,4 @@
-"""A benchmark from its trials to all rows: spread over workers, kept as they come, continued where it was stopped."""
+"""Runs the trials of a benchmark on one or several workers, stores each row at once, and resumes interrupted runs."""
 
 import hashlib
 import json
@@ -23,17 +23,17 @@ ASKED_FILE = "asked.json"
 
 @dataclass(frozen=True, slots=True)
 class Pool:
-    """Who does the work: this process, several of this machine, or the workers of a Dask cluster."""
+    """The workers: this process, several processes of this machine, or a Dask cluster."""
 
     workers: int = 1
     scheduler: str | None = None
 
 
 def run(job: Job, trials: Sequence[Trial], *, pool: Pool = Pool(), folder: Path | None = None) -> Iterator[list[Row]]:
-    """The rows of each trial as it is finished, those that the folder holds from before first.
+    """Yields the rows of each trial when it is finished, starting with those already in the folder.
 
-    With a folder every row is on the disk before the next trial's. The same benchmark in the same folder goes on where
-    it was stopped; raises SegslamError if the folder holds another one.
+    With a folder, the rows of a trial are on the disk before the next trial is yielded. The same benchmark in the same
+    folder continues where it stopped; raises SegslamError if the folder contains another benchmark.
     """
     done = _rows_before(folder, job, trials) if folder else []
     tried = grouped(done, lambda row: row.key[:3])
@@ -47,7 +47,7 @@ def run(job: Job, trials: Sequence[Trial], *, pool: Pool = Pool(), folder: Path 
 
 
 def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row]:
-    """The rows as one process would have made them, whoever was first."""
+    """The rows in the order of a single process, whatever the order in which they were finished."""
     place = {trial.key: number for number, trial in enumerate(trials)}
     return sorted(rows, key=lambda row: (place[row.key[:3]], job.methods.index(row.method)))
 
@@ -63,7 +63,7 @@ def _work(job: Job, trials: Sequence[Trial], pool: Pool) -> Iterator[list[Row]]:
 
 
 def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
-    """The rows of the trials that are finished, after making sure that they are of this benchmark."""
+    """The rows of finished trials; raises SegslamError if they belong to another benchmark."""
     asked = _asked(job, trials)
     file = folder / ASKED_FILE
     try:
@@ -79,19 +79,19 @@ def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
         return []
     for key in asked:
         if before.get(key) != asked[key]:
-            raise SegslamError(f"{folder}: holds a benchmark with other {key}; choose another --out, or delete it")
+            raise SegslamError(f"{folder}: contains a benchmark with other {key}; choose another --out, or delete it")
     rows = read_rows(folder / ROWS_FILE) if (folder / ROWS_FILE).exists() else []
     return _of_whole_trials([row for row in rows if row.reason != LOST_WORKER], job)
 
 
 def _of_whole_trials(rows: list[Row], job: Job) -> list[Row]:
-    """Those of trials that every method has finished."""
+    """The rows of trials that every method has finished."""
     trials = grouped(rows, lambda row: row.key[:3]).values()
     return [row for some in trials if {one.method for one in some} == set(job.methods) for row in some]
 
 
 def _asked(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:
-    """What makes two benchmarks the same one, in words that a person can compare."""
+    """Everything that identifies a benchmark, in readable form."""
     digest = hashlib.sha256()
     for trial in trials:
         digest.update(repr((trial.key, trial.T_target_source.round(6).tolist())).encode())

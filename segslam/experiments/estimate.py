@@ -1,4 +1,4 @@
-"""What any registration method gives."""
+"""Common result of all registration methods."""
 
 from dataclasses import dataclass
 
@@ -13,4 +13,4 @@ class Estimate:
     num_correspondences: int | None = None
     num_inliers: int | None = None
     num_edges: int | None = None
-    """Of the consistency graph."""
+    """Number of edges of the consistency graph."""

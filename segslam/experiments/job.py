@@ -1,4 +1,4 @@
-"""One benchmark's scans, methods and settings, and the two pieces of work it consists of, wherever they are done."""
+"""Data, methods and settings of a benchmark, and its two units of work: prepare a scan, register a pair."""
 
 import logging
 from collections.abc import Mapping
@@ -22,12 +22,12 @@ from segslam.types import BadScan, Points, Rejected
 logger = logging.getLogger(__name__)
 
 BAD_SCAN = "bad_scan"
-"""The reason of a row whose scan could not be read."""
+"""Reject reason of a row whose scan cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
 class DataSource:
-    """What opens the data set, here or on another machine that sees the same files."""
+    """Arguments that open the data set, here or on another machine with the same files."""
 
     data: Path
     sequence: str = "00"
@@ -50,7 +50,7 @@ class DataSource:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Job:
-    """What all trials of a benchmark have in common. Travels to the workers."""
+    """Everything that the trials of a benchmark have in common; sent to the workers."""
 
     source: DataSource
     methods: tuple[str, ...]
@@ -59,21 +59,21 @@ class Job:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedScan:
-    """All that the methods need of one scan, made once; nothing if it cannot be used."""
+    """The data of one scan that the methods share; empty if the scan cannot be used."""
 
     parts: Mapping[str, Part]
     labelling: Cost | None = None
-    """Labels by shape or by a network; None where labels came from files, whose making nobody timed."""
+    """Cost of labels by geometry or network; None for labels from files."""
     unusable: bool = False
 
 
 def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
-    """Read, rotate, label and prepare a scan, with some labels removed. Labels by shape are those of rotated points."""
+    """Read, rotate, label and prepare a scan, and remove some labels. Geometric labels are those of rotated points."""
     dataset, row_of_scan = open_once(job.source)
     try:
         scan = dataset[row_of_scan[variant.index]]
     except BadScan as error:
-        logger.warning("scan %d left out: %s", variant.index, error)
+        logger.warning("scan %d skipped: %s", variant.index, error)
         return SharedScan({}, unusable=True)
     points, labels, labelling = variant.turned(scan.points), scan.labels, None
     if callable(labels):
@@ -87,20 +87,20 @@ def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
 
 
 def points_of(source: DataSource, variant: ScanVariant) -> Points:
-    """The points of a variant, as the methods see them."""
+    """The points (n, 3) of a variant, as the methods receive them."""
     dataset, row_of_scan = open_once(source)
     scan = dataset[row_of_scan[variant.index]]
     return variant.turned(scan.points)
 
 
 def register_trial(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> list[Row]:
-    """The pair registered by every method of the job, from the same scans."""
+    """Rows of all methods of the job for one pair, from the same prepared scans."""
     return [_register(method, job.config, trial, source, target) for method in job.methods]
 
 
 @lru_cache(maxsize=4)
 def open_once(source: DataSource) -> tuple[Dataset, dict[int, int]]:
-    """The data set, once a process, and the row of each scan."""
+    """The data set, opened once per process, and the row of each scan."""
     dataset = source.open()
     return dataset, {int(index): row for row, index in enumerate(dataset.scan_index)}
 
@@ -151,7 +151,7 @@ def _uses_labels(method: str) -> bool:
 
 
 def failed_row(method: str, trial: Trial, reason: str) -> Row:
-    """The row of a registration that gave no pose."""
+    """The row of a registration without pose."""
     return Row(
         pairs=trial.pairs,
         source=trial.source.index,

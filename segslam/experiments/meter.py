@@ -1,4 +1,4 @@
-"""What a piece of work takes: seconds, and the memory it needed beyond what the process held before."""
+"""Measurement of time and additional memory."""
 
 import ctypes
 from collections.abc import Iterator
@@ -9,23 +9,23 @@ from time import perf_counter, process_time
 
 PROCESS = Path("/proc/self")
 RESET_PEAK = "5"
-"""Written to `clear_refs`, sets the peak back to what is held now (Linux, proc(5))."""
+"""Value that, written to `clear_refs`, resets the peak memory to the current memory (Linux, proc(5))."""
 
 
 @dataclass(slots=True)
 class Cost:
-    """Filled in when the work is done."""
+    """Time and memory; the fields are set when the measured block ends."""
 
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     """CPU time of all threads; more reliable than `seconds` on a busy machine."""
     peak_mb: float | None = None
-    """None if the system does not report it. Invalid while other threads of the process work."""
+    """Peak of additional memory; None if unknown. Invalid while other threads of the process work."""
 
 
 @contextmanager
 def measured() -> Iterator[Cost]:
-    """The cost of what is done inside."""
+    """Context manager that yields the cost of its block."""
     cost = Cost()
     _give_back()
     before_mb = _memory_mb("VmRSS") if _reset_peak() else None
@@ -37,8 +37,8 @@ def measured() -> Iterator[Cost]:
 
 
 def _give_back() -> None:
-    """Let the allocator return what is free: memory used again would not show."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's alone
+    """Return free memory to the system: reused memory would not be counted."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
     if trim is not None:
         trim(0)
 

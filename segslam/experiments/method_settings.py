@@ -1,4 +1,4 @@
-"""The methods by name, and the settings that make some of them from Segregator. Quick to import."""
+"""Names of the methods, and the settings of those that are variants of Segregator. Imports quickly."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ FPFH_ONLY: dict[str, Any] = {
     "max_cliques": 1,
     "solver": "decoupled",
 }
-"""Point features alone with TEASER's solver: radii and bound of Segregator's authors (Yin et al., ICRA 2023)."""
+"""Point features alone with TEASER's solver; radii and bound of Segregator's authors (Yin et al., ICRA 2023)."""
 SEGREGATOR_SETTINGS: dict[str, dict[str, Any]] = {
     "segregator": {},
     "segregator-c2f": {},
@@ -26,17 +26,17 @@ SEGREGATOR_SETTINGS: dict[str, dict[str, Any]] = {
     "teaser": FPFH_ONLY,
     "quatro": FPFH_ONLY | {"rotation": "yaw"},
 }
-"""What each changes in section `segregator`."""
+"""Settings of section `segregator` by method."""
 METHOD_NAMES = (*SEGREGATOR_SETTINGS, "vgicp", "gicp", "kiss-matcher", "ransac", "fgr")
 
 
 def check_method(name: str) -> None:
-    """Raises SegslamError for a name that no method has."""
+    """Raises SegslamError for an unknown method."""
     if name not in METHOD_NAMES:
-        raise SegslamError(f"--method {name}: no such method; known: {', '.join(METHOD_NAMES)}")
+        raise SegslamError(f"--method {name}: unknown method; known: {', '.join(METHOD_NAMES)}")
 
 
 def method_config(config: "Config", method: str) -> "Config":
-    """The configuration as a method uses it."""
+    """The configuration with the settings of a method."""
     changes = SEGREGATOR_SETTINGS.get(method, {})
     return config.model_copy(update={"segregator": config.segregator.model_copy(update=changes)})

@@ -1,4 +1,4 @@
-"""Every method on one interface: what it needs of each scan, made once a scan, and how it aligns two so prepared."""
+"""All registration methods behind one interface: the data they need per scan, and how they align two scans."""
 
 import importlib
 from collections.abc import Callable, Iterable, Mapping
@@ -22,7 +22,7 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Something made of one scan, and what that took."""
+    """Data computed from one scan, and its cost."""
 
     value: Any
     cost: Cost
@@ -30,16 +30,16 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """How two scans are aligned, from the parts of each that it names."""
+    """Aligns two scans, given the parts of each that it names."""
 
     parts: tuple[str, ...]
     align: Callable[[Values, Values, Config, Stopwatch], Estimate | Rejected]
     package: tuple[str, str] | None = None
-    """Module and extra, where it is optional or slow to import."""
+    """Module and extra, if the package is optional or slow to import."""
 
 
 class SurfaceScan:
-    """Surface and view of a scan, for refinement and verification. Travels between processes as its points."""
+    """Surface and free space of a scan, for refinement and verification. It is pickled as its points."""
 
     def __init__(self, thinned: Points, free_space: FreeSpace, config: RefineConfig) -> None:
         self.surface = refinement.make_surface(thinned, config=config)
@@ -63,12 +63,12 @@ def _fpfh_description(points: Points, labels: Labels, config: Config) -> Descrip
 
 
 def _of_points(make: Callable[[Points], Any]) -> Callable[[Points, Labels, Config], Any]:
-    """For a part that neither labels nor settings change."""
+    """Wrapper for a part that depends on neither labels nor settings."""
     return lambda points, labels, config: make(points)
 
 
 def _open3d(name: str) -> Callable[..., Any]:
-    """A function of `open3d_methods`, imported when it is first called."""
+    """A function of `open3d_methods`, imported on the first call."""
     return lambda *scans: getattr(importlib.import_module("segslam.experiments.open3d_methods"), name)(*scans)
 
 
@@ -83,7 +83,7 @@ PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
 
 
 def prepare_parts(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> dict[str, Part]:
-    """All parts of a scan that these methods need, each made once."""
+    """All parts of a scan that these methods need, each computed once."""
     parts = {}
     for name in dict.fromkeys(part for method in methods for part in METHODS[method].parts):
         with measured() as cost:
@@ -93,7 +93,7 @@ def prepare_parts(points: Points, labels: Labels, *, methods: Iterable[str], con
 
 
 def find_method(name: str) -> Method:
-    """The method of a name. Raises SegslamError if there is none, or if its package is not installed."""
+    """The method of a name. Raises SegslamError if it is unknown or its package is not installed."""
     check_method(name)
     method = METHODS[name]
     if method.package is not None:
@@ -112,7 +112,7 @@ def _match(source: Values, target: Values, config: Config, watch: Stopwatch, *, 
 
 
 def _segregator(name: str, part: str = "description") -> Method:
-    """Segregator's coarse pose under the settings of a name."""
+    """Segregator's coarse pose with the settings of a method."""
     return Method(
         (part,),
         lambda source, target, config, watch: _match(source, target, method_config(config, name), watch, part=part),

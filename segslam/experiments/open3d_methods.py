@@ -1,4 +1,4 @@
-"""Registration by Open3D, with the settings of its own examples. Imported only where it runs: it is large."""
+"""Registration by Open3D with the settings of its examples. Imported on use, because Open3D is large."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ from segslam.experiments.estimate import Estimate
 from segslam.types import Points, Rejected, RejectReason
 
 OPEN3D_VOXEL_M = 0.5
-"""Chosen: the voxel of Segregator's authors for FPFH. All else is in voxels, as in Open3D's own examples."""
+"""Chosen: voxel size of Segregator's authors for FPFH. Other lengths are multiples of it, as in Open3D's examples."""
 TOOLS: Any = open3d.pipelines.registration
 RANSAC_ITERATIONS, RANSAC_CONFIDENCE = 100_000, 0.999
 SEED = 0
@@ -34,7 +34,7 @@ def prepare_fpfh(points: Points) -> FpfhScan:
 
 
 def align_ransac(source: FpfhScan, target: FpfhScan) -> Estimate | Rejected:
-    """RANSAC over mutual FPFH matches, Open3D's."""
+    """Open3D's RANSAC over mutual FPFH matches."""
     open3d.utility.random.seed(SEED)
     reach_m = 1.5 * OPEN3D_VOXEL_M
     found = TOOLS.registration_ransac_based_on_feature_matching(
@@ -53,7 +53,7 @@ def align_ransac(source: FpfhScan, target: FpfhScan) -> Estimate | Rejected:
 
 
 def align_fgr(source: FpfhScan, target: FpfhScan) -> Estimate | Rejected:
-    """Fast global registration (Zhou et al., ECCV 2016), Open3D's."""
+    """Open3D's fast global registration (Zhou et al., ECCV 2016)."""
     open3d.utility.random.seed(SEED)
     found = TOOLS.registration_fgr_based_on_feature_matching(
         *_clouds_and_features(source, target),
@@ -65,7 +65,7 @@ def align_fgr(source: FpfhScan, target: FpfhScan) -> Estimate | Rejected:
 def _open3d_outcome(found: Any) -> Estimate | Rejected:
     num_inliers = len(found.correspondence_set)
     if num_inliers == 0:
-        return Rejected(RejectReason.TOO_FEW_INLIERS, "no pair of points agrees")
+        return Rejected(RejectReason.TOO_FEW_INLIERS, "no consistent point pairs")
     return Estimate(np.array(found.transformation), num_inliers=num_inliers)
 
 
@@ -74,7 +74,7 @@ def _cloud(points: Points) -> open3d.geometry.PointCloud:
 
 
 def _clouds_and_features(source: FpfhScan, target: FpfhScan) -> list[Any]:
-    """As Open3D's functions take them: both clouds, then both sets of features."""
+    """Arguments of Open3D's functions: both clouds, then both sets of features."""
     features = []
     for scan in (source, target):
         feature = TOOLS.Feature()

@@ -1,4 +1,4 @@
-"""Pairs of scans: lists from files, or cut from true poses as the paper's were; and the pose that is true of each."""
+"""Lists of scan pairs, from files or selected by true poses as in the paper, and the true pose of each pair."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -13,37 +13,37 @@ from segslam.trajectory import rows_of_same_scan
 from segslam.types import IndexPairs, SegslamError, Trajectory, Transform
 
 MIN_GAP = 50
-"""Scans between the two of a pair, as the paper's lists were cut."""
+"""Smallest number of scans between the two of a pair, as in the paper's lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairList:
-    """Pairs of scans, `pairs` (n, 2) of source and target by number."""
+    """Pairs of scans, `pairs` (n, 2): numbers of source and target."""
 
     name: str
     pairs: IndexPairs
     num_whole: int
-    """Pairs of the list before it was sampled."""
+    """Number of pairs before sampling."""
     truth: Mapping[tuple[int, int], Transform] | None = None
-    """T_target_source where the list brings it; else it comes from the data set's poses."""
+    """T_target_source of each pair if the list contains it; otherwise the data set's poses are used."""
 
 
 def read_pairs(file: Path) -> PairList:
-    """A list `source target` a line; or JSON, a list of {source, target, T_target_source} with its own truth.
+    """A list from a text file with `source target` per line, or from a JSON list of {source, target, T_target_source}.
 
-    Raises SegslamError that names file and line for another form.
+    Raises SegslamError, naming file and line, for another form.
     """
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(
-            f"{file}: cannot read the pairs ({error}); name a file with `source target` a line"
+            f"{file}: cannot read the pairs ({error}); give a file with `source target` on each line"
         ) from error
     return _from_json(file, text) if file.suffix == ".json" else _from_text(file, text)
 
 
 def cut_pairs(reference: Trajectory, *, name: str, min_m: float, max_m: float, min_gap: int = MIN_GAP) -> PairList:
-    """All pairs, older scan first, `min_m` to `max_m` apart and at least `min_gap` scans apart in time."""
+    """All pairs, older scan first, that are `min_m` to `max_m` apart and at least `min_gap` scans apart in time."""
     positions = reference.T_world_lidar[:, :3, 3]
     found = [np.empty((0, 2), dtype=int)]
     for row, index in enumerate(reference.scan_index):
@@ -56,7 +56,7 @@ def cut_pairs(reference: Trajectory, *, name: str, min_m: float, max_m: float, m
 
 
 def sample_pairs(whole: PairList, *, num_pairs: int, seed: int) -> PairList:
-    """So many pairs drawn from a list, in its order; the whole if it has no more."""
+    """A random sample of `num_pairs` pairs, in the order of the list; the whole list if it is not longer."""
     if num_pairs >= len(whole.pairs):
         return whole
     rows = np.random.default_rng(seed).choice(len(whole.pairs), num_pairs, replace=False)
@@ -64,12 +64,12 @@ def sample_pairs(whole: PairList, *, num_pairs: int, seed: int) -> PairList:
 
 
 def scans_named(lists: Sequence[PairList]) -> set[int]:
-    """The numbers of all scans that the lists name."""
+    """Numbers of all scans in the lists."""
     return set(chain.from_iterable(one.pairs.ravel().tolist() for one in lists))
 
 
 def true_poses(pairs: PairList, reference: Trajectory | None) -> dict[tuple[int, int], Transform]:
-    """T_target_source of each pair (source, target). Raises SegslamError for a pair whose true pose is not known."""
+    """T_target_source of each pair (source, target). Raises SegslamError for a pair without known true pose."""
     keys = [(int(source), int(target)) for source, target in pairs.pairs]
     if pairs.truth is not None:
         return {key: pairs.truth[key] for key in keys}
@@ -119,5 +119,5 @@ def _rigid(rows: object) -> Transform:
 
 def _checked(file: Path, pairs: PairList) -> PairList:
     if len(pairs.pairs) == 0:
-        raise SegslamError(f"{file}: holds no pair; write `source target` a line")
+        raise SegslamError(f"{file}: contains no pairs; write `source target` on each line")
     return pairs

@@ -1,4 +1,4 @@
-"""Values of the Segregator paper (Yin et al., ICRA 2023), to stand beside what is measured on the same lists."""
+"""Values of the Segregator paper (Yin et al., ICRA 2023), for comparison with measurements on the same lists."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 from segslam.experiments.pairs import PairList
 
 LISTS = {"easy": "3to5", "medium": "8to10", "hard": "10to15"}
-"""How the files of the lists call them, by the metres between the scans."""
+"""Names of the lists in their file names, from the distance of the scans (m)."""
 NUM_PAIRS = {
     "00": (8503, 7527, 21267),
     "05": (5155, 5243, 11600),
@@ -14,7 +14,7 @@ NUM_PAIRS = {
     "07": (1311, 1169, 2877),
     "08": (2064, 2750, 9457),
 }
-"""Of the easy, medium and hard list of each sequence."""
+"""Number of pairs in the easy, medium and hard list of each sequence."""
 SUCCESS_PERCENT = {
     "vgicp": {
         "00": (95.6, 34.1, 14.9),
@@ -52,7 +52,7 @@ SUCCESS_PERCENT = {
         "08": (96.9, 94.1, 88.8),
     },
 }
-"""Success (below 2 m and 5 degrees) on those lists."""
+"""Success rate (error below 2 m and 5 degrees) on those lists."""
 TIMING_SEQUENCE = "06"
 TIMING = {
     "vgicp": {"success_percent": 55.4, "translation_m": 0.07, "rotation_deg": 0.10, "mean_ms": 90.0},
@@ -73,13 +73,13 @@ TIMING = {
     },
     "segregator-c2f": {"success_percent": 99.0, "translation_m": 0.07, "rotation_deg": 0.12, "mean_ms": 150.0},
 }
-"""On all three lists of 06; `mean_edges` is its average inlier count, AIC."""
+"""Values over all three lists of 06; `mean_edges` is the paper's average inlier count, AIC."""
 DETERIORATION = {10: (0.09, 0.20), 30: (0.04, 0.22), 50: (0.31, 0.21), 70: (0.06, 1.70), 90: (0.27, 1.70)}
-"""Segregator's error in metres and degrees by percent of labels lost, on scans 0 and 10 of 05."""
+"""Segregator's error (m, degrees) by percentage of lost labels, on scans 0 and 10 of 05."""
 
 
 def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
-    """The paper's, on the list of this file name (kittiSS_LOtoHI) if it has the paper's number of pairs."""
+    """The paper's value for a list of this name (kittiSS_LOtoHI) and number of pairs; None if the paper has none."""
     name, _, band = pairs.removeprefix("kitti").partition("_")
     if not pairs.startswith("kitti") or name not in NUM_PAIRS or band not in LISTS.values():
         return None
@@ -92,10 +92,10 @@ def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
 def beside_paper(
     results: dict[str, dict[str, Any]], *, experiment: str, sequence: str, lists: Sequence[PairList]
 ) -> dict[str, dict[str, Any]]:
-    """The results with what the paper has for the same method and pairs, under `paper`; a list that was sampled counts.
+    """The results with the paper's values for the same method and pairs under the key `paper`.
 
-    Of `pairs` success by list; of `timing` all if the lists are the paper's three of 06; of `deterioration` the errors
-    if the pair is its 0 and 10 of 05.
+    `pairs`: success by list. `timing`: all values if the lists are the paper's three lists of 06. `deterioration`:
+    errors if the pair is scans 0 and 10 of 05. The comparison also applies to lists that were sampled.
     """
     whole = {one.name: one.num_whole for one in lists}
     timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and _are_all(whole, TIMING_SEQUENCE)
@@ -109,7 +109,7 @@ def beside_paper(
 
 
 def _paper_of(method: str, one: dict[str, Any], whole: dict[str, int], *, reduced: bool) -> dict[str, Any]:
-    """`paper` for one value of what was varied, or nothing."""
+    """`paper` for one value of the varied quantity, or an empty mapping."""
     if reduced and method == "segregator" and one["lost_percent"] in DETERIORATION:
         return {"paper": dict(zip(("translation_m", "rotation_deg"), DETERIORATION[one["lost_percent"]], strict=True))}
     if "list" not in one:

@@ -1,4 +1,4 @@
-"""Recognition of places: how often a place of a database is found again, on scans seen from above."""
+"""Benchmark of place recognition: how often a query finds its place in a database of scans, in top view."""
 
 import math
 from collections.abc import Iterator
@@ -15,16 +15,16 @@ from segslam.retrieval import Places, signature_of_standing
 from segslam.types import Points, SegslamError
 
 CELL_M = 0.4
-"""Edge of a cell of the columns, and height of the voxels counted in it."""
+"""Size of a cell of the columns, and height of its voxels."""
 HIT_M = 5.0
 SHORTLIST = 20
 VALUE_OF_A_VOXEL = 25.5
-"""The columns are proportional to the occupied voxels; 10 of them, or more, are 255."""
+"""Columns are proportional to the number of occupied voxels; 10 or more are 255."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPlaces:
-    """Scans seen from above, and where they were taken."""
+    """Scans in top view, and their poses."""
 
     columns: UInt8[np.ndarray, "n size size"]
     T_world_lidar: Float[np.ndarray, "n 3 4"]
@@ -33,7 +33,7 @@ class SeenPlaces:
         return len(self.columns)
 
     def points(self, row: int, *, yaw_rad: float = 0.0) -> Points:
-        """The columns of one as points, one a voxel, turned about the vertical."""
+        """The occupied voxels of a row as points (n, 3), rotated about the vertical."""
         ahead, left = np.nonzero(self.columns[row])
         counts = np.rint(self.columns[row][ahead, left] / VALUE_OF_A_VOXEL).astype(np.int64)
         middle = self.columns.shape[1] // 2
@@ -43,7 +43,7 @@ class SeenPlaces:
 
 
 def read_places(file: Path) -> SeenPlaces:
-    """The places of a file. Raises SegslamError, which names it, if it holds none."""
+    """The places of a file. Raises SegslamError, naming the file, if it is invalid."""
     remedy = "give a file with `columns` (n, size, size) uint8 and `poses` (n, 3, 4)"
     try:
         with np.load(file) as stored:
@@ -57,22 +57,22 @@ def read_places(file: Path) -> SeenPlaces:
 
 
 def parse_range(text: str, option: str, num_places: int) -> range:
-    """The rows `A:B`, where each end may be left out. Raises SegslamError, which names the option."""
+    """The rows `A:B`, either end optional. Raises SegslamError, naming the option."""
     first, colon, end = text.partition(":")
     try:
         rows = range(int(first or 0), int(end or num_places))
     except ValueError:
         rows = range(0)
     if not colon or not rows or not 0 <= rows.start < rows.stop <= num_places:
-        raise SegslamError(f"{option} {text}: give rows A:B, B not included, of the {num_places} places")
+        raise SegslamError(f"{option} {text}: give rows A:B, B excluded, of the {num_places} places")
     return rows
 
 
 class PlacesBench:
-    """Scores queries of a range of places against a database of another."""
+    """Scores queries from one range of places against a database of another range."""
 
     def __init__(self, places: SeenPlaces, database: range, queries: range, *, turned_seed: int | None) -> None:
-        """Queries are turned by random yaws if there is a seed for them."""
+        """`turned_seed`: seed of random yaws of the queries; None for no rotation."""
         self._places, self._database, self._queries = places, database, queries
         self._yaws = (
             np.zeros(len(queries))
@@ -85,11 +85,11 @@ class PlacesBench:
 
     @property
     def num_steps(self) -> int:
-        """Places to go through."""
+        """Number of steps of `run`."""
         return len(self._database) + len(self._queries)
 
     def run(self) -> Iterator[None]:
-        """Fills the database and asks the queries that have a place of it within 5 m, step by step."""
+        """Fill the database, then query each place that is within 5 m of one in the database, step by step."""
         for row in self._database:
             self._index.add(row, signature_of_standing(self._places.points(row)))
             yield
@@ -106,12 +106,12 @@ class PlacesBench:
             yield
 
     def figures(self) -> dict[str, float]:
-        """Recall among the queries that count, median time of a query, bytes of a place.
+        """Recall of the scored queries, median time of a query, bytes per place.
 
-        Raises SegslamError if no query counts.
+        Raises SegslamError if no query is within 5 m of a place in the database.
         """
         if not self._ranks:
-            raise SegslamError(f"no query has a place of the database within {HIT_M:g} m; give other rows")
+            raise SegslamError(f"no query is within {HIT_M:g} m of a place in the database; give other rows")
         return {
             "num_places": len(self._database),
             "num_queries": len(self._ranks),

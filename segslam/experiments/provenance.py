@@ -1,4 +1,4 @@
-"""Under what conditions figures were measured: machine, versions, data, settings. No names of users or folders."""
+"""Conditions of a benchmark: machine, versions, data, settings. They contain no names of users or folders."""
 
 import json
 import os
@@ -28,7 +28,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 def conditions(job: Job) -> dict[str, Any]:
-    """What a reader needs to judge the figures, or to measure them again."""
+    """The conditions needed to judge or to repeat the measurement."""
     return {
         "machine": machine(),
         "commit": commit(),
@@ -40,7 +40,7 @@ def conditions(job: Job) -> dict[str, Any]:
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, system, and how much there was to do in the last quarter of an hour (1: one busy core)."""
+    """Processor, cores, system, and the load average over 15 minutes (1: one busy core)."""
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count(),
@@ -51,7 +51,7 @@ def machine() -> dict[str, Any]:
 
 
 def commit() -> str | None:
-    """That of the source tree, marked where it was changed since; None for an installed package."""
+    """Commit of the source tree, marked if it was changed since; None for an installed package."""
     folder = Path(__file__).resolve().parent
     try:
         found = subprocess.run(
@@ -77,7 +77,7 @@ def simulation_of(job: Job) -> dict[str, Any] | None:
 
 
 def _cpu_model() -> str:
-    """Name of the processor from Linux; elsewhere from Python."""
+    """Name of the processor from Linux; on other systems, from Python."""
     if CPU_INFO.is_file():
         for line in CPU_INFO.read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -86,7 +86,7 @@ def _cpu_model() -> str:
 
 
 def _system() -> str:
-    """The distribution's name on Linux."""
+    """Name of the distribution on Linux."""
     try:
         return platform.freedesktop_os_release()["PRETTY_NAME"]
     except (OSError, KeyError):
@@ -106,7 +106,7 @@ def _versions() -> dict[str, str]:
 def account(
     experiment: str, job: Job, lists: Sequence[PairList], results: dict[str, Any], *, options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """One benchmark as the object that `report.json` holds: what was done, under what conditions, what came out."""
+    """Content of `report.json`: what was measured, under which conditions, and the results."""
     simulation = simulation_of(job)
     sampled = [one for one in lists if len(one.pairs) < one.num_whole]
     return {
@@ -122,23 +122,23 @@ def account(
 
 
 TIME_NOTES = (
-    "Success: error below 2 m and 5 degrees, of T_estimate inv(T_true). Errors are means over successes.",
-    "Times are of a registration on its own: labels by shape where they are used, both scans prepared, then aligned; "
-    "reading files is not in them. CPU time is that of all threads, MB the memory needed beyond what was held.",
+    "Success: error of T_estimate inv(T_true) below 2 m and 5 degrees. Errors are means over successes.",
+    "Times are those of a single registration: labels by geometry if used, preparation of both scans, alignment; "
+    "reading of files is excluded. CPU time is summed over all threads; MB is the peak of additional memory.",
 )
 
 
 def _notes(simulation: dict[str, Any] | None, sampled: Sequence[PairList], lists: Sequence[PairList]) -> list[str]:
-    """What a reader must know before comparing these figures with the paper's."""
+    """Notes needed to compare the results with those of the paper."""
     notes = []
     if simulation is not None:
         notes.append(
-            f"The scans were SIMULATED (seed {simulation['seed']}), at the real poses if they are KITTI's; the labels "
-            "beside them are true. No figure here is one on KITTI's own scans."
+            f"The scans were SIMULATED (seed {simulation['seed']}), at the real poses if they are KITTI's, with true "
+            "labels. No result here was measured on KITTI's own scans."
         )
     if sampled:
         counts = ", ".join(f"{one.name} {len(one.pairs)} of {one.num_whole}" for one in sampled)
         notes.append(f"The lists were SAMPLED: {counts}.")
     if any(one.truth is None for one in lists) and simulation is None:
-        notes.append("True poses are the data set's own, KITTI's: off by up to 1.6 m on some pairs of 00.")
+        notes.append("True poses are those of KITTI; they have errors of up to 1.6 m on some pairs of 00.")
     return notes

@@ -1,4 +1,4 @@
-"""A benchmark as Markdown, JSON and one HTML page that needs no network."""
+"""Reports of a benchmark: Markdown, JSON and a self-contained HTML page."""
 
 import json
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from segslam.system.whole_files import write_whole
 def write_bench_report(folder: Path, report: dict[str, Any], *, pictures: Mapping[str, bytes]) -> None:
     """Write `report.json`, `report.md` and `report.html` into a folder; `pictures` maps captions to PNGs.
 
-    Raises SegslamError if it cannot be written to.
+    Raises SegslamError if the folder cannot be written.
     """
     with matplotlib.rc_context(figures.STYLE):
         plots = _plots(report["results"])
@@ -65,7 +65,7 @@ def _page(report: dict[str, Any], plots: Mapping[str, str], pictures: Mapping[st
 
 
 def _facts(report: dict[str, Any]) -> dict[str, Any]:
-    """What the figures depend on, but the settings."""
+    """Conditions of the benchmark, except the settings."""
     machine = report["machine"]
     simulation = report["simulation"]
     return {

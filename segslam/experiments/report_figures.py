@@ -20,13 +20,13 @@ COLORS = (
     "#7F7F7F",
     "#1F3A93",
     "#BCBD22",
-)  # Okabe and Ito's first
+)  # first colours of Okabe and Ito
 LEAST_M, LEAST_DEG = 1e-3, 1e-3
-"""Below what the logarithmic plots show."""
+"""Lower limit of the logarithmic plots."""
 
 
 def draw_success(results: dict[str, Any]) -> str:
-    """Success of each method by list, the paper's as a diamond."""
+    """Success rate of each method by list, with the paper's values as diamonds."""
     lists = [one["list"] for one in next(iter(results.values()))["by"]]
     figure = Figure(figsize=(6.4, 1.2 + 0.24 * len(lists) * len(results)), layout="constrained")
     axes = figure.subplots()
@@ -48,7 +48,7 @@ def draw_success(results: dict[str, Any]) -> str:
 
 
 def draw_times(results: dict[str, Any]) -> str:
-    """Median and 95th percentile of a registration's time."""
+    """Median and 95th percentile of the registration time."""
     figure = Figure(figsize=(6.4, 1.0 + 0.32 * len(results)), layout="constrained")
     axes = figure.subplots()
     methods = list(results)
@@ -65,7 +65,7 @@ def draw_times(results: dict[str, Any]) -> str:
 
 
 def draw_along(results: dict[str, Any], by: str) -> str:
-    """Success and mean errors of all poses given, against what was varied."""
+    """Success rate and mean errors of all returned poses against the varied quantity."""
     figure = Figure(figsize=(6.4, 8.0), layout="constrained")
     success, metres, degrees = figure.subplots(3, 1, sharex=True)
     for place, (method, own) in enumerate(results.items()):
@@ -82,7 +82,7 @@ def draw_along(results: dict[str, Any], by: str) -> str:
 
 
 def _logarithmic(by: list[dict[str, Any]], key: str, least: float) -> list[float]:
-    """NaN, which no plot draws, where no pose was given."""
+    """Values for a logarithmic plot; NaN where no pose was returned."""
     return [np.nan if one[key] is None else max(one[key], least) for one in by]
 
 

@@ -1,4 +1,4 @@
-"""The tables of a benchmark, once for Markdown, HTML and the terminal: a caption, titles and rows of text."""
+"""Tables of a benchmark for Markdown, HTML and the terminal: a caption, column titles and rows of text."""
 
 from collections.abc import Callable, Iterable
 from html import escape
@@ -38,7 +38,7 @@ TITLES = {"list": "list", "yaw_deg": "yaw (deg)", "lost_percent": "labels lost (
 
 
 class Table(NamedTuple):
-    """As Markdown and HTML show it."""
+    """A caption, column titles and rows of text."""
 
     caption: str
     head: tuple[str, ...]
@@ -46,7 +46,7 @@ class Table(NamedTuple):
 
 
 def tables(report: dict[str, Any]) -> list[Table]:
-    """All tables of a report, the most telling first."""
+    """All tables of a report, the most important first."""
     results = report["results"]
     by = varied(results)
     made = [_by_value(results, by)] if by != "list" else [_success(results)]
@@ -59,25 +59,25 @@ def tables(report: dict[str, Any]) -> list[Table]:
 
 
 def varied(results: dict[str, Any]) -> str:
-    """What the experiment varied."""
+    """The quantity that the experiment varied."""
     first = next(iter(results.values()))["by"][0]
     return next(key for key in TITLES if key in first)
 
 
 def markdown(table: Table) -> str:
-    """As Markdown; the caption in bold above."""
+    """The table as Markdown, with the caption in bold above it."""
     lines = [table.head, tuple("---" for _ in table.head), *table.rows]
     return f"**{table.caption}**\n\n" + "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + "\n"
 
 
 def html(table: Table) -> str:
-    """As an HTML table, without the caption."""
+    """The table as HTML, without the caption."""
     rows = "".join(_html_row("td", row) for row in table.rows)
     return f"<table>{_html_row('th', table.head)}{rows}</table>"
 
 
 def plain(table: Table) -> str:
-    """As columns of text for a terminal."""
+    """The table as aligned text for a terminal."""
     lines = [table.head, *table.rows]
     widths = [max(len(cells[column]) for cells in lines) for column in range(len(table.head))]
     return "\n".join(
@@ -87,17 +87,17 @@ def plain(table: Table) -> str:
 
 
 def text(value: float | None) -> str:
-    """A number as reports have them, a dash for what is not known."""
+    """A number as text; a dash for None."""
     return UNKNOWN if value is None else number(value)
 
 
 def percent(value: float) -> str:
-    """One decimal, as the paper has them."""
+    """A percentage with one decimal, as in the paper."""
     return f"{value:.1f}"
 
 
 def _success(results: dict[str, Any]) -> Table:
-    """Success of each method by list, with the paper's value and the difference where it has one."""
+    """Success rate of each method by list, with the paper's value and the difference if known."""
     lists = [one["list"] for one in next(iter(results.values()))["by"]]
     rows = [(method, *(_compared(one) for one in own["by"])) for method, own in results.items()]
     compared = any("paper" in one for own in results.values() for one in own["by"])
@@ -123,7 +123,7 @@ def _errors(results: dict[str, Any], by: str) -> Table:
 
 
 def _table_by(results: dict[str, Any], by: str, caption: str, cell: Callable[[dict[str, Any]], str]) -> Table:
-    """A row for each value of what was varied, a column for each method."""
+    """A row for each value of the varied quantity, a column for each method."""
     values = [one[by] for one in next(iter(results.values()))["by"]]
     rows = [(f"{value:g}", *(cell(own["by"][place]) for own in results.values())) for place, value in enumerate(values)]
     return Table(caption, (TITLES[by], *results), rows)
@@ -160,7 +160,7 @@ def _beside_paper(results: dict[str, Any]) -> Table:
             if key in own.get("paper", {}) and own[key] is not None:
                 theirs = own["paper"][key]
                 rows.append((f"{method}, {title}", text(own[key]), f"{theirs:g}", f"{own[key] - theirs:+.2f}"))
-    return Table("Beside the paper's timing table", ("", "measured", "paper", "difference"), rows)
+    return Table("Comparison with the paper's timing table", ("", "measured", "paper", "difference"), rows)
 
 
 def _html_row(tag: str, cells: Iterable[str]) -> str:

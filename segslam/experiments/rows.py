@@ -1,4 +1,4 @@
-"""A row for each registration tried: written to a CSV file as it comes, read back to go on."""
+"""One row per registration, written to a CSV file at once, and read to resume a benchmark."""
 
 import csv
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ Count = Annotated[int | None, BeforeValidator(_none_if_empty)]
 
 
 class Row(BaseModel):
-    """A registration by one method; None for what it has not, as a rejected one has no pose."""
+    """A registration by one method; None for fields that do not apply, such as the pose of a rejected one."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -39,44 +39,44 @@ class Row(BaseModel):
     method: str
     accepted: bool
     reason: str
-    """Of the rejection; empty if accepted."""
+    """Reason of the rejection; empty if accepted."""
     error_m: Number = None
     error_deg: Number = None
-    """Of T_estimate inv(T_true), as the paper measures."""
+    """Error of T_estimate inv(T_true), as in the paper."""
     num_correspondences: Count = None
     num_edges: Count = None
     num_inliers: Count = None
     ms: Number = None
-    """All that this registration took had it been the only one: labels by shape, both scans prepared, aligned."""
+    """Time of the whole registration as if it were the only one: labels by geometry, preparation, alignment."""
     cpu_ms: Number = None
-    """The same by the process's own clock, which other work on the machine does not slow."""
+    """The same as CPU time, which is independent of the load of the machine."""
     label_ms: Number = None
     prepare_ms: Number = None
     match_ms: Number = None
     refine_ms: Number = None
     verify_ms: Number = None
     peak_mb: Number = None
-    """Peak of additional memory; None if the system does not report it."""
+    """Peak of additional memory; None if unknown."""
     T_target_source: str = ""
-    """12 numbers by rows, empty if rejected."""
+    """First three rows of the matrix, 12 numbers; empty if rejected."""
 
     @property
     def success(self) -> bool:
-        """By the paper's rule: 2 m and 5 degrees."""
+        """True for an error below 2 m and 5 degrees, the paper's criterion."""
         if self.error_m is None or self.error_deg is None:
             return False
         return self.accepted and PoseError(self.error_m, self.error_deg).success
 
     @property
     def key(self) -> tuple[str, ScanVariant, ScanVariant, str]:
-        """What was tried, and by which method."""
+        """Identifies the trial and the method."""
         source = ScanVariant(self.source, self.source_yaw_deg, self.source_lost, self.draw if self.source_lost else 0)
         target = ScanVariant(self.target, 0.0, self.target_lost, self.draw if self.target_lost else 0)
         return self.pairs, source, target, self.method
 
     @property
     def estimate(self) -> Transform | None:
-        """The pose that was found."""
+        """The estimated pose."""
         if not self.T_target_source:
             return None
         return np.vstack([np.array(self.T_target_source.split(), dtype=float).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
@@ -90,9 +90,9 @@ def _cells(row: Row) -> dict[str, object]:
 
 
 class RowFile:
-    """A CSV file that takes rows, all of one call on the disk before it returns; a context manager.
+    """A CSV file of rows; a context manager. All rows of one call are on the disk before the call returns.
 
-    What the file held before stays until the first rows are in the new one. Raises WorkFailed if it cannot be written.
+    The previous content of the file remains until the first rows are written. Raises WorkFailed on a write error.
     """
 
     def __init__(self, file: Path, rows: Sequence[Row]) -> None:
@@ -117,7 +117,7 @@ class RowFile:
         self._stream.close()
 
     def write(self, rows: Sequence[Row]) -> None:
-        """Add rows."""
+        """Append rows."""
         with self._room():
             self._csv.writerows(_cells(row) for row in rows)
             self._stream.flush()
@@ -131,7 +131,7 @@ class RowFile:
 
 
 def write_rows(file: Path, rows: Sequence[Row]) -> None:
-    """A file of these rows. Raises SegslamError if it cannot be written."""
+    """Write a file with these rows. Raises SegslamError if it cannot be written."""
     with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
         table = csv.DictWriter(stream, COLUMNS)
         table.writeheader()
@@ -139,9 +139,9 @@ def write_rows(file: Path, rows: Sequence[Row]) -> None:
 
 
 def read_rows(file: Path) -> list[Row]:
-    """The rows of a file that `RowFile` wrote. A last line that was cut off is left out.
+    """The rows of a file written by `RowFile`. An incomplete last line is ignored.
 
-    Raises SegslamError that names the line for one that is broken.
+    Raises SegslamError, naming the line, for an invalid row.
     """
     with file.open(newline="", encoding="utf-8") as stream:
         text = stream.read()

@@ -1,4 +1,4 @@
-"""Rows to the figures of a table."""
+"""Statistics of rows for the tables."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -12,11 +12,11 @@ STAGES = ("label_ms", "prepare_ms", "match_ms", "refine_ms", "verify_ms")
 
 
 def figures(rows: Sequence[Row]) -> dict[str, Any]:
-    """Figures of one method on some pairs; None for unknown figures.
+    """Statistics of one method over some pairs; None for unknown values.
 
-    Errors are means over successes, `accepted_m` and `accepted_deg` over all poses that were given. Times are of a
-    registration on its own, both scans prepared for it; `p95_mb` leaves out what a first call loads.
-    `mean_edges` is the mean over accepted registrations, the paper's average inlier count (AIC).
+    Errors are means over successes; `accepted_m` and `accepted_deg` are means over all returned poses. Times are those
+    of a single registration including the preparation of both scans; `p95_mb` excludes memory for imports on the first
+    call. `mean_edges` is the mean over accepted registrations, the paper's average inlier count (AIC).
     """
     good = [row for row in rows if row.success]
     accepted = [row for row in rows if row.accepted]
@@ -41,7 +41,7 @@ def figures(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def results(rows: Sequence[Row], *, by: str) -> dict[str, dict[str, Any]]:
-    """The figures of each method over all rows, and in `by` for each value of what was varied, one of `VARIED`."""
+    """Statistics of each method over all rows and, under the key `by`, for each value of a quantity in `VARIED`."""
     return {
         method: figures(own) | {"by": [{by: value} | figures(some) for value, some in grouped(own, VARIED[by]).items()]}
         for method, own in grouped(rows, lambda row: row.method).items()
@@ -53,11 +53,11 @@ VARIED: dict[str, Callable[[Row], Any]] = {
     "yaw_deg": lambda row: row.source_yaw_deg,
     "lost_percent": lambda row: round(100 * row.source_lost, 6),
 }
-"""What an experiment varies, read from a row."""
+"""Quantities that an experiment varies, as functions of a row."""
 
 
 def grouped(rows: Sequence[Row], key: Callable[[Row], Hashable]) -> dict[Any, list[Row]]:
-    """The rows by a key, in the order in which its values first come."""
+    """The rows grouped by a key, in the order in which its values first occur."""
     groups: dict[Any, list[Row]] = {}
     for row in rows:
         groups.setdefault(key(row), []).append(row)
@@ -65,7 +65,7 @@ def grouped(rows: Sequence[Row], key: Callable[[Row], Hashable]) -> dict[Any, li
 
 
 def worst_failures(rows: Sequence[Row], count: int) -> list[Row]:
-    """Accepted poses that are wrong, the farthest first; then what was rejected."""
+    """Wrong accepted poses, largest error first; then rejected registrations."""
     failures = [row for row in rows if not row.success]
     return sorted(failures, key=lambda row: -(row.error_m or 0.0))[:count]
 

@@ -11,19 +11,19 @@ from segslam.types import Label, Labels, Points, Transform
 
 @dataclass(frozen=True, slots=True)
 class ScanVariant:
-    """A scan by its number, and what is done to it before any method sees it."""
+    """A scan, and the changes applied to it before registration."""
 
     index: int
     yaw_deg: float = 0.0
-    """Turned by so much about z."""
+    """Rotation about z."""
     lost: float = 0.0
-    """Share of the points, 0 to 1, whose labels are taken away."""
+    """Share of the points, 0 to 1, whose labels are removed."""
     draw: int = 0
-    """Which of the random choices of those points."""
+    """Number of the random draw of those points."""
 
     @property
     def T_variant_scan(self) -> Transform:  # noqa: N802  (a transform)
-        """The turn."""
+        """The rotation as a transform."""
         return geometry.transform(geometry.yaw(math.radians(self.yaw_deg)), 0.0)
 
     def turned(self, points: Points) -> Points:
@@ -31,7 +31,7 @@ class ScanVariant:
         return geometry.apply(self.T_variant_scan, points).astype(points.dtype) if self.yaw_deg else points
 
     def remaining(self, labels: Labels) -> Labels:
-        """The labels of the scan without those that are taken away."""
+        """The labels of the scan, with the removed ones set to UNLABELLED."""
         if not self.lost:
             return labels
         lost = np.random.default_rng([self.draw, self.index]).random(len(labels)) < self.lost
@@ -40,10 +40,10 @@ class ScanVariant:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """One pair that each method registers. `T_target_source` is the truth, of the variants."""
+    """A pair of variants to register; `T_target_source` is the true pose between the variants."""
 
     pairs: str
-    """Name of the list that the pair is of."""
+    """Name of the list that contains the pair."""
     source: ScanVariant
     target: ScanVariant
     T_target_source: Transform
@@ -55,6 +55,6 @@ class Trial:
 
 
 def trial(pairs: str, source: ScanVariant, target: ScanVariant, T_target_source: Transform) -> Trial:
-    """The trial of two variants, given the true pose of the scans as they are."""
+    """The trial of two variants, from the true pose of the unchanged scans."""
     T_true = target.T_variant_scan @ T_target_source @ geometry.inverse(source.T_variant_scan)
     return Trial(pairs, source, target, T_true)

@@ -1,4 +1,4 @@
-"""The trials of each experiment: pairs as they are, turned through the circle, or with labels taken away."""
+"""The trials of each experiment: unchanged pairs, pairs with rotated source, pairs with labels removed."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -10,11 +10,11 @@ from segslam.experiments.trials import ScanVariant, Trial, trial
 from segslam.types import Trajectory
 
 PAPER_PAIR = PairList("0 and 10", np.array([[0, 10]]), 1)
-"""The scans (of 05) on which the paper turns the source and takes labels away."""
+"""The scans of 05 with which the paper tests rotation and removal of labels."""
 
 
 def pair_trials(pairs: PairList, reference: Trajectory | None) -> list[Trial]:
-    """A trial a pair, the scans as they are. Raises SegslamError for a pair whose true pose is not known."""
+    """One trial per pair of unchanged scans. Raises SegslamError for a pair without known true pose."""
     return [
         trial(pairs.name, ScanVariant(source), ScanVariant(target), T_target_source)
         for (source, target), T_target_source in true_poses(pairs, reference).items()
@@ -22,7 +22,7 @@ def pair_trials(pairs: PairList, reference: Trajectory | None) -> list[Trial]:
 
 
 def turned_trials(pairs: PairList, reference: Trajectory | None, *, step_deg: float) -> list[Trial]:
-    """Each pair with its source turned about z through the circle. Raises SegslamError as `pair_trials`."""
+    """Each pair with the source rotated about z in steps. Raises SegslamError as `pair_trials`."""
     return [
         trial(pairs.name, ScanVariant(source, yaw_deg=float(yaw_deg)), ScanVariant(target), T_target_source)
         for (source, target), T_target_source in true_poses(pairs, reference).items()
@@ -39,7 +39,7 @@ def unlabelled_trials(
     seed: int,
     both: bool,
 ) -> list[Trial]:
-    """Each pair with a share of its labels removed at random, drawn again for each trial: of both scans or the source.
+    """Each pair with a random share of its labels removed, from both scans or from the source; a new draw per trial.
 
     Raises SegslamError as `pair_trials`.
     """

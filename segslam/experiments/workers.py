@@ -1,4 +1,4 @@
-"""Trials done in this process, or by the workers of a Dask cluster: rows come out as they are finished."""
+"""Runs trials in this process or on the workers of a Dask cluster; yields rows as they are finished."""
 
 import logging
 from collections import Counter
@@ -15,16 +15,16 @@ from segslam.system.extras import how_to_install
 from segslam.types import SegslamError
 
 NUM_SCANS_KEPT = 128
-"""Chosen: by one process, up to 15 MB each with all methods; lists that follow the drive come back within as many."""
+"""Chosen: scans kept in one process, up to 15 MB each with all methods; consecutive pairs of a drive reuse scans."""
 PAIRS_AHEAD = 8
-"""Pairs handed out for each worker: enough that none waits, few enough that their scans fit in memory."""
+"""Pairs submitted per worker: enough that no worker idles, few enough that their scans fit in memory."""
 CONNECT_S = 5
 LOST_WORKER = "worker_lost"
-"""The reason of a row whose pair ended every worker that tried it."""
+"""Reject reason of a row whose pair terminated every worker that tried it."""
 
 
 def run_here(job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]]:
-    """The rows of one trial after the other."""
+    """Yields the rows of one trial after the other."""
     prepared = lru_cache(NUM_SCANS_KEPT)(partial(prepare_scan, job))
     for trial in trials:
         yield register_trial(job, trial, prepared(trial.source), prepared(trial.target))
@@ -32,22 +32,20 @@ def run_here(job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]]:
 
 @contextmanager
 def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
-    """A Dask client: of the cluster at an address, or of one with so many worker processes on this machine.
+    """A Dask client for the scheduler at an address, or for local worker processes.
 
-    Raises SegslamError if Dask is not installed or nothing answers at the address.
+    Raises SegslamError if Dask is not installed or the scheduler does not answer.
     """
     try:
-        from distributed import Client, LocalCluster  # optional: extra `cluster`
+        from distributed import Client, LocalCluster  # optional package: extra `cluster`
     except ImportError as error:
         raise SegslamError(f"--workers and --scheduler need Dask: {how_to_install('cluster')}") from error
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # otherwise it logs each connection
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # its info level reports each connection
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=CONNECT_S)
         except (OSError, ValueError) as error:
-            raise SegslamError(
-                f"--scheduler {scheduler}: nothing answers there ({error}); start `dask scheduler`"
-            ) from error
+            raise SegslamError(f"--scheduler {scheduler}: no answer ({error}); start `dask scheduler`") from error
         with client:
             yield client
         return
@@ -59,10 +57,10 @@ def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
 
 
 def run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]]:
-    """The rows of the trials as the workers finish them.
+    """Yields the rows of each trial when a worker finishes it.
 
-    Each scan is prepared by one worker and handed to whoever registers it. What a worker that dies had, Dask does
-    again elsewhere; a pair during which several workers were lost is recorded as failed.
+    Each scan is prepared by one worker and sent to those that register it. Dask repeats the work of a worker that dies;
+    a pair for which several workers died is recorded as failed.
     """
     from distributed import KilledWorker, as_completed
 
@@ -92,7 +90,7 @@ def run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]
         for variant in (trial.source, trial.target):
             uses[variant] -= 1
             if not uses[variant]:
-                scans.pop(variant, None)  # lets the cluster forget it
+                scans.pop(variant, None)  # the cluster frees the scan
         for following in islice(waiting, 1):
             running.add(submit(following))
         yield rows

@@ -57,10 +57,10 @@ def consistency_graph(
 
 @kernel("uint64[:, ::1](float64[:, ::1], float64[:, ::1], int64[::1], int64[::1], float64)")
 def _length_consistent(source, target, source_index, target_index, bound):
-    """Bits of the pairs with abs(a - b) <= bound for their lengths a, b, and with four ends.
+    """Bits of the pairs with abs(a - b) <= bound for their lengths a, b, and with four distinct ends.
 
-    Tested as (a^2 + b^2 - bound^2)^2 <= 4 a^2 b^2, which needs no root. A row is tested from the word of its own bit
-    on, in one loop over slices that start at 0, which the compiler turns into SIMD.
+    The test is (a^2 + b^2 - bound^2)^2 <= 4 a^2 b^2, which needs no square root. A row is tested starting with the word
+    that contains its own bit, in one loop over slices that start at 0, which the compiler vectorises.
     """
     count = len(source)
     words = (count + 63) // 64
@@ -84,7 +84,7 @@ def _length_consistent(source, target, source_index, target_index, bound):
         for word in range(i >> 6, words):
             bits = pack_flags(eights[8 * word : 8 * word + 8])
             adjacency[i, word] |= bits
-            while bits and word > i >> 6:  # the word of i itself was tested both ways
+            while bits and word > i >> 6:  # the word that contains bit i was tested for both orders
                 adjacency[64 * word + lowest_bit(bits), i >> 6] |= np.uint64(1) << np.uint64(i & 63)
                 bits &= bits - np.uint64(1)
     return adjacency
@@ -114,9 +114,9 @@ def _sum(covariances, i, j):
 
 @kernel("UniTuple(float64, 3)(float64, float64, float64)")
 def _root_eigenvalues(trace, minors, determinant):
-    """Square roots, descending, of the eigenvalues of a 3x3 matrix that has real ones at or above 0.
+    """Square roots, descending, of the eigenvalues of a 3x3 matrix with real, non-negative eigenvalues.
 
-    From the characteristic polynomial, by Viete's formula for three real roots; rounding below 0 is cut.
+    Uses Viete's formula for the three real roots of the characteristic polynomial; negative rounding errors become 0.
     """
     mean = trace / 3.0
     p = max(mean * mean - minors / 3.0, 0.0)
@@ -142,7 +142,7 @@ def _spectral_distance(a, b):
 
 @kernel("float64(UniTuple(float64, 6), UniTuple(float64, 6))")
 def _shape_distance(a, b):
-    """a^1/2 b a^1/2 has the eigenvalues of a b, whose invariants follow from those of a and b."""
+    """Shape term; a^1/2 b a^1/2 has the eigenvalues of a b, whose invariants follow from those of a and b."""
     adjugate_a, adjugate_b = _adjugate(a), _adjugate(b)
     determinant = _inner(a, adjugate_a) * _inner(b, adjugate_b) / 9.0
     roots = _root_eigenvalues(_inner(a, b), _inner(adjugate_a, adjugate_b), determinant)
@@ -161,7 +161,7 @@ def spectral_distances(pairs, source_covariances, target_covariances):
 
 @kernel("float64[::1](int64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])")
 def shape_distances(pairs, source_covariances, target_covariances):
-    """Published gate: the same, as if both covariances were in one frame (m^2)."""
+    """Published gate: the same without invariance to rotation, as if both covariances were in one frame (m^2)."""
     distances = np.empty(len(pairs))
     for row in range(len(pairs)):
         i, j = pairs[row]

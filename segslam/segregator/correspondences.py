@@ -17,9 +17,9 @@ Descriptors = Float[np.ndarray, "_ 33"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondences:
-    """Row i: the source's Gaussian `source_index[i]` may be the target's `target_index[i]`.
+    """Putative correspondences: Gaussian `source_index[i]` of the source may be `target_index[i]` of the target.
 
-    An index counts clusters first and features after them, so that it names one end of a correspondence.
+    The indices number the clusters first and the features after them.
     """
 
     source: Points
@@ -61,10 +61,10 @@ def mutual_nearest(source: Descriptors, target: Descriptors) -> IndexPairs:
 def tuple_test(
     source: Points, target: Points, *, similarity: float, trials_per_pair: int, rng: np.random.Generator
 ) -> Indices:
-    """Rows, ascending, that are in a random triple whose three edges have nearly equal lengths on both sides.
+    """Rows, ascending, that are in a random triple whose three edges have nearly equal lengths in both scans.
 
     Row i of `source` matches row i of `target`. An edge passes if the shorter length is more than `similarity` times
-    the longer one. Fewer than three rows leave nothing to test: none pass.
+    the longer length. Returns no rows for fewer than three.
     """
     num_pairs = len(source)
     if num_pairs < 3:
@@ -100,7 +100,7 @@ def feature_correspondences(
 
 
 def concatenate(first: Correspondences, second: Correspondences) -> Correspondences:
-    """The rows of both."""
+    """The rows of both, in this order."""
     return Correspondences(
         *(np.concatenate([getattr(first, name), getattr(second, name)]) for name in Correspondences.__slots__)
     )
@@ -113,7 +113,7 @@ def _mutual_nearest_of_class(source: Description, target: Description, label: La
 
 
 def _described_rows(description: Description, label: Label) -> Indices:
-    """Key points of a class that have neighbours; the descriptors of all others are zero."""
+    """Key points of a class that have neighbours; the descriptors of the others are zero."""
     return np.flatnonzero((description.feature_classes == label) & description.feature_descriptors.any(axis=1))
 
 
@@ -151,10 +151,10 @@ def _in_similar_triangles(source, target, triples, similarity):
 
 @kernel("Tuple((int64[::1], float64[::1], int64[::1]))(float64[:, ::1], float64[:, ::1])")
 def _nearest_both_ways(source, target_columns):
-    """Column of the nearest target to each source, the squared distance to it, and the nearest source to each target.
+    """Nearest target of each source, its squared distance, and nearest source of each target.
 
-    Brute force, a row at a time: at 33 dimensions a search tree visits nearly every leaf, and products of small
-    matrices lose more to the threads of the linear algebra library than they gain.
+    Brute force, one row at a time: in 33 dimensions a search tree visits nearly every leaf, and for small matrices the
+    threads of the linear algebra library cost more than they gain.
     """
     count, width = len(source), target_columns.shape[1]
     nearest_target, squared = np.empty(count, np.int64), np.empty(count)

@@ -1,7 +1,7 @@
 """Gauss-Newton over matched centroids and planes: the numerics of `gaussians`, whose header defines the cost.
 
-A perturbation T exp([phi; rho]) moves the point a of the source by R (phi x a + rho). All is done in the frame of the
-source, where the error R^T (b - t) - a of a pair a, b then falls by phi x a + rho.
+A perturbation T exp([phi; rho]) moves the point a of the source by R (phi x a + rho). All quantities are in the frame
+of the source, where the error R^T (b - t) - a of a pair a, b then decreases by phi x a + rho.
 """
 
 import math
@@ -21,7 +21,7 @@ STEP_DONE = 1e-6
 
 @kernel("void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64, float64, float64[:, ::1])")
 def _weight_matrix(source_covariance, target_covariance, R, noise, share, W):
-    """Writes the inverse covariance of the difference of two centroids, in the frame of the source, which R turns from.
+    """Writes the inverse covariance of the difference of two centroids, in the source frame. R: R_target_source.
 
     R may be a transform, of which only the rotation is used.
     """
@@ -66,7 +66,7 @@ def _squared(W, e):
     "float64, float64)"
 )
 def squared_distances(source, target, source_covariances, target_covariances, T_target_source, noise, share):
-    """Squared Mahalanobis distance of matched centroids; infinite where it is surely above the gate."""
+    """Squared Mahalanobis distance of matched centroids; infinite if it certainly exceeds the gate."""
     squared = np.full(len(source), np.inf)
     W, e = np.empty((3, 3)), np.empty(3)
     for i in range(len(source)):
@@ -76,7 +76,7 @@ def squared_distances(source, target, source_covariances, target_covariances, T_
             e[k] -= source[i, k]
             length += e[k] * e[k]
             extent += source_covariances[i, k, k] + target_covariances[i, k, k]
-        if length <= GATE * (6.0 * noise * noise + share * share * extent):  # no variance is above the trace
+        if length <= GATE * (6.0 * noise * noise + share * share * extent):  # the trace bounds every variance
             _weight_matrix(source_covariances[i], target_covariances[i], T_target_source, noise, share, W)
             squared[i] = _squared(W, e)
     return squared
@@ -84,7 +84,7 @@ def squared_distances(source, target, source_covariances, target_covariances, T_
 
 @kernel("void(float64[:, ::1], float64[::1], float64[::1], float64[:, ::1], float64[::1])")
 def _add_centroid(H, g, a, W, e):
-    """Three rows of the normal equations: the centroid at `a` is off by `e`, with Cauchy's weight over `W`."""
+    """Three rows of the normal equations: the centroid at `a` has the error `e`; Cauchy weight times `W`."""
     weight = 1.0 / (1.0 + _squared(W, e) / 3.0)
     J = np.zeros((3, 6))
     J[0, 1], J[0, 2], J[1, 0], J[1, 2], J[2, 0], J[2, 1] = a[2], -a[1], -a[2], a[0], a[1], -a[0]
@@ -114,14 +114,14 @@ def _add_plane(H, g, lever, normal, gap, weight):
 
 @kernel("float64(float64, float64[::1], float64[::1], float64, float64)")
 def _plane_weight(gap, point, centre, noise, weight):
-    """Cauchy's weight over the variance of a distance from a plane: weight / (sigma^2 + gap^2)."""
+    """Cauchy weight divided by the variance of a distance from a plane: weight / (sigma^2 + gap^2)."""
     away = (point[0] - centre[0]) ** 2 + (point[1] - centre[1]) ** 2 + (point[2] - centre[2]) ** 2
     return weight / (noise * noise + GROUND_SLOPE * GROUND_SLOPE * away + gap * gap)
 
 
 @kernel("void(float64[:, ::1], float64[::1])")
 def _solve(H, g):
-    """Writes (H + 1e-9 I)^-1 g over g, by Cholesky's root; a singular H is found out afterwards."""
+    """Writes (H + 1e-9 I)^-1 g to g, by Cholesky decomposition; the caller must check H for singularity."""
     root = np.zeros((6, 6))
     for i in range(6):
         for j in range(i + 1):
@@ -141,7 +141,7 @@ def _solve(H, g):
 
 @kernel("void(float64[:, ::1], float64[::1])")
 def _move(T, step):
-    """Writes T moved by the step [phi; rho]: t + R rho, and R turned by phi, by Rodrigues' formula."""
+    """Writes T moved by the step [phi; rho]: t + R rho, and R rotated by phi with Rodrigues' formula."""
     x, y, z = step[0], step[1], step[2]
     angle = math.sqrt(x * x + y * y + z * z)
     a = math.sin(angle) / angle if angle > 1e-8 else 1.0

@@ -3,7 +3,7 @@
 Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator: Global Point Cloud Registration with Semantic and Geometric Cues", ICRA
 2023, section III: FPFH on the voxelised cloud of each class.
 
-Differs from the paper: only the points with most neighbours are key points, and a descriptor is the square root of its
+Differs from the paper: only the points with the most neighbours are key points. A descriptor is the square root of its
 FPFH, scaled to unit length, so that Euclidean distances are Hellinger distances of histograms (Arandjelovic, Zisserman,
 "Three things everyone should know to improve object retrieval", CVPR 2012).
 """

@@ -2,16 +2,16 @@
 
 Rusu, Blodow, Beetz, "Fast Point Feature Histograms (FPFH) for 3D registration", ICRA 2009, sections II and III.
 
-Of two points with normals, the one whose normal makes the smaller angle with the line between them is the source s, the
-other the target t. With d the unit vector from s to t, u = n_s, v = d x u (normalised) and w = u x v, they have three
-angles:
+For two points with normals, the source s is the one whose normal has the smaller angle to the line between them, and
+the target t is the other. With the unit vector d from s to t, u = n_s, v = d x u (normalised) and w = u x v, three
+angles are defined:
 
     alpha = v . n_t        phi = u . d        theta = atan2(w . n_t, u . n_t)
 
-The simple histogram (SPFH) of a point counts each over its neighbours in 11 bins. Its FPFH is its own SPFH and, with
-equal weight, the mean of its neighbours', the near ones counting more. The 33 columns are those of the Point Cloud
-Library, theta, alpha, phi; so is the weight of a neighbour, the inverse of its squared distance. The library leaves out
-the point's own SPFH.
+The simple histogram (SPFH) of a point counts each angle over its neighbours in 11 bins. Its FPFH is the sum, with equal
+weight, of its own SPFH and of the weighted mean of its neighbours' SPFH. The columns (theta, alpha, phi; 33 in all) and
+the weight of a neighbour (inverse squared distance) are those of the Point Cloud Library. The library omits the point's
+own SPFH.
 """
 
 import math
@@ -27,29 +27,29 @@ BINS = 11
 CENTRE = BINS // 2
 COLUMNS = 3 * BINS
 TINY = 1e-300
-"""Keeps a sum of nothing from dividing by zero."""
+"""Prevents division by zero for empty sums."""
 
 
 def _diamond(angle: float) -> float:
-    """From -2 to 2: where the ray at this angle, of -pi to pi, leaves the diamond |x| + |y| = 1."""
+    """Position, from -2 to 2, where the ray at this angle (-pi to pi) crosses the diamond |x| + |y| = 1."""
     x, y = math.cos(angle), math.sin(angle)
     side = y / (abs(x) + abs(y))
     return side if x >= 0.0 else math.copysign(2.0, y) - side
 
 
 ANGLE_BOUNDS = (-math.inf, *(_diamond(math.pi * (2.0 * k / BINS - 1.0)) for k in range(1, BINS)), math.inf)
-"""Where the bins of an angle end, on the diamond."""
+"""Upper edges of the angle bins, as positions on the diamond."""
 
 
 @kernel("int64(float64)")
 def _bin(fraction):
-    """The bin of a value that lies `fraction` of the way along its range."""
+    """The bin of a value at `fraction` of its range."""
     return min(max(int(BINS * fraction), 0), BINS - 1)
 
 
 @kernel("int64(float64, float64)")
 def _angle_bin(y, x):
-    """The bin of atan2(y, x), found without it: the place around a diamond grows with it and is at most a bin off."""
+    """The bin of atan2(y, x), from the position on the diamond, which is off by one bin at most."""
     diamond = y / (abs(x) + abs(y)) if x != 0.0 or y != 0.0 else 0.0
     if x < 0.0:
         diamond = (2.0 if y >= 0.0 else -2.0) - diamond
@@ -61,7 +61,7 @@ def _angle_bin(y, x):
 
 @kernel("UniTuple(int64, 3)(float64[:, :], float64[:, :], int64, int64)")
 def _pair_columns(points, normals, source, target):
-    """The columns of theta, alpha and phi of two points, the same whichever is named first."""
+    """The columns of theta, alpha and phi of two points, independent of their order."""
     dx = points[target, 0] - points[source, 0]
     dy = points[target, 1] - points[source, 1]
     dz = points[target, 2] - points[source, 2]
@@ -76,9 +76,9 @@ def _pair_columns(points, normals, source, target):
     tx, ty, tz = normals[target, 0], normals[target, 1], normals[target, 2]
     vx, vy, vz = dy * uz - dz * uy, dz * ux - dx * uz, dx * uy - dy * ux
     sine = math.sqrt(vx * vx + vy * vy + vz * vz)
-    if sine == 0.0:  # the line between them is the normal: v has no direction
+    if sine == 0.0:  # the line is parallel to the normal: v is undefined
         return CENTRE, BINS + CENTRE, 2 * BINS + CENTRE
-    wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx  # times sine, as v is
+    wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx  # scaled by sine, like v
     alpha = (vx * tx + vy * ty + vz * tz) / sine
     theta = _angle_bin(wx * tx + wy * ty + wz * tz, (ux * tx + uy * ty + uz * tz) * sine)
     return theta, BINS + _bin(0.5 * alpha + 0.5), 2 * BINS + _bin(0.5 * phi + 0.5)
@@ -86,7 +86,7 @@ def _pair_columns(points, normals, source, target):
 
 @kernel("boolean[:](int64, int64[:], int64[:], int32[:], int64[:])")
 def _neighbours_of(num_points, starts, ends, rows, chosen):
-    """(n,) whether a point is a neighbour of some chosen one."""
+    """(n,) whether each point is a neighbour of a chosen point."""
     found = np.zeros(num_points, np.bool_)
     for row in chosen:
         for at in range(starts[row], ends[row]):
@@ -96,15 +96,15 @@ def _neighbours_of(num_points, starts, ends, rows, chosen):
 
 @kernel("float32[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int32[:], boolean[:])")
 def simple_histograms(points, normals, starts, ends, rows, wanted):
-    """(n, 33) SPFH over its neighbours of each wanted point; zeros for others and for points without neighbours.
+    """(n, 33) SPFH of each wanted point; zeros for other points and for points without neighbours.
 
-    Points are distinct, and neighbours of each other where one is the other's.
+    Points must be distinct, and the neighbour relation symmetric.
     """
-    histograms = np.zeros((len(points), COLUMNS), np.float32)  # half the memory is half the time
+    histograms = np.zeros((len(points), COLUMNS), np.float32)  # half the memory of float64 takes half the time
     for row in range(len(points)):
         for at in range(starts[row], ends[row]):
             other = rows[at]
-            if other > row and (wanted[row] or wanted[other]):  # once for both
+            if other > row and (wanted[row] or wanted[other]):  # each pair once
                 for column in _pair_columns(points, normals, row, other):
                     histograms[row, column] += 1.0
                     histograms[other, column] += 1.0
@@ -117,7 +117,7 @@ def simple_histograms(points, normals, starts, ends, rows, wanted):
 
 @kernel("float64[:, :](float64[:, :], float32[:, :], int64[:], int64[:], int32[:], int64[:])")
 def neighbour_histograms(points, histograms, starts, ends, rows, chosen):
-    """(k, 33) weighted sum of the neighbours' histograms for each chosen row; zeros for a point without neighbours."""
+    """(k, 33) weighted sum of the neighbours' histograms of each chosen row; zeros for a point without neighbours."""
     sums = np.zeros((len(chosen), COLUMNS))
     for index in range(len(chosen)):
         row = chosen[index]
@@ -139,9 +139,9 @@ def neighbour_histograms(points, histograms, starts, ends, rows, chosen):
 
 
 def fpfh(points: Points, normals: Points, neighbours: Neighbours, chosen: Indices) -> Float[np.ndarray, "_ 33"]:
-    """FPFH of the chosen rows, each row of 11 summing to 200; zeros for a point without neighbours.
+    """FPFH (k, 33) of the chosen rows; each third of a row sums to 200, or is zero without neighbours.
 
-    Neighbours are those within a radius. The points are distinct.
+    Neighbours are those within a radius. The points must be distinct.
     """
     wanted = _neighbours_of(len(points), *neighbours, chosen)
     simple = simple_histograms(points, normals, *neighbours, wanted)

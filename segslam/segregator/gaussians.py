@@ -30,7 +30,7 @@ GROUND_REACH_M = 4.0
 
 
 class Planes(NamedTuple):
-    """Points of one scan, and for each the matching patch of the other. Each in its own scan's frame."""
+    """Points of one scan, and the matching patch of the other scan for each; both in the frames of their scans."""
 
     points: Points
     centres: Points
@@ -77,7 +77,7 @@ def align_gaussians(
 
 
 def nearest_pairs(correspondences: Correspondences, T_target_source: Transform, *, config: SegregatorConfig) -> Indices:
-    """Rows, ascending, within the gate, that fit the pose best among all rows that share one of their ends."""
+    """Rows, ascending, within the gate that have the smallest distance among all rows sharing one of their ends."""
     squared = _squared(correspondences, T_target_source, config)
     return _least_at_both_ends(squared, correspondences.source_index, correspondences.target_index)
 
@@ -128,16 +128,16 @@ def _squared(correspondences: Correspondences, T_target_source: Transform, confi
 
 
 def _leaves_open(information: Information) -> bool:
-    """Whether some standard deviation of the pose is above 5 degrees or 2 m."""
+    """True if a standard deviation of the pose exceeds 5 degrees or 2 m."""
     values, axes = np.linalg.eigh(information)
-    if values[0] <= 1e-9 * values[-1]:  # singular but for rounding
+    if values[0] <= 1e-9 * values[-1]:  # singular up to rounding
         return True
     sigma = np.sqrt(np.sum(axes**2 / values, axis=1))
     return bool(np.any(sigma > geometry.tangent(rotation_rad=np.radians(5.0), translation_m=2.0)))
 
 
 def _least_at_both_ends(squared: Vector, source_index: Indices, target_index: Indices) -> Indices:
-    """Rows below the gate that have the smallest distance among all rows with one of their ends."""
+    """Rows below the gate with the smallest distance among all rows that share one of their ends."""
     bound = np.full(len(squared), GATE)
     for ends in (source_index, target_index):
         best = np.full(ends.max(initial=0) + 1, GATE)
@@ -148,7 +148,7 @@ def _least_at_both_ends(squared: Vector, source_index: Indices, target_index: In
 
 @kernel("int64[::1](float64[:, ::1], float64[:, ::1], float64)")
 def _nearest_within(points, others, reach):
-    """Row of the nearest other point to each, -1 where none is within reach."""
+    """Row of the nearest other point for each point, -1 if none is within reach."""
     nearest = np.full(len(points), -1)
     for i in range(len(points)):
         best = reach * reach

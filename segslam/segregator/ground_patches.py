@@ -14,12 +14,12 @@ from segslam.types import GROUND_LABELS, Labels, Points
 CELL_M = 4.0
 """Chosen: edge of a patch (m)."""
 REACH_M = 40.0
-"""Chosen: farther ground, in x or y, is observed at a too small angle to measure its height (m)."""
+"""Chosen: farther ground, in x or y, is seen at a grazing angle and its height is inaccurate (m)."""
 MIN_POINTS = 8
 MAX_THICKNESS_M = 0.15
-"""Chosen: root mean square distance of a patch's points from its plane; kerbs pass, walls and bushes do not."""
+"""Chosen: largest root mean square distance of points from the patch's plane; excludes walls and bushes, not kerbs."""
 MIN_BREADTH_M = 0.3
-"""Chosen: smallest root mean square extent of a patch along its shorter side; a single ring may tilt (m)."""
+"""Chosen: smallest root mean square extent along the shorter side; a single ring has no defined tilt (m)."""
 
 
 RESOLUTION_M = 1e-4
@@ -54,7 +54,7 @@ def ground_patches(points: Points, labels: Labels) -> Ground:
 
 @kernel("int64[:, ::1](float64[:, ::1], float64, float64, float64)")
 def _moments(points, reach, cell, resolution):
-    """Of each cell of a square grid: the number of points, and the sums of x, y, z, xx, xy, xz, yy, yz, zz."""
+    """Number of points and sums of x, y, z, xx, xy, xz, yy, yz, zz for each cell of a square grid."""
     side = int(np.ceil(2.0 * reach / cell))
     sums = np.zeros((side * side, 10), np.int64)
     for i in range(len(points)):

@@ -61,7 +61,7 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
 
 
 class _Attempt(NamedTuple):
-    """A pose, and the numbers of correspondences and edges that it was found in."""
+    """A pose, and the numbers of correspondences and edges of the graph from which it was computed."""
 
     fit: PoseFit
     num_correspondences: int
@@ -89,7 +89,7 @@ def _attempts(source: Description, target: Description, config: SegregatorConfig
             search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=config.clique_max_nodes)
             size = len(search.cliques[0])
             if size < config.min_clique:
-                yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} correspondences agree")
+                yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} consistent correspondences")
                 continue
             for clique in search.cliques:
                 fit = _solve(source, target, correspondences, clique, bound_m, config)
@@ -125,7 +125,7 @@ def _solve(
     bound_m: float,
     config: SegregatorConfig,
 ) -> PoseFit | Rejected:
-    """The pose of the members of one clique, by `config.solver`."""
+    """The pose from the correspondences of one clique, by `config.solver`."""
     if config.solver != "gaussians":
         members = correspondences.take(clique)
         return solve_pose(members.source, members.target, bound_m=bound_m, config=config)

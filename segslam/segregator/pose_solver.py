@@ -6,7 +6,7 @@ The decoupled solver is that of TEASER (Yang, Shi, Carlone, T-RO 2021), which Se
 
 | here | paper |
 |---|---|
-| control | mu |
+ control | mu |
 | bound_m | c bar |
 """
 
@@ -137,7 +137,7 @@ def graduated_non_convexity(
     previous_cost = weights @ squared
     for _ in range(config.gnc_max_iterations):
         weights = tls_weights(squared, control, bound_m**2)
-        if not weights.any():  # the growing control left nothing: the rows agree on no pose
+        if not weights.any():  # all rows became outliers: no consistent pose
             break
         fitted, squared = fit(weights)
         cost = weights @ squared
@@ -149,7 +149,7 @@ def graduated_non_convexity(
 
 
 def weighted_pose(source: Points, target: Points, weights: Vector, align: AlignRotation) -> Transform:
-    """Rotation by `align` about the weighted centroids, and the translation that joins these."""
+    """Rotation by `align` about the weighted centroids, and the translation that aligns the centroids."""
     source_centre, target_centre = weights @ source / weights.sum(), weights @ target / weights.sum()
     R = align(source - source_centre, target - target_centre, weights)
     return geometry.transform(R, target_centre - R @ source_centre)
@@ -187,12 +187,12 @@ def _squared_distances(source: Points, target: Points, T_target_source: Transfor
 
 
 def point_information(source: Points, *, sigma_m: float) -> Information:
-    """Inverse covariance of a pose fitted to matched points, each off by independent noise of `sigma_m` in each axis.
+    """Inverse covariance of a pose fitted to matched points with independent noise of `sigma_m` in each axis.
 
-    For T exp(xi) the point a moves to R (a + phi x a + rho) + t, whose derivative is R [-[a]x, I]; R drops out.
+    For T exp(xi) the point a moves to R (a + phi x a + rho) + t, whose derivative is R [-[a]x, I]; R cancels.
     Errors common to all points, such as a bias of the labels, are not included.
     """
-    columns = np.cross(np.eye(3), source[:, None, :])  # of each point, row k is e_k x a, a column of -[a]x
+    columns = np.cross(np.eye(3), source[:, None, :])  # for each point, row k is e_k x a, a column of -[a]x
     jacobians = np.concatenate([np.swapaxes(columns, 1, 2), np.broadcast_to(np.eye(3), columns.shape)], axis=2)
     return np.einsum("nki,nkj->ij", jacobians, jacobians) / sigma_m**2
 
@@ -206,7 +206,7 @@ def _axis_sigma(squared: Vector, bound_m: float) -> float:
 
 
 def _fixes_rotation(points: Points, bound_m: float, config: SegregatorConfig) -> bool:
-    """Whether the root mean square distance of points from every line (yaw: vertical line) exceeds the bound."""
+    """True if the root mean square distance of points from every line (yaw only: vertical line) exceeds the bound."""
     if len(points) < (3 if config.rotation == "full" else 2):
         return False
     centred = points - points.mean(axis=0)
@@ -215,4 +215,4 @@ def _fixes_rotation(points: Points, bound_m: float, config: SegregatorConfig) ->
 
 
 def _degenerate(num_points: int) -> Rejected:
-    return Rejected(RejectReason.DEGENERATE, f"{num_points} points that fix no rotation")
+    return Rejected(RejectReason.DEGENERATE, f"{num_points} points that do not determine the rotation")

@@ -1,1 +1,1 @@
-"""The operating system and the machine: Ctrl-C, threads, memory, whole files, compiled kernels."""
+"""Operating system and machine: Ctrl-C, threads, memory, atomic files, compiled kernels."""

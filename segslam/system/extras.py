@@ -1,4 +1,4 @@
-"""Packages of this installation's extras: which they are, and how to install them."""
+"""Packages of this installation's extras, and how to install them."""
 
 import re
 import shlex
@@ -30,6 +30,6 @@ def requirements() -> list[Requirement]:
 
 
 def how_to_install(extra: str) -> str:
-    """The command that installs the packages of an extra, wherever segslam itself came from."""
+    """The command that installs the packages of an extra, wherever segslam was installed from."""
     packages = [f"{need.package}{need.options}{need.versions}" for need in requirements() if need.extra == extra]
     return f"pip install {shlex.join(packages)}"

@@ -77,7 +77,7 @@ def _interrupt(_: int, frame: FrameType | None) -> None:
 
 
 def _remove_unfinished() -> None:
-    """With modules that are loaded already: this may be in the middle of an import."""
+    """Uses loaded modules only: an import may be in progress."""
     for path in tuple(_Heard.unfinished):
         with suppress(OSError):
             if path.is_dir():
@@ -96,10 +96,10 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 @contextmanager
 def interrupts_wait() -> Iterator[list[int]]:
-    """Within it Ctrl-C has no effect until the end; the returned list receives an entry for each.
+    """Context manager in which Ctrl-C has no effect until the end; the yielded list receives an entry for each Ctrl-C.
 
-    Unlike an exception, a list entry cannot be lost in a callback of a library. If Ctrl-C was ignored before, as in
-    background jobs of a script, it still is. Only the main thread receives Ctrl-C.
+    A list entry cannot be lost in a callback of a library, unlike an exception. If Ctrl-C was ignored before, as in
+    background jobs of a script, it stays ignored. Only the main thread receives Ctrl-C.
     """
     interrupts: list[int] = []
     before = signal.getsignal(signal.SIGINT)
@@ -117,7 +117,7 @@ def interrupts_wait() -> Iterator[list[int]]:
 
 @contextmanager
 def stopped_by_signals(stop: Callable[[], object]) -> Iterator[None]:
-    """The first Ctrl-C or SIGTERM calls `stop` and ends nothing; the next does what it would have done without this."""
+    """The first Ctrl-C or SIGTERM calls `stop` instead of ending the process; the next one has its usual effect."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
     if threading.current_thread() is not threading.main_thread():

@@ -1,6 +1,6 @@
-"""Functions that numba compiles: when they are first called, or all at once by `build`. Their code is kept on disk.
+"""Functions compiled by numba, on their first call or all at once by `build`. The compiled code is cached on disk.
 
-numba itself is imported with the first of them: a command that calls none starts without it.
+numba is imported with the first kernel that is called: commands that call none start without it.
 """
 
 import hashlib
@@ -44,14 +44,14 @@ MODULES = (
 )
 """Modules of this package that define kernels, the slowest to compile first."""
 DONE = "done "
-"""Begins the line of a process that has compiled a kernel."""
+"""Start of the line that a process prints for each compiled kernel."""
 
 _all: list["Kernel"] = []
 _lock = threading.RLock()
 
 
 class Kernel:
-    """A function that is compiled for one signature when it is first called; other kernels may call it."""
+    """A function compiled for one signature on its first call; other kernels may call it."""
 
     def __init__(self, function: Callable[..., Any], signature: str) -> None:
         update_wrapper(self, function)
@@ -64,7 +64,7 @@ class Kernel:
 
     @property
     def compiled(self) -> Any:
-        """numba's dispatcher, which takes no other signature."""
+        """numba's dispatcher, which accepts no other signature."""
         with _lock:
             if self._compiled is None:
                 self._compiled = _compile(self.py_func, self.signature)
@@ -72,7 +72,7 @@ class Kernel:
 
 
 def kernel(signature: str) -> Callable[[Function], Function]:
-    """Have a function of numbers and arrays compiled for a signature of numba's; it runs without the global lock."""
+    """Decorator: compile a function of numbers and arrays for a numba signature; it releases the global lock."""
 
     def decorate(function: Function) -> Function:
         made = Kernel(function, signature)
@@ -83,12 +83,12 @@ def kernel(signature: str) -> Callable[[Function], Function]:
 
 
 def num_kernels(modules: Sequence[str] = MODULES) -> int:
-    """How many kernels these modules define."""
+    """Number of kernels in these modules."""
     return sum(_file(name).read_text(encoding="utf-8").count("\n@kernel(") for name in modules)
 
 
 def are_built(modules: Sequence[str] = MODULES) -> bool:
-    """Whether `build` has compiled the kernels as they are now, for this machine and these versions."""
+    """True if `build` has compiled the current kernels for this machine and these versions."""
     return _stamp(modules).exists()
 
 
@@ -106,7 +106,7 @@ def build(modules: Sequence[str] = MODULES) -> Iterator[str]:
         yield from _names_of_done(lines, num_kernels(modules))
     finally:
         for process, thread in zip(processes, threads, strict=True):
-            process.kill()  # nothing happens to one that has ended
+            process.kill()  # no effect on a process that has ended
             thread.join()
     stamp = _stamp(modules)
     stamp.parent.mkdir(parents=True, exist_ok=True)
@@ -114,10 +114,10 @@ def build(modules: Sequence[str] = MODULES) -> Iterator[str]:
 
 
 def cache_folder() -> Path | None:
-    """Where compiled code is kept if not beside the modules, which is numba's choice: None.
+    """Folder of the cache, or None for numba's default beside the modules.
 
-    NUMBA_CACHE_DIR if it is set and can be written to; beside the modules if that can be; else a folder of the user's,
-    or one in the folder for temporary files.
+    NUMBA_CACHE_DIR if it is set and writable; the default if it is writable; otherwise a folder of the user, or one in
+    the folder for temporary files.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given and _can_write(Path(given)):
@@ -145,14 +145,14 @@ def _compile(function: Callable[..., Any], signature: str) -> Any:
     except RuntimeError as error:
         if "cannot cache" not in str(error):
             raise
-        return numba.njit(signature, nogil=True)(function)  # nowhere to keep it, as on a full disk
+        return numba.njit(signature, nogil=True)(function)  # no writable cache, as on a full disk
     finally:
         numba.config.CACHE_DIR = before
 
 
 @cache
 def _numba() -> Any:
-    """numba, with a rule that a kernel called by another has the type of its compiled function."""
+    """numba, extended so that a kernel called by another kernel has the type of its compiled function."""
     import numba
     from numba.core.types import Dispatcher
     from numba.extending import typeof_impl
@@ -165,7 +165,7 @@ def _numba() -> Any:
 
 
 def _stamp(modules: Sequence[str]) -> Path:
-    """The file that `build` writes: its name is a digest of source, versions and processor."""
+    """The file that `build` writes; its name is a digest of source, versions and processor."""
     digest = hashlib.sha256()
     for name in modules:
         about = _file(name).stat()
@@ -197,7 +197,7 @@ def _start(modules: Sequence[str], *, backwards: bool) -> subprocess.Popen[str]:
 
 
 def _names_of_done(lines: "Queue[str]", total: int) -> Iterator[str]:
-    """The name of each kernel when the first process reports it, until there are `total`."""
+    """Name of each kernel on its first report, until there are `total`."""
     done: set[str] = set()
     others: list[str] = []
     while len(done) < total:
@@ -213,7 +213,7 @@ def _names_of_done(lines: "Queue[str]", total: int) -> Iterator[str]:
 
 
 def _pass_on(process: subprocess.Popen[str], lines: "Queue[str]") -> None:
-    """Each line that the process writes, and an empty one if it ends in failure."""
+    """Pass on each line of the process, and an empty line if it fails."""
     assert process.stdout is not None
     with process.stdout as output:
         for line in output:
@@ -225,13 +225,13 @@ def _pass_on(process: subprocess.Popen[str], lines: "Queue[str]") -> None:
 def _build(modules: Sequence[str], *, backwards: bool) -> None:
     """Compile the kernels one by one, and print a line for each.
 
-    Two processes meet in the middle: the kernels that one has compiled the other loads, in milliseconds.
+    Two processes start at opposite ends: each loads the kernels compiled by the other within milliseconds.
     """
     for name in reversed(modules) if backwards else modules:
         module = import_module(f"segslam.{name}")
         own = [kernel for kernel in _all if kernel.__module__ == module.__name__]
         for kernel in reversed(own) if backwards else own:
-            kernel.compiled  # noqa: B018  (compiles it)
+            kernel.compiled  # noqa: B018  (compiles on access)
             print(f"{DONE}{kernel.__module__}.{kernel.py_func.__qualname__}", flush=True)
 
 

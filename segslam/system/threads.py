@@ -19,8 +19,8 @@ def both(work: Callable[..., Done], first: tuple[Any, ...], second: tuple[Any, .
 def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, most_waiting: int) -> Iterator[Done]:
     """Apply `work` to each item in another thread; yields the results in order.
 
-    The items are produced by the calling thread, up to `most_waiting` ahead of the item in work. An exception of an
-    item or of `work` is raised here in its turn. After it, after Ctrl-C, or if the caller stops early, no further item
+    The calling thread produces the items, up to `most_waiting` ahead of the item in work. An exception of an item or of
+    `work` is raised in the order of the results. After it, after Ctrl-C, or if the caller stops early, no further item
     is started.
     """
     waiting: deque[Future[Done]] = deque()

@@ -166,11 +166,11 @@ def test_older_metadata_without_sections_are_read_as_well(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("metadata", "start", "message"),
     [
-        (None, b"", r"metadata are missing: put them beside it as drive\.json"),
+        (None, b"", r"metadata are missing: put them beside the recording as drive\.json"),
         (_metadata("RGB"), b"", "packets of profile RGB; known: LEGACY"),
         (_metadata("LEGACY", lidar_intrinsics={}), b"", "has no key 'lidar_to_sensor_transform'"),
-        (_metadata("RNG19_RFL8_SIG16_NIR16"), b"", "holds no scan"),
-        (_metadata("LEGACY"), b"\x0a\x0d\x0d\x0a", "not the classic pcap format; convert it by `editcap"),
+        (_metadata("RNG19_RFL8_SIG16_NIR16"), b"", "finds no scan in it"),
+        (_metadata("LEGACY"), b"\x0a\x0d\x0d\x0a", "not the classic pcap format; convert it with `editcap"),
         (_metadata("LEGACY"), b"nonsense", "not the classic pcap format"),
     ],
 )
@@ -187,7 +187,7 @@ def test_unusable_recordings_are_refused_with_the_reason(
 
 
 def test_unknown_link_and_empty_file_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match="link of kind 9"):
+    with pytest.raises(SegslamError, match="unknown link type 9"):
         open_dataset(_write(tmp_path, [], _metadata("LEGACY"), link=9))
     (tmp_path / "drive.pcap").write_bytes(b"")
     with pytest.raises(SegslamError, match=r"drive\.pcap: cannot be opened as ouster data"):

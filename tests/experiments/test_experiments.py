@@ -90,8 +90,8 @@ def test_lists_are_read_with_comments_and_json_brings_its_own_truth(tmp_path: Pa
     [
         ("a.txt", "1 2\n3 x\n", "a.txt:2"),
         ("a.txt", "7\n", "a.txt:1"),
-        ("a.txt", "\n", "holds no pair"),
-        ("a.json", "{}", "holds no pair"),
+        ("a.txt", "\n", "contains no pairs"),
+        ("a.json", "{}", "contains no pairs"),
         ("a.json", "[1", "a.json"),
         ("a.json", '[{"source": 1, "target": 2}]', "T_target_source"),
     ],

@@ -39,7 +39,7 @@ def test_a_cut_log_gives_every_complete_step_wherever_it_is_cut(
         assert len(read) == sum(end <= size for end in ends)
         assert_same(tuple(steps[: len(read)]), tuple(read))
         if size < ends[-1]:
-            assert f"kept the {len(read)} steps before" in caplog.text
+            assert f"kept the first {len(read)} steps" in caplog.text
 
 
 def test_a_damaged_log_gives_the_steps_before_the_damage(
@@ -54,7 +54,7 @@ def test_a_damaged_log_gives_the_steps_before_the_damage(
         path = tmp_path / name
         path.write_bytes(content)
         assert len(list(read_log(path).steps())) == 20
-        assert "kept the 20 steps before" in caplog.text
+        assert "kept the first 20 steps" in caplog.text
 
 
 def test_a_full_disk_stops_with_the_file_named_and_the_log_still_opens(steps: list[Step], tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_a_full_disk_stops_with_the_file_named_and_the_log_still_opens(steps: li
             written.append(step)
 
     with LogWriter(path, config=CONFIG) as log, largest_file(60_000):
-        with pytest.raises(WorkFailed, match=r"log\.mcap: cannot go on writing the log .* free space"):
+        with pytest.raises(WorkFailed, match=r"log\.mcap: cannot continue writing the log .* free space"):
             write_all()
         with pytest.raises(SegslamError, match="closed"):
             log.write(steps[0])
@@ -127,7 +127,7 @@ def test_a_log_that_cannot_be_written_names_the_path(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"not a log", b"\x89MCAP0\r\n"], ids=["empty", "text", "magic only"])
 def test_a_file_that_is_no_log_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "log.mcap").write_bytes(content)
-    with pytest.raises(SegslamError, match=r"log\.mcap: no log of segslam"):
+    with pytest.raises(SegslamError, match=r"log\.mcap: not a log of segslam"):
         read_log(tmp_path / "log.mcap")
 
 
@@ -152,7 +152,7 @@ def _foreign(path: Path, metadata: dict[str, dict[str, str]], step_schema: bytes
 
 
 def test_somebody_elses_mcap_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match="no log of segslam"):
+    with pytest.raises(SegslamError, match="not a log of segslam"):
         read_log(_foreign(tmp_path / "other.mcap", {"ros": {"distribution": "jazzy"}}))
 
 
@@ -169,7 +169,7 @@ def test_another_schema_version_is_refused_with_the_version_that_reads_it(tmp_pa
 def test_records_that_changed_without_a_new_version_are_refused_not_misread(tmp_path: Path) -> None:
     metadata = {"segslam": {"schema_version": str(schema.VERSION)}, "segslam.config": {"yaml": ""}}
     log = read_log(_foreign(tmp_path / "changed.mcap", metadata))
-    with pytest.raises(SegslamError, match=r"its segslam\.Step is not what this version reads"):
+    with pytest.raises(SegslamError, match=r"its segslam\.Step has another format than this version reads"):
         list(log.steps())
 
 
@@ -177,5 +177,5 @@ def test_a_step_that_contradicts_its_schema_is_refused(tmp_path: Path) -> None:
     metadata = {"segslam": {"schema_version": str(schema.VERSION)}, "segslam.config": {"yaml": ""}}
     step_schema = schema.schema_text(schema.json_schemas()[schema.STEP])
     log = read_log(_foreign(tmp_path / "broken.mcap", metadata, step_schema))
-    with pytest.raises(SegslamError, match="not as segslam writes it"):
+    with pytest.raises(SegslamError, match="not written by segslam"):
         list(log.steps())

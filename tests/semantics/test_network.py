@@ -96,8 +96,8 @@ def _made(**options: Any) -> Callable[[Path], Path]:
         (lambda folder: folder / "none.onnx", r"none\.onnx: no such file"),
         (_without_settings, r"net\.yaml: cannot be read"),
         (_truncated, r"net\.onnx: onnxruntime cannot load it"),
-        (_weights_elsewhere, r"in a file of their own, net\.onnx\.data: put it beside.*external_data=False"),
-        (_two_inputs, r"takes the inputs a: tensor\(float\), b: tensor\(float\); expected a single one"),
+        (_weights_elsewhere, r"in a separate file, net\.onnx\.data: put it beside.*external_data=False"),
+        (_two_inputs, r"takes the inputs a: tensor\(float\), b: tensor\(float\); expected a single input"),
         (_made(classes=["road", "car"]), r"gives logits of 1 x 3 x 16 x 90, but net\.yaml asks for 1 x 2 x 16 x 90"),
         (_made(height=32), r"takes an image of 1 x 5 x 16 x 90, but net\.yaml makes one of 1 x 5 x 32 x 90"),
         (
@@ -108,7 +108,7 @@ def _made(**options: Any) -> Callable[[Path], Path]:
         (_made(ids=True, id_offset=7), r"gave class id 7, but net\.yaml names 3 classes, ids 0 to 2"),
         (_made(ids=True, id_offset=-1), r"gave class id -1, but net\.yaml names 3 classes"),
         (_made(azimuth_deg=[-45, 45]), r"net\.yaml: .*azimuth_deg: -45 to 45; .*full circle"),
-        (_made(azimuth_deg=[0, 360]), r"net\.yaml: .*azimuth_deg: 0 to 360; .*from straight behind"),
+        (_made(azimuth_deg=[0, 360]), r"net\.yaml: .*azimuth_deg: 0 to 360; .*full circle"),
         (_made(mean=[0.0]), r"net\.yaml: .*mean: 1 numbers for 5 channels"),
         (_made(field_of_view_deg=[3.0, -25.0]), r"net\.yaml: .*lowest elevation, then the highest"),
         (_made(classes=["road", "castle"]), r"net\.yaml: classes\.1: .*no such class"),
@@ -173,7 +173,7 @@ def test_unknown_intensities_are_zeros_and_that_is_said_once(tmp_path: Path, cap
     assert not source.geometric
     with caplog.at_level(logging.WARNING):
         labels = [made(source.read("0", points)) for _ in range(2)]
-    assert caplog.text.count("given zeros") == 1
+    assert caplog.text.count("receives zeros") == 1
     np.testing.assert_array_equal(labels[0], LABELS[expected_classes(points, np.zeros(len(points)))])
     np.testing.assert_array_equal(labels[0], labels[1])
 

@@ -1,4 +1,4 @@
-"""The command line: one file a command, the only place that prints. Heavy imports wait inside the commands."""
+"""The command line: one file per command. Only this package prints. Commands import large libraries when they run."""
 
 import errno
 import logging
@@ -19,7 +19,7 @@ app = typer.Typer(
     name="segslam",
     help="LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs.",
     no_args_is_help=True,
-    rich_markup_mode=None,  # rich takes half of the time until help is shown
+    rich_markup_mode=None,  # rich doubles the time until help is shown
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     pretty_exceptions_enable=False,
 )
@@ -39,13 +39,13 @@ def _segslam(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Map LiDAR scans, score the result, repeat a run with other settings, register pairs of scans."""
+    """Map LiDAR scans, measure the accuracy, repeat runs with other settings, register pairs of scans."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command, that of the command line unless given, and exit.
+    """Run a command, by default that of the command line, and exit.
 
-    Exit status: 0 done, 1 no pose was found, 2 bad usage, bad input or a full disk, 130 stopped by Ctrl-C.
+    Exit status: 0 success, 1 no pose found, 2 wrong usage, bad input or full disk, 130 interrupted by Ctrl-C.
     """
     with ctrl_c_in_order():
         sys.exit(_status(arguments))
@@ -76,9 +76,9 @@ def _status(arguments: list[str] | None) -> int:
 
 
 def _of_file(error: OSError) -> str:
-    """Which file cannot be used, and why; what help and figures are printed to has no name."""
+    """Message with the file and the reason; standard output has no file name."""
     if error.filename is None and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO):
-        return f"standard output: cannot be written ({reason(error)}); send it elsewhere"
+        return f"standard output: cannot be written ({reason(error)}); redirect it elsewhere"
     return f"{error.filename or 'output'}: cannot be read or written ({reason(error)})"
 
 
@@ -87,7 +87,7 @@ def _flushed(status: int) -> int:
     try:
         sys.stdout.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again as it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # prevents a second error when Python exits
         if status == 0 and not isinstance(error, BrokenPipeError):
             print(f"segslam: {_of_file(error)}", file=sys.stderr)
         return BAD_INPUT

@@ -1,4 +1,4 @@
-"""`segslam bench`: the paper's experiments, each method on the same scans."""
+"""`segslam bench`: the experiments of the paper, with all methods on the same scans."""
 
 from functools import partial
 from pathlib import Path
@@ -106,14 +106,14 @@ def places(
     file: Annotated[
         Path, typer.Argument(help="Places: a .npz with `columns` (n, size, size) uint8 and `poses` (n, 3, 4).")
     ],
-    database: Annotated[str, typer.Option("--database", help="Rows of the database: A:B, B not included.")],
+    database: Annotated[str, typer.Option("--database", help="Rows of the database: A:B, B excluded.")],
     queries: Annotated[str, typer.Option("--queries", help="Rows of the queries: C:D.")],
-    turned: Annotated[bool, typer.Option("--turned", help="Turn each query by a random yaw.")] = False,
+    turned: Annotated[bool, typer.Option("--turned", help="Rotate each query by a random yaw.")] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --turned.")] = 0,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Measure how often a place is recognised, with no labels. A hit is within 5 m; queries without one are left out.
+    """Measure how often a place is recognised, without labels. A hit is within 5 m; queries without one are omitted.
 
     Example: segslam bench places kitti_00.npz --database 0:3000 --queries 3200:
     """
@@ -135,8 +135,8 @@ def places(
         return
     say(
         f"{figures['num_queries']} queries of {figures['num_places']} places: recall@1 {figures['recall_at_1']:.3f}, "
-        f"recall@20 {figures['recall_at_20']:.3f}; {figures['query_ms']:.1f} ms a query, "
-        f"{figures['index_bytes']} bytes a place",
+        f"recall@20 {figures['recall_at_20']:.3f}; {figures['query_ms']:.1f} ms per query, "
+        f"{figures['index_bytes']} bytes per place",
         quiet=quiet,
     )
 
@@ -170,7 +170,7 @@ def _run(
     rows = run_trials(job, trials, options)
     found = beside_paper(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
     if options.out is not None:
-        workers = "those of a Dask cluster" if options.scheduler else options.workers
+        workers = "of a Dask cluster" if options.scheduler else options.workers
         asked = {"sample": options.sample, "seed": options.seed, "workers": workers, **settings}
         report = account(experiment, job, lists, found, options=asked)
         _write_report(options.out, report, _pictures(job, trials, rows, options.draw), quiet=options.quiet)
@@ -181,7 +181,7 @@ def _run(
 
 
 def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes], *, quiet: bool) -> None:
-    """The report and, beside it, the pictures as files."""
+    """Write the report, and the pictures as separate files."""
     from segslam.experiments.report import write_bench_report
     from segslam.system.whole_files import write_whole
 
@@ -192,7 +192,7 @@ def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes],
 
 
 def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) -> dict[str, bytes]:
-    """The worst failures, drawn, by caption."""
+    """Pictures of the worst failures, by caption."""
     from segslam.experiments.job import BAD_SCAN, points_of
     from segslam.experiments.summary import worst_failures
     from segslam.run.report.pairs import draw_pair
@@ -201,7 +201,7 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
     pictures = {}
     for row in worst_failures([row for row in rows if row.reason != BAD_SCAN], count):
         trial = trial_of[row.key[:3]]
-        outcome = f"{row.error_m:.1f} m, {row.error_deg:.1f} deg off" if row.accepted else row.reason.replace("_", " ")
+        outcome = f"error {row.error_m:.1f} m {row.error_deg:.1f} deg" if row.accepted else row.reason.replace("_", " ")
         caption = f"{row.method}, {row.pairs}: {row.source} to {row.target}{_changes(row)}, {outcome}"
         poses = {"truth": trial.T_target_source} | ({} if row.estimate is None else {"estimate": row.estimate})
         source, target = points_of(job.source, trial.source), points_of(job.source, trial.target)
@@ -210,6 +210,6 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
 
 
 def _changes(row: "Row") -> str:
-    """What was done to the scans."""
-    turned = f", turned {row.source_yaw_deg:g} deg" if row.source_yaw_deg else ""
+    """Text with the changes made to the scans."""
+    turned = f", rotated by {row.source_yaw_deg:g} deg" if row.source_yaw_deg else ""
     return turned + (f", {100 * row.source_lost:g} % of labels lost" if row.source_lost else "")

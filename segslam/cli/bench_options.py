@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
-DataArgument = Annotated[Path, typer.Argument(help="KITTI's folder, with real or simulated scans.")]
+DataArgument = Annotated[Path, typer.Argument(help="KITTI folder, with real or simulated scans.")]
 
 
 @dataclass(frozen=True)
 class Options:
-    """The options that every experiment takes."""
+    """The options common to all experiments."""
 
     pairs: Annotated[
         list[Path] | None,
@@ -77,7 +77,7 @@ class Options:
         int, typer.Option("--workers", min=1, help="Number of processes on this machine (extra `cluster`).")
     ] = 1
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help="Address of a Dask cluster that sees DATA (extra `cluster`).")
+        str | None, typer.Option("--scheduler", help="Address of a Dask cluster with access to DATA (extra `cluster`).")
     ] = None
     out: Annotated[
         Path | None,
@@ -117,7 +117,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def make_job(data: Path, options: Options) -> "Job":
-    """The job that the options describe. Methods not named and not installed are left out, with a message each."""
+    """The job that the options describe. By default, methods that are not installed are skipped with a message."""
     _one_thread_each()
     from segslam.config import load_config
     from segslam.experiments.job import DataSource, Job
@@ -126,7 +126,7 @@ def make_job(data: Path, options: Options) -> "Job":
     if options.details is not None:
         check_target(options.details)
     if options.draw and options.out is None:
-        raise SegslamError("--draw: the pictures need a folder; give --out DIR")
+        raise SegslamError("--draw: pictures need a folder; give --out DIR")
     chosen = []
     for name in dict.fromkeys(options.method or METHOD_NAMES):
         try:
@@ -160,7 +160,7 @@ def reference_of(job: "Job") -> "Trajectory | None":
 def read_lists(
     options: Options, reference: "Trajectory | None", *, default: "PairList | None" = None
 ) -> list["PairList"]:
-    """The lists of files, or the one that the distances cut, or the default; sampled where that is asked for."""
+    """The lists from files, or the list selected by distance, or the default; sampled if requested."""
     from segslam.experiments.pairs import cut_pairs, read_pairs, sample_pairs
 
     cuts = options.min_m is not None or options.max_m is not None
@@ -180,7 +180,7 @@ def read_lists(
 
 
 def run_trials(job: "Job", trials: list["Trial"], options: Options) -> list["Row"]:
-    """All rows in the order of the trials. Stopped by Ctrl-C, those that are done stay in the folder of `--out`."""
+    """All rows in the order of the trials. After Ctrl-C, finished rows remain in the folder of `--out`."""
     from segslam.experiments.benchmark import Pool, in_order, run
     from segslam.experiments.rows import write_rows
 
@@ -211,7 +211,7 @@ def _bounds(options: Options) -> dict[str, Any]:
 
 def _posed(reference: "Trajectory | None") -> "Trajectory":
     if reference is None:
-        raise SegslamError("--min-m: the data has no true poses to make a list from; give --pairs FILE")
+        raise SegslamError("--min-m: the data has no true poses; give lists with --pairs FILE")
     return reference
 
 

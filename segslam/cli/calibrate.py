@@ -30,29 +30,28 @@ logger = logging.getLogger(__name__)
 
 
 def calibrate(
-    data: Annotated[Path, typer.Argument(help="KITTI's folder (with sequences/), a folder of scans, or a recording.")],
+    data: Annotated[Path, typer.Argument(help="KITTI folder (with sequences/), folder of scans, or recording.")],
     dataset: DatasetOption = None,
     sequence: SequenceOption = "00",
     frames: FramesOption = None,
-    topic: Annotated[str, typer.Option(help="Topic of the points, in a recording with several (rosbag, mcap).")] = "",
+    topic: Annotated[str, typer.Option(help="Point cloud topic, if the recording (rosbag, mcap) has several.")] = "",
     distance_m: Annotated[
-        float, typer.Option("--distance", min=50, help="Use the first scans, up to this travel (m).")
+        float, typer.Option("--distance", min=50, help="Use the first scans, up to this distance of travel (m).")
     ] = 400.0,
     config: ConfigOption = None,
     settings: SetOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Measure by how much the beams of a LiDAR point too low, from the first few hundred metres of a drive.
+    """Measure the error of a LiDAR's vertical angles from the first few hundred metres of a drive.
 
-    A positive angle means that the points of the scans lie too low. It is the angle left over in the scans as read with
-    the settings given; the setting that corrects all of it is printed too.
-
+    The angle is positive if the points of the scans are too low. It is the error that remains with the given settings;
+    the value of the setting that corrects it is printed as well.
     Example: segslam calibrate kitti --sequence 00 --set sensor.vertical_angle_deg=0
     """
     from segslam.config import load_config
 
-    check_exists(data, "name the folder with sequences/ or with the scans")
+    check_exists(data, "give the folder with sequences/ or with the scans")
     settings_now = load_config(config, settings or ())
     announce(f"calibrate: opening {data}", quiet=quiet)
     from segslam.calibration import Calibrator
@@ -79,7 +78,7 @@ def calibrate(
 
 
 def _driven(calibrator: "Calibrator", scans: "Dataset", distance_m: float) -> "Iterator[None]":
-    """Each scan that can be used, until the drive is long enough."""
+    """Yields after each usable scan, until the drive is long enough."""
     from segslam.types import BadScan
 
     for scan in scans:
@@ -93,7 +92,7 @@ def _driven(calibrator: "Calibrator", scans: "Dataset", distance_m: float) -> "I
 
 
 def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, object]:
-    """Null where the angle is unknown."""
+    """The figures; null if the angle is unknown."""
     return {
         "vertical_deg": found.angle_deg if found else None,
         "sigma_deg": found.sigma_deg if found else None,
@@ -109,10 +108,10 @@ def _summary(found: "VerticalAngle | None", applied_deg: float, travel_m: float)
 
     if found is None:
         return (
-            f"the vertical angle cannot be measured: fewer than {MIN_PAIRS} pairs of scans 10 m apart show it in "
+            f"the vertical angle cannot be measured: fewer than {MIN_PAIRS} usable pairs of scans 10 m apart in "
             f"{travel_m:.0f} m of travel; give a longer drive along a street, or denser scans"
         )
     text = f"{described(found)} ({found.num_pairs} pairs of scans, {applied_deg:g} degrees corrected on reading)"
     if found.is_significant:
         return f"{text}; set sensor.vertical_angle_deg={applied_deg + found.angle_deg:.2f}"
-    return f"{text}: not significant; sensor.vertical_angle_deg={applied_deg:g} is right"
+    return f"{text}: not significant; keep sensor.vertical_angle_deg={applied_deg:g}"

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 def check_exists(path: Path, hint: str) -> None:
-    """Raises SegslamError with the hint if there is no such file or folder; before anything slow is imported."""
+    """Raises SegslamError with the hint if the path does not exist; called before large libraries are imported."""
     if not path.expanduser().exists():
         raise SegslamError(f"{path}: no such file or folder; {hint}")
 
 
 def check_intensities(scans: "Dataset") -> None:
-    """Raises SegslamError if the first scan that can be read has no intensities."""
+    """Raises SegslamError if the first readable scan has no intensities."""
     from segslam.errors import BadScan
 
     for row in range(len(scans)):
@@ -31,14 +31,14 @@ def check_intensities(scans: "Dataset") -> None:
 
 
 def log_to_resume(folder: Path) -> "RunLog":
-    """The log of the run in a folder. Raises SegslamError if there is none, or the run is still going on."""
+    """The log of the run in a folder. Raises SegslamError if there is none, or the run is still in progress."""
     from segslam.log import is_being_written, read_log
     from segslam.run.folder import LOG
 
     log = folder / LOG
     if not log.is_file():
         raise SegslamError(
-            f"{folder}: it has no {LOG}, so there is no run to resume; map into a new folder without --resume"
+            f"{folder}: contains no {LOG}, so there is no run to resume; map into a new folder without --resume"
         )
     if is_being_written(log):
         raise SegslamError(f"{log}: the run is still in progress; stop it before you resume it")
@@ -49,27 +49,27 @@ def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options:
     """Raises SegslamError if a run would be resumed with other data, settings or options."""
     for key, before, now in changed_settings(recorded.config, settings):
         raise SegslamError(
-            f"{key}: {now} now, but {recorded.path} began with {before}; a resumed run keeps its settings"
+            f"{key}: {now} now, but {recorded.path} was started with {before}; a resumed run keeps its settings"
         )
     began = {"data set": recorded.run["dataset"]} | {f"--{name}": value for name, value in recorded.options.items()}
     given = {"data set": dataset} | {f"--{name}": value for name, value in options.items()}
     for name in given:
         if began.get(name) != given[name]:
             raise SegslamError(
-                f"{name}: {given[name] or 'none'} now, but {recorded.path} began with {began.get(name) or 'none'}; "
-                "give the same to resume it"
+                f"{name}: {given[name] or 'none'} now, but {recorded.path} was started with {began.get(name) or 'none'}"
+                "; give the same value to resume it"
             )
 
 
 def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
-    """Whether the run has all its results, of all scans of the data set."""
+    """True if the run has all its results, for all scans of the data set."""
     result = recorded.result()
-    has_results = (recorded.path.parent / "report.html").is_file()  # the last that a run writes
+    has_results = (recorded.path.parent / "report.html").is_file()  # the last file that a run writes
     return has_results and result is not None and bool(result[1].scan_index[-1] == scans.scan_index[-1])
 
 
 def changed_settings(before: "Config", now: "Config") -> "Iterator[tuple[str, object, object]]":
-    """`section.key` and its two values, for each setting that differs."""
+    """`section.key` and both values, for each setting that differs."""
     for section in type(now).model_fields:
         old, new = getattr(before, section), getattr(now, section)
         for key in type(new).model_fields:

@@ -10,23 +10,23 @@ from segslam.cli.console import JsonOption, QuietOption, announce, print_json, p
 from segslam.errors import SegslamError
 
 COLUMN = 14
-"""Characters of a column of the table, at least."""
+"""Smallest width of a column of the table, in characters."""
 
 
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, two or more.", metavar="RUN RUN...")],
     plot: Annotated[
-        Path | None, typer.Option(help="Draw the trajectories and their errors into this file: .png, .svg or .pdf.")
+        Path | None, typer.Option(help="Draw the trajectories and their errors to this file: .png, .svg or .pdf.")
     ] = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Compare runs: errors, loops and speed in one table, trajectories in one picture.
+    """Compare runs: errors, loops and speed in one table, trajectories in one figure.
 
     Example: segslam compare runs/00 runs/00-strict --plot both.png
     """
     for folder in runs:
-        check_exists(folder, "give folders of runs")
+        check_exists(folder, "give run folders")
     names = _names(runs)
     announce(f"compare: reading {len(runs)} runs", quiet=quiet)
     from segslam.run.finished import read_metrics, read_run
@@ -41,11 +41,11 @@ def compare(
         return
     print_out(table(figures))
     if plot is not None:
-        say(f"picture in {plot}", quiet=quiet)
+        say(f"figure written to {plot}", quiet=quiet)
 
 
 def _names(runs: list[Path]) -> list[str]:
-    """The last part of each path, or the whole path where that is not unique."""
+    """The last part of each path, or the whole path if the last part is not unique."""
     if len({folder.resolve() for folder in runs}) < max(len(runs), 2):
         raise SegslamError("compare: give two or more different runs")
     short = [folder.resolve().name for folder in runs]
@@ -53,7 +53,7 @@ def _names(runs: list[Path]) -> list[str]:
 
 
 def table(figures: dict[str, dict[str, Any]]) -> str:
-    """A line for each figure that any run has, and a column for each run; `-` where it has none."""
+    """A line for each figure of any run, and a column for each run; `-` for missing figures."""
     from segslam.run.finished import FIGURES
 
     width = max(COLUMN, *(len(name) + 2 for name in figures))

@@ -1,4 +1,4 @@
-"""Compilation of the kernels before a command that needs them, if that was not done before."""
+"""Compiles the kernels, if necessary, before a command that needs them."""
 
 import logging
 
@@ -8,19 +8,19 @@ logger = logging.getLogger(__name__)
 
 
 def compile_kernels(*, quiet: bool) -> int:
-    """Compile all kernels, with a bar, unless that was done before; how many were compiled.
+    """Compile all kernels, with a progress bar, unless they are compiled; returns the number of compiled kernels.
 
-    If it fails, each is compiled when it is first called.
+    On failure, each kernel is compiled on its first call.
     """
     from segslam.system import kernels
 
     if kernels.are_built():
         return 0
     total = kernels.num_kernels()
-    say("first use on this machine: compiling, once, for 20 to 60 s", quiet=quiet)
+    say("first use on this machine: compiling, once, 20 to 60 s", quiet=quiet)
     try:
         for _ in progress(kernels.build(), total=total, title="compile", quiet=quiet):
             pass
     except (RuntimeError, OSError) as error:
-        logger.warning("%s; the run is slow at first", error)
+        logger.warning("%s; the run starts slowly", error)
     return total

@@ -1,4 +1,4 @@
-"""Common parts of all commands: options, progress on standard error, one JSON object on standard output."""
+"""Parts common to all commands: options, progress on standard error, JSON on standard output."""
 
 import json
 import logging
@@ -17,7 +17,7 @@ Item = TypeVar("Item")
 
 
 def _without_warnings(quiet: bool) -> bool:
-    """Callback of `--quiet`: if it is set, warnings are no longer printed."""
+    """Callback of `--quiet`: disables warnings."""
     for handler in logging.getLogger().handlers:
         if quiet and isinstance(handler, FirstOfEachKind):
             handler.setLevel(logging.ERROR)
@@ -34,7 +34,7 @@ QuietOption = Annotated[
         "--quiet",
         "-q",
         callback=_without_warnings,
-        help="Print no progress and no warnings; only the error that ends the command.",
+        help="Print no progress and no warnings, only the error that ends the command.",
     ),
 ]
 ConfigOption = Annotated[
@@ -46,10 +46,10 @@ SetOption = Annotated[
 ]
 DatasetOption = Annotated[
     str | None,
-    typer.Option("--dataset", help="Kind of data: kitti, or a reader of kiss-icp; detected from DATA by default."),
+    typer.Option("--dataset", help="Kind of data: kitti, or a reader of kiss-icp; detected by default."),
 ]
 SequenceOption = Annotated[str, typer.Option("--sequence", help="Sequence of the data set.")]
-FramesOption = Annotated[str | None, typer.Option("--frames", help="Use scans A to B by number, B not included: A:B.")]
+FramesOption = Annotated[str | None, typer.Option("--frames", help="Use scans A to B by number, B excluded: A:B.")]
 LabelsOption = Annotated[
     str,
     typer.Option(
@@ -67,34 +67,34 @@ EncodingOption = Annotated[
 
 
 def print_json(values: dict[str, Any]) -> None:
-    """Print one JSON object on standard output. Raises ValueError for NaN: unknown figures must be left out."""
+    """Print one JSON object on standard output. Raises ValueError for NaN: callers must omit unknown figures."""
     print_out(json.dumps(values, allow_nan=False))
 
 
 def print_out(text: str) -> None:
-    """Print lines on standard output. Raises WorkFailed if that fails, for example on a full disk."""
+    """Print lines on standard output. Raises WorkFailed on a write error, for example a full disk."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise WorkFailed(f"standard output: cannot be written ({reason(error)}); send it elsewhere") from error
+        raise WorkFailed(f"standard output: cannot be written ({reason(error)}); redirect it elsewhere") from error
 
 
 def say(text: str, *, quiet: bool = False) -> None:
-    """Print a message on standard error; standard output stays machine-readable."""
+    """Print a message on standard error; standard output is reserved for results."""
     if not quiet:
         print(text, file=sys.stderr)
 
 
 def announce(text: str, *, quiet: bool) -> None:
-    """Print a first message on a terminal, before libraries are loaded and data are opened."""
+    """Print a first message on a terminal, before libraries are imported and data is opened."""
     if sys.stderr.isatty():
         say(text, quiet=quiet)
 
 
 def progress(items: Iterable[Item], *, total: int, title: str, quiet: bool = False) -> Iterator[Item]:
-    """Yield the items, with a progress bar on a terminal, a line every ten seconds elsewhere, nothing if `quiet`."""
+    """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if `quiet`."""
     if quiet:
         yield from items
     elif sys.stderr.isatty():
@@ -117,7 +117,7 @@ def _bar(items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
     from rich.text import Text
 
     class Rate(ProgressColumn):
-        """Items per second; rich has no estimate before the second item."""
+        """Items per second; rich gives no estimate before the second item."""
 
         def render(self, task: Task) -> Text:
             return Text("" if task.speed is None else f"{task.speed:.1f}/s")

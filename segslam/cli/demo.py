@@ -13,11 +13,11 @@ from segslam.system.interrupts import when_stopped
 SEQUENCE = "00"
 SEED = 33
 SENSOR = "vlp16"
-"""Chosen: 16 beams are simulated and mapped in a quarter of the time of 64."""
+"""Chosen: simulating and mapping 16 beams takes a quarter of the time of 64."""
 SCALE = 1.6
-"""Chosen: a drive of 600 m that ends where it began."""
+"""Chosen: a closed loop of 600 m."""
 AXIS_WANDER_DEG, AXIS_WANDER_S = 0.35, 300.0
-"""Chosen: four times the simulator's default, and nearly constant over the drive. The odometry drifts visibly, but all
+"""Chosen: four times the simulator's default and nearly constant over the drive. The odometry drifts visibly, but all
 scans have the same distortion, so they still match."""
 
 
@@ -38,7 +38,7 @@ def demo(
     from segslam.run.report import BEFORE_AFTER, write_before_after
 
     data = new_folder(out) / "data"
-    begin_again = f"to begin again, remove {out}"
+    begin_again = f"to start again, remove {out}"
     when_stopped(begin_again)
     sensor = simulation.SensorConfig(name=SENSOR, axis_wander_sigma_deg=AXIS_WANDER_DEG, axis_wander_s=AXIS_WANDER_S)
     drive = simulation.made_up_drive(scale=SCALE)
@@ -53,4 +53,4 @@ def demo(
     scans = open_dataset(data, sequence=SEQUENCE, labels="geometric")
     map_scans(scans, out / "run", settings=Config(), go_on=begin_again, json=json, quiet=quiet)
     picture = write_before_after(out / "run", out / "run" / BEFORE_AFTER)
-    say(f"the map before and after loop closing: {picture}\nthe report: {out / 'run' / 'report.html'}", quiet=quiet)
+    say(f"map before and after loop closing: {picture}\nreport: {out / 'run' / 'report.html'}", quiet=quiet)

@@ -19,13 +19,13 @@ LIBRARIES = {
     "libEGL.so.1": "libegl1",
     "libgomp.so.1": "libgomp1",
 }
-"""Shared libraries that Open3D's wheel loads, and their packages in Debian and Ubuntu."""
+"""Shared libraries needed by Open3D, and their packages in Debian and Ubuntu."""
 
 
 def doctor(json: JsonOption = False, quiet: QuietOption = False) -> None:
-    """Show what segslam runs on: versions, shared libraries, processor, memory, display, compiled code.
+    """Show the environment: versions, shared libraries, processor, memory, display, compiled code.
 
-    Exit status 1 if a package or library that it needs is missing. Example: segslam doctor
+    Exit status 1 if a required package or library is missing. Example: segslam doctor
     """
     report = examine()
     if json:
@@ -37,7 +37,7 @@ def doctor(json: JsonOption = False, quiet: QuietOption = False) -> None:
 
 
 def examine() -> dict[str, Any]:
-    """All findings; `problems` has a line, with its remedy, for each thing that is missing."""
+    """All findings; `problems` has a line with the remedy for each missing item."""
     from importlib.metadata import version
 
     from segslam.system import extras, kernels
@@ -75,7 +75,7 @@ def examine() -> dict[str, Any]:
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    display = report["display"] or "none: `segslam view` needs --save here"
+    display = report["display"] or "none: use `segslam view RUN --save FILE.rrd`"
     compiled = "compiled" if report["kernels"]["compiled"] else "not compiled yet: `segslam warm-up`"
     lines = [
         f"segslam {report['segslam']}, Python {report['python']} ({report['executable']})",
@@ -111,7 +111,7 @@ def _loads(library: str) -> bool:
 
 
 def _memory_gb() -> dict[str, float]:
-    """Of the machine, in all and free for use."""
+    """Total and available memory of the machine."""
     text = Path("/proc/meminfo").read_text(encoding="ascii")
     kilobytes = dict(re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE))
     return {"total": int(kilobytes["MemTotal"]) / 2**20, "available": int(kilobytes["MemAvailable"]) / 2**20}

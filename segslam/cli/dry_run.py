@@ -1,4 +1,4 @@
-"""`segslam map --dry-run`: contents of the data and the resulting settings; nothing is written."""
+"""`segslam map --dry-run`: content of the data and effective settings; writes nothing."""
 
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
-    """Figures of the data set and of its first scan that can be read. Raises SegslamError if there is none."""
+    """Figures of the data set and of its first readable scan. Raises SegslamError if no scan is readable."""
     import numpy as np
 
     from segslam.config import Config
@@ -50,31 +50,31 @@ def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
 def lines(found: dict[str, Any]) -> str:
     """The figures as text."""
     scan, odometry = found["first_usable_scan"], found["odometry"]
-    rate = f", {found['scans_per_second']:.1f} a second" if found["scans_per_second"] else ""
+    rate = f", {found['scans_per_second']:.1f}/s" if found["scans_per_second"] else ""
     nearest, middle, farthest = scan["range_m"]
     low, high = scan["elevation_deg"]
-    truth = f"of {found['num_true_poses']} scans" if found["num_true_poses"] else "none"
-    changed = ", ".join(f"{key}={value}" for key, value in found["changed_settings"].items()) or "all as by default"
+    truth = f"for {found['num_true_poses']} scans" if found["num_true_poses"] else "none"
+    changed = ", ".join(f"{key}={value}" for key, value in found["changed_settings"].items()) or "defaults"
     return "\n".join(
         [
             f"{found['data']}: {found['num_scans']} scans, {found['first_scan']} to {found['last_scan']}, over "
             f"{found['seconds']:.1f} s{rate}",
             f"scan {scan['scan']}: {scan['num_points']} points at {nearest:.1f} to {farthest:.1f} m (median "
             f"{middle:.1f} m), elevations {low:.1f} to {high:.1f} degrees; "
-            f"times of points: {'yes' if scan['has_times'] else 'no, taken as motion-compensated'}; "
+            f"point times: {'yes' if scan['has_times'] else 'none, points are assumed to be motion-compensated'}; "
             f"intensities: {'read' if scan['has_intensities'] else 'not read'}",
             f"labels: {found['labels']}",
             f"ground-truth poses: {truth}",
-            f"odometry: points from {odometry['min_range_m']} to {odometry['max_range_m']} m, "
+            f"odometry: points between {odometry['min_range_m']} and {odometry['max_range_m']} m, "
             f"motion compensation {'on' if odometry['deskew'] else 'off'}",
-            f"settings: {changed}",
+            f"settings changed: {changed}",
             "nothing was written",
         ]
     )
 
 
 def _first_usable(scans: "Dataset", *, backwards: bool = False) -> "tuple[int, Scan]":
-    """Row and scan."""
+    """Row and scan of the first usable scan, or of the last with `backwards`."""
     for row in reversed(range(len(scans))) if backwards else range(len(scans)):
         with suppress(BadScan):
             return row, scans[row]
@@ -85,8 +85,8 @@ def _labels(scans: "Dataset") -> str:
     """Source of the labels, as text."""
     source = scans.labels
     if source.network is not None:
-        return "by the network, at keyframes"
+        return "by network, for keyframes"
     if source.files is not None:
-        others = "the others by shape" if source.geometric else "the others without"
+        others = "geometric for the others" if source.geometric else "none for the others"
         return f"{source.files.folder} ({source.files.encoding} ids), {others}"
-    return "by shape" if source.geometric else "none"
+    return "geometric" if source.geometric else "none"

@@ -24,10 +24,9 @@ def finish(
     more: Callable[["SlamResult"], Mapping[str, Any]] = lambda result: {},
     search_s: float = math.inf,
 ) -> dict[str, Any]:
-    """End a run: write its results, with a map where files for it are named, and show its figures.
+    """Finish a run: write its results, and the map if files are given; show and return its figures.
 
-    What `more` makes of the result is among the figures, which are returned. `search_s` limits the last search for
-    loops, as in `Slam.finish`.
+    `more` adds figures computed from the result. `search_s` limits the last search for loops, as in `Slam.finish`.
     """
     from segslam.calibration import vertical_angle_advice
     from segslam.log import read_log
@@ -49,7 +48,7 @@ def finish(
             metrics["peak_rss_mb"] = peak_rss_mb()
             write_metrics(run.folder, metrics)
     finally:
-        write_report(run.folder)  # a map that cannot be made costs nothing else
+        write_report(run.folder)  # before the map: its failure must not prevent the report
     if json:
         print_json(metrics)
     else:
@@ -62,7 +61,7 @@ def finish(
 
 
 def summary(metrics: dict[str, Any], folder: Path) -> str:
-    """The summary of a run that is printed at its end."""
+    """The summary printed at the end of a run."""
     lines = [
         f"{metrics['num_scans']} scans in {metrics['seconds_total']:.1f} s ({metrics['scans_per_second']:.1f}/s), "
         f"{metrics['num_keyframes']} keyframes, {metrics['num_loops_accepted']} loops of "
@@ -71,12 +70,10 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
     if skipped := metrics["num_scans_skipped"]:
         lines.append(f"{skipped} scan{'s' * (skipped != 1)} skipped (unreadable or empty); see the warning above")
     if repaired := metrics.get("num_motions_repaired"):
-        lines.append(
-            f"odometry: {repaired} motion{'s' * (repaired != 1)} repaired by registration with the scans before"
-        )
+        lines.append(f"odometry: {repaired} motion{'s' * (repaired != 1)} repaired by registration with earlier scans")
     if broken := metrics.get("num_motions_broken"):
         lines.append(
-            f"odometry: {broken} break{'s' * (broken != 1)}: motions that the scans do not support; see the report"
+            f"odometry: {broken} break{'s' * (broken != 1)}, i.e. motions not supported by the scans; see the report"
         )
     if "ate_m" in metrics:
         lines.append(
@@ -90,7 +87,7 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         lines.append(f"loops between sessions: {metrics['num_loops_between']}, {rejected} rejected by the optimiser")
     if "num_scans_resumed" in metrics:
         lines.append(
-            f"{metrics['num_scans_resumed']} of these scans were resumed from the log; the rate is that of the others"
+            f"{metrics['num_scans_resumed']} of the scans were resumed from the log; the rate is that of the others"
         )
     if "num_loops_won" in metrics:
         before = f"; error of the logged run: {metrics['recorded_ate_m']:.3f} m" if "recorded_ate_m" in metrics else ""

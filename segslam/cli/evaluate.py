@@ -16,7 +16,7 @@ UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
 
 def evaluate(
     run: Annotated[
-        Path | None, typer.Argument(help="Run folder; the new figures are written to its metrics.json.")
+        Path | None, typer.Argument(help="Run folder; its metrics.json is updated with the new figures.")
     ] = None,
     reference: Annotated[Path | None, typer.Option(help="Ground-truth poses, KITTI or TUM format.")] = None,
     estimate: Annotated[Path | None, typer.Option(help="Estimated poses, instead of a run folder.")] = None,
@@ -32,7 +32,7 @@ def evaluate(
         float, typer.Option(help="Largest time difference between a pose and its reference (s).")
     ] = 0.01,
     plot: Annotated[
-        Path | None, typer.Option(help="Draw both trajectories and the error into this file: .png, .svg or .pdf.")
+        Path | None, typer.Option(help="Draw both trajectories and the error to this file: .png, .svg or .pdf.")
     ] = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
@@ -56,11 +56,11 @@ def evaluate(
     elif not quiet:
         print_out(table(figures))
     if plot is not None and not json:
-        say(f"picture in {plot}", quiet=quiet)
+        say(f"figure written to {plot}", quiet=quiet)
 
 
 def table(figures: dict[str, Any]) -> str:
-    """The figures with what they mean, a line each."""
+    """The figures with their meaning, one per line."""
     from segslam.run.finished import FIGURES
 
     return "\n".join(f"{figures[key]:10.4g}  {meaning}" for key, meaning in FIGURES.items() if key in figures)
@@ -77,15 +77,15 @@ def _score_run(folder: Path, reference_file: Path | None, plot: Path | None, *, 
     run = read_run(folder)
     reference = run.reference if reference_file is None else true_poses(reference_file, run)
     if reference is None:
-        raise SegslamError(f"{folder}: the data had no ground-truth poses; give a file with --reference")
+        raise SegslamError(f"{folder}: the data has no ground-truth poses; give a file with --reference")
     figures = accuracy(run.result, reference)
     num_scans = len(run.result.trajectory)
     if "ate_m" not in figures:
         raise SegslamError(
-            f"{reference_file or folder}: only {len(reference)} of {num_scans} scans have a pose, three are needed"
+            f"{reference_file or folder}: only {len(reference)} of {num_scans} scans have a pose; three are needed"
         )
     if len(reference) < num_scans:
-        say(f"scored {len(reference)} scans that have a reference pose, of {num_scans}", quiet=quiet)
+        say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose", quiet=quiet)
     metrics = {key: value for key, value in run.metrics.items() if key.removeprefix("odometry_") not in ACCURACY}
     metrics |= figures
     write_metrics(folder, metrics)
@@ -120,12 +120,12 @@ def _score_files(
     estimate, reference = (read_poses(file, format=format) for file in (estimate_file, reference_file))
     if (estimate.stamp_ns is None) != (reference.stamp_ns is None):
         raise SegslamError(
-            f"{estimate_file}: not the format of {reference_file} (KITTI rows against TUM stamps); convert one of them"
+            f"{estimate_file}: another format than {reference_file} (KITTI rows, TUM stamps); convert one of them"
         )
     if estimate.stamp_ns is None and len(estimate) != len(reference):
         raise SegslamError(
-            f"{estimate_file}: {len(estimate)} poses, but {reference_file} has {len(reference)}; in KITTI's format "
-            "line n + 1 is of scan n in both. Score the run folder in its place, or use TUM's format, matched by stamp"
+            f"{estimate_file}: {len(estimate)} poses, but {reference_file} has {len(reference)}; in KITTI format "
+            "line n + 1 is scan n in both. Score the run folder instead, or use TUM format, which is matched by stamp"
         )
     rows = _matching_rows(estimate, reference, round(max_difference_s * 1e9))
     direction = up or ("-y" if estimate.stamp_ns is None else "z")
@@ -138,12 +138,12 @@ def _score_files(
     if plot is not None:
         _draw(plot, estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]])
     if not len(rows) == len(estimate) == len(reference):
-        say(f"scored {len(rows)} poses; the estimate has {len(estimate)}, the reference {len(reference)}", quiet=quiet)
+        say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}", quiet=quiet)
     return figures | {"num_poses": len(rows)}
 
 
 def _matching_rows(estimate: "PoseFile", reference: "PoseFile", max_difference_ns: int) -> "IndexPairs":
-    """Row by row in KITTI's format, where rows are scans; by stamp in TUM's."""
+    """Matching rows: by row in KITTI format, where rows are scans; by stamp in TUM format."""
     import numpy as np
 
     from segslam.trajectory import rows_of_same_stamp

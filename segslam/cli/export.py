@@ -1,4 +1,4 @@
-"""`segslam export`, and the maps that other commands write beside a run."""
+"""`segslam export`, and the map files of other commands."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from segslam.types import Keyframe, Transform
 
 WITH_MAP = ("map.ply", "map.png")
-"""What `--map` writes into the folder of a run."""
+"""Files that `--map` writes into the run folder."""
 
 
 def export(
@@ -23,7 +23,7 @@ def export(
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="Files to write: .ply .pcd .las .laz (cloud), .png (from above), .yaml (grid), or before_after.png."
+            help="Files to write: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid), or before_after.png."
         ),
     ],
     config: ConfigOption = None,
@@ -31,7 +31,7 @@ def export(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Write the map of a finished run: a point cloud, a picture from above, an occupancy grid for map_server.
+    """Write the map of a finished run: a point cloud, a top view, an occupancy grid for map_server.
 
     Example: segslam export runs/00 map.laz map.png grid.yaml --set map.color=height
     """
@@ -51,7 +51,7 @@ def export(
 def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", quiet: bool) -> dict[str, Any]:
     """Write the map of a finished run to each of the files. Returns figures of the map.
 
-    Raises SegslamError if the run did not finish or a name is no map's, and WorkFailed where the disk is full.
+    Raises SegslamError if the run did not finish or a name has an unknown extension, WorkFailed if the disk is full.
     """
     from time import perf_counter
 
@@ -79,20 +79,20 @@ def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", qui
 
 
 def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
-    """What a person wants to know of a map at a glance."""
+    """Summary of the map."""
     written = f"map in {', '.join(str(file) for file in files)}"
     if "num_map_points" not in figures:
         return written
     removed = figures["num_map_moving_points"], figures["num_map_voxels_seen_through"]
     return (
         f"map of {figures['num_map_points']} points in {figures['map_seconds']:.1f} s; removed as moving: "
-        f"{removed[0]} points by class, {removed[1]} voxels that later scans see through\n"
+        f"{removed[0]} points by class, {removed[1]} voxels that other scans see through\n"
         f"{written}"
     )
 
 
 def _placed(log: "RunLog", *, quiet: bool) -> "Iterator[tuple[Keyframe, Transform]]":
-    """Each keyframe with its T_world_keyframe at the end of the run."""
+    """Each keyframe with its final T_world_keyframe."""
     from segslam.types import SegslamError
 
     result = log.result()

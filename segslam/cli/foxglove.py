@@ -1,4 +1,4 @@
-"""`--foxglove`: the log of a run served live while it is written."""
+"""`--foxglove`: serves the log of a run live while it is written."""
 
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
@@ -22,9 +22,9 @@ FoxgloveOption = Annotated[
 
 
 def serve_foxglove(address: str | None, stack: ExitStack, *, quiet: bool) -> "FoxgloveServer | None":
-    """A server that lasts as long as the stack; None without an address.
+    """A server that runs until the stack is closed; None without an address.
 
-    Raises SegslamError where foxglove-sdk is missing or the port cannot be had.
+    Raises SegslamError if foxglove-sdk is missing or the port is not available.
     """
     if address is None:
         return None

@@ -1,4 +1,4 @@
-"""`segslam map --odometry`: a trajectory from a file, in place of KISS-ICP."""
+"""`segslam map --odometry`: a trajectory from a file instead of KISS-ICP."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 
 def given_odometry(file: Path, scans: "Dataset", config: "OdometryConfig") -> "Odometry":
-    """TUM rows are found by stamp; KITTI rows by the scan's number, or by its place among the scans that are mapped.
+    """Odometry from a file. TUM rows are matched by stamp; KITTI rows by scan number, or position among mapped scans.
 
-    Raises SegslamError for KITTI rows that are neither as many as the scans of the data nor as those that are mapped.
+    Raises SegslamError unless the number of KITTI rows is that of all scans of the data or of the mapped scans.
     """
     import numpy as np
 
@@ -30,8 +30,8 @@ def given_odometry(file: Path, scans: "Dataset", config: "OdometryConfig") -> "O
     if not by_number and len(poses) != len(scans):
         numbers = dict.fromkeys((scans.num_recorded, len(scans)))
         raise SegslamError(
-            f"{file}: {len(poses)} poses, but {scans.name} has {' or '.join(map(str, numbers))}; KITTI's format needs "
-            "a line for each scan, TUM's is matched by stamp"
+            f"{file}: {len(poses)} poses, but {scans.name} has {' or '.join(map(str, numbers))}; KITTI format needs "
+            "one line per scan, TUM format is matched by stamp"
         )
     rows = np.arange(len(poses)) if by_number else scans.scan_index
     return GivenOdometry(Trajectory(rows, np.zeros(len(poses), dtype=np.int64), poses.T_a_b), config)

@@ -1,4 +1,4 @@
-"""The pipeline of a run that is localised in the map of an old one."""
+"""The pipeline of a run that is localised in the map of an earlier run."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
 
 
 def pipeline(in_map: Path | None) -> "SlamOf | None":
-    """The pipeline that localises in the map of an old run; None, for `Slam`, without one. It reads the run."""
+    """A factory of pipelines that localise in the map of a run, which is read now; None, for `Slam`, without a run."""
     if in_map is None:
         return None
     from functools import partial

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Labelled:
-    """A scan, its labels and, where they are asked for, the true ones; a row for each point that can be used."""
+    """A usable scan, its labels and, if requested, its true labels; one row per usable point."""
 
     row: int
     scan: "Scan"
@@ -41,29 +41,29 @@ class Labelled:
 
 
 def label(
-    data: Annotated[Path, typer.Argument(help="KITTI's folder (with sequences/), a folder of scans, or a recording.")],
+    data: Annotated[Path, typer.Argument(help="KITTI folder (with sequences/), folder of scans, or recording.")],
     out: Annotated[Path, typer.Option(help="New folder for the labels and pictures.")],
     labels: LabelsOption,
     truth: Annotated[Path | None, typer.Option(help="Folder of true .label files to compare with.")] = None,
     dataset: DatasetOption = None,
     sequence: SequenceOption = "00",
     frames: FramesOption = None,
-    topic: Annotated[str, typer.Option(help="Topic of the points, in a recording that has several.")] = "",
+    topic: Annotated[str, typer.Option(help="Point cloud topic, if the recording has more than one.")] = "",
     encoding: EncodingOption = None,
     truth_encoding: Annotated[
         Literal["raw", "learning", "learning-0"] | None,
         typer.Option(help="Numbering of the true labels, if it cannot be detected."),
     ] = None,
     write_as: Annotated[
-        Literal["raw", "learning", "learning-0"], typer.Option(help="Numbering of the label files that are written.")
+        Literal["raw", "learning", "learning-0"], typer.Option(help="Numbering of the written label files.")
     ] = "raw",
-    pictures: Annotated[int, typer.Option(min=0, help="Scans that are drawn, spread evenly over the drive.")] = 1,
+    pictures: Annotated[int, typer.Option(min=0, help="Number of scans to draw, spread evenly over the drive.")] = 1,
     config: ConfigOption = None,
     settings: SetOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Label scans: a .label file for each, pictures, and the accuracy where the truth is known.
+    """Label scans: write a .label file per scan and pictures, and measure the accuracy if true labels are given.
 
     Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
     """
@@ -105,7 +105,7 @@ def label(
 
 
 def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Dataset":
-    """The same scans with their true labels. The folder is looked for here, and then beside the scans."""
+    """The same scans with their true labels. A relative folder is searched here, then beside the scans."""
     from segslam.types import SegslamError
 
     try:
@@ -118,7 +118,7 @@ def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Data
 
 
 def _labelled(scans: "Dataset", true_scans: "Dataset | None", config: "Config") -> Iterator[Labelled | None]:
-    """Each scan with its labels; None, with a warning, for one that cannot be used."""
+    """Each scan with its labels; None, with a warning, for an unusable scan."""
     import logging
     from time import perf_counter
 
@@ -142,7 +142,7 @@ def _labelled(scans: "Dataset", true_scans: "Dataset | None", config: "Config") 
 
 
 class Tally:
-    """Writes each labelled scan, and counts."""
+    """Writes the labels of each scan, and counts classes and confusions."""
 
     def __init__(self, scans: "Dataset", folder: Path, *, write_as: "Encoding", num_pictures: int) -> None:
         import numpy as np
@@ -159,7 +159,7 @@ class Tally:
         self.seconds: list[float] = []
 
     def add(self, one: Labelled) -> None:
-        """Write the labels, and the picture if the scan is one of those that are drawn."""
+        """Write the labels, and the picture if the scan was selected for drawing."""
         import numpy as np
 
         from segslam.semantics.label_files import write_labels
@@ -176,7 +176,7 @@ class Tally:
             write_whole(self._folder / f"{name}.png", self._picture(one))
 
     def figures(self) -> dict[str, Any]:
-        """Shares of classes and time; and the scores, with `confusion.csv` written, where a true class is known."""
+        """Shares of the classes and time; with true labels also scores, and `confusion.csv` is written."""
         from statistics import median_low
 
         import numpy as np
@@ -231,9 +231,9 @@ def _write_confusion(file: Path, counts: Any) -> None:
 
 
 def _table(figures: dict[str, Any], folder: Path) -> str:
-    """The figures for a person, a line a class."""
+    """The figures as text, one line per class."""
     scores = figures.get("iou", {})
-    lines = [f"{figures['num_scans']} scans, {figures['num_points']} points, {figures['ms_per_scan']:.0f} ms a scan"]
+    lines = [f"{figures['num_scans']} scans, {figures['num_points']} points, {figures['ms_per_scan']:.0f} ms per scan"]
     lines.append(f"{'class':16}{'share':>8}{'IoU':>8}" if scores else f"{'class':16}{'share':>8}")
     for name in [*figures["shares"], *(name for name in scores if name not in figures["shares"])]:
         score = f"{scores[name]:8.3f}" if name in scores else ""
@@ -244,8 +244,8 @@ def _table(figures: dict[str, Any], folder: Path) -> str:
             f"{each['truth']} as {each['label']} {each['share']:.1%}" for each in figures["confusions"]
         )
         lines += [
-            f"right: {figures['accuracy']:.1%} of the points whose class is known; mean IoU {figures['mean_iou']:.3f}",
+            f"correct: {figures['accuracy']:.1%} of the points with a known class; mean IoU {figures['mean_iou']:.3f}",
             f"IoU of groups: {groups}",
-            f"confused most: {confusions or 'nothing'}",
+            f"most frequent confusions: {confusions or 'none'}",
         ]
     return "\n".join([*lines, f"labels and pictures in {folder}"])

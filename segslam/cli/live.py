@@ -35,30 +35,30 @@ if TYPE_CHECKING:
     from segslam.types import BadScan, Step
 
 MOST_BEHIND = 20
-"""Chosen: keyframes that wait for their loops, 2 MB each; beyond, keyframes are kept but their loops are not searched
-until the end of the run."""
+"""Chosen: largest number of keyframes that wait for loop closing, 2 MB each. Further keyframes are stored, but their
+loops are searched at the end of the run only."""
 
 MAP_SO_FAR = "map_so_far.ply"
 """Written by the service `/segslam/save_map`."""
 FINAL_SEARCH_S = 60.0
-"""Chosen: the last search for loops ends after this time, so that the results of a live run are not long in coming."""
+"""Chosen: the last search for loops ends after this time, so that the results of a live run are soon complete."""
 
 
 def live(
     out: Annotated[Path, typer.Option(help="New folder for the run.")],
     folder: Annotated[
-        Path | None, typer.Argument(help="Folder that a recorder writes scans to (.bin .npy .ply .pcd).")
+        Path | None, typer.Argument(help="Folder into which a recorder writes scans (.bin .npy .ply .pcd).")
     ] = None,
     topic: Annotated[
-        str | None, typer.Option(help="ROS 2 topic of sensor_msgs/PointCloud2 messages, in place of a folder.")
+        str | None, typer.Option(help="ROS 2 topic of sensor_msgs/PointCloud2 messages, instead of a folder.")
     ] = None,
     idle: Annotated[
-        float | None, typer.Option(min=0.1, metavar="SECONDS", help="End after so long without a new scan.")
+        float | None, typer.Option(min=0.1, metavar="SECONDS", help="End after this time without a new scan.")
     ] = None,
     labels: Annotated[str, typer.Option("--labels", help="Labels: geometric (auto is the same) or none.")] = "auto",
     config: ConfigOption = None,
     settings: SetOption = None,
-    preset: Annotated[str, typer.Option(help="Settings for a kind of place: driving, campus or indoor.")] = "driving",
+    preset: Annotated[str, typer.Option(help="Settings for an environment: driving, campus or indoor.")] = "driving",
     with_map: WithMapOption = False,
     map_file: MapFileOption = None,
     view: ViewOption = False,
@@ -66,7 +66,7 @@ def live(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Map scans while they arrive. Ctrl-C, or SIGTERM, ends it with a finished run.
+    """Map scans while they arrive. Ctrl-C or SIGTERM finishes the run.
 
     Example: segslam live /data/scans --out runs/now --idle 10
     """
@@ -77,14 +77,14 @@ def live(
     _check_source(folder, topic, out)
     settings_now = load_config(config, settings or ())
     if labels not in ("auto", "geometric", "none"):
-        raise SegslamError(f"--labels {labels}: live scans are labelled by shape; give geometric or none")
+        raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
     announce("live: starting", quiet=quiet)
     if preset != "driving":
         from segslam.presets import SETTINGS
         from segslam.presets import preset as settings_of
 
         if preset not in SETTINGS:
-            raise SegslamError(f"--preset {preset}: no such preset; known: {', '.join(SETTINGS)}")
+            raise SegslamError(f"--preset {preset}: unknown preset; known: {', '.join(SETTINGS)}")
         settings_now = load_config(config, settings or (), base=settings_of(cast("Preset", preset)))
     from segslam.run.folder import new_folder
 
@@ -136,9 +136,9 @@ def map_live(
     json: bool,
     quiet: bool,
 ) -> str:
-    """Map what a source gives into a new folder until it ends. What failed, if something did.
+    """Map the scans of a source into a new folder until it ends. Returns the reason if it failed, otherwise "".
 
-    Raises SegslamError if the source cannot be opened or no scan arrived; nothing is left behind then.
+    Raises SegslamError if the source cannot be opened or no scan arrived; the folder is then removed.
     """
     from segslam.live import Front, LiveMap
     from segslam.run.run import Run
@@ -178,7 +178,7 @@ def map_live(
 
 
 def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]", *, quiet: bool) -> LiveFigures:
-    """Close the loops of every scan that was placed, log and show it."""
+    """Close the loops of each scan with a pose, log it and show it."""
     figures = LiveFigures()
     with Status(quiet=quiet) as status:
         for placed in front:
@@ -192,7 +192,7 @@ def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]
 def _watch(
     run: "Run", scene: "Scene | None", live_map: "LiveMap", publisher: "MappingPublisher | None"
 ) -> "Callable[[Step | BadScan], None]":
-    """What shows each step to all who look."""
+    """A function that passes each step to all displays."""
     from segslam.types import Step
 
     def watch(step: "Step | BadScan") -> None:
@@ -210,7 +210,7 @@ def _watch(
 
 
 def _shows(server: "FoxgloveServer | None", publisher: "MappingPublisher | None") -> "list[Show]":
-    """All that show a map that was drawn."""
+    """Functions that display an updated map."""
     shows: list[Show] = []
     if server:
         shows.append(lambda drawn: server.send_map(drawn.points, drawn.labels, drawn.stamp_ns))
@@ -220,14 +220,14 @@ def _shows(server: "FoxgloveServer | None", publisher: "MappingPublisher | None"
 
 
 def _check_source(folder: Path | None, topic: str | None, out: Path) -> None:
-    """Raises SegslamError unless there is one source; before anything slow is imported."""
+    """Raises SegslamError unless exactly one source is given; called before large libraries are imported."""
     if (folder is None) == (topic is None):
         raise SegslamError(
-            "name one source: a folder that scans appear in, as in segslam live /data/scans --out runs/now, "
+            "give one source: a folder into which scans are written, as in segslam live /data/scans --out runs/now, "
             "or a ROS 2 topic, --topic /points"
         )
     if folder is not None:
-        check_exists(folder, "name the folder that scans appear in")
+        check_exists(folder, "give the folder into which scans are written")
         if not folder.is_dir():
             raise SegslamError(f"{folder}: not a folder; for a recording: segslam map {folder} --out {out}")
     elif find_spec("rclpy") is None:
@@ -249,7 +249,7 @@ def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertic
 
 
 def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublisher | None":
-    """For a topic, what publishes path and map, and saves the map where a client of the service asks for it."""
+    """The publisher of path and map if the source is a topic; it also saves the map on request."""
     from segslam.live import FolderSource
     from segslam.live.saved_map import save_map
 

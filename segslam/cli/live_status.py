@@ -1,4 +1,4 @@
-"""What a live run shows while it goes on, and the figures of it in `metrics.json`."""
+"""Status line of a live run, and its figures in `metrics.json`."""
 
 import sys
 from statistics import median
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
 
 LINE_EVERY_S, BAR_EVERY_S = 10.0, 0.2
 LATE_S = 5.0
-"""A larger delay of the loops is reported."""
+"""Larger delays of loop closing are shown."""
 
 
 class LiveFigures:
-    """Latencies, lags and counts of a live run."""
+    """Latencies, delays and counts of a live run."""
 
     def __init__(self) -> None:
         self._latency_ms: list[float] = []
@@ -25,7 +25,7 @@ class LiveFigures:
         self.num_dropped = self.num_missing = 0
 
     def note(self, placed: "Placed", *, lag_s: float, tries_loops: bool) -> None:
-        """A scan that is mapped and logged."""
+        """Record a scan that was mapped and logged."""
         from segslam.tracker import Tracked
 
         self._latency_ms.append(1000 * placed.latency_s)
@@ -35,7 +35,7 @@ class LiveFigures:
         self.num_dropped, self.num_missing = placed.num_dropped, placed.num_missing
 
     def metrics(self, ended: "Ended") -> dict[str, Any]:
-        """The figures of `metrics.json` that only a live run has."""
+        """The figures of `metrics.json` that only live runs have."""
         num_dropped = max(self.num_dropped, ended.num_dropped)
         return {
             "num_scans_arrived": ended.num_arrived or len(self._lag_s) + num_dropped,
@@ -50,7 +50,7 @@ class LiveFigures:
         }
 
     def line(self) -> str:
-        """How it stands, in a line."""
+        """The status in one line."""
         num = len(self._lag_s)
         rate = num / max(monotonic() - self._started, 1e-9)
         text = f"live: {num} scans, {rate:.1f}/s"
@@ -61,12 +61,12 @@ class LiveFigures:
         if self.num_dropped:
             text += f", {self.num_dropped} dropped"
         if self.num_missing:
-            text += f", {self.num_missing} never arrived"
+            text += f", {self.num_missing} missing"
         return text
 
 
 class Status:
-    """A line that changes on a terminal, a line every ten seconds elsewhere, nothing if `quiet`; a context manager."""
+    """Status line that is updated on a terminal, printed every ten seconds elsewhere; a context manager."""
 
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
@@ -90,7 +90,7 @@ class Status:
             self._bar.__exit__(kind, error, trace)
 
     def show(self, figures: LiveFigures) -> None:
-        """Show how it stands, if it is time."""
+        """Show the status if it is due."""
         now = monotonic()
         if self._quiet or now - self._shown < (LINE_EVERY_S if self._bar is None else BAR_EVERY_S):
             return
@@ -102,6 +102,6 @@ class Status:
 
 
 def _spread(values: list[float]) -> dict[str, float]:
-    """Median, 95th percentile and largest."""
+    """Median, 95th percentile and maximum."""
     ordered = sorted(values)
     return {"median": median(ordered), "p95": ordered[int(0.95 * (len(ordered) - 1))], "max": ordered[-1]}

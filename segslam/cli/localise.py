@@ -31,7 +31,7 @@ from segslam.cli.run_options import (
 
 
 def localise(
-    run: Annotated[Path, typer.Argument(help="Folder of the finished run whose map is used. It is only read.")],
+    run: Annotated[Path, typer.Argument(help="Folder of the finished run that provides the map. It is not changed.")],
     data: DataArgument,
     out: Annotated[Path, typer.Option(help="New folder for the run; with --resume the folder of the run.")],
     dataset: DatasetOption = None,
@@ -51,12 +51,11 @@ def localise(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Localise new scans in the map of an old run: a run folder as of `map`, in the old run's frame.
+    """Localise new scans in the map of an earlier run; writes a run folder like `map`, in the frame of the earlier run.
 
-    The first place is found without a guess, and so is each after the track was lost. Scans far from every place that
-    was found are in localised.csv, and not in poses_tum.txt.
-
-    Example: segslam localise runs/monday friday_scans --out runs/friday
+    The first pose is found without initial guess, and likewise after tracking is lost. Scans far from every pose found
+    in the map are marked in localised.csv and omitted from poses_tum.txt. Example: segslam localise runs/monday
+    friday_scans --out runs/friday
     """
     check_exists(run, "give the folder of a finished run")
     map_command(

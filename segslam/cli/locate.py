@@ -18,28 +18,28 @@ if TYPE_CHECKING:
 
 def locate(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run, or its log.mcap.")],
-    scans: Annotated[list[Path], typer.Argument(help="Scans to be found: .bin, .npy, .ply or .pcd.")],
+    scans: Annotated[list[Path], typer.Argument(help="Scans to locate: .bin, .npy, .ply or .pcd.")],
     dataset: Annotated[str | None, typer.Option(help="kitti: apply KITTI's correction of the vertical angles.")] = None,
     labels: Annotated[
-        str, typer.Option(help="Labels: geometric, none, or a folder of .label files named as the scans are.")
+        str, typer.Option(help="Labels: geometric, none, or a folder of .label files named like the scans.")
     ] = "geometric",
     encoding: EncodingOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Find where single scans were taken in a finished run, without an initial guess. Exit status 1 if none is found.
+    """Find the poses of single scans in a finished run, without an initial guess. Exit status 1 if none is found.
 
     Example: segslam locate runs/00 004413.bin 000020.bin --dataset kitti
     """
     for scan in scans:
-        check_exists(scan, "give files of scans")
+        check_exists(scan, "give scan files")
     announce(f"locate: reading {run}", quiet=quiet)
     from segslam.run.folder import folder_of
     from segslam.run.locator import Locator
 
     locator = Locator.from_run(folder_of(run))
     compile_kernels(quiet=quiet)
-    locator.floor()  # before the first scan is timed
+    locator.floor()  # computed before the first scan is timed
     clouds = (_read(scan, scans, dataset, labels, encoding, locator) for scan in scans)
     found = []
     for points, classes in progress(clouds, total=len(scans), title="locate", quiet=quiet):
@@ -56,7 +56,7 @@ def locate(
 def _read(
     scan: Path, scans: list[Path], dataset: str | None, labels: str, encoding: Any, locator: "Locator"
 ) -> tuple["Points", "Labels | None"]:
-    """A scan and its labels, in step; no labels where they are to be made by shape."""
+    """Points of a scan and their labels; None for labels if they are to be computed from geometry."""
     import numpy as np
 
     from segslam.datasets.clouds import read_cloud
@@ -100,7 +100,7 @@ def _figures(found: "Located | Rejected") -> dict[str, Any]:
 
 
 def _show(scans: list[Path], found: list[dict[str, Any]], *, quiet: bool) -> None:
-    """Of each scan its file and pose on standard output, and the rest on standard error."""
+    """Print file and pose of each scan on standard output, and details on standard error."""
     for scan, one in zip(scans, found, strict=True):
         if one["found"]:
             print_out(f"{scan} " + " ".join(f"{value:.6f}" for value in one["T_world_lidar"]))

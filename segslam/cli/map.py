@@ -81,7 +81,7 @@ def map_command(
     foxglove: FoxgloveOption = None,
     resume: ResumeOption = False,
     dry_run: DryRunOption = False,
-    in_map: Annotated[Path | None, typer.Option(help="Localise in the map of this run: `segslam localise`.")] = None,
+    in_map: Annotated[Path | None, typer.Option(help="Localise in the map of this run (`segslam localise`).")] = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -94,8 +94,8 @@ def map_command(
     from segslam.config import load_config
 
     if out is None and not dry_run:
-        raise SegslamError("--out: name a new folder for the run, as in --out runs/00 (or look first: --dry-run)")
-    check_exists(data, "name the folder with sequences/ or with the scans")
+        raise SegslamError("--out: give a new folder for the run, as in --out runs/00 (to look first: --dry-run)")
+    check_exists(data, "give the folder with sequences/ or with the scans")
     recorded = log_to_resume(out) if resume and out else None
     check_preset(preset, resumes=recorded is not None)
     settings_now = load_config(config, settings or (), base=recorded.config if recorded else None)
@@ -150,7 +150,7 @@ def map_command(
             recorded=recorded,
             map_files=map_files,
             watch=scene.add if scene else _nobody,
-            go_on=f"go on with: segslam resume {shlex.quote(str(folder))}",
+            go_on=f"continue with: segslam resume {shlex.quote(str(folder))}",
             slam_of=slam_of,
             mirror=server.send if server else None,
             json=json,
@@ -161,19 +161,19 @@ def map_command(
 
 
 def check_preset(name: str, *, resumes: bool) -> None:
-    """Raises SegslamError for a preset that does not exist, and for any if a run is resumed."""
+    """Raises SegslamError for an unknown preset, and for any preset if a run is resumed."""
     if name == "auto":
         return
     from segslam.presets import SETTINGS
 
     if name not in SETTINGS:
-        raise SegslamError(f"--preset {name}: no such preset; known: auto, {', '.join(SETTINGS)}")
+        raise SegslamError(f"--preset {name}: unknown preset; known: auto, {', '.join(SETTINGS)}")
     if resumes:
-        raise SegslamError(f"--preset {name}: a resumed run keeps its settings; leave the option out")
+        raise SegslamError(f"--preset {name}: a resumed run keeps its settings; omit the option")
 
 
 def preset_config(name: str, scans: "Dataset", *, quiet: bool) -> "Config":
-    """The settings of a preset that exists; of the one that fits the scans if it is `auto`, with a message."""
+    """The settings of a preset; with `auto`, of the preset that fits the scans, with a message."""
     from segslam.presets import extent_m, preset, preset_for
 
     if name != "auto":
@@ -181,7 +181,7 @@ def preset_config(name: str, scans: "Dataset", *, quiet: bool) -> "Config":
     extent = extent_m(scans)
     chosen = preset_for(extent)
     if chosen != "driving":
-        say(f"surfaces are near (median {extent:.0f} m): settings of --preset {chosen}", quiet=quiet)
+        say(f"surfaces are near (median range {extent:.0f} m): using --preset {chosen}", quiet=quiet)
     return preset(chosen)
 
 
@@ -228,11 +228,11 @@ def map_scans(
     json: bool,
     quiet: bool,
 ) -> None:
-    """Map a data set into a new folder, or go on with the run `recorded` there, and show the figures.
+    """Map a data set into a new folder, or resume the run `recorded`, and show the figures.
 
-    The run keeps the vertical angle that the data set was opened with.
-    `watch` is given each step, `mirror` each message of the log; `slam_of` makes another pipeline than `Slam`. Raises
-    typer.Exit(130) if Ctrl-C ended it early; `go_on` is the advice that is printed then.
+    The run keeps the vertical angle with which the data set was opened.
+    `watch` is called with each step, `mirror` with each message of the log; `slam_of` creates the pipeline. Raises
+    typer.Exit(130) if Ctrl-C ended the run early; `go_on`, the command that continues it, is then printed.
     """
     from segslam.odometry import OdometryApart
     from segslam.run.folder import new_folder
@@ -273,14 +273,14 @@ def map_scans(
         when_stopped(f"{metrics['num_scans']} of {len(scans)} scans are mapped; {go_on}")
         raise typer.Exit(EXIT_STATUS)
     if metrics.get("localised_percent") == 0.0:
-        say(f"segslam: {scans.name}: no scan was found in the old map; {folder} has the odometry alone")
+        say(f"segslam: {scans.name}: no scan was found in the map; {folder} has the odometry only")
         raise typer.Exit(1)
 
 
 def _take_over(
     run: "Run", recorded: "RunLog", scans: "Dataset", watch: "Callable[[Step | BadScan], None]", *, quiet: bool
 ) -> None:
-    """Do again what the log holds. Raises typer.Exit(130) for Ctrl-C, which leaves the log as it was."""
+    """Repeat the steps in the log. Raises typer.Exit(130) after Ctrl-C, which leaves the log unchanged."""
     try:
         for step in progress(run.resume(recorded, scans), total=recorded.num_steps(), title="resume", quiet=quiet):
             watch(step)
@@ -289,7 +289,7 @@ def _take_over(
 
 
 def _process(run: "Run", scans: "Dataset", watch: "Callable[[Step | BadScan], None]", *, quiet: bool) -> bool:
-    """Map every scan. Whether Ctrl-C ended it before the last one."""
+    """Map every scan. Returns True if Ctrl-C ended it before the last one."""
     with suppress(KeyboardInterrupt):
         left = len(scans) - run.num_scans_resumed - run.num_scans_skipped
         for step in progress(run.map(scans), total=left, title="map", quiet=quiet):

@@ -32,10 +32,11 @@ def merge(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Merge runs that pass the same places into one run: one frame, one map, one log.
+    """Merge runs that share places into one run: one frame, one map, one log.
 
-    Each run is found in the others without a guess. The world of the merged run is that of the first. A session whose
-    stamps are not later than those of the session before is shifted to follow it, and its scans are numbered on.
+    The runs are registered with each other without initial guess. The world frame of the merged run is that of the
+    first. A session whose stamps are not later than those of the previous session is shifted in time; scan numbers
+    continue.
 
     Example: segslam merge runs/monday runs/friday --out runs/both
     """
@@ -45,7 +46,7 @@ def merge(
     from segslam.run.folder import check_new, new_folder
 
     check_new(out)
-    load_config(config, settings or ())  # a wrong setting is refused before the logs are read
+    load_config(config, settings or ())  # reports a wrong setting before the logs are read
     announce(f"merge: reading {len(runs)} runs", quiet=quiet)
     from segslam.sessions.merge import plan, run_of
     from segslam.sessions.recorded import read_sessions

@@ -29,15 +29,15 @@ def optimize(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Optimise a pose graph. Errors are half the chi-square, as GTSAM's, of the edges that were not rejected.
+    """Optimise a pose graph. Errors are half the chi-square, as in GTSAM, of the edges that were not rejected.
 
-    A result that may be wrong is reported as such, with the reason.
+    A result that may be wrong is reported with the reason.
 
     Example: segslam optimize parking-garage.g2o --out optimum.g2o
     """
     check_target(out)
     if out.exists() and not force:
-        raise SegslamError(f"--out {out}: exists; name another file, or replace it with --force")
+        raise SegslamError(f"--out {out}: exists; give another file, or replace it with --force")
     announce(f"optimize: reading {graph}", quiet=quiet)
     from segslam.pose_graph import optimize_graph, read_g2o, write_g2o
 
@@ -70,11 +70,11 @@ def optimize(
 
 def _lines(result: "Optimized", out: Path) -> Iterator[str]:
     yield (
-        f"error {result.initial_error:.6g} -> {result.final_error:.6g} (half the chi-square of the edges kept) in "
+        f"error {result.initial_error:.6g} -> {result.final_error:.6g} (half the chi-square of the inlier edges), "
         f"{result.iterations} iterations, {result.seconds:.3f} s; {result.num_outliers} outliers; written to {out}"
     )
     if result.robust_cost is not None:
         yield f"cost under the kernel {result.robust}: {result.robust_cost:.6g}"
     median, p95, most = result.chi2_quantiles
-    per_dof = "none redundant" if result.chi2_per_dof is None else f"{result.chi2_per_dof:.3g} per degree of freedom"
-    yield f"chi-square of all edges but outliers: {per_dof}; median {median:.3g}, 95 % {p95:.3g}, largest {most:.3g}"
+    per_dof = "not redundant" if result.chi2_per_dof is None else f"{result.chi2_per_dof:.3g} per degree of freedom"
+    yield f"chi-square of the inlier edges: {per_dof}; median {median:.3g}, 95 % {p95:.3g}, maximum {most:.3g}"

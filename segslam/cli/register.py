@@ -31,7 +31,7 @@ LABEL_WORDS = ("geometric", "none")
 
 
 class LabelsCommand(TyperCommand):
-    """Takes `--labels S T` as well as `--labels geometric`."""
+    """Accepts `--labels S T` as well as `--labels geometric`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Repeat the option before its second value, because click accepts one value per option."""
@@ -43,12 +43,12 @@ class LabelsCommand(TyperCommand):
 
 
 def _is_word(label_source: str) -> bool:
-    """Whether the value is a labelling method for both scans, not a file."""
+    """True if the value is a labelling method for both scans, not a file."""
     return label_source in LABEL_WORDS or label_source.startswith("network:")
 
 
 def register(
-    source: Annotated[Path, typer.Argument(help="Scan to be moved: .bin, .npy, .ply or .pcd.")],
+    source: Annotated[Path, typer.Argument(help="Scan to align: .bin, .npy, .ply or .pcd.")],
     target: Annotated[Path, typer.Argument(help="Fixed scan.")],
     dataset: Annotated[str | None, typer.Option(help="kitti: apply KITTI's correction of the vertical angles.")] = None,
     labels: Annotated[
@@ -74,7 +74,7 @@ def register(
     from segslam.config import load_config
 
     for scan in (source, target):
-        check_exists(scan, "give two files of scans")
+        check_exists(scan, "give two scan files")
     check_method(method)
     settings_now = load_config(config, settings or ())
     announce(f"register: reading {source} and {target}", quiet=quiet)
@@ -139,7 +139,7 @@ def _read(
         ]
     else:
         raise SegslamError(
-            f"--labels {words[0]}: give two .label files, the source's and the target's, or geometric, or network:MODEL"
+            f"--labels {words[0]}: give two .label files, source and target, or geometric, or network:MODEL"
         )
     scans = [
         make_scan(file, 0, 0, points, ids, vertical_angle_deg=angle_deg)

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from segslam.types import Step, Trajectory
 
 BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "keyframes", "geometric")
-"""Sections of the settings that a replay cannot change, because the log holds their results."""
+"""Sections of the settings that a replay cannot change, because the log contains their results."""
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(help="The log.mcap of a run, finished or cut.")],
+    log: Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, finished or not.")],
     out: Annotated[Path, typer.Option(help="New folder for the run.")],
     config: ConfigOption = None,
     settings: SetOption = None,
@@ -41,7 +41,7 @@ def replay(
     from segslam.config import load_config
 
     check_exists(log, "give a run folder, or its log.mcap")
-    load_config(config, settings or ())  # a wrong setting is refused before the log is read
+    load_config(config, settings or ())  # reports a wrong setting before the log is read
     announce(f"replay: reading {log}", quiet=quiet)
     from segslam.log import read_log
     from segslam.run.folder import log_of, new_folder
@@ -77,7 +77,7 @@ def replay(
         more = changes | _recorded_accuracy(recorded, reference)
         finish(run, reference, json=json, quiet=quiet, more=lambda _: more)
     if interrupted:
-        when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps are replayed; results in {folder}")
+        when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps were replayed; results in {folder}")
         raise typer.Exit(EXIT_STATUS)
 
 
@@ -89,7 +89,7 @@ def _check_settings(settings_now: "Config", recorded: "RunLog") -> None:
         if key.partition(".")[0] in BEFORE_THE_KEYFRAMES:
             raise SegslamError(
                 f"{key}: a replay uses the keyframes of {recorded.path}, which were made with {before}; "
-                "keep that value, or map the data again"
+                "keep this value, or map the data again"
             )
 
 
@@ -97,7 +97,7 @@ def _repeat(run: "Run", recorded: "RunLog", *, quiet: bool) -> tuple[dict[str, A
     """Repeat every step. Returns the numbers of new and lost loops, and whether Ctrl-C ended it early."""
     before: set[tuple[int, int]] = set()
     after: set[tuple[int, int]] = set()
-    originals, sources = tee(recorded.steps())  # read in turn: only one step is kept
+    originals, sources = tee(recorded.steps())  # read alternately: only one step is in memory
     pairs = zip(originals, run.repeat(sources), strict=True)
     interrupted = True
     with suppress(KeyboardInterrupt):
@@ -116,7 +116,7 @@ def _closures(step: "Step") -> set[tuple[int, int]]:
 
 
 def _recorded_accuracy(recorded: "RunLog", reference: "Trajectory | None") -> dict[str, Any]:
-    """The error of the replayed run, if it was finished and has ground truth."""
+    """The error of the replayed run, if it finished and has ground truth."""
     from segslam.run.accuracy import trajectory_accuracy
 
     result = recorded.result()

@@ -9,7 +9,7 @@ from segslam.cli.console import JsonOption, QuietOption, announce, print_json, s
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Run folder; report.html is written into it.")],
+    run: Annotated[Path, typer.Argument(help="Run folder; report.html is written there.")],
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -25,4 +25,4 @@ def report(
     if json:
         print_json({"report": str(page)})
     else:
-        say(f"report in {page}", quiet=quiet)
+        say(f"report written to {page}", quiet=quiet)

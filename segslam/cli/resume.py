@@ -19,26 +19,26 @@ def resume(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Continue an interrupted run with the data and options that it began with, which its log has.
+    """Continue an interrupted run with its original data and options, which are read from its log.
 
     Example: segslam resume runs/00
     """
-    check_exists(run, "give the folder of a run")
+    check_exists(run, "give a run folder")
     announce(f"resume: reading {run}", quiet=quiet)
     recorded = log_to_resume(run)
     chosen: dict[str, Any] = dict(recorded.options)
     if chosen.get("live"):
         raise SegslamError(
-            f"{recorded.path}: a live run cannot be resumed, for its scans are gone; make the results of what it has: "
+            f"{recorded.path}: a live run cannot be resumed, because its scans were not stored; to make its results: "
             f"segslam replay {run} --out NEW"
         )
     if not chosen.get("data"):
         raise SegslamError(
-            f"{recorded.path}: it has no path of its data; resume it by: segslam map DATA --out {run} --resume"
+            f"{recorded.path}: has no path of the data; resume with: segslam map DATA --out {run} --resume"
         )
     check_exists(
         Path(chosen["data"]),
-        f"{recorded.path} began with it. Put it back, or: segslam map DATA --out {run} --resume",
+        f"{recorded.path} was started with it. Restore it, or: segslam map DATA --out {run} --resume",
     )
     map_command(
         Path(chosen["data"]),

@@ -1,4 +1,4 @@
-"""Options that all commands share which make a run."""
+"""Options common to all commands that make a run."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,26 +9,24 @@ import typer
 from segslam.cli.export import WITH_MAP
 from segslam.system.whole_files import check_target
 
-DataArgument = Annotated[
-    Path, typer.Argument(help="A folder of scans, a recording, or KITTI's folder (with sequences/).")
-]
+DataArgument = Annotated[Path, typer.Argument(help="Folder of scans, recording, or KITTI folder (with sequences/).")]
 TopicOption = Annotated[
     str, typer.Option("--topic", help="Point cloud topic, if the recording (rosbag, mcap) has more than one.")
 ]
 OdometryOption = Annotated[
     Path | None,
-    typer.Option("--odometry", help="Trajectory to use in place of KISS-ICP (KITTI or TUM format, LiDAR frame)."),
+    typer.Option("--odometry", help="Trajectory to use instead of KISS-ICP (KITTI or TUM format, LiDAR frame)."),
 ]
 PresetOption = Annotated[
     str,
-    typer.Option("--preset", help="Settings for a kind of place: driving, campus or indoor; auto: by DATA."),
+    typer.Option("--preset", help="Settings for an environment: driving, campus or indoor; auto: by DATA."),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in --out.")]
 DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="Show what DATA holds and the settings; write nothing. Needs no --out.")
+    bool, typer.Option("--dry-run", help="Show the content of DATA and the settings; write nothing. Needs no --out.")
 ]
 WithMapOption = Annotated[
-    bool, typer.Option("--map", help="Also write the map: map.ply (cloud) and map.png (picture from above).")
+    bool, typer.Option("--map", help="Also write the map: map.ply (cloud) and map.png (top view).")
 ]
 MapFileOption = Annotated[
     list[Path] | None,
@@ -36,11 +34,11 @@ MapFileOption = Annotated[
         help="Also write the map to this file in the run folder: .ply .pcd .las .laz .png .yaml; may be repeated."
     ),
 ]
-ViewOption = Annotated[bool, typer.Option("--view", help="Show the run in Rerun's viewer while it is mapped.")]
+ViewOption = Annotated[bool, typer.Option("--view", help="Show the run in the Rerun viewer while it is mapped.")]
 
 
 def chosen_maps(folder: Path, *, with_map: bool, map_file: Sequence[Path] | None) -> tuple[list[Path], list[Path]]:
-    """Files of the map, as named and within the run folder. Raises SegslamError for one that cannot be written."""
+    """Map files as given, and as paths in the run folder. Raises SegslamError for a file that cannot be written."""
     from segslam.map import check_names
 
     names = [*map(Path, WITH_MAP if with_map else ()), *(map_file or ())]

@@ -16,16 +16,16 @@ def simulate(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="KITTI pose file (camera frame) to drive along, heights levelled; default: a made-up loop of streets."
+            help="KITTI pose file (camera frame) to drive along, levelled; default: a generated loop of streets."
         ),
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; default: the whole drive.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same scans.")] = 0,
     sensor: Annotated[str, typer.Option(help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16.")] = "hdl64",
     lane: Annotated[
-        float, typer.Option(min=-4, max=4, help="Drive so far to the left of the path (m); negative: to the right.")
+        float, typer.Option(min=-4, max=4, help="Offset to the left of the path (m); negative: to the right.")
     ] = 0.0,
-    reverse: Annotated[bool, typer.Option("--reverse", help="Drive the path from its end to its start.")] = False,
+    reverse: Annotated[bool, typer.Option("--reverse", help="Drive the path in the opposite direction.")] = False,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -36,10 +36,10 @@ def simulate(
     ] = None,
     pairs: Annotated[
         list[Path] | None,
-        typer.Option("--pairs", help="Write only the scans named in this list of pairs; may be repeated."),
+        typer.Option("--pairs", help="Write only the scans in this list of pairs; may be repeated."),
     ] = None,
     sample: Annotated[
-        int | None, typer.Option(min=1, help="Keep only N pairs of each list, drawn as by `bench --sample N --seed 0`.")
+        int | None, typer.Option(min=1, help="Use only N pairs of each list, those of `bench --sample N --seed 0`.")
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier simulated sequence in this folder.")
@@ -68,7 +68,7 @@ def simulate(
         out, sequence, drive, config=config, seed=seed, driven=driven, num_frames=frames, only=only
     )
     last = 0
-    begin_again = f"to begin again: {same_command_with('--overwrite')}"
+    begin_again = f"to start again: {same_command_with('--overwrite')}"
     try:
         with interrupts_wait() as interrupts:
             for done in progress(written, total=total, title="simulate", quiet=quiet):
@@ -88,7 +88,7 @@ def simulate(
 
 
 def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]:
-    """The scans that the lists name. Raises SegslamError for one that the drive does not have."""
+    """Numbers of the scans in the lists. Raises SegslamError for a scan that the drive does not have."""
     from segslam.experiments.pairs import read_pairs, sample_pairs, scans_named
     from segslam.types import SegslamError
 
@@ -96,6 +96,6 @@ def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]
     only = scans_named(lists if sample is None else [sample_pairs(one, num_pairs=sample, seed=0) for one in lists])
     if max(only) >= num_scans:
         raise SegslamError(
-            f"--pairs: the list names scan {max(only)}, but the drive has {num_scans} scans; use the list of this drive"
+            f"--pairs: the list contains scan {max(only)}, but the drive has {num_scans}; use the list of this drive"
         )
     return only

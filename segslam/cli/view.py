@@ -24,7 +24,7 @@ def view(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Open a run in Rerun's viewer: trajectory, clouds and loops, step by step.
+    """Open a run in the Rerun viewer: trajectory, clouds and loops, step by step.
 
     Example: segslam view runs/00
     """
@@ -50,17 +50,17 @@ def view(
 
 
 def check_display() -> None:
-    """Raises SegslamError if no window can be opened: the viewer would wait without a message."""
+    """Raises SegslamError if no window can be opened: the viewer would wait forever."""
     has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"))
     if sys.platform == "linux" and not has_display:
         raise SegslamError(
-            "no display here: write a file with `segslam view RUN --save run.rrd`, and open it with rerun on a "
-            "machine that has one"
+            "no display: write a file with `segslam view RUN --save run.rrd`, and open it with rerun on a "
+            "machine with a display"
         )
 
 
 def open_scene(file: Path | None, *, view_every: int, named: Path | None = None) -> "Scene":
-    """An empty scene in a new viewer, or in a file, which messages call `named`. Raises SegslamError if it fails."""
+    """An empty scene in a new viewer, or in a file, called `named` in messages. Raises SegslamError if it fails."""
     os.environ.setdefault("RUST_LOG", "off")  # otherwise Rerun prints every action
     try:
         import rerun
@@ -68,7 +68,7 @@ def open_scene(file: Path | None, *, view_every: int, named: Path | None = None)
         from segslam.run.viewer import Scene
     except ImportError as error:
         raise SegslamError(
-            f"the viewer is a package of its own: {how_to_install('viewer')} (or open log.mcap in Foxglove)"
+            f"the viewer is an optional package: {how_to_install('viewer')} (or open log.mcap in Foxglove)"
         ) from error
     viewer = rerun.RecordingStream("segslam")
     try:
@@ -83,7 +83,7 @@ def open_scene(file: Path | None, *, view_every: int, named: Path | None = None)
 
 
 def close_scene(scene: "Scene", file: Path | None) -> None:
-    """Wait until the viewer, or the file, has all. Raises SegslamError if it does not take it."""
+    """Wait until the viewer or the file has received everything. Raises SegslamError if it fails."""
     try:
         scene.end()
     except (OSError, RuntimeError) as error:
@@ -93,10 +93,10 @@ def close_scene(scene: "Scene", file: Path | None) -> None:
 def _no_viewer(file: Path | None, error: Exception) -> SegslamError:
     reason = str(error).partition("\n")[0]
     if file is None:
-        return SegslamError(f"the viewer cannot be opened or does not answer ({reason}); --save FILE.rrd needs none")
+        return SegslamError(f"the viewer cannot be opened or does not answer ({reason}); use --save FILE.rrd instead")
     return WorkFailed(f"{file}: cannot be written ({reason}); free space there, or name another file")
 
 
 def _find_beside_python() -> None:
-    """Have the viewer found where Python is, which need not be on the path."""
+    """Add Python's folder to the search path, so that the viewer is found."""
     os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])

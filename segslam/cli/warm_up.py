@@ -8,14 +8,14 @@ from segslam.system.interrupts import when_stopped
 
 
 def warm_up(json: JsonOption = False, quiet: QuietOption = False) -> None:
-    """Compile all numba kernels now, so that the first run does not have to: after installing, or in a container image.
+    """Compile all numba kernels now instead of in the first run, for example in a container image.
 
-    Compiled code is kept in NUMBA_CACHE_DIR if that is set, else beside the package, or in the user's cache folder
-    where the package cannot be written to.
+    Compiled code is stored in NUMBA_CACHE_DIR if set, otherwise beside the package, or in the user's cache folder if
+    the package is read-only.
 
     Example: segslam warm-up
     """
-    when_stopped("what was compiled so far is kept; the same command compiles the rest")
+    when_stopped("the kernels compiled so far are kept; the same command compiles the others")
     started = perf_counter()
     num_compiled = compile_kernels(quiet=quiet)
     seconds = perf_counter() - started
@@ -24,4 +24,4 @@ def warm_up(json: JsonOption = False, quiet: QuietOption = False) -> None:
     elif num_compiled:
         say(f"ready in {seconds:.1f} s; {num_compiled} kernels were compiled", quiet=quiet)
     else:
-        say("ready: the kernels were compiled before", quiet=quiet)
+        say("ready: all kernels are compiled", quiet=quiet)

@@ -1,4 +1,4 @@
-"""Warnings on standard error: the first of a kind at once, those after it as a count at the end."""
+"""Warnings on standard error: the first of each kind at once, the number of the others at the end."""
 
 import logging
 import sys
@@ -25,5 +25,5 @@ class FirstOfEachKind(logging.Handler):
         """Print the number of further warnings of each kind."""
         for kind, num_told in self._told.items():
             if num_told > 1:
-                print(f"segslam: {num_told - 1} more like this one: {self._first[kind]}", file=sys.stderr)
+                print(f"segslam: {num_told - 1} more warnings like this: {self._first[kind]}", file=sys.stderr)
         self._told.clear()

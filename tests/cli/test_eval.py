@@ -94,7 +94,7 @@ def test_run_takes_the_new_figures_into_its_metrics(tmp_path: Path, capsys: pyte
 def test_run_is_scored_against_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = make_run(tmp_path / "run", with_truth=False)
     assert _eval(made.folder) == 2
-    assert "the data had no ground-truth poses; give a file with --reference" in capsys.readouterr().err
+    assert "the data has no ground-truth poses; give a file with --reference" in capsys.readouterr().err
     write_tum(tmp_path / "truth.txt", made.truth.stamp_ns, made.truth.T_world_lidar)
     assert _eval(made.folder, "--reference", tmp_path / "truth.txt", "--quiet") == 0
     assert capsys.readouterr().out == ""
@@ -108,7 +108,7 @@ def test_run_is_scored_against_a_file(tmp_path: Path, capsys: pytest.CaptureFixt
         (["--estimate", "estimate.txt"], "give either a run folder, or two files"),
         (["nowhere"], "nowhere: no such folder"),
         (["--estimate", "nowhere.txt", "--reference", "truth.txt"], "nowhere.txt: cannot read the poses"),
-        (["--estimate", "estimate.txt", "--reference", "truth_tum.txt"], "not the format of"),
+        (["--estimate", "estimate.txt", "--reference", "truth_tum.txt"], "another format than"),
         (["--estimate", "estimate.txt", "--reference", "truth.txt", "--format", "tum"], "found 12 numbers; TUM"),
     ],
 )

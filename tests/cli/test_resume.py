@@ -75,7 +75,7 @@ def test_data_that_are_gone_are_named(
         shutil.move(tmp_path / "away", kitti)
     message = capsys.readouterr().err.strip()
     assert str(kitti) in message
-    assert "Put it back" in message
+    assert "Restore it" in message
     assert len(message.splitlines()) == 1
     assert (cut / "log.mcap").read_bytes() == log
 

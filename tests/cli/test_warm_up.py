@@ -24,7 +24,7 @@ def test_it_says_when_there_is_nothing_to_compile(
 ) -> None:
     monkeypatch.setattr(kernels, "are_built", lambda: True)
     assert _warm_up() == 0
-    assert "compiled before" in capsys.readouterr().err
+    assert "all kernels are compiled" in capsys.readouterr().err
 
 
 def test_a_build_that_fails_is_a_warning_only(

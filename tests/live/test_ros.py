@@ -219,4 +219,4 @@ def test_a_live_run_has_one_source(
     sources: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("live", *sources, "--out", tmp_path / "run", "--quiet") == 2
-    assert "name one source" in capsys.readouterr().err
+    assert "give one source" in capsys.readouterr().err

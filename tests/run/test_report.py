@@ -155,7 +155,7 @@ def test_unfinished_run_is_refused(tmp_path: Path) -> None:
 def test_command_writes_the_page_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = make_run(tmp_path / "run").folder
     for arguments, status, said in (
-        (["report", str(folder)], 0, f"report in {folder / 'report.html'}\n"),
+        (["report", str(folder)], 0, f"report written to {folder / 'report.html'}\n"),
         (["report", str(tmp_path / "nowhere")], 2, "nowhere: no such folder"),
     ):
         with pytest.raises(SystemExit) as ended:

@@ -107,7 +107,7 @@ def test_a_run_that_was_stopped_goes_on_by_the_command_that_is_told(
         interrupt_after(2, patch)
         assert run(*command, "--quiet") == 130
     (line,) = capsys.readouterr().err.splitlines()
-    told = line.partition("go on with: segslam ")[2]
+    told = line.partition("continue with: segslam ")[2]
     assert line.startswith("segslam: stopped: ")
     assert shlex.split(told)[:2] == ["resume", str(tmp_path / "a run")]
     assert run(*shlex.split(told), "--json") == 0
@@ -160,7 +160,7 @@ def _has_begun(file: Path) -> bool:
 @pytest.mark.parametrize(
     ("command", "begun", "kept"),
     [
-        (("demo", "--out", "FOLDER/demo"), "demo/data/sequences/00/velodyne/000001.bin", "to begin again, remove"),
+        (("demo", "--out", "FOLDER/demo"), "demo/data/sequences/00/velodyne/000001.bin", "to start again, remove"),
         (
             (
                 "bench",
@@ -176,7 +176,7 @@ def _has_begun(file: Path) -> bool:
                 "FOLDER/b",
             ),
             "b/details.csv",
-            "the same command goes on",
+            "the same command continues",
         ),
     ],
 )

@@ -732,7 +732,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{path}: cannot read the configuration ({error}); name a YAML file") from error
+        raise SegslamError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
     return _parse_yaml(text, str(path))
 
 

@@ -170,7 +170,7 @@ def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{path}: cannot read the poses ({error}); name a KITTI or TUM trajectory") from error
+        raise SegslamError(f"{path}: cannot read the poses ({error}); give a KITTI or TUM trajectory") from error
     split = (
         (number, re.split(r"[\s,]+", line.partition("#")[0].strip())) for number, line in enumerate(text.split("\n"), 1)
     )

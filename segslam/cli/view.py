@@ -94,7 +94,7 @@ def _no_viewer(file: Path | None, error: Exception) -> SegslamError:
     reason = str(error).partition("\n")[0]
     if file is None:
         return SegslamError(f"the viewer cannot be opened or does not answer ({reason}); use --save FILE.rrd instead")
-    return WorkFailed(f"{file}: cannot be written ({reason}); free space there, or name another file")
+    return WorkFailed(f"{file}: cannot be written ({reason}); free space there, or give another file")
 
 
 def _find_beside_python() -> None:

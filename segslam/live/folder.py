@@ -48,7 +48,7 @@ class FolderSource:
         mask = IN_CLOSE_WRITE | IN_MOVED_TO | IN_DELETE_SELF | IN_MOVE_SELF | IN_ONLYDIR
         if self._fd < 0 or libc.inotify_add_watch(self._fd, os.fsencode(self._folder), mask) < 0:
             why = os.strerror(ctypes.get_errno())
-            raise SegslamError(f"{self._folder}: cannot be watched ({why}); name a folder on this machine's own disk")
+            raise SegslamError(f"{self._folder}: cannot be watched ({why}); give a folder on a local disk")
         there = [entry for entry in self._folder.iterdir() if entry.suffix in SUFFIXES]
         if not there or there[0].suffix in (".ply", ".pcd"):
             import open3d  # noqa: F401  (takes seconds: now, and not at the first scan)

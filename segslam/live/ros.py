@@ -185,7 +185,7 @@ class TopicSource:
                 if parameter.type_ != Parameter.Type.BOOL:
                     return SetParametersResult(successful=False, reason="paused: give true or false")
                 self._is_paused = bool(parameter.value)
-                self._tell(f"{self._topic}: {'paused' if self._is_paused else 'goes on'}")
+                self._tell(f"{self._topic}: {'paused' if self._is_paused else 'running'}")
         return SetParametersResult(successful=True)
 
 

@@ -84,7 +84,7 @@ class LogWriter:
         try:
             self._output = Output(path)
         except OSError as error:
-            raise SegslamError(f"{path}: cannot write the log ({error.strerror}); name a folder to write to") from error
+            raise SegslamError(f"{path}: cannot write the log ({error.strerror}); give another folder") from error
         compression = CompressionType[config.log.compression.upper()]
         self._mcap = Writer(cast(IO[bytes], self._output), chunk_size=CHUNK_BYTES, compression=compression)
         with self._whole():

@@ -1,1 +1,1 @@
-"""Around a run: its folder, its files, the finished run read back, accuracy, viewer and report."""
+"""Run folders: writing and reading them, accuracy, viewer and report."""

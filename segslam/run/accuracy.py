@@ -9,7 +9,7 @@ from segslam.types import IndexPairs, LoopClosure, Trajectory
 
 
 def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
-    """The figures of `metrics.json` that need ground truth; those of the odometry start with `odometry_`."""
+    """The figures of `metrics.json` that need ground truth; figures of the odometry start with `odometry_`."""
     corrected = trajectory_accuracy(result.trajectory, reference)
     odometry = trajectory_accuracy(result.odometry, reference)
     return (

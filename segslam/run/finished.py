@@ -34,18 +34,18 @@ FIGURES = {
     "num_keyframes": "keyframes",
     "num_candidates": "loop candidates tried",
     "num_motions_repaired": "motions of the odometry replaced by registrations",
-    "num_motions_broken": "breaks: motions that nothing supports",
+    "num_motions_broken": "breaks: motions not supported by the scans",
     "num_loops_accepted": "loops accepted",
     "localised_percent": "scans localised in the old map (%)",
     "num_sessions": "sessions merged",
     "num_loops_between": "loops between sessions, accepted",
-    "num_loops_between_switched_off": "of these, rejected by the optimiser",
+    "num_loops_between_switched_off": "loops between sessions rejected by the optimiser",
     "num_loops_switched_off": "accepted loops rejected by the optimiser",
     "num_loops_false": "false loops: accepted, but wrong by more than 2 m or 5 degrees",
     "loop_precision": "share of the accepted loops that are correct",
     "loop_recall": "share of the revisits within 4 m that a correct loop closes",
-    "vertical_deg": "vertical angle left over in the scans; positive: their points lie too low (degrees)",
-    "vertical_sigma_deg": "standard deviation of that angle (degrees)",
+    "vertical_deg": "remaining error of the vertical angles; positive: points are too low (degrees)",
+    "vertical_sigma_deg": "standard deviation of this error (degrees)",
     "seconds_total": "total time (s)",
     "scans_per_second": "scans per second",
     "peak_rss_mb": "peak memory (MB)",
@@ -63,7 +63,7 @@ ACCURACY = frozenset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedRun:
-    """The contents of a run folder."""
+    """The content of a run folder."""
 
     folder: Path
     dataset: str
@@ -77,10 +77,10 @@ class FinishedRun:
 
 
 def read_run(folder: str | Path) -> FinishedRun:
-    """The run of a folder. Raises SegslamError if it holds none, or one that did not finish."""
+    """The run of a folder. Raises SegslamError if there is none, or it did not finish."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise SegslamError(f"{folder}: no such folder; name one that `segslam map --out` made")
+        raise SegslamError(f"{folder}: no such folder; give a folder made by `segslam map --out`")
     log = read_log(folder / LOG)
     return FinishedRun(
         folder=folder,
@@ -100,14 +100,14 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
-        raise SegslamError(f"{file}: cannot read the run's figures ({error}); replay its log.mcap") from error
+        raise SegslamError(f"{file}: cannot read the figures of the run ({error}); replay its log.mcap") from error
 
 
 def true_poses(file: Path, run: FinishedRun) -> Trajectory:
     """Ground-truth LiDAR poses of the scans of a run, from a KITTI or TUM file.
 
-    KITTI rows are matched by scan number, and are camera poses if the data of the run are KITTI's; TUM rows are matched
-    by stamp. Raises SegslamError if no scan has a pose, or if the number of KITTI rows does not fit the run.
+    KITTI rows are matched by scan number; they are camera poses if the data of the run is KITTI's. TUM rows are matched
+    by stamp. Raises SegslamError if no scan has a pose, or if the number of KITTI rows does not match the run.
     """
     poses = read_poses(file)
     scans = run.result.trajectory
@@ -128,8 +128,8 @@ def _check_length(file: Path, num_poses: int, run: FinishedRun) -> None:
     took_all = run.options.get("frames") == "" and not run.dataset.startswith("kitti/")  # whose numbers may have gaps
     if num_poses <= last or (took_all and num_poses != num_read):
         raise SegslamError(
-            f"{file}: {num_poses} poses, but the run has scans up to number {last}; KITTI's format needs a line for "
-            "each scan, line n + 1 for scan n. TUM's is matched by stamp, and may leave scans out"
+            f"{file}: {num_poses} poses, but the run has scans up to number {last}; KITTI format needs one line per "
+            "scan, line n + 1 for scan n. TUM format is matched by stamp and may omit scans"
         )
 
 
@@ -156,7 +156,7 @@ def _result(log: RunLog) -> SlamResult:
         if step.keyframe is not None:
             keyframe_rows.append(row)
     if len(T_odom_lidar) < len(trajectory):
-        left = f"{len(T_odom_lidar)} of its {len(trajectory)} steps are left"
+        left = f"only {len(T_odom_lidar)} of its {len(trajectory)} steps are readable"
         raise SegslamError(f"{log.path}: damaged, {left}; replay it, or map the data again")
     late = log.late_loops()
     odometry = Trajectory(trajectory.scan_index, trajectory.stamp_ns, np.array(T_odom_lidar))

@@ -18,11 +18,11 @@ POSE_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4
 STAGES = ("prepare", "match", "refine", "verify")
 LOG = "log.mcap"
 UNFINISHED = ".part"
-"""Suffix of a file that replaces another one when it is complete."""
+"""Suffix of a file that replaces another when it is complete."""
 
 
 def log_of(run: Path) -> Path:
-    """Path of the log of a run, given its folder or the log itself."""
+    """Path of the log of a run, given its folder or the log."""
     return run if run.is_file() else run / LOG
 
 
@@ -37,26 +37,26 @@ def new_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SegslamError(f"{folder}: cannot be written to ({error.strerror}); name another with --out") from error
+        raise SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out") from error
     return folder
 
 
 def check_new(folder: Path) -> None:
-    """Raises SegslamError if there is anything in the folder of a run to be."""
+    """Raises SegslamError if the new folder of a run is not empty."""
     try:
         if folder.exists() and any(folder.iterdir()):
-            raise SegslamError(f"{folder}: not empty; name another folder with --out, or remove it")
+            raise SegslamError(f"{folder}: not empty; give another folder with --out, or remove it")
     except OSError as error:
-        raise SegslamError(f"{folder}: cannot be written to ({error.strerror}); name another with --out") from error
+        raise SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out") from error
 
 
 def write_poses(
     folder: Path, name: str, trajectory: Trajectory, T_camera_lidar: Transform | None, *, among: Mask | None = None
 ) -> None:
-    """`NAME_tum.txt` in the LiDAR frame, and `NAME_kitti.txt`, in the camera frame where there is one.
+    """`NAME_tum.txt` in the LiDAR frame, and `NAME_kitti.txt`, in the camera frame if it is known.
 
-    TUM's format, whose lines have stamps, holds only the poses `among` the trajectory's if that is given; KITTI's has a
-    line for each scan.
+    The TUM file, whose lines have stamps, contains only the poses selected by the mask `among`; the KITTI file has one
+    line per scan.
     """
     poses = trajectory.T_world_lidar
     rows = slice(None) if among is None else among
@@ -69,7 +69,7 @@ def write_poses(
 
 
 def write_localised(folder: Path, trajectory: Trajectory, from_map_m: Vector, localised: Mask) -> None:
-    """`localised.csv`, a row for each scan: whether it is localised, and the travel to a keyframe with a place."""
+    """`localised.csv`, one row per scan: whether it is localised, and the travel to a keyframe with a placement."""
     with whole_file(folder / "localised.csv") as part, part.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(("scan", "stamp_ns", "localised", "from_placed_keyframe_m"))
@@ -80,7 +80,7 @@ def write_localised(folder: Path, trajectory: Trajectory, from_map_m: Vector, lo
 
 
 def write_loops(file: Path, attempts: tuple[LoopAttempt, ...], weights: dict[tuple[int, int], float]) -> None:
-    """A row for every attempt; cells that do not apply are empty. `weight`: final weight in the graph, 0 to 1."""
+    """One row per attempt; cells that do not apply are empty. `weight`: final weight in the graph, 0 to 1."""
     head = ("source", "target", "outcome", "detail", "distance_m", "correspondences", "inliers", "overlap", "rms_m")
     with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
@@ -89,7 +89,7 @@ def write_loops(file: Path, attempts: tuple[LoopAttempt, ...], weights: dict[tup
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
-    """Write `metrics.json` atomically; the caller leaves out unknown figures."""
+    """Write `metrics.json` atomically; callers omit unknown figures."""
     with room_for(folder):
         write_whole(folder / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
@@ -103,8 +103,8 @@ def room_for(folder: Path) -> Iterator[None]:
         cause = error if isinstance(error, OSError) else error.__cause__
         why = reason(cause) if isinstance(cause, OSError) else str(error)
         raise WorkFailed(
-            f"{folder}: cannot write the results ({why}); free space on the disk, then go on with --resume: "
-            "the log has all"
+            f"{folder}: cannot write the results ({why}); free space on the disk, then continue with --resume: "
+            "the log is complete"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""The channels of a log served live to Foxglove, by foxglove-sdk: the only importer of it."""
+"""Live server of the channels of a log for Foxglove. No other module imports foxglove-sdk."""
 
 from threading import Lock
 
@@ -12,22 +12,22 @@ from segslam.log.drawing import map_message
 from segslam.types import Labels, Points
 
 LASTING = (schema.MAP, schema.ODOMETRY, schema.TRAJECTORY, schema.GROUND_TRUTH, schema.GRAPH, schema.RESULT)
-"""Channels whose last message is sent to whoever subscribes later: they are written now and then only."""
+"""Channels that are written rarely; their last message is sent to late subscribers."""
 LOOPBACK = "127.0.0.1"
 MOST_MESSAGES = 128
-"""Chosen: messages kept for a viewer that is slow, the newest; of clouds these are some 40 MB."""
+"""Chosen: number of messages kept for a slow viewer, the newest ones; about 40 MB for clouds."""
 
 
 class FoxgloveServer(ServerListener):
-    """A WebSocket server; a context manager. A viewer that is slow loses messages and delays nothing."""
+    """A WebSocket server; a context manager. A slow viewer loses messages and does not delay the run."""
 
     def __init__(self, address: str) -> None:
-        """Listen on `PORT` of loopback, or on `HOST:PORT`; port 0 is any free one.
+        """Listen on `PORT` of the loopback address, or on `HOST:PORT`; port 0 selects a free port.
 
-        Raises SegslamError for another form, and where the port cannot be had.
+        Raises SegslamError for another form, and if the port is not available.
         """
         host, port = parse_address(address)
-        self._context = context = foxglove.Context()  # channels close when it goes
+        self._context = context = foxglove.Context()  # its channels close with it
         self._channels = {
             channel.topic: foxglove.Channel(
                 channel.topic,
@@ -49,22 +49,22 @@ class FoxgloveServer(ServerListener):
                 message_backlog_size=MOST_MESSAGES,
             )
         except (OSError, RuntimeError) as error:
-            raise SegslamError(f"--foxglove {address}: cannot listen there ({error}); name another port") from error
+            raise SegslamError(f"--foxglove {address}: cannot listen there ({error}); give another port") from error
         self.url = f"ws://{host}:{self._server.port}"
 
     def send(self, topic: str, data: bytes, stamp_ns: int) -> None:
-        """Hand a message of the log to whoever has subscribed to its topic."""
+        """Send a message of the log to the subscribers of its topic."""
         if topic in LASTING:
             with self._lock:
                 self._last[topic] = data, stamp_ns
         self._channels[topic].log(data, log_time=stamp_ns)
 
     def send_map(self, points: Points, labels: Labels, stamp_ns: int) -> None:
-        """Send a map as the log has it at its end."""
+        """Send a map in the format of the log's final map."""
         self.send(schema.MAP, map_message(points, labels, stamp_ns=stamp_ns)[1].SerializeToString(), stamp_ns)
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Send the last message of a lasting channel again."""
+        """Send the last message of a rarely written channel to the new subscriber."""
         with self._lock:
             last = self._last.get(channel.topic)
         if last is not None:
@@ -81,5 +81,5 @@ def parse_address(address: str) -> tuple[str, int]:
     """Host and port of `PORT` or `HOST:PORT`. Raises SegslamError for anything else."""
     host, _, port = address.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
-        raise SegslamError(f"--foxglove {address}: give a port, as 8765, or an address to listen on, as 0.0.0.0:8765")
+        raise SegslamError(f"--foxglove {address}: give a port, like 8765, or address and port, like 0.0.0.0:8765")
     return host.strip("[]") or LOOPBACK, int(port)

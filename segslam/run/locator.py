@@ -1,4 +1,4 @@
-"""Where single scans were taken in a finished run, with no guess."""
+"""Localisation of single scans in a finished run, without initial guess."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,41 +25,41 @@ from segslam.verification import gates
 from segslam.verification.noise_floor import NeighbourNoise
 
 NUM_PREPARED = 256
-"""Keyframes ready for alignment in memory, some 2 MB each."""
+"""Number of keyframes prepared for alignment in memory, about 2 MB each."""
 NUM_FIRST = 3
-"""Chosen: places tried before the scan is looked at from points around its sensor, too."""
+"""Chosen: number of places tried before views from points around the sensor are tried as well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Located(Record):
-    """Where a scan was taken."""
+    """The pose of a scan in a run."""
 
     T_world_lidar: Transform
-    """Its pose in the frame of the run."""
+    """Pose of the scan in the world of the run."""
     keyframe_id: int
-    """The keyframe that it was aligned with."""
+    """Keyframe with which the scan was registered."""
     alignment: Alignment
-    """Of the scan in that keyframe."""
+    """Pose of the scan in that keyframe."""
     seconds: float
 
     @property
     def ok(self) -> bool:
-        """True, where `Rejected` has False."""
+        """True; False for `Rejected`."""
         return True
 
     @property
     def inliers(self) -> int:
-        """Of the coarse pose."""
+        """Number of inliers of the coarse pose."""
         return self.alignment.coarse.num_inliers
 
     @property
     def overlap(self) -> float:
-        """Share of the standing points of either that lie on the other; the smaller of the two."""
+        """Share of the standing points of one cloud that lie on the other; the smaller of both directions."""
         return self.alignment.overlap
 
 
 class Locator:
-    """Finds scans among the keyframes of a finished run, which it only reads."""
+    """Locates scans among the keyframes of a finished run, which is not changed."""
 
     def __init__(
         self,
@@ -69,14 +69,13 @@ class Locator:
         *,
         config: Config,
     ) -> None:
-        """`keyframes` by their number, with or without points, which `clouds` gives; signatures are made where they
-        have none."""
+        """`keyframes`: by id, with or without points; `clouds` provides the points. Missing signatures are computed."""
         self.config = config
         self.T_world_keyframe = T_world_keyframe
         travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
         self.submaps = Submaps(config, lambda: clouds, partial(shape_labels, config=config), lambda: travel_m)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
-        """A keyframe by its number, ready for alignment."""
+        """A keyframe by its id, prepared for alignment."""
         self._floor = NeighbourNoise(
             lambda number: self.prepared(number).observed,
             lambda number: self.submaps.T_odom[number],
@@ -91,21 +90,21 @@ class Locator:
 
     @classmethod
     def from_run(cls, folder: str | Path) -> "Locator":
-        """From the folder of a run. Raises SegslamError, which names the file, if it is damaged or did not finish."""
+        """The locator of a run folder. Raises SegslamError, naming the file, if it is damaged or did not finish."""
         run = read_run(folder)
         recorded = read_log(log_of(run.folder)).keyframes()
         keyframes = [recorded[number] for number in range(len(recorded))]
         return cls(keyframes, recorded, run.result.estimate.T_world_keyframe, config=run.config)
 
     def floor(self) -> gates.NoiseFloor:
-        """How neighbouring keyframes of the run agree; measured when it is first asked for."""
+        """Residuals between neighbouring keyframes of the run; computed on first use."""
         return self._floor.at(len(self.T_world_keyframe) - 1)
 
     def locate(self, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:
-        """Where a scan was taken, or why that is not known; points are rows of x, y, z in the sensor's frame (m).
+        """The pose of a scan, or the reason why it was not found. `points`: rows of x, y, z in the sensor's frame (m).
 
-        Labels are learning ids, a row a point; a scan without is labelled by shape. Raises SegslamError for an array of
-        another shape.
+        `labels`: learning ids, one per point; without labels, geometric labels are computed. Raises SegslamError for an
+        array of another shape.
         """
         started = perf_counter()
         config = self.config
@@ -147,5 +146,5 @@ class Locator:
 
 
 def locate(run: str | Path, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:
-    """Where a scan was taken in the run of a folder. For several scans make a `Locator` once: it reads the run."""
+    """Locate a scan in the run of a folder. For several scans, create a `Locator` once, because it reads the run."""
     return Locator.from_run(run).locate(points, labels)

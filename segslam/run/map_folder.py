@@ -1,4 +1,4 @@
-"""Map a data set into a run folder with one call."""
+"""Mapping of a data set into a run folder with one call."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class SlamOf(Protocol):
-    """Makes the pipeline of a run: `Slam`, or another one with the same methods."""
+    """Factory of the pipeline of a run: `Slam`, or another class with the same methods."""
 
     def __call__(
         self, config: Config, *, odometry: "Odometry | None" = None, labeller: "Labeller | None" = None
     ) -> Slam:
-        """As `Slam`."""
+        """Arguments as for `Slam`."""
         ...
 
 
@@ -49,12 +49,12 @@ def map_folder(
     slam_of: "SlamOf" = Slam,
     options: Mapping[str, str] = MappingProxyType({}),
 ) -> FinishedRun:
-    """Map a folder of scans or a recording into the new folder `out`, as `segslam map` does; the finished run.
+    """Map a folder of scans or a recording into the new folder `out`, like `segslam map`; returns the finished run.
 
-    Options as those of `open_dataset` and `Slam`; without `config` the preset that fits the scans. `on_step` is called
-    with each Step, in order. `slam_of` makes the pipeline, another one than `Slam` if given, and `options` go to the
-    log. Scans that cannot be used are skipped with a warning. Raises SegslamError that names the file and the remedy,
-    also if no scan is left.
+    Options are those of `open_dataset` and `Slam`; without `config`, the preset that fits the scans is used. `on_step`
+    is called with each Step, in order. `slam_of` creates the pipeline; `options` are written to the log. Scans that
+    cannot be used are skipped with a warning. Raises SegslamError, naming the file and the remedy, also if no scan
+    remains.
     """
     from segslam.run.report import write_report
 
@@ -94,11 +94,11 @@ def map_folder(
 
 
 def in_effect(settings: Config, scans: Dataset) -> Config:
-    """The settings with the vertical angle that the data set was opened with, if they leave it undefined."""
+    """The settings, with the vertical angle of the data set if they do not define one."""
     sensor = settings.sensor.model_copy(update={"vertical_angle_deg": scans.vertical_angle_deg})
     return settings.model_copy(update={"sensor": sensor})
 
 
 def labeller_of(scans: Dataset) -> "Labeller | None":
-    """None for labels by shape; a labeller without labels if the data set was opened with `none`."""
+    """None for geometric labels; a labeller that returns UNLABELLED if the data set was opened with `none`."""
     return None if scans.labels.geometric else lambda points: unlabelled(len(points))

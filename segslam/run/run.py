@@ -38,7 +38,7 @@ from segslam.types import (
 logger = logging.getLogger(__name__)
 
 MOST_WAITING = 8
-"""Chosen: scans that odometry may be ahead of loop closing, about 2 MB each: the time of a keyframe with two loops."""
+"""Chosen: scans by which odometry may lead loop closing, about 2 MB each: the time of a keyframe with two loops."""
 
 
 class Run:
@@ -58,9 +58,9 @@ class Run:
     ) -> None:
         """`T_camera_lidar`, for KITTI, transforms the KITTI-format poses into the camera frame of its ground truth.
 
-        `reference` goes to the log, for whoever scores or repeats the run from its folder; `options` too, for whoever
-        resumes it. A run that `resumes` has a log in its folder, which stays until `resume` has taken it over. The
-        folder of any other run goes where it ends without a step. `mirror` is given each message of the log.
+        `reference` and `options` are written to the log, for later scoring, replaying and resuming. With `resumes`, the
+        existing log in the folder remains until `resume` has replaced it. Otherwise the folder is removed if the run
+        ends without a step. `mirror` is called with each message of the log.
         """
         self.folder = folder
         self.num_steps = 0
@@ -112,16 +112,16 @@ class Run:
                 self.folder.rmdir()
 
     def resume(self, recorded: RunLog, dataset: Dataset) -> Iterator[Step]:
-        """Repeat the logged steps from the keyframes on; `map` then continues with the following scans.
+        """Repeat the logged steps, starting from the keyframes; `map` then continues with the following scans.
 
-        The steps go to a new log, which replaces the old one when it is complete, so a kill loses no step.
-        Raises SegslamError if the log belongs to another data set.
+        The steps are written to a new log, which replaces the old one when it is complete, so that a kill loses no
+        step. Raises SegslamError if the log belongs to another data set.
         """
         row_of_scan = {int(index): row for row, index in enumerate(dataset.scan_index)}
         taken: list[tuple[int, int]] = []
         for step in recorded.steps():
             if step.scan_index not in row_of_scan:
-                raise _other_data(recorded.path, f"has scan {step.scan_index}, the data given has not")
+                raise _other_data(recorded.path, f"contains scan {step.scan_index}, which the given data does not")
             taken.append((row_of_scan[step.scan_index], step.stamp_ns))
             yield self._logged(replace(self._slam.repeat(step), stage_seconds=step.stage_seconds))
 
@@ -140,29 +140,29 @@ class Run:
         self.num_scans_skipped = self._next_row - len(taken)
 
     def map(self, dataset: Dataset) -> Iterator[Step | BadScan]:
-        """Process and log each scan after those resumed; a bad one is reported, counted and skipped.
+        """Process and log each scan after those resumed; a bad scan is reported, counted and skipped.
 
-        Scans are read here, tracked in a thread beside, and in another loops are closed and steps logged.
+        Scans are read by the calling thread and tracked in a second; a third closes loops and logs the steps.
         """
         tracked = in_other_thread(self._read(dataset), self._track, most_waiting=1)
         return in_other_thread(tracked, self._done, most_waiting=MOST_WAITING)
 
     def follow(self, tracked: Tracked | BadScan, *, tries_loops: bool = True) -> Step | BadScan:
-        """Close loops for a scan that was tracked elsewhere, and log the step."""
+        """Close loops for a scan tracked by the caller, and log the step."""
         return self._done(tracked, tries_loops=tries_loops)
 
     def map_so_far(self) -> tuple[dict[int, Transform], CloudOf]:
-        """The pose of each keyframe now, and what reads their points; these may be read by another thread."""
+        """The current pose of each keyframe, and a function that reads its points, which is safe in other threads."""
         return dict(enumerate(self._slam.graph.T_world_keyframes.copy())), self._log.cloud
 
     def repeat(self, steps: Iterator[Step]) -> Iterator[Step]:
-        """Repeat the steps of a log from the keyframes on; the log is read in this thread, the rest runs in another."""
+        """Repeat the steps of a log, starting from the keyframes; this thread reads the log, another works."""
         return in_other_thread(
             steps, lambda recorded: self._logged(self._slam.repeat(recorded)), most_waiting=MOST_WAITING
         )
 
     def take(self, steps: Iterator[tuple[Step, int, bool]]) -> Iterator[Step]:
-        """Take over recorded steps with their loops: each a Step, and `below` and `optimize` of `Slam.take`."""
+        """Take over recorded steps with their loops: each item is a Step, and `below` and `optimize` of `Slam.take`."""
 
         def taken(item: tuple[Step, int, bool]) -> Step:
             step, below, optimize = item
@@ -282,7 +282,7 @@ def peak_rss_mb() -> float:
 
 
 def _other_data(log: Path, difference: str) -> SegslamError:
-    return SegslamError(f"{log}: {difference}; resume with the data that the run began with")
+    return SegslamError(f"{log}: {difference}; resume with the data of the interrupted run")
 
 
 def _median_and_p95(times: list[float]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The steps of a run in Rerun's viewer: trajectory, clouds, loops coloured by their outcome, times and memory."""
+"""Display of a run in the Rerun viewer: trajectory, clouds, loops coloured by outcome, times and memory."""
 
 import numpy as np
 import rerun as rr
@@ -24,7 +24,7 @@ STAGE_COLORS = {
 }
 """Fixed colours, because automatic ones may be similar."""
 SCANS_TIMED = 300
-"""Number of scans before the current one whose times are drawn."""
+"""Number of latest scans whose times are drawn."""
 
 
 FLUSH_S = 60.0
@@ -32,7 +32,7 @@ FLUSH_S = 60.0
 
 
 class Scene:
-    """The run so far in the viewer."""
+    """Displays a run step by step in the viewer."""
 
     def __init__(self, viewer: rr.RecordingStream, *, view_every: int) -> None:
         """`view_every`: every n-th point of a keyframe is shown."""
@@ -52,7 +52,7 @@ class Scene:
             viewer.log(f"{TIMES}/{stage}", rr.SeriesLines(colors=[_rgb(color)], names=[stage]), static=True)
 
     def add(self, step: Step | BadScan) -> None:
-        """Show a step; a bad scan has nothing to show."""
+        """Show a step; bad scans are not shown."""
         if isinstance(step, BadScan):
             return
         self._viewer.set_time("scan", sequence=step.scan_index)
@@ -74,7 +74,7 @@ class Scene:
         self._viewer.disconnect()
 
     def _draw_paths(self) -> None:
-        """Both paths through the keyframes so far."""
+        """Draw the paths of odometry and estimate through the keyframes so far."""
         self._num_on_paths = len(self._T_odom_keyframe)
         for name, poses, color in (
             ("trajectory", self._T_world_keyframe, CORRECTED_COLOR),
@@ -115,7 +115,7 @@ class Scene:
 
 
 def _layout() -> rrb.Blueprint:
-    """The world, and beneath it how long each stage took."""
+    """The world above, the time of each stage below."""
     now = rrb.TimeRangeBoundary.cursor_relative(seq=0)
     lately = rrb.VisibleTimeRange("scan", start=rrb.TimeRangeBoundary.cursor_relative(seq=-SCANS_TIMED), end=now)
     world = rrb.Spatial3DView(origin=WORLD, name="world")

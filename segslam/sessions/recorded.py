@@ -78,12 +78,12 @@ def read_session(folder: Path) -> Session:
 def read_sessions(folders: list[Path]) -> list[Session]:
     """The sessions of several runs, in their order. Raises SegslamError for fewer than two, or one given twice."""
     if len(folders) < 2:
-        raise SegslamError(f"{len(folders)} run given; name two or more runs to merge")
+        raise SegslamError(f"{len(folders)} run given; give two or more")
     given: dict[Path, Path] = {}
     for folder in folders:
         log = log_of(folder).resolve()
         if log in given:
-            raise SegslamError(f"{folder}: given twice; name each run once")
+            raise SegslamError(f"{folder}: given twice; give each run once")
         given[log] = folder
     return [read_session(folder) for folder in folders]
 

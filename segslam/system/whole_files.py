@@ -12,9 +12,9 @@ def check_target(file: Path) -> None:
     """Raises SegslamError for a file that cannot be written: its folder is missing, or it is no regular file."""
     try:
         if file.exists() and not file.is_file():
-            raise SegslamError(f"{file}: exists and is not a regular file, so it is not replaced; name another file")
+            raise SegslamError(f"{file}: exists and is not a regular file, so it is not replaced; give another file")
         if not file.parent.is_dir():
-            raise SegslamError(f"{file}: there is no folder {file.parent}; make it, or name another file")
+            raise SegslamError(f"{file}: there is no folder {file.parent}; create it, or give another file")
     except OSError as error:
         raise cannot_write(file, error) from error
 
@@ -47,4 +47,4 @@ def write_whole(file: Path, content: bytes | str) -> None:
 
 def cannot_write(file: Path, error: OSError) -> WorkFailed:
     """The exception for a file that cannot be written."""
-    return WorkFailed(f"{file}: cannot be written ({reason(error)}); free space there, or name another file")
+    return WorkFailed(f"{file}: cannot be written ({reason(error)}); free space there, or give another file")

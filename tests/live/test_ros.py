@@ -211,7 +211,7 @@ def test_a_source_that_is_paused_takes_no_cloud() -> None:
         source.close()
     assert not refused.successful
     assert waiting.num_arrived == 1
-    assert told[-2:] == ["/points: paused", "/points: goes on"]
+    assert told[-2:] == ["/points: paused", "/points: running"]
 
 
 @pytest.mark.parametrize("sources", [(), ("--topic", "/points", ".")])

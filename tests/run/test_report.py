@@ -61,13 +61,13 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_map_from_above_is_on_the_page(scored: Path, tmp_path: Path) -> None:
-    assert "Map from above" not in scored.read_text()
+    assert "Map in top view" not in scored.read_text()
     folder = shutil.copytree(scored.parent, tmp_path / "run")
     (folder / "map.png").write_bytes(b"a picture")
     html = write_report(folder).read_text()
-    [data] = re.findall(r'alt="Map from above" src="data:image/png;base64,([^"]*)">', html)
+    [data] = re.findall(r'alt="Map in top view" src="data:image/png;base64,([^"]*)">', html)
     assert base64.b64decode(data) == b"a picture"
-    assert html.index("Map by odometry, and corrected") < html.index("Map from above") < html.index("Trajectory from")
+    assert html.index("Map by odometry, and corrected") < html.index("Map in top view") < html.index("Trajectory, top")
 
 
 def test_page_is_whole_and_loads_nothing(scored: Path) -> None:
@@ -97,7 +97,7 @@ def test_without_truth_nothing_is_compared_with_it(tmp_path: Path) -> None:
     html = write_report(make_run(tmp_path / "run", with_truth=False).folder).read_text()
     plots = _plots(html)
     assert "Error along the drive, after alignment" not in plots
-    assert "truth" not in plots["Trajectory from above, and its height"]
+    assert "truth" not in plots["Trajectory, top view and height"]
     assert "rejected by the optimiser (1)" in plots["Loops by outcome"]
     assert "error after alignment" not in html
 

@@ -210,7 +210,7 @@ def test_other_data_under_the_same_name_are_refused_and_the_log_stays(
     write_kitti_sequence(tmp_path / "other")
     (tmp_path / "other" / "sequences" / "00" / "times.txt").write_text("".join(f"{0.1 * i:.6f}\n" for i in range(72)))
     assert run("map", tmp_path / "other", "--out", out, "--resume", *OPTIONS) == 2
-    assert "resume with the data that the run began with" in capsys.readouterr().err
+    assert "resume with the data of the interrupted run" in capsys.readouterr().err
     assert (out / "log.mcap").read_bytes() == log
 
 

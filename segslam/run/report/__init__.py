@@ -20,13 +20,13 @@ __all__ = ["BEFORE_AFTER", "write_before_after", "write_report"]
 BEFORE_AFTER = "before_after.png"
 
 MOST_KEYFRAMES = 500
-"""Chosen: of a longer drive every second keyframe is drawn, or every third, and so on; each takes some 10 ms."""
+"""Chosen: in longer drives, every second keyframe is drawn, or every third, and so on; each takes about 10 ms."""
 
 
 def write_report(folder: Path) -> Path:
     """Write `report.html` into a run folder, from the files there; returns its path.
 
-    Raises SegslamError if the folder holds no finished run, or cannot be written to.
+    Raises SegslamError if the folder contains no finished run, or cannot be written.
     """
     run = read_run(folder)
     log = read_log(folder / LOG)
@@ -37,7 +37,7 @@ def write_report(folder: Path) -> Path:
 
 
 def write_before_after(folder: Path, file: Path) -> Path:
-    """The map by odometry beside the corrected map, as a PNG file. Raises SegslamError as `write_report`."""
+    """Write a PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
     picture, _ = _drawn(read_run(folder))
     return _write(file, picture)
 
@@ -48,8 +48,8 @@ def _write(file: Path, content: bytes) -> Path:
 
 
 def _plots(run: FinishedRun) -> dict[str, str]:
-    """The plots by caption, as far as the run has the data."""
-    plots = {"Trajectory from above, and its height": figures.draw_paths(run)}
+    """The plots by caption, as far as the run contains the data."""
+    plots = {"Trajectory, top view and height": figures.draw_paths(run)}
     true = figures.compared(run)
     if true is not None:
         plots["Error along the drive, after alignment"] = figures.draw_errors(true)
@@ -63,7 +63,7 @@ def _plots(run: FinishedRun) -> dict[str, str]:
 
 
 def _pictures(run: FinishedRun) -> Pictures:
-    """What needs the clouds of the log: the map before and after, and pairs of keyframes."""
+    """Pictures that need the clouds of the log: the map before and after, and pairs of keyframes."""
     chosen = gallery.choose(run.result.attempts)
     wanted = {number for a in chosen for number in (a.candidate.source_id, a.candidate.target_id)}
     before_after, kept = _drawn(run, wanted)
@@ -76,7 +76,7 @@ def _pictures(run: FinishedRun) -> Pictures:
 
 
 def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:
-    """The map before and after, and the keyframes of these ids, in one pass over the log."""
+    """The map before and after, and the keyframes with these ids, in one pass over the log."""
     poses = run.result.odometry.T_world_lidar[run.result.keyframe_rows]
     before_after = BeforeAfter(dict(enumerate(poses)), run.result.estimate)
     every = 1 + len(poses) // MOST_KEYFRAMES

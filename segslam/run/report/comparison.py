@@ -1,4 +1,4 @@
-"""Several runs, or an estimate and its reference, in one picture."""
+"""Figures that compare several runs, or an estimate and its reference."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,14 +20,14 @@ ENDINGS = (".png", ".svg", ".pdf")
 
 
 def check_picture(file: Path) -> None:
-    """Raises SegslamError for a file that cannot be written, or is no picture by its name."""
+    """Raises SegslamError for a file that cannot be written, or whose extension is not that of a figure."""
     if file.suffix.lower() not in ENDINGS:
-        raise SegslamError(f"{file}: not a picture; end its name in {', '.join(ENDINGS)}")
+        raise SegslamError(f"{file}: unknown kind of figure; its name must end in {', '.join(ENDINGS)}")
     check_target(file)
 
 
 def draw_scored(file: Path, estimate: Poses, reference: Poses) -> None:
-    """Matched poses from above, the estimate aligned with the reference, and the error along the way."""
+    """Draw matched poses in top view, the estimate aligned with the reference, and the error against travel."""
     aligned = align_positions(estimate[:, :3, 3], reference[:, :3, 3]) @ estimate
     with matplotlib.rc_context(figures.STYLE):
         figure = Figure(figsize=(12.8, 6.0), layout="constrained")
@@ -39,9 +39,9 @@ def draw_scored(file: Path, estimate: Poses, reference: Poses) -> None:
 
 
 def draw_runs(file: Path, runs: Mapping[str, FinishedRun]) -> None:
-    """The trajectories of runs from above, and, for those with ground truth, the error along the way.
+    """Draw the trajectories of runs in top view and, for those with ground truth, the error against travel.
 
-    All are aligned with the ground truth of the first that has any, or with the first run, by the scans in common.
+    All are aligned with the ground truth of the first run that has any, otherwise with the first run, by common scans.
     """
     trajectories = {name: run.result.trajectory for name, run in runs.items()}
     truth = next((run.reference for run in runs.values() if run.reference is not None), None)
@@ -80,7 +80,7 @@ def _plot_error(axes: Axes, name: str, aligned: Poses, reference: Poses, color: 
 
 def _finish(figure: Figure, above: Axes, error: Axes, file: Path, *, error_of: str = "error") -> None:
     above.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
-    error.set(xlabel="travelled (m)", ylabel=f"{error_of} after alignment (m)")
+    error.set(xlabel="distance travelled (m)", ylabel=f"{error_of} after alignment (m)")
     error.set_ylim(bottom=0)
     for axes in (above, error):
         axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, fontsize=10)

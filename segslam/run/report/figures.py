@@ -23,7 +23,7 @@ ACCEPTED, OPTIMISED_AWAY, FALSE = "#009E73", "#CC79A7", "#D55E00"
 REJECTED = ("#56B4E9", "#8C564B", "#7F7F7F", "#9467BD", "#BCBD22", "#17BECF", "#1F3A93")
 STYLE: Any = {"svg.fonttype": "none", "font.size": 11, "axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
 WIDTH_IN = 5.4
-"""Letters of 11 points are then 10 pixels high on a phone."""
+"""Text of 11 points is then 10 pixels high on a phone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,7 @@ class Compared:
 
 
 class Line(NamedTuple):
-    """A path and how it is drawn."""
+    """A path and its style."""
 
     name: str
     poses: Poses
@@ -46,7 +46,7 @@ class Line(NamedTuple):
 
 
 def compared(run: FinishedRun) -> Compared | None:
-    """None if no scan has a true pose."""
+    """The scans of a run with ground truth; None if there are none."""
     if run.reference is None:
         return None
     rows = rows_of_same_scan(run.result.trajectory.scan_index, run.reference.scan_index)
@@ -60,7 +60,7 @@ def compared(run: FinishedRun) -> Compared | None:
 
 
 def draw_paths(run: FinishedRun) -> str:
-    """Ground truth, odometry and corrected trajectory from above, and their heights along the way."""
+    """Ground truth, odometry and corrected trajectory in top view, and their heights against travel."""
     figure = Figure(figsize=(WIDTH_IN, 6.6), layout="constrained")
     above, height = figure.subplots(2, 1, height_ratios=(3, 1))
     paths = _paths(run)
@@ -69,19 +69,19 @@ def draw_paths(run: FinishedRun) -> str:
     for line in paths:
         along_m = travelled_m(line.poses)
         height.plot(along_m, line.poses[:, 2, 3], line.style, color=line.color, linewidth=line.width)
-    height.set(xlabel="travelled (m)", ylabel="height (m)")
+    height.set(xlabel="distance travelled (m)", ylabel="height (m)")
     return svg(figure, "paths")
 
 
 def draw_loops(run: FinishedRun) -> str:
-    """Every attempt to close a loop, on the corrected trajectory: closures join their ends, rejections are dots."""
+    """All loop candidates on the corrected trajectory: closures as lines between their ends, rejected ones as dots."""
     figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
     _plot_attempts(figure.subplots(), run)
     return svg(figure, "loops")
 
 
 def draw_loops_over_time(run: FinishedRun) -> str:
-    """Every attempt: the time of the new keyframe across, that of the old one upwards, coloured by outcome."""
+    """All loop candidates: time of the new keyframe against that of the old one, coloured by outcome."""
     figure = Figure(figsize=(WIDTH_IN, 5.2), layout="constrained")
     axes = figure.subplots()
     time_s = (run.result.odometry.stamp_ns - run.result.odometry.stamp_ns[0]) / 1e9
@@ -104,7 +104,7 @@ def _plot_times(axes: Axes, time_s: Vector, pairs: list[tuple[int, int]], label:
 
 
 def draw_errors(poses: Compared) -> str:
-    """Position error and height error over the distance travelled, after the alignment of the ATE."""
+    """Position error and height error against the distance travelled, after the alignment of the ATE."""
     figure = Figure(figsize=(WIDTH_IN, 4.8), layout="constrained")
     whole, height = figure.subplots(2, 1, sharex=True)
     along_m = travelled_m(poses.truth)
@@ -116,13 +116,13 @@ def draw_errors(poses: Compared) -> str:
         height.plot(along_m, (aligned - poses.truth)[:, 2, 3], color=color, linewidth=1.4)
     whole.set(ylabel="error (m)")
     whole.set_ylim(bottom=0)
-    height.set(xlabel="travelled (m)", ylabel="height error (m)")
+    height.set(xlabel="distance travelled (m)", ylabel="height error (m)")
     _legend_on_top(whole)
     return svg(figure, "errors")
 
 
 def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
-    """Median and 95th percentile of the time of each stage, per call; the longest first."""
+    """Median and 95th percentile of the time of each stage per call, longest first."""
     figure = Figure(figsize=(WIDTH_IN, 0.9 + 0.32 * len(stage_ms)), layout="constrained")
     axes = figure.subplots()
     stages = sorted(stage_ms, key=lambda stage: stage_ms[stage]["median"])
@@ -143,7 +143,7 @@ def _plot_from_above(axes: Axes, paths: Iterable[Line]) -> None:
 
 
 def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:
-    """Marks repaired motions of the odometry, and breaks."""
+    """Mark repaired motions of the odometry, and breaks."""
     for name, color, marker, states in (
         ("motion repaired", "#D55E00", ".", (MotionState.REPAIRED, MotionState.REJOINED)),
         ("break", "#CC0000", "x", (MotionState.BROKEN,)),
@@ -191,7 +191,7 @@ def _paths(run: FinishedRun) -> list[Line]:
 
 
 def _rejected_pairs(run: FinishedRun) -> dict[RejectReason, list[tuple[int, int]]]:
-    """The new and the old keyframe of each rejected attempt, by reason, in the order of the pipeline."""
+    """New and old keyframe of each rejected candidate, by reason, in the order of the pipeline."""
     pairs: dict[RejectReason, list[tuple[int, int]]] = {}
     for attempt in run.result.attempts:
         if isinstance(attempt.outcome, Rejected):
@@ -218,7 +218,7 @@ def _closure_kinds(run: FinishedRun) -> list[tuple[str, str, list[LoopClosure]]]
 
 
 def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:
-    """(source, target) of the closures that are wrong by the ground truth."""
+    """(source, target) of the closures that are false by the ground truth."""
     if run.reference is None:
         return set()
     closures, rows, truth = judged_closures(run.result, run.reference)
@@ -232,7 +232,7 @@ def _legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
 
 
 def svg(figure: Figure, name: str) -> str:
-    """The picture; the same for the same data."""
+    """The figure as SVG; equal data give equal text."""
     text = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": name}):
         figure.savefig(text, format="svg", metadata={"Date": None})

@@ -1,4 +1,4 @@
-"""Pictures of loops: the best accepted ones, and the rejected ones closest to acceptance."""
+"""Pictures of loop candidates: the best accepted ones, and the rejected ones closest to acceptance."""
 
 from collections.abc import Iterable, Mapping
 
@@ -15,7 +15,7 @@ APART = 10
 
 
 def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
-    """Accepted loops by overlap, then rejected ones by how late in the pipeline they failed and by distance."""
+    """Accepted candidates by overlap; then rejected ones, those that failed last first, by distance."""
     attempts = list(attempts)
     accepted = [a for a in attempts if isinstance(a.outcome, LoopClosure)]
     rejected = [a for a in attempts if isinstance(a.outcome, Rejected)]
@@ -23,16 +23,16 @@ def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
 
 
 def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int, Keyframe]) -> dict[str, bytes]:
-    """A PNG for each, by caption."""
+    """A PNG for each candidate, by caption."""
     pictures = {}
     for attempt in chosen:
         source_id, target_id = attempt.candidate.source_id, attempt.candidate.target_id
         T_world = run.result.estimate.T_world_keyframe
-        poses = {"by odometry and earlier loops": attempt.candidate.T_target_source_prior}
+        poses = {"initial guess": attempt.candidate.T_target_source_prior}
         if isinstance(attempt.outcome, LoopClosure):
-            poses["the loop closure"] = attempt.outcome.T_target_source
+            poses["registered"] = attempt.outcome.T_target_source
         else:
-            poses["in the final map"] = geometry.inverse(T_world[target_id]) @ T_world[source_id]
+            poses["final map"] = geometry.inverse(T_world[target_id]) @ T_world[source_id]
         source, target = (_standing(keyframes[number]) for number in (source_id, target_id))
         caption = f"{source_id} to {target_id}: {outcome_text(run, attempt)}"
         pictures[caption] = draw_pair(source, target, poses=poses, title=f"keyframes {caption}")
@@ -40,7 +40,7 @@ def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int
 
 
 def outcome_text(run: FinishedRun, attempt: LoopAttempt) -> str:
-    """The outcome of an attempt in a line."""
+    """The outcome of a candidate in one line."""
     outcome = attempt.outcome
     if isinstance(outcome, Rejected):
         reason = outcome.reason.value.replace("_", " ")

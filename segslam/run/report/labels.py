@@ -1,4 +1,4 @@
-"""The labels of a scan as a picture: its range image and the view from above, in the colours of the classes."""
+"""Pictures of the labels of a scan: range image and top view, in the colours of the classes."""
 
 import io
 
@@ -22,13 +22,13 @@ Image = UInt8[np.ndarray, "_ _ 3"]
 
 
 def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: ImageSettings, title: str) -> bytes:
-    """A PNG of the labels; with the truth beside, and of the wrong ones, where it is known."""
+    """A PNG of the labels; with true labels also these, and the wrong labels in red."""
     panels = {"labels": _colors(labels)}
     if truth is not None:
         known = truth != Label.UNLABELLED
         wrong = known & (STILL[labels] != STILL[truth])
         colors = np.where(wrong[:, None], WRONG, RIGHT).astype(np.uint8)
-        panels |= {"truth": _colors(truth), f"{wrong.sum() / max(known.sum(), 1):.1%} wrong (red)": colors}
+        panels |= {"true labels": _colors(truth), f"{wrong.sum() / max(known.sum(), 1):.1%} wrong (red)": colors}
     figure = Figure(figsize=(15, 1.2 * len(panels) + (8.5 if len(panels) == 1 else 5.8)), layout="constrained")
     ranges, above, legend = figure.subfigures(3, 1, squeeze=False, height_ratios=[1.2 * len(panels), 5.0, 0.8])[:, 0]
     ranges.suptitle(title)
@@ -38,7 +38,7 @@ def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: 
         strip.imshow(_range_image(points, colors, image), aspect="auto", interpolation="nearest")
         strip.set(title=f"range image, {name}", xticks=[], yticks=[])
         square.imshow(_from_above(points, colors), extent=(REACH_M, -REACH_M, -REACH_M, REACH_M))
-        square.set(title=f"from above, {name}", xlabel="y, left (m)", ylabel="x, ahead (m)")
+        square.set(title=f"top view, {name}", xlabel="y, left (m)", ylabel="x, ahead (m)")
     legend.legend(handles=_legend(labels, truth), loc="center", ncols=7, frameon=False)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=100)
@@ -46,7 +46,7 @@ def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: 
 
 
 def fitting_image(points: Points) -> ImageSettings:
-    """An image that shows a scan of any sensor, but for the lowest and highest percent of its points."""
+    """An image for a scan of any sensor; excludes the lowest and highest percent of its points."""
     elevations = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     low, high = np.percentile(elevations, [1, 99])
     return ImageSettings(field_of_view_deg=(float(low), float(max(high, low + 1.0))), height=64, width=1024)
@@ -64,10 +64,10 @@ def _range_image(points: Points, colors: Colors, settings: ImageSettings) -> Ima
 
 
 def _from_above(points: Points, colors: Colors) -> Image:
-    """Ahead is up, left is left; the highest point of a cell hides the others."""
+    """Top view with x up and y to the left; the highest point of a pixel is visible."""
     side = round(2 * REACH_M / CELL_M)
     picture = np.full((side, side, 3), BACKGROUND, np.uint8)
-    order = np.argsort(points[:, 2], kind="stable")  # what is written last stays
+    order = np.argsort(points[:, 2], kind="stable")  # the last assignment to a pixel remains
     rows, columns = np.floor((REACH_M - points[order, :2].astype(np.float64)) / CELL_M).astype(np.int64).T
     inside = (rows >= 0) & (rows < side) & (columns >= 0) & (columns < side)
     picture[rows[inside], columns[inside]] = colors[order[inside]]
@@ -75,7 +75,7 @@ def _from_above(points: Points, colors: Colors) -> Image:
 
 
 def _legend(labels: Labels, truth: Labels | None) -> list[Patch]:
-    """A patch for each class that is drawn, with its share of the labels."""
+    """A patch for each class in the labels, with its share."""
     shares = np.bincount(labels, minlength=len(Label)) / max(len(labels), 1)
     drawn = np.union1d(np.unique(labels), [] if truth is None else np.unique(truth)).astype(np.uint8)
     colors = _colors(drawn) / 255

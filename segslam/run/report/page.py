@@ -1,4 +1,4 @@
-"""The page: a few headline figures, the plots, tables; everything inside one HTML file."""
+"""The HTML page: headline figures, plots and tables in one file."""
 
 import base64
 from collections import Counter
@@ -16,20 +16,20 @@ from segslam.run.finished import FIGURES, FinishedRun
 from segslam.types import Rejected
 
 ODOMETRY = "odometry_"
-"""Prefix of the figures of the odometry without loops."""
+"""Prefix of the figures of the odometry without loop closing."""
 FILES = {
-    "map.png": "the map from above",
+    "map.png": "the map in top view",
     "map.ply": "the map as a point cloud",
     "before_after.png": "the map by odometry beside the corrected map",
     "poses_tum.txt": "pose of every scan, TUM format, LiDAR frame",
     "poses_kitti.txt": "pose of every scan, KITTI format",
     "odometry_tum.txt": "the same before loop closing, TUM format",
     "odometry_kitti.txt": "the same before loop closing, KITTI format",
-    "loops.csv": "every attempt to close a loop, with its outcome",
+    "loops.csv": "all loop candidates and their outcomes",
     "graph.g2o": "the pose graph",
     "metrics.json": "the figures of this page",
     "config.yaml": "the settings",
-    "log.mcap": "everything, for Foxglove and for segslam replay",
+    "log.mcap": "complete log, for Foxglove and segslam replay",
 }
 CONDITIONS = {
     "started": "started (UTC)",
@@ -70,9 +70,9 @@ class Pictures:
     """PNGs."""
 
     before_after: bytes | None = None
-    """The map by odometry alone beside the corrected one."""
+    """The map by odometry alone beside the corrected map."""
     map: bytes | None = None
-    """The map from above, where the run has one."""
+    """Top view of the map, if the run has one."""
     loops: Mapping[str, bytes] = field(default_factory=dict)
     """Pairs of scans, by caption."""
 
@@ -88,7 +88,7 @@ def page(
     pictures = pictures or Pictures()
     name = run.folder.resolve().name
     title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
-    maps = {"Map by odometry, and corrected": pictures.before_after, "Map from above": pictures.map}
+    maps = {"Map by odometry, and corrected": pictures.before_after, "Map in top view": pictures.map}
     top = "".join(png_section(caption, png) for caption, png in maps.items() if png is not None)
     sections = [plot_section(caption, svg) for caption, svg in plots.items()]
     sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
@@ -107,12 +107,12 @@ def _gallery(loops: Mapping[str, bytes]) -> str:
     if not loops:
         return ""
     shown = "".join(f"<figure>{_picture(caption, png, 'png')}</figure>" for caption, png in loops.items())
-    note = "Target in grey, source in orange, seen from above without the ground. Left: the initial guess of the loop."
+    note = "Target in grey, source in orange, top view without ground. Left: initial guess of the loop."
     return section("Loops: best accepted, and nearest missed", f'<p>{note}</p><div class="gallery">{shown}</div>')
 
 
 def _files(run: FinishedRun) -> str:
-    """Links to the files beside the page that are there."""
+    """Links to the existing files beside the page."""
     there = [(name, text) for name, text in FILES.items() if (run.folder / name).is_file()]
     rows = (f'<tr><td><a href="{escape(name)}">{escape(name)}</a></td><td>{text}</td></tr>' for name, text in there)
     return f"<table>{''.join(rows)}</table>"
@@ -179,7 +179,7 @@ def _picture(caption: str, picture: bytes, kind: str) -> str:
 
 
 def _figures(metrics: dict[str, Any]) -> str:
-    """Figures with a meaning first, in their order, then the others; beside each, the figure of the odometry."""
+    """Figures with a description first, in their order, then the others; each beside that of the odometry."""
     known = [key for key in FIGURES if key in metrics]
     rest = [key for key, value in metrics.items() if key not in FIGURES and isinstance(value, int | float)]
     of_run = [key for key in known + rest if not key.startswith(ODOMETRY)]
@@ -199,7 +199,7 @@ def _outcomes(run: FinishedRun) -> str:
 
 
 def settings_tables(config: Config) -> str:
-    """Every setting by section; those that differ from the defaults are marked, and their sections come first, open."""
+    """All settings by section. Changed settings are marked; their sections come first and are open."""
     default = Config()
     names = sorted(Config.model_fields, key=lambda name: getattr(config, name) == getattr(default, name))
     return "".join(_setting_section(name, getattr(config, name), getattr(default, name)) for name in names)
@@ -226,7 +226,7 @@ def section(title: str, body: str) -> str:
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str, *tuple[float | None, ...]]]) -> str:
-    """Rows of a name and numbers, where a number may be unknown."""
+    """Rows of a name and numbers; unknown numbers are None."""
     titles = "".join(f"<th>{title}</th>" for title in head)
     return f"<table><tr>{titles}</tr>{''.join(_row(*row) for row in rows)}</table>"
 
@@ -237,7 +237,7 @@ def _row(name: str, *values: float | None) -> str:
 
 
 def number(value: float) -> str:
-    """Three digits, none of them beyond the third after the point."""
+    """At least three significant digits, and at most three decimals."""
     if isinstance(value, int):
         return str(value)
     digits = 3 if abs(value) < 1 else 2 if abs(value) < 10 else 1 if abs(value) < 100 else 0

@@ -1,4 +1,4 @@
-"""A picture of two scans laid on each other from above."""
+"""Pictures of two overlaid scans in top view."""
 
 import io
 from collections.abc import Mapping

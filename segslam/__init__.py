@@ -1,9 +1,9 @@
 """LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs.
 
-    run = segslam.map_folder("scans", "runs/first")         # map a folder of scans, or a recording
-    found = segslam.register(source_points, target_points)  # the pose of one scan in another, no initial guess
+run = segslam.map_folder("scans", "runs/first")         # map a folder of scans, or a recording
+found = segslam.register(source_points, target_points)  # pose of one scan in another, without initial guess
 
-`Slam` maps scan by scan; `open_dataset` and `Scan` are where scans come from, `read_run` reads the folder of a run.
+`Slam` maps scan by scan; `open_dataset` and `Scan` provide scans; `read_run` reads the folder of a run.
 """
 
 from importlib import import_module
@@ -71,7 +71,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for: `segslam --help` needs none of them."""
+    """Import a public name on first access; `segslam --help` needs none of them."""
     if name in _HOMES:
         return getattr(import_module(f"segslam.{_HOMES[name]}"), name)
     if name == "__version__":
@@ -82,5 +82,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """What `help` and completion show."""
+    """Names for `help` and completion."""
     return [*__all__, "__version__", "__doc__", "__all__", "__name__", "__file__", "__path__"]

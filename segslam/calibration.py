@@ -1,11 +1,11 @@
-"""Calibration of a LiDAR's vertical angle from scans of one drive that lie some metres apart.
+"""Calibration of a LiDAR's vertical angle from scans of one drive that are some metres apart.
 
-Beams that all point lower than recorded turn every plane into a cone around the sensor. Two scans from different
-places bend one surface differently, and no rigid motion lays the one on the other: the angle is a seventh unknown of
-their registration. An odometry that registers such scans takes a part of the angle for a pitch of every motion, so the
-angle is corrected in the scans, before the odometry (`sensor.vertical_angle_deg`).
+If all beams point lower than assumed, every plane is measured as a cone around the sensor. Scans from different places
+then distort one surface differently, and no rigid motion aligns them: the angle is a seventh unknown of their
+registration. An odometry that registers such scans explains part of the angle by a pitch in every motion. The angle is
+therefore corrected in the scans, before the odometry (`sensor.vertical_angle_deg`).
 
-Positive angles: the points of a scan lie too low, and have to be raised by the angle.
+Positive angles: the points of a scan are too low and have to be raised by the angle.
 """
 
 import math
@@ -28,49 +28,49 @@ from segslam.semantics.label_files import unlabelled
 from segslam.types import Mask, Points, Scan, Transform, Vector
 
 PointsOf = Callable[[int], Points]
-"""The points of a keyframe, by id, in its own frame."""
+"""Returns the points of a keyframe, by id, in its own frame."""
 
 APART_M = 10.0
-"""Travel between the two scans of a pair. Chosen on KITTI 00, as it is and with 0.205 degrees corrected: the medians
-are 0.18 and -0.02 degrees. Fewer points meet over 14 to 30 m."""
+"""Travel between the two scans of a pair. Chosen on KITTI 00, uncorrected and corrected by 0.205 degrees: the medians
+are 0.18 and -0.02 degrees. Over 14 to 30 m, fewer points match."""
 MOST_APART = 1.5
-"""Pairs whose straight distance is less than `APART_M` divided by this, or more than it times this, are dropped: the
-sensor stood or jittered, or keyframes are missing."""
+"""Pairs are dropped if their straight distance is less than `APART_M` divided by this, or more than `APART_M` times
+this: the sensor stood still, or keyframes are missing."""
 MOST_PAIRS = 24
-"""Pairs that a run measures. Chosen: 1.6 s of one core, whatever the length of the drive."""
+"""Number of pairs measured in a run. Chosen: 1.6 s of one core, whatever the length of the drive."""
 CALIBRATION_PAIRS = 96
-"""Pairs that a calibration measures."""
+"""Number of pairs measured in a calibration."""
 MIN_PAIRS = 8
-"""Chosen: the scatter of fewer pairs is not known well enough to claim anything."""
+"""Chosen: the scatter of fewer pairs is too uncertain."""
 MOST_TURN_RAD = math.radians(30.0)
-"""Chosen: scans that turned more share less of the scene, and lie on a curve of the drive."""
+"""Chosen: after larger rotations, scans share less of the scene."""
 MOST_POINTS = 4000
-"""Of the source. Chosen: 1500 change the median by 0.02 degrees, and lose pairs."""
+"""Number of points of the source. Chosen: 1500 points change the median by 0.02 degrees, and lose pairs."""
 SEARCH_M = (1.0, 0.8, 0.6, *[0.5] * 17)
-"""Search distance of each step. Chosen: over 10 m odometry is off by less than the first."""
+"""Search distance of each step. Chosen: the error of the odometry over 10 m is below the first."""
 CONVERGED = 2e-3
-"""A step smaller than this (rad, m) is the last."""
+"""The iteration ends after a step smaller than this (rad, m)."""
 SETTLED_RAD = math.radians(0.03)
-"""Largest change of the angle in the last step where steps never become that small, for pairs of points still change.
-Chosen: half of what pairs of KITTI's scans scatter by."""
+"""Largest change of the angle in the last step if the iteration does not converge, because point pairs still change.
+Chosen: half of the scatter between pairs of KITTI's scans."""
 RESIDUAL_M = 0.05
-"""Distance at which a point has lost three quarters of its weight. Chosen: above the noise of ranges."""
+"""Distance at which the weight of a point is a quarter. Chosen: above the noise of ranges."""
 LEVEL_NORMAL_Z, STANDING_NORMAL_Z = 0.95, 0.15
-"""Chosen: surfaces that are neither level nor upright are mostly foliage."""
+"""Chosen: surfaces that are neither horizontal nor vertical are mostly foliage."""
 MIN_PAIRED = 500
-"""Chosen: fewer points that meet are no dense scan of a street."""
+"""Chosen: fewer matching points do not come from a dense scan of a street."""
 MOST_SIGMA_DEG = 0.05
-"""Pairs that know the angle less well, by their own residuals, are dropped. Chosen: KITTI's know it to 0.02, thinned
-clouds of 32 beams to 0.07 or worse."""
+"""Pairs with a larger standard deviation of the angle, from their residuals, are dropped. Chosen: 0.02 for KITTI's
+pairs, 0.07 or more for downsampled clouds of 32 beams."""
 BIAS_DEG = 0.02
-"""Standard deviation added to that of the median. Chosen: on KITTI 00 the medians with 8 to 30 m between the scans
-differ by as much."""
+"""Standard deviation added to that of the median. Chosen: difference of the medians on KITTI 00 for 8 to 30 m between
+the scans."""
 SIGNIFICANT_SIGMAS, SIGNIFICANT_DEG = 2.5, 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class VerticalAngle:
-    """The vertical angle left over in some scans; positive where their points lie too low."""
+    """The remaining vertical angle of some scans; positive if their points are too low."""
 
     angle_deg: float
     sigma_deg: float
@@ -78,12 +78,12 @@ class VerticalAngle:
 
     @property
     def is_significant(self) -> bool:
-        """Whether the angle differs from zero by more than its error, and enough to matter."""
+        """True if the angle differs from zero by more than its error, and by a relevant amount."""
         return abs(self.angle_deg) > max(SIGNIFICANT_SIGMAS * self.sigma_deg, SIGNIFICANT_DEG)
 
 
 def vertical_angle_advice(metrics: Mapping[str, Any], sensor: SensorCalibrationConfig) -> str:
-    """A line on the vertical angle that a run measured, and the setting that corrects it; empty if not significant."""
+    """A line about the vertical angle of a run, with the setting that corrects it; empty if not significant."""
     if "vertical_deg" not in metrics:
         return ""
     found = VerticalAngle(metrics["vertical_deg"], metrics["vertical_sigma_deg"], MIN_PAIRS)
@@ -94,7 +94,7 @@ def vertical_angle_advice(metrics: Mapping[str, Any], sensor: SensorCalibrationC
 
 
 def described(found: VerticalAngle) -> str:
-    """The angle in words."""
+    """The angle as text."""
     side = "low" if found.angle_deg >= 0 else "high"
     return f"beams point {abs(found.angle_deg):.2f} +- {found.sigma_deg:.2f} degrees {side}"
 
@@ -107,7 +107,7 @@ def measure_vertical_angle(
     config: RefineConfig,
     most_pairs: int = MOST_PAIRS,
 ) -> VerticalAngle | None:
-    """The median over pairs of keyframes `APART_M` apart; None where too few pairs show the angle."""
+    """The median over pairs of keyframes `APART_M` apart; None if too few pairs determine the angle."""
 
     @lru_cache(2)
     def surface(keyframe_id: int) -> Surface:
@@ -123,12 +123,12 @@ def measure_vertical_angle(
         return None
     median = float(np.median(found))
     spread = 1.4826 * float(np.median(np.abs(np.array(found) - median)))
-    error = math.sqrt(math.pi / 2 / len(found)) * spread  # of the median of normal errors
+    error = math.sqrt(math.pi / 2 / len(found)) * spread  # standard error of the median of normal errors
     return VerticalAngle(median, math.hypot(error, BIAS_DEG), len(found))
 
 
 class Calibrator:
-    """Measures the vertical angle of the scans of one drive; they need no labels and no map. Memory: keyframes only."""
+    """Measures the vertical angle of the scans of one drive, without labels and map. It stores keyframes only."""
 
     def __init__(self, config: Config, *, odometry: Odometry | None = None) -> None:
         self._config = config
@@ -140,11 +140,11 @@ class Calibrator:
 
     @property
     def travel_m(self) -> float:
-        """Length of the path so far."""
+        """Length of the path so far (m)."""
         return self._selector.travel_m
 
     def add(self, scan: Scan) -> None:
-        """The next scan in order of time. Raises BadScan, and forgets the scan, if it cannot be used."""
+        """Add the next scan in order of time. Raises BadScan, and ignores the scan, if it cannot be used."""
         registered = self._odometry.register(scan)
         if self._selector.update(registered.T_odom_lidar):
             kept = thin_keyframe(
@@ -155,7 +155,7 @@ class Calibrator:
             self._travel_m.append(self._selector.travel_m)
 
     def vertical_angle(self) -> VerticalAngle | None:
-        """What is left over in the scans so far; None where too few of them show it."""
+        """The remaining vertical angle of the scans so far; None if too few of them determine it."""
         if not self._points:
             return None
         poses, travel_m = np.stack(self._T_odom_keyframes), np.array(self._travel_m)
@@ -170,19 +170,19 @@ class Calibrator:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairAngle:
-    """The pose of one scan in another, and the vertical angle of both."""
+    """The pose of one scan in another, and their common vertical angle."""
 
     T_target_source: Transform
     angle_rad: float
     sigma_rad: float
-    """As if all points erred independently."""
+    """Standard deviation of the angle for independent errors of the points."""
 
 
 def register_with_angle(source: Surface, target: Surface, T_target_source: Transform) -> PairAngle | None:
-    """Pose and angle together, from a first guess of the pose.
+    """Estimate pose and angle together, starting at an initial guess of the pose.
 
-    Minimises distances from points to planes under the kernel of Geman and McClure. None where too few points meet, or
-    the angle does not settle.
+    Minimises point-to-plane distances under the Geman-McClure kernel. Returns None if too few points match, or the
+    angle does not converge.
     """
     if min(len(source.points), len(target.points)) < MIN_PAIRED:
         return None
@@ -205,7 +205,7 @@ def register_with_angle(source: Surface, target: Surface, T_target_source: Trans
 
 
 def _is_clear(normals: Points) -> Mask:
-    """(n,) whether each surface is level or upright, as the ground and walls are."""
+    """(n,) bool: whether each surface is horizontal or vertical, like ground and walls."""
     upward = np.abs(normals[:, 2])
     return (upward > LEVEL_NORMAL_Z) | (upward < STANDING_NORMAL_Z)
 
@@ -213,7 +213,7 @@ def _is_clear(normals: Points) -> Mask:
 def _step(
     source: Points, target: Points, normals: Points, T_target_source: Transform, angle_rad: float
 ) -> tuple[Float[np.ndarray, "7"], float]:
-    """One Gauss-Newton step of matched points, a tangent of the pose and a change of the angle; sigma of the angle."""
+    """One Gauss-Newton step from matched points: tangent of the pose and change of the angle; sigma of the angle."""
     raising_source, raising_target = raising(source), raising(target)
     raised = source + angle_rad * raising_source
     moved = geometry.apply(T_target_source, raised)
@@ -225,12 +225,12 @@ def _step(
     weighted = jacobian * weight[:, None]
     hessian = weighted.T @ jacobian
     variance = float(weight @ residual_m**2 / weight.sum()) * float(np.linalg.pinv(hessian)[6, 6])
-    known = np.linalg.cond(hessian) < 1e12  # else some direction is open, and the angle perhaps with it
+    known = np.linalg.cond(hessian) < 1e12  # otherwise a direction, perhaps the angle, is undetermined
     return -np.linalg.lstsq(hessian, weighted.T @ residual_m)[0], math.sqrt(variance) if known else math.inf
 
 
 def _pairs(T_odom_keyframes: np.ndarray, travel_m: Vector, most_pairs: int) -> Iterator[tuple[int, int]]:
-    """(older, newer) keyframes some `APART_M` apart, evenly along the drive, without a sharp turn between."""
+    """(older, newer) keyframes about `APART_M` apart, evenly along the drive, without a sharp turn between them."""
     last_m = float(travel_m[-1]) - APART_M if len(travel_m) else -1.0
     if last_m < 0.0:
         return

@@ -18,7 +18,7 @@ class BadScan(SegslamError):
 
 
 def reason(error: OSError) -> str:
-    """Why, in a few words; NumPy's errors have no `strerror`, and count items where the disk is full."""
+    """Short reason of an error; NumPy's errors have no `strerror`, and give item counts if the disk is full."""
     if error.strerror is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):
         return os.strerror(errno.ENOSPC)
     return error.strerror or str(error) or type(error).__name__

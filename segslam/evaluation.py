@@ -1,6 +1,6 @@
 """Errors of an estimate against ground truth, matched row by row; both are poses of the same body.
 
-Absolute errors are the residuals after the best rigid alignment, without scale.
+Absolute errors are residuals after the best rigid alignment, without scale.
 """
 
 import math
@@ -18,23 +18,23 @@ from segslam.types import IndexPairs, Points, Transform, Vector
 Flags = Bool[np.ndarray, "_"]
 
 Z_UP = (0.0, 0.0, 1.0)
-"""Upwards in a LiDAR's frames."""
+"""Upward axis of LiDAR frames."""
 CAMERA_UP = (0.0, -1.0, 0.0)
-"""Upwards in KITTI's camera frames, x right, y down, z ahead."""
-MIN_POSES = 3  # fewer are aligned without error, whatever they are
-LINE_TOLERANCE = 1e-6  # share of the spread along a line; rounding has less across it
-LINE_TURN_DEG = 5.0  # chosen: a turn about the line of the positions that is known worse than this makes no are_deg
+"""Upward axis of KITTI's camera frames (x right, y down, z ahead)."""
+MIN_POSES = 3  # fewer poses are always aligned without error
+LINE_TOLERANCE = 1e-6  # smallest extent across a line, relative to that along it; above rounding
+LINE_TURN_DEG = 5.0  # chosen: are_deg is omitted if the rotation about the line of positions is less certain than this
 
 SEGMENT_LENGTHS_M = tuple(range(100, 801, 100))
 SEGMENT_STEP = 10
-"""Scans between the starts of KITTI's segments."""
+"""Number of scans between the starts of KITTI's segments."""
 
 SUCCESS_M, SUCCESS_DEG = 2.0, 5.0
-"""Largest errors of a correct registration or loop, those of the Segregator paper."""
+"""Largest errors of a correct registration or loop, as in the Segregator paper."""
 REVISIT_M = 4.0
 """A keyframe within this distance of an older one revisits its place (m)."""
 REVISIT_MIN_TRAVEL_M = 50.0
-FOUND_WITHIN_M = 10.0  # chosen: a closure corrects the drift of the revisit around it
+FOUND_WITHIN_M = 10.0  # chosen: a closure corrects the drift of revisits within this travel
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +68,14 @@ class PoseErrors:
 
 
 def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, float, float] = Z_UP) -> dict[str, float]:
-    """The error figures of `metrics.json` that can be computed from two trajectories.
+    """The error figures of `metrics.json` that can be computed from two trajectories, (n, 4, 4) each.
 
-    ate_m, are_deg, height_m: root mean squares after alignment; the last along `up` of the reference's frame.
-    rpe_m, rpe_deg: root mean squares of the motion from each row to the next. kitti_translation_percent,
-    kitti_rotation_deg_per_100m: means over KITTI's segments, left out if the drive is shorter than 100 m.
-    Nothing at all for fewer than 3 rows; no height_m for positions that leave one line by no more than the error, and
-    no are_deg for those that leave it by less than 11 times that: the turn about the line is not known to 5 degrees.
+    ate_m, are_deg, height_m: root mean square errors after alignment; height along `up` in the reference frame.
+    rpe_m, rpe_deg: root mean square errors of the motion from each row to the next. kitti_translation_percent,
+    kitti_rotation_deg_per_100m: means over KITTI's segments, omitted for drives shorter than 100 m.
+    Empty for fewer than 3 rows. height_m is omitted if the positions deviate from a line by no more than the error.
+    are_deg is omitted if they deviate by less than 11 times the error: the rotation about the line is then uncertain by
+    more than 5 degrees.
     """
     if len(reference) < MIN_POSES:
         return {}
@@ -125,9 +126,9 @@ def relative_errors(estimate: Poses, reference: Poses) -> PoseErrors:
 
 
 def segment_errors(estimate: Poses, reference: Poses) -> PoseErrors:
-    """KITTI's errors of segments of 100 to 800 m (Geiger et al. 2012): both fields are per metre of the segment.
+    """KITTI's errors over segments of 100 to 800 m (Geiger et al. 2012); both fields are per metre of the segment.
 
-    A segment starts at every tenth row and ends at the first that is farther along the true path than its length.
+    A segment starts at every tenth row and ends at the first row that is farther along the true path than its length.
     """
     travel_m = travelled_m(reference)
     starts, lengths = np.meshgrid(np.arange(0, len(reference), SEGMENT_STEP), SEGMENT_LENGTHS_M, indexing="ij")
@@ -140,11 +141,11 @@ def segment_errors(estimate: Poses, reference: Poses) -> PoseErrors:
 
 
 def loop_metrics(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> dict[str, float]:
-    """Number of false loops among the accepted ones, and share of the revisits with a correct loop.
+    """Number of false loops among the accepted loops, and share of the revisits with a correct loop.
 
-    `reference` has a row a keyframe, in order of time; `rows` names the (source, target) of each closure in it.
-    num_loops_false and loop_precision are left out where there is no closure to judge; loop_recall, the share of
-    revisiting keyframes with a true closure at most 10 m of travel away, without revisits.
+    `reference`: one row per keyframe, in order of time; `rows`: row of source and target of each closure.
+    num_loops_false and loop_precision are omitted without closures. loop_recall, the share of revisiting keyframes with
+    a correct closure within 10 m of travel, is omitted without revisits.
     """
     false = false_loops(T_target_source, rows, reference)
     metrics: dict[str, float] = {}
@@ -168,9 +169,9 @@ def false_loops(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> F
 
 
 def revisits(reference: Poses) -> Flags:
-    """True for poses within 4 m of an earlier pose that is at least 50 m of travel back."""
+    """(n,) True for poses within 4 m of an earlier pose at least 50 m of travel before."""
     travel_m = travelled_m(reference)
-    near = cKDTree(reference[:, :3, 3]).query_pairs(REVISIT_M, output_type="ndarray")  # the older row first
+    near = cKDTree(reference[:, :3, 3]).query_pairs(REVISIT_M, output_type="ndarray")  # older row first
     far_in_travel = travel_m[near[:, 1]] - travel_m[near[:, 0]] >= REVISIT_MIN_TRAVEL_M
     result = np.zeros(len(reference), dtype=bool)
     result[near[far_in_travel, 1]] = True
@@ -178,7 +179,7 @@ def revisits(reference: Poses) -> Flags:
 
 
 def _turn_about_line_deg(positions: Points, error_m: float) -> float:
-    """Rotation by which errors of the positions can turn the line fitted to them about itself."""
+    """Rotation about the line fitted to the positions that errors of this size can cause (degrees)."""
     along, across, _ = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
     return float(np.degrees(error_m / across)) if across > LINE_TOLERANCE * along else np.inf
 

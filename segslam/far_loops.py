@@ -1,7 +1,8 @@
-"""Loops at any drift: keyframes whose look recalls an older place, wherever the graph expects them.
+"""Loop closing by place recognition, independent of drift: keyframes similar to an older place, wherever it is.
 
-One such registration may be wrong, and would ruin a drive: streets repeat. A loop is closed only if several keyframes
-along some metres of travel are registered with one place, and their poses there fit the odometry between them.
+A single registration of this kind may be wrong, because streets repeat, and would then ruin the map. A loop is closed
+only if several keyframes, along some metres of travel, are registered with one place, and their poses are consistent
+with the odometry between them.
 """
 
 import math
@@ -29,33 +30,33 @@ from segslam.types import (
 from segslam.verification import gates
 
 MIN_SCORE = 0.6
-"""Chosen on the real places of KITTI 05: 97 % of revisits have more, 99 % of the best other places less."""
+"""Chosen on the real places of KITTI 05: 97 % of the revisits are more similar, 99 % of other best places less."""
 NUM_AGREEING, AGREEING_M = 3, 5.0
-"""Chosen: keyframes that must agree, and the travel between the first and the last of them."""
+"""Chosen: number of keyframes that must be consistent, and travel between the first and the last."""
 WAITING_M = 40.0
-"""Chosen: travel after which a registration that none agrees with is dropped."""
+"""Chosen: travel after which an unconfirmed registration is dropped."""
 SAME_M, SAME_SHARE, SAME_RAD = 0.5, 0.05, math.radians(2.0)
-"""Chosen: two registrations agree if their motions differ by no more; metres, and per metre between them."""
+"""Chosen: largest difference of motions between consistent registrations; constant (m), and per metre between them."""
 MOST_DRIFT, LEAST_REACH_M = 0.25, 15.0
-"""Chosen: odometry may be off by this share of the travel between, and by this in any case."""
+"""Chosen: largest error of the odometry, as a share of the travel, and constant."""
 NUM_LISTED = 5
-"""Chosen: number of the most similar places whose distance is compared with the largest drift of odometry."""
+"""Chosen: number of the most similar places whose distance is compared with the largest drift of the odometry."""
 RETRY_M = 4.0
-"""Chosen: travel after a rejection until the next attempt, unless a registration waits to be confirmed."""
+"""Chosen: travel after a rejection until the next attempt, unless a registration waits for confirmation."""
 NEAR_M = 10.0
-"""Chosen: nearer to the place that the graph expects, proximity alone proposes loops."""
+"""Chosen: places nearer to the predicted position than this are candidates of proximity only."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Waiting:
-    """A registration that others have not confirmed yet."""
+    """A registration that is not yet confirmed by others."""
 
     closure: LoopClosure
     candidate: LoopCandidate
 
 
 class FarLoops:
-    """Registers keyframes with places that look alike, and closes the loops that several of them confirm."""
+    """Registers keyframes with similar places, and closes the loops that several keyframes confirm."""
 
     def __init__(
         self,
@@ -74,12 +75,12 @@ class FarLoops:
         """Travel at the last rejection."""
 
     def add(self, keyframe_id: int, signature: PlaceSignature) -> None:
-        """Take note of the newest keyframe."""
+        """Add the newest keyframe."""
         self._places.add(keyframe_id, signature)
         self._signatures = {keyframe_id: signature}
 
     def attempt(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        """Try the place that looks most like that of the newest keyframe; closures once enough keyframes agree."""
+        """Try the place most similar to that of the newest keyframe; closures follow once enough others confirm it."""
         at_m = self._graph.travel_m[keyframe_id]
         self._waiting = [one for one in self._waiting if at_m - self._travel_m(one) <= WAITING_M]
         with watch("propose"):
@@ -107,7 +108,7 @@ class FarLoops:
         return self._confirmed(Waiting(closure, candidate), own.seconds)
 
     def _candidate(self, keyframe_id: int) -> LoopCandidate | None:
-        """The older place that looks most like the keyframe's, if odometry can be so far off and proximity is blind."""
+        """The most similar older place that lies within the largest drift and is not a candidate of proximity."""
         travel_m = self._graph.travel_m
         if not self._waiting and travel_m[keyframe_id] - self._rejected_m < RETRY_M:
             return None
@@ -137,16 +138,16 @@ class FarLoops:
         )
 
     def _expected_m(self, candidate: LoopCandidate) -> float:
-        """How far off proximity expects a pose at most."""
+        """Largest distance from the prior that proximity accepts."""
         return float(search_radius_m(np.array([candidate.chain_m]), config=self._config.proximity)[0])
 
     def _confirmed(self, newest: Waiting, seconds: dict[str, float]) -> tuple[LoopAttempt, ...]:
-        """The attempts that follow from a registration: closures if enough agree with it, or that it waits."""
+        """Attempts that result from a registration: closures if enough others confirm it; otherwise it waits."""
         at_m = self._travel_m(newest)
         agreeing = [one for one in self._waiting if self._agree(one, newest)]
         if len(agreeing) + 1 < NUM_AGREEING or at_m - self._travel_m(agreeing[0]) < AGREEING_M:
             self._waiting.append(newest)
-            shown = f"{len(agreeing)} of {NUM_AGREEING - 1} keyframes before agree"
+            shown = f"{len(agreeing)} of {NUM_AGREEING - 1} earlier keyframes confirm it"
             return (LoopAttempt(newest.candidate, Rejected(RejectReason.UNCONFIRMED, shown), seconds),)
         self._waiting = []
         return (
@@ -155,7 +156,7 @@ class FarLoops:
         )
 
     def _agree(self, earlier: Waiting, later: Waiting) -> bool:
-        """Whether the motion between two keyframes is the same by their registrations and by odometry."""
+        """True if the motion between two keyframes is the same by their registrations and by odometry."""
         T_world = self._graph.T_world_keyframes
         a, b = earlier.closure, later.closure
         T_a_b = geometry.inverse(T_world[a.target_id] @ a.T_target_source) @ T_world[b.target_id] @ b.T_target_source
@@ -171,11 +172,11 @@ class FarLoops:
 def _not_far(
     T_target_source: Transform, *, candidate: LoopCandidate, expected_m: float, slack_m: float
 ) -> Rejected | None:
-    """Rejects poses that no drift explains, and poses that proximity expects, which it proposes itself."""
+    """Rejects poses beyond the largest drift, and poses near the prior, which are candidates of proximity."""
     off_m = float(np.linalg.norm(T_target_source[:3, 3] - candidate.T_target_source_prior[:3, 3]))
     if off_m > candidate.search_radius_m + slack_m:
         return Rejected(RejectReason.FAR_FROM_PRIOR, f"distance {off_m:.1f} m > {candidate.search_radius_m:.1f} m")
     is_expected = off_m + slack_m < expected_m < candidate.distance_m and candidate.chain_m < BREAK_TRAVEL_M
     if is_expected:
-        return Rejected(RejectReason.FAR_FROM_PRIOR, f"where odometry has it, {candidate.distance_m:.1f} m away")
+        return Rejected(RejectReason.FAR_FROM_PRIOR, f"near the predicted position, {candidate.distance_m:.1f} m away")
     return None

@@ -23,9 +23,9 @@ class KeyframeSelector:
         """Length of the path through all scans so far."""
 
     def update(self, T_odom_lidar: Transform, *, break_m: float = 0.0) -> bool:
-        """Whether the next scan is a keyframe; the first scan is, and the first after a break (`break_m` of travel).
+        """True if the next scan becomes a keyframe, as do the first scan and the first after a break (`break_m`).
 
-        The distance is the straight one from the last keyframe, so that jitter of a standing sensor makes no keyframes.
+        The distance is the straight one from the last keyframe, so that jitter of a standing sensor adds no keyframes.
         """
         if break_m:
             self.travel_m += break_m
@@ -51,8 +51,8 @@ def downsample_keyframe(
 ) -> tuple[Points, Labels, Indices]:
     """The points of a keyframe: all points of `whole_classes`, one per voxel of the others; float32, rounded.
 
-    Also returns their labels and rows.
-    Every later stage works on these points and the log holds exactly these, so that a replay repeats the run.
+    Also returns their labels and rows. All later stages use these points, and the log contains exactly these, so that a
+    replay repeats the run.
     """
     is_kept = np.isin(labels, np.array([int(label) for label in whole_classes], dtype=np.uint8))
     others = np.flatnonzero(~is_kept)
@@ -71,12 +71,12 @@ class Clouds(Protocol):
         ...
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
-        """Points and labels of a keyframe, as they were."""
+        """Points and labels of a keyframe, as stored."""
         ...
 
 
 class CloudStore:
-    """Points and labels in memory, in 7 bytes each: coordinates are whole multiples of the keyframes' resolution."""
+    """Stores points and labels in 7 bytes per point: coordinates are multiples of the keyframes' resolution."""
 
     def __init__(self, resolution_m: float) -> None:
         self._resolution_m = resolution_m
@@ -89,6 +89,6 @@ class CloudStore:
         self._kept[keyframe.id] = (steps.astype(np.int16 if fits else np.int32), keyframe.labels)
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
-        """Points and labels of a keyframe, as they were."""
+        """Points and labels of a keyframe, as stored."""
         steps, labels = self._kept[keyframe_id]
         return (steps * self._resolution_m).astype(np.float32), labels

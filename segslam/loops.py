@@ -1,4 +1,4 @@
-"""Loop closing: candidates for a keyframe, each registered and verified; a second search with the final poses."""
+"""Loop closing: candidates for each keyframe are registered and verified; a second search uses the final poses."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -19,19 +19,19 @@ from segslam.verification.noise_floor import NeighbourNoise
 from segslam.verification.prior import far_from_prior
 
 NUM_PREPARED = 64
-"""Number of prepared keyframes in memory, about 2 MB each; others are prepared again in about 40 ms."""
+"""Number of prepared keyframes in memory, about 2 MB each; preparing another takes about 40 ms."""
 ROUNDS = 3
-"""Chosen: largest number of searches after the final optimisation; the first without a new loop is the last."""
+"""Chosen: largest number of searches after the final optimisation; they end with the first that finds no loop."""
 MOST_AGAIN = 0.5
-"""Chosen: attempts of such a search, as a share of all earlier attempts, which limits its time."""
+"""Chosen: number of attempts in such a search, as a share of all earlier attempts; limits its time."""
 LEAST_AGAIN = 40
 
 
 class LoopCloser:
-    """Proposes loops by the graph's poses, and adds those that are verified to the graph."""
+    """Proposes loops from the poses of the graph, and adds the verified ones to the graph."""
 
     def __init__(self, config: Config, graph: Graph, clouds: Callable[[], Clouds], labeller: Labeller) -> None:
-        """`clouds` gives the points of keyframes; `labeller` labels gathered clouds by shape."""
+        """`clouds` provides the points of keyframes; `labeller` computes geometric labels of gathered clouds."""
         self._config = config
         self._graph = graph
         self._detector = ProximityDetector(config.proximity)
@@ -48,7 +48,7 @@ class LoopCloser:
         self._is_finished = False
 
     def add(self, T_odom_keyframe: Transform, *, labelled_by_shape: bool) -> PlaceSignature | None:
-        """Take note of the newest keyframe, which the graph and the clouds hold already; the signature of its place."""
+        """Add the newest keyframe, which graph and clouds contain already; returns the signature of its place."""
         newest_id = len(self.submaps.T_odom)
         self.submaps.add(T_odom_keyframe, labelled_by_shape=labelled_by_shape)
         if not self._config.retrieval.enabled:
@@ -59,7 +59,7 @@ class LoopCloser:
         return signature
 
     def attempt(self, keyframe_id: int, watch: Stopwatch, *, below: int | None = None) -> tuple[LoopAttempt, ...]:
-        """Propose loops for a keyframe, only with keyframes of ids smaller than `below` if given, and try them."""
+        """Propose and try loops for a keyframe; only with ids smaller than `below`, if given."""
         with watch("propose"):
             candidates = self._detector.candidates(
                 keyframe_id, self._graph.T_world_keyframes, self._graph.travel_m, below=below
@@ -69,14 +69,19 @@ class LoopCloser:
         return (*near, *self._far_loops(keyframe_id, watch)) if is_newest and not _has_closure(near) else near
 
     def note_estimate(self, weights: dict[tuple[int, int], float]) -> None:
-        """The graph was optimised: closures that it keeps shorten the chains between keyframes."""
+        """Note the result of an optimisation: closures with weight shorten the chains between keyframes."""
         self._detector.note_estimate(weights)
 
+<<<<<<< HEAD
     def look_again(self, watch: Stopwatch, *, end_s: float = math.inf) -> Iterator[LoopAttempt]:
         """Try the pairs that the final poses propose and that were not tried before: a limited number, in order.
 
         No keyframe is begun after `end_s`, by time.monotonic.
         """
+=======
+    def look_again(self, watch: Stopwatch) -> Iterator[LoopAttempt]:
+        """Try the pairs proposed from the final poses that were not tried before, nearest first, up to a limit."""
+>>>>>>> 92ca088 (Plain English in sessions, live input, health, retrieval, loops and trajectories)
         self._is_finished = True
         most = max(LEAST_AGAIN, int(MOST_AGAIN * len(self._tried)))
         for keyframe_id in range(len(self.submaps.T_odom)):
@@ -87,7 +92,7 @@ class LoopCloser:
                 return
 
     def _far_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        """Loops with places that only look alike; odometry that they contradict is weighted down."""
+        """Loops found by place recognition; the noise of contradicting odometry is increased."""
         if not self._config.retrieval.enabled:
             return ()
         attempts = self._far.attempt(keyframe_id, watch)
@@ -103,7 +108,7 @@ class LoopCloser:
         return attempts
 
     def take(self, attempts: tuple[LoopAttempt, ...]) -> None:
-        """Add loops that were tried before to the graph; they are not tried again."""
+        """Add loops tried in an earlier run to the graph; they are not tried again."""
         for attempt in attempts:
             self._tried.add((attempt.candidate.source_id, attempt.candidate.target_id))
             if isinstance(attempt.outcome, LoopClosure):

@@ -1,4 +1,4 @@
-"""Settings for the kind of place: a street, a campus, the inside of a building."""
+"""Settings for kinds of environments: street, campus, indoor."""
 
 from types import MappingProxyType
 from typing import Literal
@@ -25,24 +25,24 @@ SETTINGS = MappingProxyType[Preset, tuple[str, ...]](
     }
 )
 """Differences from the defaults, which are for driving. Chosen on `courtyard` and a simulated office (indoor) and on
-NCLT (campus): ATE 0.022 in place of 0.030 m, 0.020 in place of 0.028 m, and 0.20 in place of 0.22 to 0.35 m."""
+NCLT (campus): ATE 0.022 instead of 0.030 m, 0.020 instead of 0.028 m, and 0.20 instead of 0.22 to 0.35 m."""
 LARGEST_M = MappingProxyType[Preset, float]({"indoor": 12.0, "campus": 17.0})
-"""Chosen: largest `extent_m` of such a place. Measured: office 7 m, courtyard 10 m, NCLT 14 m, KITTI 00 20 m, and
-23 to 30 m along the simulated 06."""
+"""Chosen: largest `extent_m` of such an environment. Measured: office 7 m, courtyard 10 m, NCLT 14 m, KITTI 00 20 m,
+and 23 to 30 m along the simulated 06."""
 VOXEL_M = 0.5
 NUM_SCANS = 9
-"""Chosen: scans over the whole recording that are looked at, some 20 ms each."""
+"""Chosen: number of scans examined, spread over the recording; about 20 ms each."""
 SEQUENTIAL_SCANS = 80
-"""Chosen: a recording without random access is read so far only."""
+"""Chosen: number of scans read from the start of a recording without random access."""
 
 
 def preset(name: Preset) -> Config:
-    """The defaults with the settings of a kind of place."""
+    """The defaults with the settings of a preset."""
     return load_config(None, SETTINGS[name])
 
 
 def preset_for(extent_m: float | None) -> Preset:
-    """The kind of place in which the surfaces are so near; `driving` if that is unknown."""
+    """The preset for surfaces at this median distance; `driving` if it is unknown."""
     names = [name for name, largest_m in LARGEST_M.items() if extent_m is not None and extent_m <= largest_m]
     return names[0] if names else "driving"
 
@@ -50,8 +50,8 @@ def preset_for(extent_m: float | None) -> Preset:
 def extent_m(scans: Dataset) -> float | None:
     """Median horizontal distance (m) of the surfaces around the sensor; None if no scan can be used.
 
-    Each occupied voxel counts once, and the median is taken over scans spread evenly over the data set, or over its
-    start if it can only be read in order.
+    Each occupied voxel counts once. The median is taken over scans spread evenly over the data set, or over its start
+    if it can only be read in order.
     """
     medians_m: list[float] = []
     last = min(len(scans), SEQUENTIAL_SCANS) if scans.is_sequential else len(scans)
@@ -59,7 +59,7 @@ def extent_m(scans: Dataset) -> float | None:
         try:
             points = scans[row].points
         except BadScan:
-            continue  # reported when it is mapped
+            continue  # reported when the scan is mapped
         distance_m = np.linalg.norm(points[voxel_first(points, VOXEL_M), :2], axis=1)
         if len(distance_m) > 0:
             medians_m.append(float(np.median(distance_m)))

@@ -18,14 +18,14 @@ from segslam.types import REJECTED_WEIGHT, IndexPairs, Indices, LoopCandidate, L
 from segslam.verification.prior import height_bounds_m
 
 BREAK_TRAVEL_M = 1e5
-"""Travel that a break of the odometry counts: the relative pose across it is unknown."""
+"""Travel assigned to a break of the odometry, because the relative pose across it is unknown."""
 NO_CLOSURES: IndexPairs = np.empty((0, 2), dtype=np.int64)
 
 
 class ProximityDetector:
     """Proposes loop candidates, and stores the accepted loops.
 
-    A search compares the position of each keyframe with the new one; all other costs arise for near keyframes only.
+    A search compares all keyframes with the new one by position; all other computations are for near keyframes only.
     """
 
     def __init__(self, config: ProximityConfig) -> None:
@@ -114,7 +114,7 @@ class Chains:
 
     def __init__(self, closures: IndexPairs) -> None:
         """`closures` (k, 2): the two keyframes of each."""
-        self._pairs = np.unique(closures, axis=0)  # the sparse format would add up what stands there twice
+        self._pairs = np.unique(closures, axis=0)  # the sparse format would add up duplicates
         self._ends = np.unique(self._pairs)
         self._found: dict[int, Vector] = {}
 

@@ -1,4 +1,4 @@
-"""Where a scan was taken among many places, with no guess: the likeliest places are aligned and verified in turn.
+"""Recognition of the place of a scan, without initial guess: the most similar places are aligned and verified in turn.
 
 A place is accepted only if no other place fits almost as well, because streets repeat.
 """
@@ -16,23 +16,23 @@ from segslam.types import Alignment, Rejected, RejectReason, Transform
 from segslam.verification import gates
 
 MAX_PLACES = 6
-"""Chosen: places tried until one is found; each takes some 100 ms."""
+"""Chosen: number of places tried until one is found; each takes about 100 ms."""
 MAX_RIVALS = 2
-"""Chosen: other places tried after one is found."""
+"""Chosen: number of other places tried after one is found."""
 SPREAD_M = 4.0
-"""Chosen: candidates nearer than this to one that was tried are the same place."""
+"""Chosen: candidates nearer than this to a tried one are the same place."""
 ELSEWHERE_M = 10.0
-"""Chosen: a candidate this far from the place found is another place."""
+"""Chosen: a candidate farther than this from the found place is another place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Recognised(Record):
-    """A scan found at a place."""
+    """The pose of a scan at a place."""
 
     place_id: int
     T_world_lidar: Transform
     alignment: Alignment
-    """Of the scan in the frame of the place."""
+    """Alignment of the scan in the frame of the place."""
 
 
 def recognise(
@@ -47,10 +47,10 @@ def recognise(
     max_places: int = MAX_PLACES,
     watch: Stopwatch | None = None,
 ) -> Recognised | Rejected:
-    """The place among the candidates, the likeliest first, where the scan was taken.
+    """The place at which a scan was taken, among candidates sorted by similarity.
 
-    Rejects AMBIGUOUS where two places agree with it almost equally, with the first candidate's reason where none does,
-    and TOO_FEW_CORRESPONDENCES where there is no candidate. `gate` gives what else is known of the pose in a place.
+    Rejects with AMBIGUOUS if two places fit almost equally well; with the reason of the first candidate if none fits;
+    with TOO_FEW_CORRESPONDENCES if there are no candidates. `gate` adds prior knowledge about the pose at a place.
     """
     watch = watch or Stopwatch()
 
@@ -81,7 +81,7 @@ def recognise(
 
 
 class _Both(NamedTuple):
-    """Two gates in one."""
+    """Combination of two gates."""
 
     first: Gate
     second: Gate
@@ -92,7 +92,7 @@ class _Both(NamedTuple):
 
 
 class _Elsewhere(NamedTuple):
-    """Rejects poses that put the scan where it was found already."""
+    """Rejects poses near a place that was found already."""
 
     T_world_found: Transform
     T_world_target: Transform
@@ -110,7 +110,7 @@ def _no_gate(T_target_source: Transform, *, slack_m: float) -> None:
 def _spread(
     candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform], most: int
 ) -> Iterator[int]:
-    """Candidates that lie apart from those before them."""
+    """Candidates that are apart from all previous ones."""
     taken: list[Transform] = []
     for candidate in candidates:
         T_world = T_world_place(candidate.place_id)
@@ -124,7 +124,7 @@ def _spread(
 def _others(
     found: Recognised, candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform]
 ) -> list[int]:
-    """The likeliest places that the scan was not found near, each apart from the others."""
+    """The most similar places away from the found one, each apart from the others."""
     taken: list[int] = []
     for candidate in candidates:
         T_world = T_world_place(candidate.place_id)
@@ -140,7 +140,7 @@ def _others(
 def _clear_winner(
     scan: PreparedScan, found: Sequence[Recognised], places: Callable[[int], PreparedScan], config: Config
 ) -> Recognised | Rejected:
-    """The place that agrees best, unless one somewhere else agrees almost as well."""
+    """The place that fits best; AMBIGUOUS if another place fits almost as well."""
     ranked = sorted(((_mismatch(scan, places(one.place_id), one.alignment), one) for one in found), key=lambda p: p[0])
     (least, best), *others = ranked
     for mismatch, other in others:
@@ -150,7 +150,7 @@ def _clear_winner(
 
 
 def _mismatch(scan: PreparedScan, place: PreparedScan, alignment: Alignment) -> float:
-    """As `gates.Agreement` has it."""
+    """Mismatch as defined by `gates.Agreement`."""
     roughness_m = max(scan.surface.roughness_m, place.surface.roughness_m)
     ratio = alignment.rms_m / roughness_m
     return gates.Agreement(alignment.overlap, alignment.rms_m, ratio, alignment.free_space_violation).mismatch

@@ -1,6 +1,7 @@
 """Coarse-to-fine GICP from a coarse pose; the search distance decreases from stage to stage.
 
-The only importer of small_gicp. Its tangents are [rotation; translation] with the perturbation on the right, as ours.
+No other module imports small_gicp. Its tangents, like ours, are [rotation; translation] with the perturbation on the
+right.
 """
 
 import math
@@ -172,7 +173,7 @@ def observability(information: Information, *, config: RefineConfig) -> tuple[fl
 
 
 def _information(hessian: Information, config: RefineConfig) -> Information:
-    """The information with the noise common to all points, and without false information along smooth surfaces."""
+    """The information with the noise common to all points, without spurious information along smooth surfaces."""
     information = geometry.with_noise(
         hessian, rotation_rad=math.radians(config.shared_noise_deg), translation_m=config.shared_noise_m
     )

@@ -47,7 +47,7 @@ class Gate(Protocol):
 
 
 class Stopwatch:
-    """Seconds spent in each stage, added up over all calls."""
+    """Seconds spent in each stage, summed over all calls."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -62,7 +62,7 @@ class Stopwatch:
             self.add(stage, perf_counter() - started)
 
     def add(self, stage: str, seconds: float) -> None:
-        """Add a time that was measured elsewhere (s)."""
+        """Add a time measured elsewhere (s)."""
         self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
 
@@ -91,8 +91,8 @@ def register(
     """The pose of one scan in another without an initial guess, each in its own sensor's frame (z up, metres).
 
     Points are rows of x, y, z; further columns, such as intensities, are ignored. Labels are learning ids, one per
-    point; a scan without labels is labelled by shape. The pose is `fine.T_target_source` of the result, or the result
-    is `Rejected`. Raises SegslamError for arrays of another shape.
+    point; for a scan without labels, geometric labels are computed. The pose is `fine.T_target_source` of the result,
+    or the result is `Rejected`. Raises SegslamError for arrays of another shape.
     """
     config = config or Config()
 
@@ -105,7 +105,7 @@ def register(
 
 
 def shape_labels(points: Points, *, config: Config) -> Labels:
-    """Labels computed from shape alone."""
+    """Labels computed from geometry alone."""
     return geometric_labels(points, config=config.geometric)
 
 
@@ -124,7 +124,7 @@ def prepare_scan(
 def prepare_observed(
     points: Points, labels: Labels, *, config: Config, seen_from_here: Points | None = None
 ) -> gates.Observed:
-    """The surface and the view of `prepare_scan` alone: enough to refine and verify a pose that is nearly known."""
+    """Surface and free space as in `prepare_scan`: sufficient to refine and verify a pose that is nearly known."""
     still = points.compress(labels < Label.MOVING_CAR, axis=0)
     surface = refinement.make_surface(refinement.downsample(still, config=config.refine), config=config.refine)
     return surface, observe_free_space(still if seen_from_here is None else seen_from_here)
@@ -167,7 +167,7 @@ class Found(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """Two scans, and the gates that a pose between them has to pass."""
+    """Two scans, and the gates that a pose between them must pass."""
 
     source: PreparedScan
     target: PreparedScan
@@ -253,7 +253,7 @@ def _rivals(found: Found, trial: _Trial) -> Iterator[Registration]:
 
 
 def _is_near(T_target_source: Transform, others: Sequence[Found]) -> bool:
-    """Whether a pose is so close to one of the others that refinement would lead to it."""
+    """True if a pose is so close to one of the others that refinement would lead to it."""
     apart = [geometry.inverse(other.alignment.fine.T_target_source) @ T_target_source for other in others]
     return any(geometry.distance(T) < SAME_POSE_M and geometry.angle(T) < SAME_POSE_RAD for T in apart)
 

@@ -1,4 +1,7 @@
-"""The whole pipeline, one call per scan. It knows no file and no viewer; these consume the Steps that it returns."""
+"""The whole pipeline, with one call per scan.
+
+It uses no files and no viewers; these consume the Steps that it returns.
+"""
 
 import math
 from collections.abc import Callable
@@ -39,14 +42,14 @@ from segslam.types import (
 class Slam:
     """Odometry, keyframes, loops and graph. `process` each scan in order of time, then `finish`.
 
-    `process` is `track` and then `close_loops`. The first never waits for what the second finds, so the two may run in
-    two threads, each called for one scan after the other: the steps are the same.
+    `process` is `track` followed by `close_loops`. `track` does not use results of `close_loops`, so the two may run in
+    two threads, with one call per scan in order; the steps are the same.
     """
 
     def __init__(
         self, config: Config | None = None, *, odometry: Odometry | None = None, labeller: Labeller | None = None
     ) -> None:
-        """`odometry` replaces KISS-ICP; `labeller` replaces the geometric labels given to scans without any."""
+        """`odometry` replaces KISS-ICP; `labeller` replaces the geometric labels of scans without labels."""
         self.config = config or Config()
         by_shape = partial(shape_labels, config=self.config)
         self._tracker = Tracker(self.config, odometry=odometry)
@@ -66,25 +69,25 @@ class Slam:
         return PoseGraph(self.config.graph)
 
     def keep_clouds_in(self, clouds: Clouds) -> None:
-        """Store the points of keyframes elsewhere than in memory. Call it before the first scan."""
+        """Store the points of keyframes in `clouds` instead of memory. Call it before the first scan."""
         self._clouds = clouds
 
     def process(self, scan: Scan) -> Step:
-        """Process one scan: a Step with everything that it caused.
+        """Process one scan; returns a Step with all results that it caused.
 
-        Raises BadScan, and forgets the scan, if it cannot be used or is not later than the one before. Raises
+        Raises BadScan, and ignores the scan, if it cannot be used or is not later than the previous scan. Raises
         SegslamError after `finish`.
         """
         return self.close_loops(self.track(scan))
 
     def track(self, scan: Scan) -> Tracked:
-        """Where the scan was taken, and whether it becomes a keyframe. Raises BadScan as `process` does."""
+        """Estimate the pose of a scan, and decide whether it becomes a keyframe. Raises BadScan as `process` does."""
         if self._is_finished:
             raise SegslamError(f"scan {scan.index}: the run is finished; map further scans with a new Slam")
         return self._tracker.track(scan)
 
     def close_loops(self, tracked: Tracked, *, tries_loops: bool = True) -> Step:
-        """What follows from a scan that was tracked. Loops not tried now may be in the search that `finish` does."""
+        """Close the loops of a tracked scan. Loops that are not tried now may be tried in the search of `finish`."""
         keyframe = None
         if tracked.registered is not None:
             keyframe = self._cut(tracked, tracked.registered)
@@ -99,7 +102,7 @@ class Slam:
         )
 
     def repeat(self, recorded: Step) -> Step:
-        """As `process`, from a Step that was made before: all from the keyframe on is done again."""
+        """As `process`, but from a recorded Step: repeat everything after the selection of the keyframe."""
         motion = recorded.motion or Motion(MotionState.UNCHECKED)
         self._tracker.note(recorded)
         return self._advance(
@@ -107,9 +110,9 @@ class Slam:
         )
 
     def take(self, recorded: Step, *, below: int = 0, optimize: bool = False) -> Step:
-        """As `repeat`, with the loops of the Step as they were; more are searched among keyframes of ids under `below`.
+        """As `repeat`, but with the recorded loops; further loops are searched among keyframes with ids below `below`.
 
-        The graph is optimised only where it is asked for.
+        The graph is optimised only with `optimize`.
         """
 
         def attempts(keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
@@ -128,16 +131,24 @@ class Slam:
         )
 
     def go_on(self, scan_of: Callable[[int], Scan]) -> None:
-        """Let `process` follow on `repeat`. `scan_of` reads the scan of a step, counted from 0, where it is needed."""
+        """Prepare `process` to continue after `repeat`.
+
+        `scan_of` reads the scan of a step, counted from 0, if needed.
+        """
         if self._steps:
             T_odom_lidar = np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps])
             self._tracker.restore(T_odom_lidar, self._motions, self._stamps(), scan_of)
 
+<<<<<<< HEAD
     def finish(self, *, search_s: float = math.inf) -> SlamResult:
         """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan.
 
         With the final poses loops are searched again, for `search_s` seconds at most.
         """
+=======
+    def finish(self) -> SlamResult:
+        """Final optimisation; returns the pose of every scan. Raises ValueError before the first scan."""
+>>>>>>> 92ca088 (Plain English in sessions, live input, health, retrieval, loops and trajectories)
         if not self._steps:
             raise ValueError("no scan was processed")
         self._is_finished = True
@@ -158,11 +169,16 @@ class Slam:
         attempts = (*self._attempts, *late)
         return SlamResult(trajectory, odometry, estimate, rows, attempts, tuple(self._motions), len(late))
 
+<<<<<<< HEAD
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         """The final estimate, after loops were searched again with better poses; and the attempts of that search.
 
         The search ends at `end_s`, by time.monotonic.
         """
+=======
+    def _settle(self) -> tuple[GraphEstimate, list[LoopAttempt]]:
+        """The final estimate, after a second search for loops with better poses; and the attempts of that search."""
+>>>>>>> 92ca088 (Plain English in sessions, live input, health, retrieval, loops and trajectories)
         late: list[LoopAttempt] = []
         estimate = self.graph.finish()
         for _ in range(ROUNDS):
@@ -218,7 +234,7 @@ class Slam:
         return Step(scan_index, stamp_ns, T_odom_lidar, keyframe, attempts, estimate, watch.seconds, motion)
 
     def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:
-        """A keyframe of this scan, labelled by shape if it has no labels, and downsampled."""
+        """A keyframe of this scan, downsampled; geometric labels are computed if it has none."""
         with tracked.watch("label"):
             labels = made(registered.labels)
             is_unlabelled = not labels.any()

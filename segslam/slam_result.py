@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRUSTED_M = 20.0
-"""Chosen: a scan is localised if a keyframe with a place in the old map is this near; odometry drifts by 1 or 2 %."""
+"""Chosen: a scan is localised if a keyframe placed in the map is this near in travel; odometry drifts by 1 or 2 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -42,13 +42,13 @@ class SlamResult(Record):
     motions: tuple[Motion, ...] = ()
     """Check of each scan's motion, one per row of the trajectories; empty for logs of older versions."""
     num_late_attempts: int = 0
-    """Number of attempts, the last ones, that were made after the last scan."""
+    """Number of attempts made after the last scan; they are the last ones."""
     from_map_m: Vector | None = None
-    """For a drive localised in an old map: travel from each scan to the nearest keyframe placed in the map, infinite
-    across a break. None without an old map."""
+    """For a drive localised in an existing map: travel from each scan to the nearest keyframe placed in the map,
+    infinite across a break. None without such a map."""
 
     def localised(self) -> Mask:
-        """(n,) True for scans near enough to a keyframe placed in the old map; all, if there is no old map."""
+        """(n,) True for scans near enough to a keyframe placed in the map; True for all scans without such a map."""
         if self.from_map_m is None:
             return np.ones(len(self.trajectory), dtype=bool)
         return self.from_map_m <= TRUSTED_M
@@ -58,7 +58,7 @@ class SlamResult(Record):
         write_tum(Path(path), self.trajectory.stamp_ns, self.trajectory.T_world_lidar)
 
     def to_kitti(self, path: str | Path, *, T_camera_lidar: Transform | None = None) -> None:
-        """Write the corrected poses in KITTI format, 12 numbers a line; camera poses if a calibration is given."""
+        """Write the corrected poses in KITTI format, 12 numbers per line; camera poses if a calibration is given."""
         poses = self.trajectory.T_world_lidar
         write_kitti(Path(path), poses if T_camera_lidar is None else camera_from_lidar(poses, T_camera_lidar))
 
@@ -75,7 +75,7 @@ class SlamResult(Record):
         return figures
 
     def plot(self, reference: Trajectory | Poses | None = None) -> "Figure":
-        """matplotlib figure of odometry, corrected trajectory, loops and reference from above."""
+        """matplotlib figure with a top view of odometry, corrected trajectory, loops and reference."""
         from matplotlib.figure import Figure
 
         T_show_world = np.eye(4)

@@ -1,4 +1,4 @@
-"""The front of the pipeline: odometry, its check, and which scans become keyframes. It knows no graph and no log."""
+"""Front end of the pipeline: odometry, its check, and selection of keyframes. It uses no graph and no log."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,12 +16,12 @@ from segslam.types import BadScan, Indices, Motion, MotionState, Scan, Step, Tra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
-    """A scan that odometry has placed. What follows, `Slam.close_loops`, may be done while the next is tracked."""
+    """A scan with its odometry pose. `Slam.close_loops` may process it while the next scan is tracked."""
 
     scan_index: int
     stamp_ns: int
     registered: OdometryResult | None
-    """What a keyframe is cut from; None where none is to be cut."""
+    """Data of the keyframe to be made; None if the scan does not become one."""
     T_odom_lidar: Transform
     travel_m: float
     motion: Motion
@@ -29,7 +29,7 @@ class Tracked:
 
 
 class Tracker:
-    """Places scan after scan by odometry. Its results may be sent to another process."""
+    """Estimates the pose of each scan by odometry. Its results may be sent to another process."""
 
     def __init__(self, config: Config, *, odometry: Odometry | None = None) -> None:
         """`odometry` replaces KISS-ICP."""
@@ -41,11 +41,11 @@ class Tracker:
         self._last_stamp_ns: int | None = None
 
     def track(self, scan: Scan, *, gap: float = 1.0) -> Tracked:
-        """Where the scan was taken, and whether it becomes a keyframe.
+        """Estimate the pose of a scan, and decide whether it becomes a keyframe.
 
-        `gap`: time since the scan before, in intervals of the sensor, where scans between were lost; the constant
-        velocity that odometry assumes is scaled by it. Raises BadScan, and forgets the scan, if it cannot be used or is
-        not later than the one before.
+        `gap`: time since the previous scan in intervals of the sensor; above 1 if scans between them were lost. It
+        scales the constant-velocity prediction of the odometry. Raises BadScan, and ignores the scan, if it cannot be
+        used or is not later than the previous scan.
         """
         self._check_later(scan)
         index = self._num_tracked if scan.index is None else scan.index
@@ -62,7 +62,7 @@ class Tracker:
         return Tracked(index, scan.stamp_ns, kept, T_odom_lidar, self._selector.travel_m, motion, watch)
 
     def note(self, recorded: Step) -> None:
-        """Take note of a step that was made before, which `restore` lets `track` follow on."""
+        """Note a recorded step; after `restore`, `track` continues from it."""
         motion = recorded.motion or Motion(MotionState.UNCHECKED)
         self._selector.update(recorded.T_odom_lidar, break_m=BREAK_TRAVEL_M * motion.is_break)
         self._last_stamp_ns = recorded.stamp_ns
@@ -70,12 +70,12 @@ class Tracker:
     def restore(
         self, T_odom_lidar: Poses, motions: Sequence[Motion], stamps_ns: Indices, scan_of: Callable[[int], Scan]
     ) -> None:
-        """Go on after scans with these poses, motions and stamps; `scan_of` reads the scan of a row."""
+        """Continue after scans with these poses, motions and stamps; `scan_of` reads the scan of a row."""
         self._odometry.restore(T_odom_lidar, motions, stamps_ns, scan_of)
 
     def _check_later(self, scan: Scan) -> None:
         if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:
             raise BadScan(
-                f"scan {scan.index}: its stamp {scan.stamp_ns} ns is not later than {self._last_stamp_ns} ns, that of "
-                "the scan before; give each scan once, in order of time"
+                f"scan {scan.index}: its stamp {scan.stamp_ns} ns is not later than that of the previous scan, "
+                f"{self._last_stamp_ns} ns; give each scan once, in order of time"
             )

@@ -1,6 +1,6 @@
-"""Pose files of KITTI and TUM, which rows of two belong together, and the poses of all scans from those of keyframes.
+"""KITTI and TUM pose files, matching of their rows, and the poses of all scans from the poses of keyframes.
 
-A pose file does not name its frames: the reader hands over T_a_b as the lines hold it.
+A pose file does not name its frames: the reader returns T_a_b as stored in the lines.
 """
 
 import re
@@ -17,33 +17,33 @@ from segslam import geometry
 from segslam.types import IndexPairs, Indices, Mask, SegslamError, Transform
 
 Poses = Float[np.ndarray, "_ 4 4"]
-"""Rigid transforms T_a_b, one a row."""
+"""Rigid transforms T_a_b, one per row."""
 PoseFormat = Literal["kitti", "tum"]
 COLUMNS: dict[PoseFormat, int] = {"kitti": 12, "tum": 8}
 LAYOUT: dict[PoseFormat, str] = {
-    "kitti": "KITTI's format has 12 numbers a line, a 3x4 matrix by rows",
-    "tum": "TUM's format has 8 numbers a line: seconds x y z qx qy qz qw",
+    "kitti": "KITTI format has 12 numbers per line, a 3x4 matrix by rows",
+    "tum": "TUM format has 8 numbers per line: seconds x y z qx qy qz qw",
 }
-ROTATION_TOLERANCE = 0.01  # chosen: above the rounding of any writer met, far below any other kind of matrix
+ROTATION_TOLERANCE = 0.01  # chosen: above the rounding in files, far below the error of other matrices
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFile:
-    """What a pose file holds, a row a pose, in the file's own frames."""
+    """Content of a pose file, one row per pose, in the file's own frames."""
 
     T_a_b: Poses
     stamp_ns: Indices | None
-    """None in KITTI's format, where a row's number is the scan's."""
+    """None in KITTI format, where the row is the number of the scan."""
 
     def __len__(self) -> int:
         return len(self.T_a_b)
 
 
 def read_poses(path: Path, *, format: PoseFormat | None = None) -> PoseFile:
-    """The poses of a KITTI or TUM file with exact rotations; the format is detected from the columns unless given.
+    """The poses of a KITTI or TUM file with exact rotations; by default the format is detected from the columns.
 
-    Empty lines are skipped, and lines from a # on. Raises SegslamError that names the file, and the line if one is
-    broken: another number of columns, no finite number, or a matrix or quaternion that is no rotation.
+    Empty lines, and text after a #, are ignored. Raises SegslamError, naming the file and line, for another number of
+    columns, numbers that are not finite, and matrices or quaternions that are not rotations.
     """
     lines = _number_lines(path)
     chosen = format or _format_of(path, *lines[0])
@@ -54,12 +54,12 @@ def read_poses(path: Path, *, format: PoseFormat | None = None) -> PoseFile:
 
 
 def write_kitti(path: Path, T_a_b: Poses) -> None:
-    """A line of 12 numbers a pose, as evo's `kitti` reads it. The poses are in the frame that the file is to have."""
+    """Write one pose per line, 12 numbers, as read by evo's `kitti`. The poses must be in the frame of the file."""
     np.savetxt(path, T_a_b[:, :3].reshape(-1, 12), fmt="%.12g")
 
 
 def write_tum(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
-    """A line of `seconds x y z qx qy qz qw` a pose, stamps to the nanosecond, as evo's `tum` reads it."""
+    """Write one pose per line, `seconds x y z qx qy qz qw`, with stamps to the nanosecond, as read by evo's `tum`."""
     quaternions = ScipyRotation.from_matrix(T_a_b[:, :3, :3]).as_quat().reshape(-1, 4)
     rows = np.hstack([T_a_b[:, :3, 3], quaternions])
     lines = [
@@ -70,28 +70,28 @@ def write_tum(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
 
 
 def nanoseconds(seconds: str) -> int:
-    """The stamp of a text, exact: a double of today's seconds has lost them. Raises ValueError if it is no time."""
+    """The stamp (ns) of a text, exactly; a double cannot represent it. Raises ValueError if it is not a time."""
     try:
         stamp_ns = int(Decimal(seconds).scaleb(9).to_integral_value())
     except (ArithmeticError, ValueError) as error:
-        raise ValueError(f"{seconds} is no time in seconds") from error
+        raise ValueError(f"{seconds} is not a time in seconds") from error
     if abs(stamp_ns) >= 2**63:
         raise ValueError(f"{seconds} s are more than 292 years")
     return stamp_ns
 
 
 def camera_from_lidar(T_world_lidar: Poses, T_camera_lidar: Transform) -> Poses:
-    """The LiDAR's poses as KITTI writes them: the camera's, in the frame of the first camera."""
+    """LiDAR poses as KITTI stores them: poses of the camera in the frame of the first camera."""
     return T_camera_lidar @ T_world_lidar @ geometry.inverse(T_camera_lidar)
 
 
 def lidar_from_camera(T_world_camera: Poses, T_camera_lidar: Transform) -> Poses:
-    """Poses as KITTI writes them, as the LiDAR's in the frame of the first LiDAR; undoes `camera_from_lidar`."""
+    """LiDAR poses in the frame of the first, from poses as KITTI stores them; undoes `camera_from_lidar`."""
     return geometry.inverse(T_camera_lidar) @ T_world_camera @ T_camera_lidar
 
 
 def rows_of_same_stamp(stamp_ns_a: Indices, stamp_ns_b: Indices, *, max_difference_ns: int) -> IndexPairs:
-    """Rows (of a, of b) that are each other's nearest in time and at most `max_difference_ns` apart; ascending in a."""
+    """Rows (of a, of b) that are mutually nearest in time and at most `max_difference_ns` apart; ascending in a."""
     if len(stamp_ns_a) == 0 or len(stamp_ns_b) == 0:
         return np.empty((0, 2), dtype=np.int64)
     nearest_b = _nearest(stamp_ns_b, stamp_ns_a)
@@ -103,13 +103,13 @@ def rows_of_same_stamp(stamp_ns_a: Indices, stamp_ns_b: Indices, *, max_differen
 
 
 def rows_of_same_scan(scan_index_a: Indices, scan_index_b: Indices) -> IndexPairs:
-    """Rows (of a, of b) that hold the same scan, ascending in the scan's number."""
+    """Rows (of a, of b) of the same scan, ascending in the scan's number."""
     _, rows_a, rows_b = np.intersect1d(scan_index_a, scan_index_b, return_indices=True)
     return np.column_stack([rows_a, rows_b])
 
 
 def travelled_m(T_a_b: Poses) -> np.ndarray:
-    """(n,) length of the path from the first pose to each."""
+    """(n,) length of the path from the first pose to each pose (m)."""
     steps = np.linalg.norm(np.diff(T_a_b[:, :3, 3], axis=0), axis=1)
     return np.concatenate([np.zeros(min(1, len(T_a_b))), np.cumsum(steps)])
 
@@ -117,12 +117,12 @@ def travelled_m(T_a_b: Poses) -> np.ndarray:
 def corrected_poses(
     T_odom_lidar: Poses, keyframe_rows: Indices, T_world_keyframe: Poses, *, after_break: Mask | None = None
 ) -> Poses:
-    """T_world_lidar of every scan, from the odometry of every scan and the corrected poses of the keyframes among them.
+    """T_world_lidar of every scan, from the odometry of every scan and the corrected poses of the keyframes.
 
-    Each of the two keyframes around a scan predicts its pose by the odometry between them; the two predictions are
-    blended on SE(3) by the share of the way travelled. Before the first and after the last keyframe the nearest one
-    predicts alone, and before a keyframe that follows a break (`after_break`, one a keyframe) the one before it.
-    `keyframe_rows` ascend. Raises ValueError if there is no keyframe, or not a pose for each.
+    The keyframes before and after a scan each predict its pose by the odometry between them. The two predictions are
+    blended on SE(3) by the share of the way travelled. Only the nearest keyframe is used before the first and after the
+    last, and only the keyframe before if the next one follows a break (`after_break`, one value per keyframe).
+    `keyframe_rows` must ascend. Raises ValueError without keyframes, or for another number of poses.
     """
     if len(keyframe_rows) == 0 or len(keyframe_rows) != len(T_world_keyframe):
         raise ValueError(f"{len(keyframe_rows)} keyframes and {len(T_world_keyframe)} poses of keyframes")
@@ -148,7 +148,7 @@ def _surroundings(keyframe_rows: Indices, travel_m: np.ndarray) -> tuple[Indices
     last = len(keyframe_rows) - 1
     position = np.searchsorted(keyframe_rows, rows, side="right")
     before, after = np.clip(position - 1, 0, last), np.clip(position, 0, last)
-    standing = 1e-9 * rows  # where nothing moves, the share is that of the scans between
+    standing = 1e-9 * rows  # where the sensor does not move, the share is that of the scans
     progress = travel_m + standing
     start, end = progress[keyframe_rows[before]], progress[keyframe_rows[after]]
     share = (progress - start) / np.where(before == after, 1.0, end - start)
@@ -166,7 +166,7 @@ def _nearest(values: Indices, targets: Indices) -> Indices:
 
 
 def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
-    """(line number, fields) of each line that holds any."""
+    """(line number, fields) of each line with content."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -176,7 +176,7 @@ def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
     )
     lines = [(number, fields) for number, fields in split if fields != [""]]
     if not lines:
-        raise SegslamError(f"{path}: holds no pose; {LAYOUT['kitti']}, {LAYOUT['tum']}")
+        raise SegslamError(f"{path}: contains no pose; {LAYOUT['kitti']}, {LAYOUT['tum']}")
     return lines
 
 
@@ -197,7 +197,7 @@ def _numbers(path: Path, number: int, fields: list[str], format: PoseFormat) -> 
     except ValueError as error:
         raise SegslamError(f"{path}:{number}: {error}; {LAYOUT[format]}: correct or remove the line") from error
     if not np.isfinite(values).all():
-        raise SegslamError(f"{path}:{number}: holds {' '.join(fields)}; every number must be finite")
+        raise SegslamError(f"{path}:{number}: {' '.join(fields)}: every number must be finite")
     return values
 
 
@@ -221,7 +221,7 @@ def _poses_from_matrices(rows: np.ndarray) -> Poses:
 def _poses_from_quaternions(rows: np.ndarray) -> Poses:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     norms = np.linalg.norm(rows[:, 4:], axis=1)
-    quaternions = np.where(norms[:, None] > 0, rows[:, 4:], [0.0, 0.0, 0.0, 1.0])  # zero is refused with its line, next
+    quaternions = np.where(norms[:, None] > 0, rows[:, 4:], [0.0, 0.0, 0.0, 1.0])  # zeros are rejected below
     poses[:, :3, :3] = ScipyRotation.from_quat(quaternions).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
     return poses
@@ -236,5 +236,5 @@ def _require_rotations(path: Path, numbers: list[int], rows: np.ndarray, poses: 
     if off[worst] > ROTATION_TOLERANCE:
         what = "3x3 part" if format == "kitti" else "quaternion"
         raise SegslamError(
-            f"{path}:{numbers[worst]}: the {what} is no rotation, it is off by {off[worst]:.3g}; correct the line"
+            f"{path}:{numbers[worst]}: the {what} is not a rotation (error {off[worst]:.3g}); correct the line"
         )

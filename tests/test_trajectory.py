@@ -94,7 +94,7 @@ def test_quaternion_that_is_no_rotation_is_named(tmp_path: Path, line: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"), [("", "holds no pose"), ("# nothing\n", "holds no pose"), ("1 2 3\n", "found 3 numbers")]
+    ("text", "complaint"), [("", "contains no pose"), ("# nothing\n", "holds no pose"), ("1 2 3\n", "found 3 numbers")]
 )
 def test_file_without_poses_is_refused(tmp_path: Path, text: str, complaint: str) -> None:
     file = tmp_path / "poses.txt"
@@ -173,7 +173,7 @@ def test_seconds_become_exact_nanoseconds(text: str, stamp_ns: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "now", "nan", "inf"])
 def test_text_that_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="is no time in seconds"):
+    with pytest.raises(ValueError, match="is not a time in seconds"):
         trajectory.nanoseconds(text)
 
 

@@ -187,8 +187,8 @@ def run_trials(job: "Job", trials: list["Trial"], options: Options) -> list["Row
     compile_kernels(quiet=options.quiet)
     rows: list[Row] = []
     pool = Pool(options.workers, options.scheduler)
-    kept = f"are kept, the same command goes on from {options.out}" if options.out else "are lost; --out keeps them"
-    when_stopped(f"the registrations that are done {kept}")
+    kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
+    when_stopped(f"the finished registrations {kept}")
     work = run(job, trials, pool=pool, folder=options.out)
     try:
         for some in progress(work, total=len(trials), title="bench", quiet=options.quiet):

@@ -1,4 +1,4 @@
-"""Health of the odometry: each motion is checked against the scans, and repaired where they contradict it."""
+"""Health of the odometry: motions are checked against the scans, and repaired if the scans contradict them."""
 
 from segslam.health.checked import CheckedOdometry, Recover, least_informed
 

@@ -1,6 +1,6 @@
-"""A quick test of one motion: a few Gauss-Newton steps of a scan's points to the planes of an earlier scan.
+"""A fast check of a motion: a few Gauss-Newton steps from a scan's points to the planes of an earlier scan.
 
-At the right pose the steps lead nowhere. This costs a few milliseconds, where a full registration costs tens.
+At the correct pose the steps are nearly zero. The check takes a few milliseconds, a full registration tens.
 """
 
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ NUM_POINTS = 1500
 REACHES_M = (1.0, 1.0, 0.5)
 """Search distance of each step (m)."""
 RESIDUAL_SCALE_M = 0.1
-"""Scale of the Cauchy weights: residuals of planar surfaces in voxels of 0.5 m are half of this."""
+"""Scale of the Cauchy weights; residuals of planar surfaces in voxels of 0.5 m are half of it."""
 LEAST_CONSTRAINT = 0.02
-"""Chosen: least mean squared cosine between a direction and the normals of a scan; 1/3 if all directions are equal.
+"""Chosen: smallest mean squared cosine between a direction and the normals of a scan; 1/3 if all directions are equal.
 Measured: at least 0.109 in KITTI's scans, 0.063 in NCLT's, 0.166 in the courtyard's; 0.058 in a simulated tunnel with
 niches, at most 0.005 in one without features."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nudge:
-    """What the Gauss-Newton steps found."""
+    """Result of the Gauss-Newton steps."""
 
     T_target_source: Transform
     overlap: float
@@ -35,9 +35,9 @@ class Nudge:
 
 
 def nudge(points: Points, target: Surface, T_target_source: Transform) -> Nudge | None:
-    """Point-to-plane correction of a pose; None where too few points meet the target.
+    """Point-to-plane correction of a pose; None if too few points are near the target.
 
-    `points` (n, 3) of the source, thinned. Source: Chen and Medioni 1992; Cauchy weights.
+    `points` (n, 3) of the source, downsampled. Chen and Medioni 1992, with Cauchy weights.
     """
     if len(points) < 50 or len(target) < 50:
         return None
@@ -66,7 +66,7 @@ def nudge(points: Points, target: Surface, T_target_source: Transform) -> Nudge 
 
 
 def open_direction(scan: Surface) -> Direction | None:
-    """The direction (unit length, in the scan's frame) along which its surfaces show no motion; None if there is none.
+    """Direction (unit length, scan frame) in which the surfaces of a scan do not constrain motion, or None.
 
     It is the direction of the smallest eigenvalue of the mean of n n^T over the normals n.
     """

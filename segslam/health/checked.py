@@ -1,9 +1,10 @@
-"""An odometry whose motions are held against the scans: kept, repaired, or declared unknown.
+"""An odometry whose motions are checked against the scans: confirmed, repaired, or marked as unknown.
 
-While the odometry is sound, a scan every `keyframes.distance_m` is compared with the one before by `check.nudge`, in a
-few milliseconds. A motion that the scans contradict is registered again with the last scans (`LocalMap`): from
-several initial guesses, then with none. From there on each scan is registered, until the odometry agrees with
-`watch_scans` registrations in a row. A motion that nothing supports is a break: a guess with nearly no information.
+As long as the odometry is sound, one scan every `keyframes.distance_m` is compared with the previous one by
+`check.nudge`, in a few milliseconds. If the scans contradict a motion, the scan is registered with the last scans
+(`LocalMap`): first from several initial guesses, then without any. Each following scan is registered as well, until the
+odometry agrees with `watch_scans` registrations in a row. A motion that no registration supports is a break: a guess
+with nearly no information.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,29 +36,29 @@ from segslam.types import (
 )
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
-"""Registers a source (n, 3) with a target (m, 3) without an initial guess, verified."""
+"""Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
 RECOVER_EVERY = 5
-"""Chosen: of these, every fifth is registered without an initial guess, at 0.2 s each."""
+"""Chosen: number of scans tried after a break; every fifth is registered without initial guess, 0.2 s each."""
 DIFFERENT_M, DIFFERENT_RAD = 0.3, np.radians(3.0)
-"""Chosen: initial guesses nearer to each other lead to the same pose."""
+"""Chosen: initial guesses nearer to each other than this lead to the same pose."""
 LEAST_SUPPORTED = 0.15
 SUPPORT_M, SUPPORT_RAD = 0.5, np.radians(3.0)
-"""Chosen: a registration this near an initial guess is kept with this overlap already: two sources agree."""
+"""Chosen: a lower overlap suffices for a registration this near to an initial guess: two sources agree."""
 BREAK_SIGMA_M, BREAK_SIGMA_RAD = 30.0, np.radians(60.0)
-"""Standard deviations of a motion that nothing supports: the sensor may have been carried anywhere near."""
+"""Standard deviations of an unsupported motion: the sensor may have been carried to any place nearby."""
 SUDDEN_M, SUDDEN_RAD = 0.5, np.radians(5.0)
-"""Chosen: a motion that differs by more than this from the one before is checked, however short it is."""
+"""Chosen: a motion that differs by more than this from the previous one is checked, however short it is."""
 CHECK_EVERY = 10
-"""Chosen: at least every tenth scan is checked, for an odometry that is stuck reports no motion."""
+"""Chosen: at least every tenth scan is checked, because a stuck odometry reports no motion."""
 UNSEEN_SHARE = 0.7
-"""Chosen: standard deviation of a predicted motion along a direction that the scans leave open, as a share of it."""
+"""Chosen: standard deviation of a predicted motion in a direction that the scans do not constrain, as a share of it."""
 SEEN_M, SEEN_RAD = 0.05, np.radians(0.2)
 """Chosen: standard deviations of such a motion in the other directions."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """A scan's pose in a local map, and how well it fits there."""
+    """Pose of a scan in a local map, and the quality of its fit."""
 
     T_map_lidar: Transform
     fit: Fit
@@ -65,10 +66,10 @@ class _Found:
 
 
 class CheckedOdometry:
-    """Another odometry with its motions checked and repaired; an `Odometry` itself."""
+    """Another odometry with its motions checked and repaired; itself an `Odometry`."""
 
     def __init__(self, inner: Odometry, config: Config, *, recover: Recover) -> None:
-        """`recover` registers two clouds without an initial guess."""
+        """`recover` registers two clouds without initial guess."""
         self._inner = inner
         self._config = config.health
         self._keyframes = config.keyframes
@@ -77,21 +78,21 @@ class CheckedOdometry:
         self._recover = recover
         self._map = LocalMap(config.health, config.refine)
         self._lost: LocalMap | None = None
-        """The map before a break, while scans are still tried against it."""
+        """The map before a break, as long as scans are tried against it."""
         self._history = History(config.health)
         self._anchor: tuple[Transform, Surface] | None = None
-        """Pose and surface of the last scan that was checked."""
+        """Pose and surface of the last checked scan."""
         self._T_odom_last = np.eye(4)
         self._T_before_last = self._T_steady = np.eye(4)
-        """Motion between the last two scans, in one interval of the sensor; and the last one that the scans showed."""
+        """Motion between the last two scans, per interval of the sensor; and the last one confirmed by the scans."""
         self._intervals = 1.0
-        """From the last scan to this, where it is known that scans between were lost."""
+        """Intervals from the last scan to this one, if scans between them are known to be lost."""
         self._pace = Intervals()
         self._num_unchecked = 0
-        """Scans since the last one that was checked."""
+        """Number of scans since the last checked one."""
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
-        """The checked pose and the kept points of the next scan. `gap` and BadScan as of the inner odometry."""
+        """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry."""
         self._intervals = gap
         proposed = self._inner.register(scan, gap=gap)
         if not self._config.check:
@@ -104,9 +105,10 @@ class CheckedOdometry:
     def restore(
         self, T_odom_lidar: Poses, motions: Sequence[Motion], stamps_ns: Indices, scan_of: Callable[[int], Scan]
     ) -> None:
-        """Go on after the scans that had these poses, motions and stamps; `scan_of` reads the scan of a row.
+        """Continue after scans with these poses, motions and stamps; `scan_of` reads the scan of a row.
 
-        The state equals that of a run without a stop, exactly if no motion was registered again, else to rounding.
+        The state equals that of an uninterrupted run: exactly if no motion was registered again, otherwise up to
+        rounding.
         """
         if not self._config.check:
             self._inner.restore(T_odom_lidar, scan_of)
@@ -136,12 +138,12 @@ class CheckedOdometry:
             self._T_before_last = self._T_steady = geometry.inverse(T_odom_lidar[-2]) @ T_odom_lidar[-1]
 
     def _points(self, T_odom_lidar: Poses, row: int, scan_of: Callable[[int], Scan]) -> Points:
-        """The kept points of an earlier scan, motion-compensated as they were then."""
+        """The cropped points of an earlier scan, motion-compensated as before."""
         T_last_lidar = np.eye(4) if row < 2 else np.linalg.inv(T_odom_lidar[row - 2]) @ T_odom_lidar[row - 1]
         return deskew_scan(scan_of(row), T_last_lidar, self._odometry)[0].astype(np.float32)
 
     def _since_last(self, T_odom_lidar: Transform) -> Transform:
-        """The motion of one interval of the sensor."""
+        """The motion per interval of the sensor."""
         return geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / self._intervals)
 
     def _checked(self, proposed: OdometryResult, gap: float) -> tuple[Transform, Motion]:
@@ -162,7 +164,7 @@ class CheckedOdometry:
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
         thinned = self._map.downsample(proposed.points)
-        if min(len(thinned), len(self._anchor[1])) < self._min_points:  # too sparse to be judged
+        if min(len(thinned), len(self._anchor[1])) < self._min_points:  # too sparse for a check
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         surface = self._map.make_surface(thinned)
         direction = open_direction(surface)
@@ -183,7 +185,7 @@ class CheckedOdometry:
     ) -> tuple[Transform, Motion]:
         """The scan's pose in the local map, or in the map before a break, or a guess.
 
-        Along a `direction` that the scan leaves open, its position is predicted from the last motion that was seen.
+        In a `direction` that the scan does not constrain, its position is predicted from the last confirmed motion.
         """
         T_odom_proposed = proposed.T_odom_lidar
         T_before_last = self._T_before_last if direction is None else self._T_steady
@@ -209,7 +211,7 @@ class CheckedOdometry:
         if before_break is not None and self._map is before_break:
             state = MotionState.REJOINED
         elif state is MotionState.REFINED and not self._inner.is_from_scans:
-            state, T_odom_lidar = MotionState.CONFIRMED, T_odom_proposed  # it knows more than these scans
+            state, T_odom_lidar = MotionState.CONFIRMED, T_odom_proposed  # the odometry uses more than these scans
         information = None
         if direction is None:
             self._T_steady = self._since_last(T_odom_lidar)
@@ -231,9 +233,9 @@ class CheckedOdometry:
         points: Points,
         surface: Surface,
     ) -> tuple[Transform, Motion]:
-        """A motion that no registration supports: the odometry's, if it is steady and has some overlap; else a break.
+        """A motion that no registration supports: that of the odometry, if steady and with some overlap; else a break.
 
-        Thin scans cannot always be registered; that alone is no evidence against the odometry.
+        Sparse scans cannot always be registered; this alone is no evidence against the odometry.
         """
         found = self._map.fit(surface, geometry.inverse(self._map.T_odom_map) @ T_odom_proposed)
         off = geometry.inverse(T_odom_predicted) @ T_odom_proposed
@@ -242,7 +244,7 @@ class CheckedOdometry:
         return self._break(T_odom_predicted, thinned, points, surface)
 
     def _best(self, local: LocalMap, surface: Surface, T_odom_guesses: list[Transform]) -> _Found | None:
-        """The registration that overlaps most, from guesses that differ; None if none fits as scans usually do."""
+        """The registration with the largest overlap, from distinct guesses; None if none has the usual fit."""
         T_map_odom = geometry.inverse(local.T_odom_map)
         best: _Found | None = None
         for T_map_guess in _different([T_map_odom @ T_odom_guess for T_odom_guess in T_odom_guesses]):
@@ -260,14 +262,14 @@ class CheckedOdometry:
         return best
 
     def _recovered(self, local: LocalMap, surface: Surface, points: Points) -> _Found | None:
-        """The pose with no initial guess, verified as loops are, then registered; None if there is none."""
+        """The pose without initial guess, verified like a loop and then registered; None if there is none."""
         alignment = self._recover(points, local.cloud(self._keyframes.dense_voxels))
         if isinstance(alignment, Rejected):
             return None
         return self._best(local, surface, [local.T_odom_map @ alignment.fine.T_target_source])
 
     def _found_again(self, surface: Surface, points: Points, T_odom_guesses: list[Transform]) -> _Found | None:
-        """The pose in the map before the last break, if there was one within `LOST_SCANS`."""
+        """The pose in the map before the last break, if the break was within the last `LOST_SCANS`."""
         if self._lost is None:
             return None
         self._history.scans_lost += 1
@@ -282,7 +284,7 @@ class CheckedOdometry:
     def _break(
         self, T_odom_lidar: Transform, thinned: Points, points: Points, surface: Surface
     ) -> tuple[Transform, Motion]:
-        """Start a new local map at a guess; the old one is kept for a while."""
+        """Start a new local map at a guess; the old one is kept for some time."""
         if self._lost is None:
             self._lost, self._map = self._map, self._map.empty_copy()
             self._history.scans_lost = 0
@@ -295,19 +297,19 @@ class CheckedOdometry:
         return T_odom_lidar, Motion(MotionState.BROKEN, information=np.diag(sigmas**-2.0))
 
     def _take(self, T_odom_lidar: Transform, thinned: Points, points: Points, surface: Surface | None) -> None:
-        """Make the scan the anchor of the next check, and part of the local map."""
+        """Make the scan the reference of the next check, and add it to the local map."""
         self._anchor = T_odom_lidar, surface or self._map.make_surface(thinned)
         self._map.add(T_odom_lidar, thinned, points)
 
 
 def _moved_along(direction: Direction, T_odom_lidar: Transform, T_odom_along: Transform) -> Transform:
-    """A pose with the position of another one along a direction in its own frame."""
+    """A pose, with its position along a direction in its own frame replaced by that of another pose."""
     apart = (geometry.inverse(T_odom_lidar) @ T_odom_along)[:3, 3]
     return T_odom_lidar @ geometry.transform(np.eye(3), direction * (direction @ apart))
 
 
 def _open_information(direction: Direction, T_predicted: Transform) -> Information:
-    """Of a motion that was predicted along a direction of the new scan, which it leaves open."""
+    """Information of a motion predicted along a direction that the new scan does not constrain."""
     sigma_m = max(UNSEEN_SHARE * geometry.distance(T_predicted), 0.1)
     covariance = np.diag(geometry.tangent(rotation_rad=SEEN_RAD, translation_m=SEEN_M) ** 2)
     covariance[3:, 3:] += sigma_m**2 * np.outer(direction, direction)
@@ -315,12 +317,12 @@ def _open_information(direction: Direction, T_predicted: Transform) -> Informati
 
 
 def _exact(T_a_b: Transform) -> Transform:
-    """The same without the rounding that long products gather in a rotation: KISS-ICP refuses 1e-11."""
+    """The pose without the rounding errors that long products accumulate in a rotation: KISS-ICP rejects 1e-11."""
     return geometry.transform(geometry.nearest_rotation(T_a_b[:3, :3]), T_a_b[:3, 3])
 
 
 def _is_supported(found: _Found, T_map_odom: Transform, T_odom_guesses: list[Transform]) -> bool:
-    """Whether a guess, which owes nothing to the registration, is near a pose that has some overlap."""
+    """True if a guess, which does not depend on the registration, is near a registered pose with some overlap."""
     if found.fit.overlap < LEAST_SUPPORTED:
         return False
     offsets = [geometry.inverse(T_map_odom @ T_odom_guess) @ found.T_map_lidar for T_odom_guess in T_odom_guesses]
@@ -328,12 +330,12 @@ def _is_supported(found: _Found, T_map_odom: Transform, T_odom_guesses: list[Tra
 
 
 def _is_sudden(T_predicted_lidar: Transform) -> bool:
-    """Whether the motion differs much from the one before."""
+    """True if the motion differs much from the previous one."""
     return geometry.distance(T_predicted_lidar) > SUDDEN_M or bool(geometry.angle(T_predicted_lidar) > SUDDEN_RAD)
 
 
 def _different(guesses: list[Transform]) -> list[Transform]:
-    """The guesses without those that lie near an earlier one."""
+    """The guesses without those near an earlier one."""
     kept: list[Transform] = []
     for guess in guesses:
         offsets = [geometry.inverse(other) @ guess for other in kept]
@@ -343,6 +345,6 @@ def _different(guesses: list[Transform]) -> list[Transform]:
 
 
 def least_informed(motions: Sequence[Motion]) -> Information | None:
-    """The information of the least certain of some motions; None where the noise model of odometry holds for all."""
+    """The information of the least certain motion; None if the noise model of odometry applies to all."""
     own = [motion.information for motion in motions if motion.information is not None]
     return min(own, key=lambda information: float(np.trace(information))) if own else None

@@ -1,4 +1,4 @@
-"""What the last checks and registrations of a drive found: how it usually is, and whether it is to be watched."""
+"""Results of the last checks and registrations of a drive: usual values, and whether each scan is to be registered."""
 
 from collections import deque
 from statistics import median
@@ -11,30 +11,30 @@ from segslam.health.local_map import Fit
 from segslam.types import MotionState
 
 NUM_CHECKS = 9
-"""Chosen: checks whose median correction is watched. On real KITTI it stays below 0.06 m and 0.27 degrees, on the
-courtyard and on NCLT, where KISS-ICP fails, it reaches 0.09 and 0.28 m."""
+"""Chosen: number of checks whose median correction is monitored. On real KITTI it stays below 0.06 m and 0.27 degrees;
+on the courtyard and on NCLT, where KISS-ICP fails, it reaches 0.09 and 0.28 m."""
 NUM_FITS = 30
 MIN_OVERLAPS, LEAST_SHARE = 3, 0.75
-"""Chosen: a check with less overlap than this share of the drive's median fails: where the scans lie metres apart, the
-correction leads nowhere. On real KITTI the least of 178 is 0.80 of the median."""
+"""Chosen: smallest overlap of a check, relative to the drive's median; below it the scans are metres apart and the
+correction is meaningless. On real KITTI the smallest of 178 is 0.80 of the median."""
 LEAST_OVERLAP = 0.35
-"""Chosen: least overlap of a registered scan where the drive has no usual one yet."""
+"""Chosen: smallest overlap of a registered scan while the drive has no median yet."""
 
 LOST_SCANS = 30
-"""Chosen: after a break, so many scans are still tried against the map before it (3 s at 10 Hz)."""
+"""Chosen: number of scans after a break that are tried against the map before it (3 s at 10 Hz)."""
 LONG_GAP = 1.5
-"""Chosen: a scan that comes after more than this many usual intervals is checked, however near it is."""
+"""Chosen: a scan after more than this many usual intervals is checked, however near it is."""
 
 
 class Intervals:
-    """The usual time between scans, a moving average over the gaps that are not long."""
+    """The usual time between scans: a moving average over intervals that are not gaps."""
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
         self._usual_s = 0.0
 
     def note(self, stamp_ns: int) -> float:
-        """Time since the last scan, in usual intervals; 1 if the stamps are unknown."""
+        """Time since the last scan in usual intervals; 1 if the stamps are unknown."""
         interval_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) * 1e-9
         self._last_ns = stamp_ns
         if interval_s <= 0.0:
@@ -46,33 +46,33 @@ class Intervals:
 
 
 class History:
-    """A pure function of the checks and registrations so far, in their order."""
+    """State that depends only on the checks and registrations so far, in their order."""
 
     def __init__(self, config: HealthConfig) -> None:
         self._config = config
         self._tolerance = config.tolerance_m, np.radians(config.tolerance_deg)
         self._checks: deque[tuple[float, float]] = deque(maxlen=NUM_CHECKS)
-        """Correction of each: metres, radians."""
+        """Correction of each check: metres, radians."""
         self._overlaps: deque[float] = deque(maxlen=NUM_FITS)
         self._fits: deque[Fit] = deque(maxlen=NUM_FITS)
         self._num_to_watch = 0
         self.scans_lost = 0
-        """Scans since the last break."""
+        """Number of scans since the last break."""
 
     @property
     def is_watching(self) -> bool:
-        """Whether each scan is to be registered."""
+        """True if each scan is to be registered."""
         return self._num_to_watch > 0
 
     def note_check(self, found: Nudge | None) -> None:
-        """Begin to watch if one check fails, or if many correct by half of the tolerance."""
+        """Note a check; watch from now on if it fails, or if the median correction exceeds half the tolerance."""
         if found is None:
             self.watch()
         else:
             self.note_moved(found.moved_m, found.moved_rad, found.overlap)
 
     def note_moved(self, moved_m: float, moved_rad: float, overlap: float) -> None:
-        """As `note_check`, from the correction and the overlap that were found."""
+        """As `note_check`, from a correction and an overlap."""
         lost = len(self._overlaps) >= MIN_OVERLAPS and overlap < LEAST_SHARE * median(self._overlaps)
         self._checks.append((moved_m, moved_rad))
         halves = len(self._checks) == NUM_CHECKS and any(
@@ -84,12 +84,12 @@ class History:
             self._overlaps.append(overlap)
 
     def watch(self) -> None:
-        """Have the next scans registered, and forget the checks so far."""
+        """Register the next scans, and discard the checks so far."""
         self._checks.clear()
         self._num_to_watch = self._config.watch_scans
 
     def note_registration(self, moved_m: float, moved_rad: float, fit: Fit) -> MotionState:
-        """What a registered motion is, by how far the odometry's was off."""
+        """State of a registered motion, from the error of the odometry."""
         self._fits.append(fit)
         if self._is_off(moved_m, moved_rad):
             self.watch()
@@ -98,7 +98,7 @@ class History:
         return MotionState.REFINED
 
     def is_usual(self, fit: Fit) -> bool:
-        """Whether a registered scan fits the map about as well as scans of this drive do."""
+        """True if a registered scan fits the map as well as is usual for this drive."""
         if len(self._fits) < 5:
             return fit.overlap >= LEAST_OVERLAP
         usual_overlap = median(other.overlap for other in self._fits)

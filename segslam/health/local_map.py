@@ -1,4 +1,4 @@
-"""The last scans of a drive in one cloud, and the pose of the next scan in it."""
+"""The last scans of a drive in one cloud, and registration of the next scan with it."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -10,33 +10,33 @@ from segslam.config import HealthConfig, RefineConfig
 from segslam.types import Points, Registration, Rejected, Transform
 
 MIN_STANDING = 50
-"""Chosen: with fewer points above the ground, all points count."""
+"""Chosen: with fewer points above the ground, all points are used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How well a scan fits the local map: the quantities that verification of loops uses, one way."""
+    """Fit of a scan to the local map: the quantities used for verification of loops, in one direction."""
 
     overlap: float
     """Share of the scan's points on steep surfaces that lie within `inlier_m` of the map, 0 to 1."""
     rms_m: float
-    """Root mean square distance of these inliers to the planes of the map; `inlier_m` if there is none."""
+    """Root mean square distance of these inliers to the planes of the map; `inlier_m` without inliers."""
 
 
 class LocalMap:
-    """The thinned clouds of the last scans that moved, in the frame of the newest one."""
+    """The downsampled clouds of the last scans that moved, in the frame of the newest one."""
 
     def __init__(self, config: HealthConfig, refine: RefineConfig) -> None:
         self._config = config
         self._base = refine
         self._refine = refine.model_copy(update={"correspondence_m": config.correspondence_m})
         self._scans: deque[tuple[Transform, Points, Points]] = deque(maxlen=config.map_scans)
-        """Pose, thinned points and all points of each scan."""
+        """Pose, downsampled points and all points of each scan."""
         self._surface: refinement.Surface | None = None
 
     @property
     def scans(self) -> list[tuple[Transform, Points]]:
-        """T_odom_lidar and thinned points (n, 3) of each scan, the oldest first."""
+        """T_odom_lidar and downsampled points (n, 3) of each scan, oldest first."""
         return [(T_odom_lidar, thinned) for T_odom_lidar, thinned, _ in self._scans]
 
     @property
@@ -48,16 +48,16 @@ class LocalMap:
         return len(self._scans)
 
     def empty_copy(self) -> "LocalMap":
-        """A map with the same settings and no scan."""
+        """An empty map with the same settings."""
         return LocalMap(self._config, self._base)
 
     def clear(self) -> None:
-        """Forget all scans."""
+        """Remove all scans."""
         self._scans.clear()
         self._surface = None
 
     def add(self, T_odom_lidar: Transform, thinned: Points, points: Points) -> bool:
-        """Take in a scan, unless it was taken where the newest one was; whether it was taken in."""
+        """Add a scan, unless it is too near to the newest one; returns True if it was added."""
         if self._scans:
             T_map_lidar = geometry.inverse(self.T_odom_map) @ T_odom_lidar
             turned = geometry.angle(T_map_lidar) >= np.radians(self._config.map_spacing_deg)
@@ -68,7 +68,7 @@ class LocalMap:
         return True
 
     def cloud(self, enough: int) -> Points:
-        """All points of the newest scans, in the frame of the newest one: so many that they thin to `enough`."""
+        """All points of the newest scans, in the frame of the newest one: as many scans as give `enough` voxels."""
         T_map_odom = geometry.inverse(self.T_odom_map)
         gathered, num_thinned = [], 0
         for T_odom_lidar, thinned, points in reversed(self._scans):
@@ -79,15 +79,15 @@ class LocalMap:
         return np.vstack(gathered)
 
     def downsample(self, points: Points) -> Points:
-        """What the map keeps of a scan, float32."""
+        """The points of a scan that the map stores, float32."""
         return refinement.downsample(points, config=self._refine)
 
     def make_surface(self, thinned: Points) -> refinement.Surface:
-        """A thinned scan made ready for `register` and `fit`."""
+        """The surface of a downsampled scan, for `register` and `fit`."""
         return refinement.make_surface(thinned, config=self._refine)
 
     def surface(self) -> refinement.Surface:
-        """The surface through all scans, in the frame of the newest one; made once for each newest scan."""
+        """The surface of all scans, in the frame of the newest one; cached."""
         if self._surface is None:
             T_map_odom = geometry.inverse(self.T_odom_map)
             clouds = [geometry.apply(T_map_odom @ T_odom_lidar, thinned) for T_odom_lidar, thinned, _ in self._scans]
@@ -100,12 +100,12 @@ class LocalMap:
         return refinement.refine(scan, self.surface(), T_map_lidar, config=self._refine, must_converge=False)
 
     def fit(self, scan: refinement.Surface, T_map_lidar: Transform) -> Fit:
-        """How well the scan fits the map at this pose."""
+        """Fit of the scan to the map at this pose."""
         return _fit(scan, self.surface(), T_map_lidar, inlier_m=self._config.inlier_m)
 
 
 def _fit(source: refinement.Surface, target: refinement.Surface, T_target_source: Transform, *, inlier_m: float) -> Fit:
-    """Overlap and residual of the source's steep points, or of all points where few are steep."""
+    """Overlap and residual of the source's points on steep surfaces, or of all points if there are few."""
     standing = source.standing
     chosen = standing if len(standing) >= MIN_STANDING else source.points
     if not len(chosen) or not len(target):

@@ -1,4 +1,4 @@
-"""Which scans the local maps of a stopped run held, found again from the motions that it recorded."""
+"""The scans in the local maps of an interrupted run, reconstructed from its recorded motions."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -18,9 +18,9 @@ class RowsInMaps:
 
     now: list[int]
     lost: list[int] | None
-    """In the map before a break, while scans are still tried against it."""
+    """Rows in the map before a break, as long as scans are tried against it."""
     followed: tuple[int, list[int]] | None
-    """The last row that the inner odometry was made to follow, and the rows in the map then."""
+    """The last row at which the inner odometry was set to another pose, and the rows in the map then."""
 
 
 def rows_in_maps(
@@ -31,9 +31,9 @@ def rows_in_maps(
     empty: Callable[[], LocalMap],
     map_scans: int,
 ) -> RowsInMaps:
-    """Repeat the decisions of `CheckedOdometry` on its poses and motions, a row each; `history` takes note of them.
+    """Repeat the decisions of `CheckedOdometry` from its poses and motions, one row each; `history` is updated.
 
-    `empty` makes an empty local map, which holds `map_scans` scans at most.
+    `empty` makes an empty local map for up to `map_scans` scans.
     """
     nothing = np.empty((0, 3), np.float32)
     local, rows = empty(), deque[int](maxlen=map_scans)

@@ -1,4 +1,4 @@
-"""Mapping while scans arrive: sources of scans, and odometry in a process that nothing else delays."""
+"""Mapping while scans arrive: sources of scans, and odometry in a process that other work does not delay."""
 
 from segslam.live.folder import FolderSource
 from segslam.live.front import Ended, Front, Placed

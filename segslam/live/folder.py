@@ -1,4 +1,4 @@
-"""A folder that a recorder writes scans to. A scan is taken when its file is closed, or renamed to its final name."""
+"""A folder into which a recorder writes scans. A scan is read when its file is closed or renamed to its final name."""
 
 import ctypes
 import os
@@ -21,18 +21,18 @@ SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 IN_CLOSE_WRITE, IN_MOVED_TO = 0x8, 0x80
 IN_DELETE_SELF, IN_MOVE_SELF, IN_UNMOUNT, IN_Q_OVERFLOW = 0x400, 0x800, 0x2000, 0x4000
 IN_ONLYDIR = 0x01000000
-"""Of Linux's inotify(7)."""
+"""Constants of Linux's inotify(7)."""
 EVENT = struct.Struct("iIII")
-"""Watch, mask, cookie and length of the name that follows."""
+"""Watch, mask, cookie and length of the following name."""
 NAMES_KEPT = 1000
-"""A file that is written again is the same scan; so many names are remembered."""
+"""A file that is written again is the same scan; number of names that are remembered."""
 STAMP_NAME = re.compile(r"(?P<s>\d{9,10})[._-](?P<fraction>\d{1,9})|(?P<ns>\d{19})|(?P<us>\d{16})")
 WAKE_S = 0.2
-"""Longest time until a stop is noticed."""
+"""Longest time until a stop takes effect."""
 
 
 class FolderSource:
-    """Scans as their files appear; those that are in the folder before are left alone."""
+    """Scans as their files appear; existing files are ignored."""
 
     def __init__(self, folder: Path, *, intensities: bool = False, vertical_angle_deg: float = 0.0) -> None:
         self._folder = folder.expanduser().resolve()
@@ -42,7 +42,7 @@ class FolderSource:
         self._fd = -1
 
     def open(self, tell: Callable[[str], None]) -> None:
-        """Watch the folder from now on. Raises SegslamError if it cannot be watched."""
+        """Start to watch the folder. Raises SegslamError if it cannot be watched."""
         libc = ctypes.CDLL(None, use_errno=True)
         self._fd = libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
         mask = IN_CLOSE_WRITE | IN_MOVED_TO | IN_DELETE_SELF | IN_MOVE_SELF | IN_ONLYDIR
@@ -51,21 +51,21 @@ class FolderSource:
             raise SegslamError(f"{self._folder}: cannot be watched ({why}); give a folder on a local disk")
         there = [entry for entry in self._folder.iterdir() if entry.suffix in SUFFIXES]
         if not there or there[0].suffix in (".ply", ".pcd"):
-            import open3d  # noqa: F401  (takes seconds: now, and not at the first scan)
+            import open3d  # noqa: F401  (takes seconds: now instead of at the first scan)
         if there:
-            tell(f"{len(there)} scans are in {self._folder} already; only new ones are mapped (for these: segslam map)")
+            tell(f"{len(there)} scans already in {self._folder} are ignored; use segslam map for these")
 
     def feed(self, waiting: Waiting, stopped: Event) -> str:
-        """Put the scans whose files are complete, until `stopped` or the folder goes."""
+        """Put the scans whose files are complete, until `stopped` is set or the folder is removed."""
         seen: OrderedDict[str, None] = OrderedDict()
         while not stopped.is_set():
             if not select.select([self._fd], [], [], WAKE_S)[0]:
                 continue
             for mask, name in _events(os.read(self._fd, 65536)):
                 if mask & (IN_DELETE_SELF | IN_MOVE_SELF | IN_UNMOUNT):
-                    return f"{self._folder} is gone"
+                    return f"{self._folder} was removed"
                 if mask & IN_Q_OVERFLOW:
-                    return f"{self._folder}: the system lost events; more files appear than it can report"
+                    return f"{self._folder}: the system lost events, because files appear faster than it can report"
                 file = self._folder / name
                 if file.suffix not in SUFFIXES or name.startswith(".") or name in seen:
                     continue
@@ -76,7 +76,7 @@ class FolderSource:
         return ""
 
     def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
-        """Nobody listens."""
+        """No effect: a folder has no subscribers."""
 
     def close(self) -> None:
         """Stop watching."""
@@ -91,7 +91,7 @@ class FolderSource:
         try:
             named_ns = stamp_of_name(file.stem)
             stamp_ns = file.stat().st_mtime_ns if named_ns is None else named_ns
-        except OSError:  # gone already: it is counted, and reported when it is read
+        except OSError:  # already removed: the scan is counted, and reported when it is read
             stamp_ns = 0
         waiting.put(stamp_ns, read)
 
@@ -116,7 +116,7 @@ class FolderSource:
 
 
 def stamp_of_name(stem: str) -> int | None:
-    """The stamp that a file's name holds: seconds with a fraction, or 19 digits of ns or 16 of us since 1970."""
+    """The stamp in a file name: seconds with a fraction, or 19 digits of ns or 16 of us since 1970; or None."""
     found = STAMP_NAME.fullmatch(stem)
     if found is None:
         return None

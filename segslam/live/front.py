@@ -1,7 +1,7 @@
-"""The front process: it receives scans, places them by odometry and publishes their poses.
+"""The front process: receives scans, estimates their poses by odometry and publishes the poses.
 
-Loops, graph, log and viewers are in the process of the command. What they do cannot delay a pose: poses go to it
-through a thread of their own, and however long it takes, nothing comes back but the order to stop.
+Loop closing, graph, log and viewers run in the main process. They cannot delay a pose: poses are sent to the main
+process by a separate thread, and the only message in the other direction is the request to stop.
 """
 
 import multiprocessing
@@ -30,23 +30,23 @@ READY = b"ready"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A scan that odometry has placed, or could not use, and the counts until then."""
+    """A scan with its odometry pose, or an unusable scan, and the counts so far."""
 
     tracked: Tracked | BadScan
     latency_s: float
-    """From the scan's arrival until its pose was published."""
+    """Time from the arrival of the scan to the publication of its pose."""
     placed_s: float
-    """When that was, by time.monotonic."""
+    """Time of the publication, by time.monotonic."""
     num_dropped: int
     num_missing: int
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How the stream ended, and the counts of all of it."""
+    """End of the stream: reason and final counts."""
 
     why: str = ""
-    """Empty if it was asked to."""
+    """Empty if the stop was requested."""
     failed: bool = False
     num_arrived: int = 0
     num_dropped: int = 0
@@ -57,14 +57,14 @@ class Ended:
 
 
 class Front:
-    """The front process as seen by the command: an iterator of `Placed`; a context manager."""
+    """The front process as seen from the main process: an iterator of `Placed`; a context manager."""
 
     def __init__(
         self, source: Source, config: Config, *, tell: Callable[[str], None], idle_s: float | None = None
     ) -> None:
-        """Start the process. `tell` shows a person the lines of the source.
+        """Start the process. `tell` prints messages of the source.
 
-        The stream ends after `idle_s` without a scan, where that is not None.
+        The stream ends after `idle_s` without a scan, unless it is None.
         """
         self._tell = tell
         context = multiprocessing.get_context("spawn")
@@ -78,7 +78,7 @@ class Front:
         Thread(target=self._receive, name="receive", daemon=True).start()
 
     def wait_until_ready(self) -> None:
-        """Until scans that arrive are taken. Raises SegslamError if the source cannot be opened."""
+        """Wait until arriving scans are processed. Raises SegslamError if the source cannot be opened."""
         first = self._received.get()
         if isinstance(first, Ended):
             raise SegslamError(first.why)
@@ -91,7 +91,7 @@ class Front:
         self.ended = item
 
     def stop(self) -> None:
-        """Take no more scans; those that wait are still placed."""
+        """Accept no more scans; waiting scans are still processed."""
         with suppress(OSError):
             self._pipe.send(None)
 
@@ -115,7 +115,7 @@ class Front:
         except (EOFError, OSError):
             self._process.join(timeout=1.0)
             code = self._process.exitcode
-            why = f"the odometry's process has ended (exit code {code}; -9 is often want of memory)"
+            why = f"the odometry process has ended (exit code {code}; -9 is often a lack of memory)"
             self._received.put(Ended(why, failed=True))
 
 
@@ -124,10 +124,10 @@ def _is_keyframe(item: object) -> bool:
 
 
 def _serve(pipe: Connection, source: Source, config: Config, idle_s: float | None) -> None:
-    """Place scans until the source ends, `idle_s` pass without one, or the other side sends something or closes."""
+    """Process scans until the source ends, `idle_s` pass without a scan, or the main process sends or closes."""
     keep_freed_memory()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # both are for the command, which then stops this process
+        signal.signal(number, signal.SIG_IGN)  # the main process handles both, and then stops this process
     to_send: SimpleQueue[Any] = SimpleQueue()
     sender = Thread(target=_send, args=(pipe, to_send), daemon=True)
     sender.start()
@@ -169,19 +169,19 @@ def _serve(pipe: Connection, source: Source, config: Config, idle_s: float | Non
 
 
 def _warm_up(config: Config, odometry: OdometryApart) -> None:
-    """Load what the first scan needs, which takes seconds: the first scans would be dropped."""
+    """Load what the first scan needs; this takes seconds, in which the first scans would be dropped."""
     odometry.follow([], np.eye(4), np.eye(4))
     throwaway = Tracker(config, odometry=KissOdometry(config.odometry))
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
     points *= 0.5 * (config.odometry.min_range_m + config.odometry.max_range_m) / np.abs(points).max(axis=1)[:, None]
-    for stamp_ns in (0, 100_000_000, 400_000_000):  # the last after a gap, so that its motion is checked
+    for stamp_ns in (0, 100_000_000, 400_000_000):  # the last one after a gap, so that its motion is checked
         throwaway.track(Scan(points, stamp_ns))
 
 
 def _place_all(
     tracker: Tracker, source: Source, waiting: Waiting, to_send: "SimpleQueue[Any]", idle_s: float | None
 ) -> bool:
-    """Place each scan. Whether it ended because none came for `idle_s`."""
+    """Process each scan. Returns True if it ended because no scan came for `idle_s`."""
     last_ns: int | None = None
     while (arrival := waiting.take(idle_s)) is not None:
         tracked: Tracked | BadScan
@@ -199,7 +199,7 @@ def _place_all(
 
 
 class _Feeder(Thread):
-    """Runs the source's `feed`."""
+    """Thread that runs the source's `feed`."""
 
     def __init__(self, source: Source, waiting: Waiting, stopped: Event) -> None:
         super().__init__(name="feed", daemon=True)
@@ -208,8 +208,8 @@ class _Feeder(Thread):
         self.start()
 
     def run(self) -> None:
-        """Until the source ends; the queue is closed then."""
-        self.why, self.failed = "the source has failed", True  # whatever is raised that is not expected
+        """Run until the source ends; the queue is then closed."""
+        self.why, self.failed = "the source has failed", True  # remains after an unexpected exception
         try:
             self.why, self.failed = self._source.feed(self._waiting, self._stopped), False
         except (SegslamError, OSError) as error:
@@ -219,7 +219,7 @@ class _Feeder(Thread):
 
 
 def _listen(pipe: Connection, waiting: Waiting, stopped: Event) -> None:
-    """Stop when the command asks for it, or has ended."""
+    """Stop when the main process requests it or has ended."""
     with suppress(EOFError, OSError):
         pipe.recv()
     stopped.set()

@@ -1,4 +1,4 @@
-"""The map so far, drawn again in a thread of its own when it has changed."""
+"""The map so far, drawn by a separate thread when it has changed."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -12,19 +12,19 @@ from segslam.types import Labels, Points, SegslamError, Transform
 logger = logging.getLogger(__name__)
 
 GROWTH = 1.05
-"""Chosen: without a correction, a map is drawn again when it has so many times the keyframes."""
+"""Chosen: without a correction, the map is drawn again when the number of keyframes has grown by this factor."""
 LEAST_S, SHARE = 2.0, 0.15
-"""Chosen: a map is drawn at most every 2 s, and for at most this share of the time."""
+"""Chosen: the map is drawn at most every 2 s, and for at most this share of the time."""
 
 
 class DrawnMap(NamedTuple):
-    """A map in world."""
+    """A map in the world frame."""
 
     points: Points
     labels: Labels
     T_world_keyframe: dict[int, Transform]
     stamp_ns: int
-    """Of its last keyframe."""
+    """Stamp of its last keyframe."""
 
 
 Show = Callable[[DrawnMap], None]
@@ -37,7 +37,7 @@ class _Wanted(NamedTuple):
 
 
 class LiveMap:
-    """Draws the newest map that was asked for, and leaves out those that it has no time for; a context manager."""
+    """Draws the newest requested map and skips older requests; a context manager."""
 
     def __init__(self, shows: Sequence[Show], *, view_every: int) -> None:
         self._shows = shows
@@ -61,7 +61,7 @@ class LiveMap:
     def note(
         self, T_world_keyframe: dict[int, Transform], cloud: CloudOf, *, stamp_ns: int, is_corrected: bool
     ) -> None:
-        """There is a new keyframe. Never waits for a map that is being drawn."""
+        """Note a new keyframe. Does not wait for a map that is being drawn."""
         with self._changed:
             if self._shows and (is_corrected or self._wanted or len(T_world_keyframe) >= GROWTH * self._num_drawn):
                 self._wanted = _Wanted(T_world_keyframe, cloud, stamp_ns)

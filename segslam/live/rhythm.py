@@ -1,18 +1,18 @@
-"""The usual interval of a sensor, and the gaps in its stamps."""
+"""Usual interval of a sensor, and gaps in its stamps."""
 
 from collections import deque
 from statistics import median
 
 LONG_GAP = 1.5
-"""Chosen: stamps farther apart than this many usual intervals have a gap between them."""
+"""Chosen: there is a gap if stamps are farther apart than this many usual intervals."""
 LONGEST_PREDICTED = 10.0
-"""Chosen: beyond so many intervals (1 s at 10 Hz) a constant velocity is no useful guess."""
+"""Chosen: after more intervals (1 s at 10 Hz), prediction with constant velocity is useless."""
 SET_BACK_NS = 1_000_000_000
-"""Chosen: a stamp this much earlier than the last is of a clock that was set back, as by a recording played again."""
+"""Chosen: the sender's clock was set back if a stamp is this much earlier than the last, as in a replay."""
 
 
 class Rhythm:
-    """Follows the stamps of the scans that arrive."""
+    """Tracks the stamps of arriving scans."""
 
     def __init__(self) -> None:
         self._intervals_ns: deque[int] = deque(maxlen=21)
@@ -20,12 +20,12 @@ class Rhythm:
         self._shift_ns = 0
         self.num_gaps = 0
         self.num_missing = 0
-        """Scans that never arrived, by the length of the gaps."""
+        """Number of missing scans, estimated from the length of the gaps."""
         self.longest_gap_s = 0.0
         self.num_set_back = 0
 
     def note(self, sent_ns: int) -> int:
-        """The stamp of the next scan: as sent, or moved to follow the last one if the clock was set back."""
+        """The stamp of the next scan: as sent, or shifted to follow the last one if the clock was set back."""
         stamp_ns = sent_ns + self._shift_ns
         last_ns = self._last_ns
         if last_ns is not None and stamp_ns < last_ns - SET_BACK_NS:

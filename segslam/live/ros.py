@@ -1,4 +1,4 @@
-"""ROS 2: point clouds in, odometry, path and map out. The only importer of rclpy."""
+"""ROS 2 node: point clouds in; odometry, path and map out. No other module imports rclpy."""
 
 from array import array
 from collections.abc import Callable, Iterable
@@ -35,7 +35,7 @@ from segslam.types import BadScan, GraphEstimate, Labels, Points, Scan, SegslamE
 
 try:
     from tf2_msgs.msg import TFMessage
-except ImportError:  # it is not on PyPI
+except ImportError:  # tf2_msgs is not on PyPI
     TFMessage = None
 try:
     from std_srvs.srv import Trigger
@@ -45,33 +45,34 @@ except ImportError:  # a minimal installation
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 NAMESPACE = "segslam"
 ODOM, MAP = "odom", "map"
-"""Frames, as of REP 105."""
+"""Frames, as in REP 105."""
 DEPTH = 10
-"""Chosen: clouds that the middleware keeps while Python is busy, some 20 MB."""
+"""Chosen: number of clouds that the middleware keeps while Python is busy, about 20 MB."""
 LOOK_EVERY_S = 0.5
-"""How often publishers are looked for: they come, go, and come again with another reliability."""
+"""Interval of the search for publishers, which may come, go, and change their reliability."""
 PATIENCE_S = 5.0
-"""After so long without a publisher the point clouds that there are are named."""
+"""Time without a publisher after which the available point cloud topics are listed."""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Whoever subscribes later is sent the last message."""
+"""Late subscribers receive the last message."""
 
 
 class TopicSource:
     """The clouds of a topic; each pose is published as nav_msgs/Odometry, with the stamp of its cloud.
 
-    The reliability of the publisher is copied: a reliable subscription hears no best-effort publisher, and the other
-    way round large clouds are lost where they need not be. The parameter `paused` leaves arriving clouds out.
+    The reliability of the publisher is copied: a reliable subscription does not receive from a best-effort publisher,
+    and a best-effort subscription may lose large clouds of a reliable publisher. With the parameter `paused`, arriving
+    clouds are ignored.
     """
 
     def __init__(self, topic: str, *, intensities: bool = False, vertical_angle_deg: float = 0.0) -> None:
-        """Raises SegslamError for a name that no topic can have; one without a slash at its start is given it."""
+        """Raises SegslamError for an invalid topic name. A missing slash at its start is added."""
         self._topic = topic if topic.startswith("/") else f"/{topic}"
         self.name = f"live{self._topic}"
         try:
             validate_full_topic_name(self._topic)
         except (InvalidTopicNameException, ValueError) as error:
             raise SegslamError(
-                f"--topic {topic}: no name of a topic ({error}); `ros2 topic list` shows them"
+                f"--topic {topic}: not a topic name ({error}); `ros2 topic list` shows the topics"
             ) from error
         self._has_intensities = intensities
         self._vertical_angle_deg = vertical_angle_deg
@@ -93,7 +94,7 @@ class TopicSource:
             tell("no transforms on /tf: tf2_msgs is not installed (it comes with a ROS installation, not from PyPI)")
 
     def feed(self, waiting: Waiting, stopped: Event) -> str:
-        """Put the clouds of all publishers, until `stopped`."""
+        """Put the clouds of all publishers, until `stopped` is set."""
         executor = SingleThreadedExecutor(context=self._context)
         executor.add_node(self._node)
         started, next_look, has_told = monotonic(), 0.0, False
@@ -111,7 +112,7 @@ class TopicSource:
         return "ROS was shut down"
 
     def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
-        """Publish where a cloud was taken."""
+        """Publish the pose of a cloud."""
         message = Odometry(child_frame_id=self._lidar_frame)
         message.header.frame_id = ODOM
         message.header.stamp = _time(arrival.sent_ns)
@@ -122,13 +123,13 @@ class TopicSource:
             self._transforms.publish(TFMessage(transforms=[transform]))
 
     def close(self) -> None:
-        """End the node."""
+        """Destroy the node."""
         if self._context is not None:
             self._node.destroy_node()
             self._context.try_shutdown()
 
     def _follow_publishers(self, waiting: Waiting) -> None:
-        """Subscribe as the publishers publish; again if that has changed."""
+        """Subscribe with the reliability of the publishers; subscribe again if it has changed."""
         publishers = [
             info for info in self._node.get_publishers_info_by_topic(self._topic) if info.topic_type == CLOUD_TYPE
         ]
@@ -152,7 +153,7 @@ class TopicSource:
         others = sorted(set(names) - {self._topic, f"/{NAMESPACE}/map"})
         if others:
             return f"point clouds are on {', '.join(others)}"
-        return "there is no point cloud on any topic; is ROS_DOMAIN_ID the same on both sides?"
+        return "no topic has point clouds; is ROS_DOMAIN_ID the same on both sides?"
 
     def _put(self, message: PointCloud2, waiting: Waiting) -> None:
         if self._is_paused:
@@ -190,7 +191,7 @@ class TopicSource:
 
 
 class MappingPublisher:
-    """The node `/segslam/mapping`: the corrected path, the map, and where odom lies in map; a context manager.
+    """The node `/segslam/mapping`: publishes corrected path, map and the transform map -> odom; a context manager.
 
     Its service `/segslam/save_map` (std_srvs/Trigger) calls `save`.
     """
@@ -231,7 +232,7 @@ class MappingPublisher:
             self._transforms.publish(TFMessage(transforms=[transform]))
 
     def show_map(self, drawn: DrawnMap) -> None:
-        """Publish a map and the path through its keyframes."""
+        """Publish a map and the path of its keyframes."""
         path = Path()
         path.header.frame_id = MAP
         path.header.stamp = _time(drawn.stamp_ns)
@@ -257,7 +258,7 @@ class MappingPublisher:
 
 
 def start_node(name: str) -> tuple[Any, Any]:
-    """A node of segslam's in a context of its own, which leaves Ctrl-C to the command."""
+    """A node in its own context, which leaves Ctrl-C to the command."""
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     return context, Node(name, namespace=NAMESPACE, context=context)
@@ -279,7 +280,7 @@ def point_cloud2(points: Points, labels: Labels, *, frame: str, stamp_ns: int) -
 
 
 def _common_reliability(offered: Iterable[ReliabilityPolicy]) -> ReliabilityPolicy:
-    """What hears all publishers: reliable only if all of them are."""
+    """The reliability compatible with all publishers: reliable only if all of them are."""
     best_effort = ReliabilityPolicy.BEST_EFFORT
     return best_effort if best_effort in list(offered) else ReliabilityPolicy.RELIABLE
 

@@ -1,4 +1,4 @@
-"""What every source of live scans offers. It is made in the process of the command and opened in the front process."""
+"""Interface of all sources of live scans. A source is created in the main process and opened in the front process."""
 
 from collections.abc import Callable
 from threading import Event
@@ -10,28 +10,31 @@ from segslam.types import Transform
 
 @runtime_checkable
 class Source(Protocol):
-    """A stream of scans. It is sent to the front process before it is opened."""
+    """A stream of scans; it is sent to the front process before it is opened."""
 
     @property
     def name(self) -> str:
-        """For people and logs, such as `live/scans`."""
+        """Name for messages and logs, such as `live/scans`."""
         ...
 
     def open(self, tell: Callable[[str], None]) -> None:
-        """Start to listen; `tell` shows a person a line, now and later.
+        """Start to listen; `tell` prints messages, now and later.
 
-        Raises SegslamError if there is nothing to listen to.
+        Raises SegslamError if the source is not available.
         """
         ...
 
     def feed(self, waiting: Waiting, stopped: Event) -> str:
-        """Put scans as they arrive until `stopped`; why it ended, if it ended by itself. In a thread of its own."""
+        """Put scans as they arrive until `stopped`; returns the reason if it ended otherwise.
+
+        Runs in its own thread.
+        """
         ...
 
     def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
-        """Tell whoever listens where a scan was taken; at once, for the next scan waits."""
+        """Publish the pose of a scan to subscribers; must be fast, because the next scan waits."""
         ...
 
     def close(self) -> None:
-        """Release what `open` took."""
+        """Release the resources of `open`."""
         ...

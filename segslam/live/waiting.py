@@ -1,4 +1,4 @@
-"""Scans that have arrived and wait for the odometry; the oldest are dropped when there are too many."""
+"""Queue of scans that wait for the odometry; the oldest are dropped if it is full."""
 
 from collections import deque
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from segslam.live.rhythm import Rhythm
 from segslam.types import Scan
 
 MOST_WAITING = 4
-"""Chosen: at 10 Hz a pose is then at most 0.4 s older than by the time odometry takes for one scan."""
+"""Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,19 +18,19 @@ class Arrival:
     """A scan that has arrived and is not yet read."""
 
     index: int
-    """Its number among all that arrived, those dropped later included."""
+    """Number of the scan among all that arrived, including dropped ones."""
     stamp_ns: int
-    """Later than that of the scan before, also where the clock of the sender was set back."""
+    """Later than the stamp of the previous scan, also if the clock of the sender was set back."""
     sent_ns: int
-    """The stamp as it was sent."""
+    """The stamp as sent."""
     arrived_s: float
-    """By time.monotonic, which all processes of a machine share."""
+    """Arrival time by time.monotonic, which all processes of a machine share."""
     read: Callable[[int, int], Scan]
-    """The scan, from its number and stamp. Raises BadScan."""
+    """Reads the scan, given its number and stamp. Raises BadScan."""
 
 
 class Waiting:
-    """A bounded queue between the thread that receives scans and the one that places them."""
+    """A bounded queue between the thread that receives scans and the one that processes them."""
 
     def __init__(self, *, most: int = MOST_WAITING) -> None:
         self._most = most
@@ -42,7 +42,7 @@ class Waiting:
         self.num_dropped = 0
 
     def put(self, sent_ns: int, read: Callable[[int, int], Scan]) -> None:
-        """Add a scan; the oldest that waits is dropped if there are too many. Never waits."""
+        """Add a scan; drop the oldest if the queue is full. Does not wait."""
         arrived_s = monotonic()
         with self._changed:
             if self.is_closed:
@@ -62,7 +62,7 @@ class Waiting:
             return self._arrivals.popleft() if self._arrivals else None
 
     def close(self) -> None:
-        """Take no more scans; those that wait are still given."""
+        """Accept no more scans; waiting scans are still returned."""
         with self._changed:
             self.is_closed = True
             self._changed.notify()

@@ -44,25 +44,25 @@ class PoseGraph:
     def __init__(self, config: GraphConfig) -> None:
         self._configured = config
         self._config = config
-        """The same with the noise of odometry as measured."""
+        """The configuration with the measured noise of the odometry."""
         self._odometry: list[Edge] = []
         self._rejected = np.zeros(0, dtype=bool)
-        """Of the motions that the last final optimisation knew: whether it rejected them."""
+        """For each motion: whether the last final optimisation rejected it."""
         self._has_breaks = False
         self._has_own_information: list[bool] = []
-        """Of each motion: whether its information came with it."""
+        """For each motion: whether it was added with its own information."""
         self._closures: list[Edge] = []
         self._backbone = gtsam.NonlinearFactorGraph()
         """The prior of the first pose and the factors of odometry."""
         self._closure_factors = gtsam.NonlinearFactorGraph()
         """The factors of the closures, without robust kernel."""
         self._robust = gtsam.NonlinearFactorGraph()
-        """The same under the kernel."""
+        """The same factors with the robust kernel."""
         self._inlier_bound = noise.inlier_bound(config.inlier_probability, error_allowance=config.error_allowance)
         self._kernel = noise.kernel(config.robust, self._inlier_bound)
         self._values = gtsam.Values()
         self._T_world = Rows(np.empty((0, 4, 4)))
-        """The poses of the values."""
+        """The poses in `_values`, as an array."""
         self._num_closures_in_estimate = 0
         self._T_odom_last = np.eye(4)
         self._travel_m = Rows(np.empty(0))
@@ -84,7 +84,7 @@ class PoseGraph:
 
     @property
     def is_due(self) -> bool:
-        """Whether enough closures wait for an optimisation: one, or more if the estimate has hundreds already."""
+        """True if enough closures wait for an optimisation: one, or more if the estimate has hundreds already."""
         waiting = len(self._closures) - self._num_closures_in_estimate
         return waiting > self._num_closures_in_estimate // CLOSURES_PER_WAITING
 
@@ -149,9 +149,9 @@ class PoseGraph:
         self._robust.add(edge.factor(kernel=self._kernel))
 
     def consistent(self, closures: Sequence[LoopClosure]) -> Mask:
-        """(k,) the largest set of some closures of which every two agree with the odometry between their ends.
+        """(k,) the largest subset in which every two closures are consistent with the odometry between their ends.
 
-        The closures need not be in the graph, their keyframes must be.
+        The closures need not be in the graph, but their keyframes must be.
         """
         edges = [self._edge(closure) for closure in closures]
         pairs = consistent_pairs(self._kept_odometry(), edges, self._inlier_bound)
@@ -178,9 +178,9 @@ class PoseGraph:
         self._rebuild_backbone()
 
     def weigh_odometry_by(self, closure: LoopClosure) -> None:
-        """Raise the noise of odometry until the drift that a closure measures, which is certain, is a usual one.
+        """Increase the noise of odometry until the drift measured by a certain closure is a usual one.
 
-        Drift is usual if its chi-square is the number of its degrees of freedom. Across a break nothing changes.
+        Drift is usual if its chi-square equals the number of degrees of freedom. Across a break nothing changes.
         """
         edge = self._edge(closure)
         first, last = sorted((edge.a, edge.b))
@@ -235,7 +235,7 @@ class PoseGraph:
         return Edge(closure.target_id, closure.source_id, _exact(closure.T_target_source), information)
 
     def _rejected_motions(self) -> Mask:
-        """(n - 1,) those that the last final optimisation rejected."""
+        """(n - 1,) True for motions that the last final optimisation rejected."""
         return np.concatenate([self._rejected, np.zeros(len(self._odometry) - len(self._rejected), dtype=bool)])
 
     def _kept_odometry(self) -> list[Edge]:
@@ -264,7 +264,7 @@ class PoseGraph:
         return values_of(relinked(odometry, self._closures, self.T_world_keyframes, likely))
 
     def _take(self, values: gtsam.Values) -> None:
-        """Values that all closures so far were part of."""
+        """Store values that include all closures so far."""
         self._values = values
         self._T_world = Rows(poses_by_id(values))
         self._num_closures_in_estimate = len(self._closures)

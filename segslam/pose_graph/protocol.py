@@ -1,4 +1,4 @@
-"""What the pipeline needs of a graph of keyframes."""
+"""Interface of a graph of keyframes, as the pipeline uses it."""
 
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -9,11 +9,11 @@ from segslam.types import GraphEstimate, Information, LoopClosure, Transform, Ve
 
 @runtime_checkable
 class Graph(Protocol):
-    """`PoseGraph`, or one that has the same keyframes in another frame."""
+    """`PoseGraph`, or a graph of the same keyframes in another frame."""
 
     @property
     def num_keyframes(self) -> int:
-        """Those added so far."""
+        """Number of keyframes added so far."""
         ...
 
     @property
@@ -23,12 +23,12 @@ class Graph(Protocol):
 
     @property
     def T_world_keyframes(self) -> Poses:  # noqa: N802
-        """(n, 4, 4) by id: the last estimate, and odometry from there for keyframes that are newer."""
+        """(n, 4, 4) poses by id: the last estimate, continued by odometry for newer keyframes."""
         ...
 
     @property
     def is_due(self) -> bool:
-        """Whether measurements enough wait for an optimisation."""
+        """True if enough measurements wait for an optimisation."""
         ...
 
     def add_keyframe(
@@ -39,19 +39,19 @@ class Graph(Protocol):
         *,
         information: Information | None = None,
     ) -> None:
-        """Add the next keyframe, tied by odometry to the one before."""
+        """Add the next keyframe, with an odometry edge from the previous one."""
         ...
 
     def add_closure(self, closure: LoopClosure) -> None:
-        """A loop between two keyframes that the graph holds."""
+        """Add a loop between two keyframes of the graph."""
         ...
 
     def weigh_odometry_by(self, closure: LoopClosure) -> None:
-        """Raise the noise of odometry until the drift that a certain closure measures is a usual one."""
+        """Increase the noise of odometry until the drift measured by a certain closure is a usual one."""
         ...
 
     def optimize(self) -> GraphEstimate:
-        """An estimate good enough to go on with."""
+        """Optimise with a coarse tolerance, as during the run."""
         ...
 
     def finish(self) -> GraphEstimate:

@@ -4,7 +4,7 @@ import numpy as np
 
 
 class Rows:
-    """Rows of one shape. What was given out by `all` stays as it is: rows are added behind it, never changed."""
+    """Rows of one shape. Arrays returned by `all` do not change: rows are only appended."""
 
     def __init__(self, rows: np.ndarray) -> None:
         self._rows = rows
@@ -14,7 +14,7 @@ class Rows:
         return self._num
 
     def append(self, row: np.ndarray | float) -> None:
-        """Add a row, in a time that does not grow with their number."""
+        """Add a row; amortised constant time."""
         if self._num == len(self._rows):
             longer = np.empty((max(16, 2 * self._num), *self._rows.shape[1:]))
             longer[: self._num] = self._rows
@@ -23,7 +23,7 @@ class Rows:
         self._num += 1
 
     def all(self) -> np.ndarray:
-        """A view of the rows so far, not to be written to."""
+        """A read-only view of the rows so far."""
         view = self._rows[: self._num]
         view.flags.writeable = False
         return view

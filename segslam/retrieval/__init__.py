@@ -1,4 +1,4 @@
-"""Places by their look: which keyframes may show the place of a scan, with no guess of where that is."""
+"""Place recognition: keyframes whose surroundings resemble those of a scan, without initial guess."""
 
 from segslam.retrieval.places import PlaceCandidate, Places
 from segslam.retrieval.signature import PlaceSignature, signature_of, signature_of_standing, signatures_around

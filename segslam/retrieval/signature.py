@@ -1,9 +1,9 @@
-"""The signature of a place: the spectrum of the scan seen from above, which a shift or a turn hardly changes.
+"""The signature of a place: the magnitude spectrum of a scan in top view, nearly invariant to shift and rotation.
 
-The magnitude of the two-dimensional Fourier transform of an image does not change when the image is shifted, and turns
-when the image is turned; sampled along rays, a turn is a shift of the rays (Reddy and Chatterji, "An FFT-based
-technique for translation, rotation, and scale-invariant image registration", 1996). A real image has the same
-magnitude on opposite rays, so the signature determines the yaw up to half a turn.
+The magnitude of the two-dimensional Fourier transform of an image is invariant to a shift of the image and rotates with
+the image. Sampled along rays, a rotation is a shift of the rays (Reddy and Chatterji, "An FFT-based technique for
+translation, rotation, and scale-invariant image registration", 1996). The magnitudes of a real image are equal on
+opposite rays, so the signature determines the yaw up to 180 degrees.
 """
 
 import math
@@ -27,60 +27,60 @@ HALF = 75
 WINDOW_CELLS = 35.0
 """Standard deviation of the Gaussian weight around the sensor: 14 m."""
 MAX_LEVELS = 10
-"""Most occupied voxels of a column that count."""
+"""Largest number of occupied voxels counted per column."""
 SIZE = 256
-"""Cells of the transform, with zeros around the image."""
+"""Size of the transform in cells; the image is padded with zeros."""
 NUM_RADII, MAX_RADIUS = 24, 100
-"""Circles of the spectrum, evenly spaced; the largest has a wavelength of 1.02 m."""
+"""Number of circles in the spectrum, evenly spaced; the largest has a wavelength of 1.02 m."""
 NUM_ANGLES = 60
-"""Rays of half a turn, 3 degrees apart."""
+"""Number of rays over 180 degrees, 3 degrees apart."""
 GROUND_M = 0.4
-"""Points lower above the ground do not count."""
+"""Smallest height above the ground of the points used."""
 CIRCLES = ((8.0, 6), (16.0, 10))
-"""Radius (m) and number of the points from which a place is looked at besides the sensor's; chosen on scan 4413 of
-KITTI 00, 12 m beside the path of a map."""
+"""Radius (m) and number of additional viewpoints around the sensor; chosen on scan 4413 of KITTI 00, 12 m beside the
+path of a map."""
 
-# All but the last two of these are chosen on the real places of KITTI 05; 00 was not used.
+# All but the last two are chosen on the real places of KITTI 05; 00 was not used.
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class PlaceSignature(Record):
-    """Signature of a place: a byte for each circle and ray of its spectrum."""
+    """Signature of a place: one byte per circle and ray of its spectrum."""
 
     spectrum: UInt8[np.ndarray, "24 60"]
-    """Square roots of the magnitudes, 255 for the greatest."""
+    """Square roots of the magnitudes, scaled to a maximum of 255."""
 
     def to_bytes(self) -> bytes:
-        """1,440 bytes."""
+        """The signature as 1,440 bytes."""
         return self.spectrum.tobytes()
 
     @staticmethod
     def from_bytes(data: bytes) -> "PlaceSignature":
-        """The signature that `to_bytes` wrote. Raises SegslamError for another length."""
+        """The signature from the bytes of `to_bytes`. Raises SegslamError for another length."""
         if len(data) != NUM_RADII * NUM_ANGLES:
-            raise SegslamError(f"a signature of {len(data)} bytes; this version has {NUM_RADII * NUM_ANGLES}")
+            raise SegslamError(f"a signature of {len(data)} bytes; this version uses {NUM_RADII * NUM_ANGLES}")
         return PlaceSignature(np.frombuffer(data, np.uint8).reshape(NUM_RADII, NUM_ANGLES))
 
 
 def signature_of(points: Points, labels: Labels, *, config: GeometricLabelsConfig) -> PlaceSignature:
-    """The signature of a scan in its sensor's frame; of labels, only those of moving things are used.
+    """The signature of a scan in its sensor's frame. Labels are used to remove points of moving classes only.
 
-    The sensor may lean: the ground is found and left out.
+    The sensor may be tilted: the ground is estimated and removed.
     """
     return signature_of_standing(_standing(points, labels, config))
 
 
 def signatures_around(points: Points, labels: Labels, *, config: GeometricLabelsConfig) -> tuple[PlaceSignature, ...]:
-    """Those of a scan, seen from 16 points around its sensor: one of them may be near the path of a map.
+    """The signatures of a scan seen from 16 points around its sensor: one of them may be near the path of a map.
 
-    As the weight of a point falls with its distance, a place seen from 10 m beside has another signature.
+    The weight of a point decreases with its distance, so the signature changes over 10 m.
     """
     standing = _standing(points, labels, config)
     return tuple(signature_of_standing(standing - centre) for centre in _centres())
 
 
 def _standing(points: Points, labels: Labels, config: GeometricLabelsConfig) -> Points:
-    """What stands still above the ground, in a level frame."""
+    """Static points above the ground, in a level frame."""
     still = points.compress((labels < Label.MOVING_CAR) & np.isfinite(points).all(axis=1), axis=0)
     if not len(still):
         return still
@@ -94,7 +94,7 @@ def _standing(points: Points, labels: Labels, config: GeometricLabelsConfig) -> 
 
 @cache
 def _centres() -> Points:
-    """Where a place is looked at from besides the sensor's own."""
+    """Additional viewpoints around the sensor."""
     return np.array(
         [
             [radius_m * math.cos(angle), radius_m * math.sin(angle), 0.0]

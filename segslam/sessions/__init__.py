@@ -1,1 +1,1 @@
-"""Finished runs and new recordings in one frame: several runs merged, and a recording localised in an old run."""
+"""Several sessions in one frame: merging of finished runs, and localisation of a recording in a finished run."""

@@ -1,8 +1,8 @@
-"""The graph of a drive in the frame of an old map that does not move.
+"""The pose graph of a drive in the frame of an existing map, which is fixed.
 
-The map is one vertex more, which comes before all keyframes and is held where it is. Nothing is known of the motion
-from it to the first keyframe, as after a break of the odometry, and each keyframe that was placed in the map closes a
-loop with it. The robust optimisation of loops and breaks holds for placements as they are.
+The map is an additional, fixed vertex before all keyframes. The motion from it to the first keyframe is unknown, like
+that across a break of the odometry. Each keyframe that was placed in the map has a loop closure with it. The robust
+optimisation of loops and breaks therefore applies to placements without change.
 """
 
 from collections.abc import Iterable
@@ -26,11 +26,11 @@ from segslam.types import (
 )
 
 OPTIMIZE_EVERY = 25
-"""Chosen: placements between two optimisations while running; the pose of a keyframe is its placement until then."""
+"""Chosen: placements between two optimisations during the run; until then the pose of a keyframe is its placement."""
 
 
 class AnchoredGraph:
-    """Keyframes of ids 0, 1, 2, ... in the world of an old map, as `PoseGraph` has them in their own."""
+    """Keyframes 0, 1, 2, ... in the world frame of an existing map, with the interface of `PoseGraph`."""
 
     def __init__(self, config: GraphConfig) -> None:
         self._graph = PoseGraph(config)
@@ -38,11 +38,11 @@ class AnchoredGraph:
         self._placements: list[int] = []
         self._num_waiting = 0
         self.weights: dict[int, float] = {}
-        """Keyframe -> 0 (rejected) to 1 (full weight), of those placed when the graph was last optimised."""
+        """Weight of each keyframe placed before the last optimisation: 0 (rejected) to 1 (full weight)."""
 
     @property
     def num_keyframes(self) -> int:
-        """Those added so far."""
+        """Number of keyframes added so far."""
         return self._graph.num_keyframes - 1
 
     @property
@@ -52,12 +52,12 @@ class AnchoredGraph:
 
     @property
     def T_world_keyframes(self) -> Poses:  # noqa: N802
-        """(n, 4, 4) by id, in the map's world: the last estimate, and odometry from there for newer keyframes."""
+        """(n, 4, 4) poses by id in the map's world: the last estimate, continued by odometry for newer keyframes."""
         return self._graph.T_world_keyframes[1:]
 
     @property
     def is_due(self) -> bool:
-        """Whether placements enough wait for an optimisation: the first, or `OPTIMIZE_EVERY`."""
+        """True if enough placements wait for an optimisation: the first, or `OPTIMIZE_EVERY`."""
         return self._num_waiting >= OPTIMIZE_EVERY or 0 < self._num_waiting == len(self._placements)
 
     def add_keyframe(
@@ -75,14 +75,14 @@ class AnchoredGraph:
 
     def add_closure(self, closure: LoopClosure) -> None:
         """Raises SegslamError: a localised drive has no loops of its own."""
-        raise SegslamError(f"keyframe {closure.source_id}: a drive that is placed in an old map takes no loops")
+        raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 
     def weigh_odometry_by(self, closure: LoopClosure) -> None:
         """Raises SegslamError, as `add_closure` does."""
         self.add_closure(closure)
 
     def place(self, placement: Placement) -> None:
-        """Place a keyframe of the graph in the map; it takes effect with the next optimisation."""
+        """Place a keyframe in the map; takes effect in the next optimisation."""
         source_id = placement.keyframe_id + 1
         self._graph.add_closure(
             LoopClosure(source_id, 0, placement.T_world_keyframe, placement.information, placement.alignment)

@@ -1,4 +1,4 @@
-"""From an old run and new data to the folder of a run in the old one's frame."""
+"""Localisation of new data in a finished run; writes a run folder in the frame of that run."""
 
 from functools import partial
 from pathlib import Path
@@ -11,10 +11,10 @@ from segslam.sessions.localiser import Localiser
 
 
 def localise(run: str | Path, data: str | Path, out: str | Path, **options: Any) -> FinishedRun:
-    """Localise a folder of scans or a recording in the map of a finished run, as `segslam localise` does.
+    """Localise a folder of scans or a recording in the map of a finished run, like `segslam localise`.
 
-    The new folder `out` holds a run as `map_folder` makes it, whose world is that of the old run. Options are those of
-    `map_folder`. Raises SegslamError as `map_folder`, and if the old run did not finish or is damaged.
+    The new folder `out` has the files of `map_folder`; its world frame is that of the finished run. Options are those
+    of `map_folder`. Raises SegslamError as `map_folder`, and if the run did not finish or is damaged.
     """
     locator = Locator.from_run(run)
     return map_folder(

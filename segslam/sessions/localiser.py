@@ -1,4 +1,4 @@
-"""A drive in the frame of an old map, one call a scan."""
+"""Localisation of a drive in an existing map, with one call per scan."""
 
 import math
 from dataclasses import replace
@@ -18,14 +18,14 @@ from segslam.trajectory import travelled_m
 from segslam.types import GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
 
 KEPT_WEIGHT = 0.5
-"""The optimiser has rejected a placement of a smaller weight."""
+"""Placements with a smaller weight were rejected by the optimiser."""
 
 
 class Localiser(Slam):
-    """Odometry, keyframes and their places in an old map that stays as it is. `process` each scan, then `finish`.
+    """Odometry, keyframes, and their placements in an existing map, which is fixed. `process` each scan, then `finish`.
 
-    A Step has the keyframes that it placed (`placements`), or why its own has no place (`not_placed`). The trajectory
-    is in the map's frame where `SlamResult.localised` is True; loops within the drive are not searched.
+    A Step contains the keyframes placed in it (`placements`), or the reason why its own was not (`not_placed`). The
+    trajectory is in the map's frame where `SlamResult.localised` is True; loops within the drive are not searched.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Localiser(Slam):
         odometry: Odometry | None = None,
         labeller: Labeller | None = None,
     ) -> None:
-        """`locator` is of the old map; the rest as for `Slam`."""
+        """`locator` belongs to the existing map; other arguments as for `Slam`."""
         super().__init__(config, odometry=odometry, labeller=labeller)
         self._placer = Placer(self.config, locator, self._anchored, self._loops.submaps)
         self._placed: tuple[tuple[Placement, ...], Rejected | None] = (), None
@@ -58,12 +58,18 @@ class Localiser(Slam):
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         return self.graph.finish(), []
 
+<<<<<<< HEAD
     def finish(self, *, search_s: float = math.inf) -> SlamResult:
         """As `Slam.finish`, in the map's frame; `from_map_m` shows which scans are localised."""
         return replace(super().finish(search_s=search_s), from_map_m=self._from_map_m())
+=======
+    def finish(self) -> SlamResult:
+        """As `Slam.finish`, in the map's frame; `from_map_m` determines which scans are localised."""
+        return replace(super().finish(), from_map_m=self._from_map_m())
+>>>>>>> 92ca088 (Plain English in sessions, live input, health, retrieval, loops and trajectories)
 
     def _from_map_m(self) -> Vector:
-        """(n,) travel from each scan to the nearest keyframe that keeps its place; infinite across a break."""
+        """(n,) travel from each scan to the nearest keyframe whose placement was kept; infinite across a break."""
         travel_m = travelled_m(np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]))
         segment = np.cumsum([motion.is_break for motion in self._motions])
         distance_m = np.full(len(travel_m), np.inf)

@@ -1,7 +1,7 @@
-"""Where a session meets another: keyframes of one found in the other with no guess, and the largest consistent set.
+"""Relative pose of two sessions: keyframes of one are located in the other, and the largest consistent set is used.
 
-Consistent means that two found places and the odometry between them, in either session, close a loop within their
-noise (`segslam.pose_graph.consistency`). A place found wrong is consistent with few others.
+Two located keyframes are consistent if they and the odometry between them, in both sessions, form a loop within the
+noise (`segslam.pose_graph.closure_pairs`). A wrong location is consistent with few others.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -20,34 +20,34 @@ from segslam.sessions.recorded import UNTIED, Session, submaps
 from segslam.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 
 NUM_QUERIES = 60
-"""Chosen: keyframes of a session that are looked for in another, spread over its travel."""
+"""Chosen: number of keyframes of a session that are searched in another, spread over its travel."""
 NUM_ENOUGH = 12
-"""Chosen: no more are looked for when so many are found; further loops are found by proximity."""
+"""Chosen: the search ends when this many are found; further loops are found by proximity."""
 MIN_FOUND = 3
-"""Chosen: so many places that are consistent make a meeting."""
+"""Chosen: smallest number of consistent locations that relate two sessions."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 MIN_SPREAD_M = 10.0
-"""Chosen: if they lie within less travel, they are one look at one place, which may be wrong."""
+"""Chosen: smallest travel between them; nearer ones show a single place, which may be wrong."""
 
 Shown = Callable[[Iterable[Any], int, str], Iterator[Any]]
-"""Shows the progress of some work: the items, how many there are, and a title."""
+"""Shows progress: takes the items, their number, and a title."""
 
 
 def not_shown(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
-    """Work whose progress nobody watches."""
+    """Progress that is not shown."""
     return iter(items)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meeting:
-    """How a session lies in an earlier one."""
+    """Pose of a session in an earlier one."""
 
     earlier: int
     """Number of the earlier session."""
     T_earlier_world: Transform
-    """The session's world in that of the earlier one."""
+    """Pose of the session's world frame in that of the earlier session."""
     found: tuple[tuple[int, int, Alignment], ...]
-    """Keyframe of the session, keyframe of the earlier one, and their alignment, of the consistent places."""
+    """Keyframe of the session, keyframe of the earlier one, and their alignment, for each consistent location."""
 
 
 def meeting(
@@ -59,9 +59,9 @@ def meeting(
     config: Config,
     shown: Shown = not_shown,
 ) -> Meeting | str:
-    """How a session lies in an earlier one, the session of this `number`; or, in words, why it is not known.
+    """The pose of a session in the earlier session of this `number`, or the reason as text if it is unknown.
 
-    Thin keyframes are looked for together with their neighbours.
+    Sparse keyframes are searched together with their neighbours.
     """
     submap = submaps(session, config)
     found: list[tuple[int, int, Alignment]] = []
@@ -76,7 +76,7 @@ def meeting(
             break
     summary = f"{len(found)} of {num_tried} keyframes were found there"
     if len(found) < MIN_FOUND:
-        return f"{summary}, and {MIN_FOUND} are needed"
+        return f"{summary}, {MIN_FOUND} are needed"
     graph, first_id = _both(earlier, session, config)
     closures = [closure(one, first_id) for one in found]
     consistent = graph.consistent(closures)
@@ -93,20 +93,20 @@ def meeting(
 
 
 def _spread(num_keyframes: int) -> list[int]:
-    """Keyframes spread over a session, each far from those before it."""
+    """Keyframes spread over a session, each far from the previous ones."""
     evenly = np.unique(np.linspace(0, num_keyframes - 1, NUM_QUERIES).astype(int))
     return evenly[np.argsort(np.arange(len(evenly)) * GOLDEN % 1.0)].tolist()
 
 
 def closure(found: tuple[int, int, Alignment], first_id: int, target_shift: int = 0) -> LoopClosure:
-    """A found place as a loop of a graph in which the session's keyframes begin at `first_id`."""
+    """A located keyframe as a loop of a graph in which the ids of the session start at `first_id`."""
     own, target, alignment = found
     fine = alignment.fine
     return LoopClosure(own + first_id, target + target_shift, fine.T_target_source, fine.information, alignment)
 
 
 def attempt(found: tuple[int, int, Alignment], first_id: int, target_shift: int) -> LoopAttempt:
-    """The same as an attempt: its prior is what was found."""
+    """The same as an attempt, whose prior is the found pose."""
     made = closure(found, first_id, target_shift)
     T_target_source = made.T_target_source
     distance_m = geometry.distance(T_target_source)
@@ -115,7 +115,7 @@ def attempt(found: tuple[int, int, Alignment], first_id: int, target_shift: int)
 
 
 def _both(earlier: Session, session: Session, config: Config) -> tuple[PoseGraph, int]:
-    """A graph of the keyframes of two sessions, each as its own run estimates them; and the first id of the second."""
+    """A graph of the keyframes of two sessions, each with the estimate of its run; and the first id of the second."""
     graph = PoseGraph(config.graph)
     first_id = len(earlier.travel_m)
     add = partial(_add, graph)

@@ -1,4 +1,4 @@
-"""Several finished runs as one: one graph, one map, one log."""
+"""Merging of several finished runs into one: one graph, one map, one log."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -21,16 +21,16 @@ from segslam.slam import Slam, SlamResult
 from segslam.types import LoopAttempt, SegslamError, Step, Trajectory
 
 OPTIMIZE_EVERY = 25
-"""Chosen: keyframes of a later session until the graph is optimised again; odometry drifts little over 50 m."""
+"""Chosen: number of keyframes of a later session between two optimisations; odometry drifts little over 50 m."""
 LOOK_EVERY_M = 12.0
-"""Chosen: travel between two keyframes of a later session that are tried against the sessions before."""
+"""Chosen: travel between two keyframes of a later session for which loops with earlier sessions are searched."""
 Taken = tuple[Step, int, bool]
-"""A step, and `below` and `optimize` of `Slam.take`."""
+"""A step, and the arguments `below` and `optimize` of `Slam.take`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merged:
-    """Sessions that meet, in the order in which they are taken over, and how."""
+    """Sessions with known relative poses, in the order in which they are merged."""
 
     sessions: tuple[Session, ...]
     meetings: tuple[Meeting | None, ...]
@@ -41,16 +41,16 @@ class Merged:
 
     @property
     def num_steps(self) -> int:
-        """Scans of all sessions."""
+        """Number of scans of all sessions."""
         return sum(len(session.run.result.trajectory) for session in self.sessions)
 
     @property
     def dataset(self) -> str:
-        """What the sessions are of."""
+        """Names of the data sets."""
         return " + ".join(dict.fromkeys(session.run.dataset for session in self.sessions))
 
     def summary(self) -> str:
-        """In words, a line a session: in which run it was found."""
+        """One line per session: the run in which it was found."""
         lines = [
             f"{session.name}: found in {self.sessions[found.earlier].name} by {len(found.found)} of its keyframes"
             for session, found in zip(self.sessions, self.meetings, strict=True)
@@ -59,7 +59,7 @@ class Merged:
         return "\n".join(lines)
 
     def options(self) -> dict[str, str]:
-        """For the log: which runs were merged, and what was added to their numbers."""
+        """For the log: the merged runs, and the offsets of their numbers."""
         rows = [
             {
                 "run": str(session.run.folder.resolve()),
@@ -73,7 +73,7 @@ class Merged:
         return {"sessions": json.dumps(rows)}
 
     def steps(self) -> Iterator[Taken]:
-        """The steps of all sessions; those of later ones are tried against the sessions before them."""
+        """The steps of all sessions; loops with earlier sessions are searched for the later ones."""
         for session, shift, found in zip(self.sessions, self.shifts, self.meetings, strict=True):
             last_id = len(session.travel_m) - 1
             looked_m = -np.inf
@@ -93,7 +93,7 @@ class Merged:
         return {one[0]: (attempt(one, shift.keyframe_id, target_shift),) for one in found.found}
 
     def figures(self, result: SlamResult) -> dict[str, Any]:
-        """The figures of `metrics.json` that a merged run has beside those of every run."""
+        """The figures of `metrics.json` that only merged runs have."""
         first_ids = [shift.keyframe_id for shift in self.shifts[1:]]
         between = [
             weight
@@ -110,10 +110,10 @@ class Merged:
 def plan(
     sessions: Sequence[Session], *, config: Config, same_reference: bool = False, shown: Shown = not_shown
 ) -> Merged:
-    """How some sessions become one run. Writes nothing.
+    """Determine how sessions are merged. Writes nothing.
 
-    `same_reference` means that the true poses of all runs are in one frame, which is known of runs of
-    one sequence. Raises SegslamError that names the run if one meets no other.
+    `same_reference`: the true poses of all runs are in one frame, as for runs of one sequence. Raises SegslamError,
+    naming the run, if one was not found in any other.
     """
     taken: list[Session] = [sessions[0]]
     meetings: list[Meeting | None] = [None]
@@ -143,11 +143,11 @@ def merge(
     same_reference: bool = False,
     on_step: Callable[[Step], object] = lambda step: None,
 ) -> FinishedRun:
-    """Merge finished runs into the new folder `out`, as `segslam merge` does; the merged run.
+    """Merge finished runs into the new folder `out`, like `segslam merge`; returns the merged run.
 
-    Its world is that of the first run. `config`: the settings, those of the first run unless given. `same_reference`
-    means that the true poses of all runs are in one frame. `on_step` is called with each Step. Raises SegslamError that
-    names the run if one did not finish, is damaged, is given twice or meets no other.
+    Its world frame is that of the first run. `config`: settings, by default those of the first run. `same_reference`:
+    the true poses of all runs are in one frame. `on_step` is called with each Step. Raises SegslamError, naming the
+    run, if one did not finish, is damaged, is given twice or was not found in any other.
     """
     from segslam.run.report import write_report
 
@@ -187,7 +187,7 @@ def _first_meeting(
     config: Config,
     shown: Shown,
 ) -> Meeting | None:
-    """How a session lies in the first of some others that it meets. `why` has those that it does not meet."""
+    """The pose of a session in the first session in which it is found. Reasons of failures are added to `why`."""
     for number, (earlier, locator) in enumerate(zip(taken, locators, strict=True)):
         if (session.name, number) not in why:
             found = meeting(session, earlier, number, locator, config=config, shown=shown)
@@ -199,11 +199,11 @@ def _first_meeting(
 
 def _do_not_meet(session: Session, taken: Sequence[Session], why: dict[tuple[str, int], str]) -> str:
     tried = "; ".join(f"in {one.name}: {why[session.name, number]}" for number, one in enumerate(taken))
-    return f"{session.name}: does not meet any other run ({tried}); merge runs that pass the same places"
+    return f"{session.name}: not found in any other run ({tried}); merge runs that share places"
 
 
 def _shifts(sessions: Sequence[Session], meetings: Sequence[Meeting | None]) -> tuple[Shift, ...]:
-    """What is added to the numbers of each session; its odometry starts where it was found to."""
+    """Offsets of the numbers of each session, and the transform of its odometry to the pose found."""
     shifts = [Shift()]
     T_first_world = [np.eye(4)]
     for before, session, found in zip(sessions[:-1], sessions[1:], meetings[1:], strict=True):
@@ -220,7 +220,7 @@ def _shifts(sessions: Sequence[Session], meetings: Sequence[Meeting | None]) -> 
 
 
 def _reference(sessions: Sequence[Session], shifts: Sequence[Shift], same_reference: bool) -> Trajectory | None:
-    """The true poses of all sessions by the new numbers of their scans; None if one has none, or another frame."""
+    """The true poses of all sessions by new scan numbers; None if a session has none, or another frame."""
     sequences = {(one.run.options.get("data"), one.run.options.get("sequence")) for one in sessions}
     is_one_sequence = len(sequences) == 1 and sequences != {(None, None)}
     references = [session.run.reference for session in sessions]

@@ -1,9 +1,9 @@
-"""Places the keyframes of a drive in an old map: found with no initial guess, then tracked from one to the next.
+"""Places the keyframes of a drive in an existing map: the first without initial guess, then by tracking.
 
-A place that is found is taken once a second one agrees with it by the odometry between them, or it agrees with where
-odometry alone has the drive since it was last placed. From then on each keyframe is registered with the nearest
-keyframes of the map, from the pose that odometry predicts, and verified. Where that fails for some metres, or after a
-break of the odometry, the place is searched again.
+A location without initial guess is accepted if it is consistent, by odometry, with a second one or with the last
+placement. From then on each keyframe is registered with the nearest keyframes of the map, starting at the pose that
+odometry predicts, and verified. If that fails for some metres, or after a break of the odometry, the place is searched
+again without initial guess.
 """
 
 from collections.abc import Callable
@@ -23,22 +23,22 @@ from segslam.types import Alignment, Placement, Registration, Rejected, RejectRe
 from segslam.verification import gates
 
 REACH_M = 12.0
-"""Chosen: the map's keyframes within this distance of a prediction are registered with."""
+"""Chosen: the map's keyframes within this distance of a prediction are used for registration."""
 NUM_TRIED, APART_M = 2, 4.0
-"""Chosen: so many of them, the nearest first and so far apart."""
+"""Chosen: largest number of these, nearest first, and smallest distance between them."""
 BASE_M, DRIFT = 0.8, 0.02
-"""Chosen: a registration may move a prediction by so much, and this share of the way since the last placement."""
+"""Chosen: largest correction of a prediction by registration, constant and as a share of the travel since the last."""
 BASE_RAD, DRIFT_RAD_PER_M = np.radians(3.0), np.radians(0.03)
 MOST_M, MOST_RAD = 2.0, np.radians(10.0)
-"""Chosen: refinement finds no pose that is farther off."""
+"""Chosen: largest initial error from which refinement converges."""
 SEARCH_AFTER_M = 20.0
-"""Chosen: travel without a placement after which the place is searched with no guess."""
+"""Chosen: travel without a placement after which the place is searched without initial guess."""
 SEARCH_EVERY_M = 4.0
-"""Chosen: travel between two such searches; each takes some tenths of a second."""
+"""Chosen: travel between two such searches, each of which takes some tenths of a second."""
 AGREE_M, AGREE_RAD = 1.0, np.radians(4.0)
-"""Chosen: two places that are found agree within this and the drift between them."""
+"""Chosen: tolerance of two consistent locations, in addition to the drift between them."""
 REMEMBERED_M = 60.0
-"""Chosen: travel in which a second place has to be found."""
+"""Chosen: travel within which a second location must be found."""
 NUM_PREPARED = 64
 
 
@@ -51,23 +51,23 @@ class _Pose:
 
 
 class Placer:
-    """Takes the place of the loop closer in a drive that is localised; the calls come in the same order."""
+    """Replaces the loop closer in a drive that is localised; the calls come in the same order."""
 
     def __init__(self, config: Config, locator: Locator, graph: AnchoredGraph, submaps: Submaps) -> None:
-        """`submaps` gives the keyframes of the drive, which the graph holds."""
+        """`submaps` provides the keyframes of the drive, which are in the graph."""
         self._config, self._locator, self._graph, self._submaps = config, locator, graph, submaps
         self._allowed = gates.limits(gates.SINGLE_PAIR, config=config.verify)
         ids = sorted(locator.T_world_keyframe)
         self._T_world_map = np.array([locator.T_world_keyframe[number] for number in ids])
         self._map_seen: Callable[[int], gates.Observed] = lru_cache(NUM_PREPARED)(self._seen_of_map)
         self._last: _Pose | None = None
-        """The newest keyframe that was placed."""
+        """The newest placed keyframe."""
         self._found: list[Placement] = []
-        """Places that nothing bears out yet."""
+        """Locations that are not yet confirmed."""
         self._searched_m = -np.inf
 
     def place(self, keyframe_id: int, watch: Stopwatch) -> tuple[tuple[Placement, ...], Rejected | None]:
-        """Where a keyframe and perhaps earlier ones are in the map; or why this one has no place."""
+        """Placements of a keyframe and possibly earlier ones; or the reason why this keyframe is not placed."""
         travel_m = self._graph.travel_m
         why = Rejected(RejectReason.NO_PLACE, "not found yet")
         since_m = np.inf if self._last is None else travel_m[keyframe_id] - travel_m[self._last.keyframe_id]
@@ -87,11 +87,11 @@ class Placer:
         return self._believed(_placement(keyframe_id, found))
 
     def _tracked(self, keyframe_id: int, since_m: float, watch: Stopwatch) -> Placement | Rejected:
-        """The keyframe registered with the nearest ones of the map, from where odometry has it."""
+        """The keyframe registered with the nearest ones of the map, starting at the odometry's prediction."""
         T_world_predicted = self._predicted(keyframe_id)
         apart_m = np.hypot(*(self._T_world_map[:, :2, 3] - T_world_predicted[:2, 3]).T)
         apart_m = np.hypot(apart_m, self._T_world_map[:, 2, 3] - T_world_predicted[2, 3])
-        outcome: Placement | Rejected = Rejected(RejectReason.NO_PLACE, f"the map is {apart_m.min():.0f} m away")
+        outcome: Placement | Rejected = Rejected(RejectReason.NO_PLACE, f"{apart_m.min():.0f} m from the map")
         with watch("prepare"):
             submap = self._submaps.submap(keyframe_id)
             own = prepare_observed(
@@ -147,17 +147,17 @@ class Placer:
         return Placement(keyframe_id, target_id, T_world_keyframe, fine.information, alignment, is_found=False)
 
     def _believed(self, found: Placement) -> tuple[tuple[Placement, ...], Rejected | None]:
-        """The place that was found, with an earlier one that it agrees with; it waits if there is none."""
+        """The location with an earlier one that is consistent with it; it waits if there is none."""
         if self._last is not None and self._agree(self._last, found):
             return self._taken((found,)), None
         for earlier in reversed(self._found):
             if self._agree(earlier, found):
                 return self._taken((earlier, found)), None
         self._found.append(found)
-        return (), Rejected(RejectReason.UNCONFIRMED, "found, but nothing else bears it out yet")
+        return (), Rejected(RejectReason.UNCONFIRMED, "found, but not yet confirmed by another keyframe")
 
     def _agree(self, earlier: "Placement | _Pose", later: Placement) -> bool:
-        """Whether odometry leads from one place to the other."""
+        """True if odometry leads from one location to the other."""
         travel_m = self._graph.travel_m
         way_m = float(travel_m[later.keyframe_id] - travel_m[earlier.keyframe_id])
         if way_m >= (REMEMBERED_M if isinstance(earlier, Placement) else BREAK_TRAVEL_M):

@@ -1,4 +1,4 @@
-"""A finished run as one session of a merged run: its keyframes, and its steps with other numbers."""
+"""A finished run as one session of a merged run: its keyframes, and its steps with new numbers."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -31,23 +31,23 @@ from segslam.types import (
 )
 
 GAP_NS = 1_000_000_000
-"""Chosen: the first scan of a session that does not come later than the session before is put so much after it."""
+"""Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
 UNTIED = Motion(MotionState.BEGUN, information=np.zeros((6, 6)))
-"""The motion to the first scan of a session: nothing is known of it."""
+"""The motion to the first scan of a session, which is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Session:
-    """A finished run with the positions of its keyframes."""
+    """A finished run with the poses of its keyframes."""
 
     run: FinishedRun
     log: RunLog
     T_world_keyframe: Poses
-    """By the run's own estimate."""
+    """Poses by the run's own estimate."""
     T_odom_keyframe: Poses
     travel_m: Vector
     informations: tuple[Information | None, ...]
-    """Of the motion to each keyframe from the one before; None where the noise model of odometry holds."""
+    """Information of the motion from the previous keyframe to each keyframe; None for the noise model of odometry."""
 
     @property
     def name(self) -> str:
@@ -90,21 +90,21 @@ def read_sessions(folders: list[Path]) -> list[Session]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shift:
-    """What is added to the numbers of a session, so that its steps follow on those of the sessions before."""
+    """Offsets of the numbers of a session, so that its steps follow those of the previous sessions."""
 
     keyframe_id: int = 0
     scan_index: int = 0
     stamp_ns: int = 0
     travel_m: float = 0.0
     T_new_old: Transform | None = None
-    """Moves the frame of its odometry; None: not at all."""
+    """Transform of its odometry frame; None for identity."""
 
     def pose(self, T_odom_lidar: Transform) -> Transform:
         """A pose of the session's odometry in that of the merged run."""
         return T_odom_lidar if self.T_new_old is None else self.T_new_old @ T_odom_lidar
 
     def attempt(self, attempt: LoopAttempt) -> LoopAttempt:
-        """A loop of the session by the new ids of its keyframes."""
+        """A loop of the session with the new ids of its keyframes."""
         ids = {name: getattr(attempt.candidate, name) + self.keyframe_id for name in ("source_id", "target_id")}
         outcome = attempt.outcome
         return replace(
@@ -115,9 +115,9 @@ class Shift:
 
 
 def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopAttempt, ...]]) -> Iterator[Step]:
-    """The steps of a session with their points; `more` are further loops of its keyframes, by their own ids.
+    """The steps of a session with their points; `more`: further loops of its keyframes, by original id.
 
-    Loops that were tried after the session's last scan come with its last keyframe.
+    Loops tried after the session's last scan are added to the step of its last keyframe.
     """
     late = session.log.late_loops()
     last_id = len(session.travel_m) - 1
@@ -149,7 +149,7 @@ def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopA
 
 
 def next_shift(before: Shift, session: Session, T_new_old: Transform, following: Session) -> Shift:
-    """The shift of the session `following`, after `session` with the shift `before`. Stamps that are later stay."""
+    """The shift of the session `following`, after `session` with the shift `before`. Later stamps are unchanged."""
     last_ns = int(session.run.result.trajectory.stamp_ns[-1]) + before.stamp_ns
     first_ns = int(following.run.result.trajectory.stamp_ns[0])
     return Shift(
@@ -162,7 +162,7 @@ def next_shift(before: Shift, session: Session, T_new_old: Transform, following:
 
 
 def submaps(session: Session, config: Config) -> Callable[[int], tuple[Points, Labels]]:
-    """The points and labels of a keyframe of the session by its id; of a thin one with its neighbours'."""
+    """Function from a keyframe's id to its points and labels; sparse keyframes are merged with their neighbours."""
     recorded = session.log.keyframes()
     made = Submaps(config, lambda: recorded, partial(shape_labels, config=config), lambda: session.travel_m)
     for number in range(len(recorded)):

@@ -47,7 +47,7 @@ def test_figures_and_picture_of_several_runs(
     [
         ("nowhere", (), "nowhere: no such file or folder"),
         ("one", (), "two or more different runs"),
-        ("two", ("--plot", "both.doc"), "both.doc: not a picture"),
+        ("two", ("--plot", "both.doc"), "both.doc: unknown kind of figure"),
         ("two", ("--plot", "nowhere/both.png"), "there is no folder nowhere"),
     ],
 )

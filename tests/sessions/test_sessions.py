@@ -127,7 +127,7 @@ def test_a_session_in_another_town_is_refused_and_nothing_is_left(
     assert run("merge", days.monday.folder, elsewhere.folder, "--out", tmp_path / "both") == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert str(elsewhere.folder) in error
-    assert "does not meet any other run" in error
+    assert "not found in any other run" in error
     assert not (tmp_path / "both").exists()
 
 

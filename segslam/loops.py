@@ -72,16 +72,11 @@ class LoopCloser:
         """Note the result of an optimisation: closures with weight shorten the chains between keyframes."""
         self._detector.note_estimate(weights)
 
-<<<<<<< HEAD
     def look_again(self, watch: Stopwatch, *, end_s: float = math.inf) -> Iterator[LoopAttempt]:
-        """Try the pairs that the final poses propose and that were not tried before: a limited number, in order.
+        """Try the pairs proposed from the final poses that were not tried before, up to a limit of their number.
 
-        No keyframe is begun after `end_s`, by time.monotonic.
+        No further keyframe is started after `end_s`, by time.monotonic.
         """
-=======
-    def look_again(self, watch: Stopwatch) -> Iterator[LoopAttempt]:
-        """Try the pairs proposed from the final poses that were not tried before, nearest first, up to a limit."""
->>>>>>> 92ca088 (Plain English in sessions, live input, health, retrieval, loops and trajectories)
         self._is_finished = True
         most = max(LEAST_AGAIN, int(MOST_AGAIN * len(self._tried)))
         for keyframe_id in range(len(self.submaps.T_odom)):

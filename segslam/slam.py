@@ -139,16 +139,11 @@ class Slam:
             T_odom_lidar = np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps])
             self._tracker.restore(T_odom_lidar, self._motions, self._stamps(), scan_of)
 
-<<<<<<< HEAD
     def finish(self, *, search_s: float = math.inf) -> SlamResult:
-        """Optimise once more, and give the pose of every scan. Raises ValueError before the first scan.
+        """Final optimisation; returns the pose of every scan. Raises ValueError before the first scan.
 
-        With the final poses loops are searched again, for `search_s` seconds at most.
+        Loops are then searched again with the final poses, for at most `search_s` seconds.
         """
-=======
-    def finish(self) -> SlamResult:
-        """Final optimisation; returns the pose of every scan. Raises ValueError before the first scan."""
->>>>>>> 92ca088 (Plain English in sessions, live input, health, retrieval, loops and trajectories)
         if not self._steps:
             raise ValueError("no scan was processed")
         self._is_finished = True
@@ -169,16 +164,11 @@ class Slam:
         attempts = (*self._attempts, *late)
         return SlamResult(trajectory, odometry, estimate, rows, attempts, tuple(self._motions), len(late))
 
-<<<<<<< HEAD
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
-        """The final estimate, after loops were searched again with better poses; and the attempts of that search.
+        """The final estimate, after a second search for loops with better poses; and the attempts of that search.
 
         The search ends at `end_s`, by time.monotonic.
         """
-=======
-    def _settle(self) -> tuple[GraphEstimate, list[LoopAttempt]]:
-        """The final estimate, after a second search for loops with better poses; and the attempts of that search."""
->>>>>>> 92ca088 (Plain English in sessions, live input, health, retrieval, loops and trajectories)
         late: list[LoopAttempt] = []
         estimate = self.graph.finish()
         for _ in range(ROUNDS):

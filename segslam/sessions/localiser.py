@@ -58,15 +58,9 @@ class Localiser(Slam):
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         return self.graph.finish(), []
 
-<<<<<<< HEAD
     def finish(self, *, search_s: float = math.inf) -> SlamResult:
-        """As `Slam.finish`, in the map's frame; `from_map_m` shows which scans are localised."""
-        return replace(super().finish(search_s=search_s), from_map_m=self._from_map_m())
-=======
-    def finish(self) -> SlamResult:
         """As `Slam.finish`, in the map's frame; `from_map_m` determines which scans are localised."""
-        return replace(super().finish(), from_map_m=self._from_map_m())
->>>>>>> 92ca088 (Plain English in sessions, live input, health, retrieval, loops and trajectories)
+        return replace(super().finish(search_s=search_s), from_map_m=self._from_map_m())
 
     def _from_map_m(self) -> Vector:
         """(n,) travel from each scan to the nearest keyframe whose placement was kept; infinite across a break."""

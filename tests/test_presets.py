@@ -73,4 +73,4 @@ def test_map_shows_and_keeps_the_preset_and_settings_change_it(
 def test_a_preset_that_does_not_exist_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_ring(tmp_path / "scans", 6.0)
     assert run("map", folder, "--out", tmp_path / "run", "--preset", "forest") == 2
-    assert "--preset forest: no such preset; known: auto, driving, campus, indoor" in capsys.readouterr().err
+    assert "--preset forest: unknown preset; known: auto, driving, campus, indoor" in capsys.readouterr().err

@@ -72,9 +72,9 @@ def test_comments_blank_lines_commas_and_a_byte_order_mark_are_read_over(tmp_pat
     [
         ("1 0 0 0 0 1 0 0 0 0 1", "poses.txt:2: found 11 numbers; KITTI"),
         ("1 0 0 0 0 1 0 0 0 0 1 x", "poses.txt:2: could not convert string to float: 'x'"),
-        ("1 0 0 nan 0 1 0 0 0 0 1 0", "poses.txt:2: holds 1 0 0 nan"),
-        ("2 0 0 0 0 2 0 0 0 0 2 0", "poses.txt:2: the 3x3 part is no rotation"),
-        ("1 0 0 0 0 1 0 0 0 0 -1 0", "poses.txt:2: the 3x3 part is no rotation"),
+        ("1 0 0 nan 0 1 0 0 0 0 1 0", "poses.txt:2: 1 0 0 nan"),
+        ("2 0 0 0 0 2 0 0 0 0 2 0", "poses.txt:2: the 3x3 part is not a rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0", "poses.txt:2: the 3x3 part is not a rotation"),
         ("0 1 2 3 0 0 0 1", "poses.txt:2: found 8 numbers; KITTI"),
     ],
 )
@@ -89,7 +89,7 @@ def test_broken_kitti_line_is_named(tmp_path: Path, line: str, complaint: str) -
 def test_quaternion_that_is_no_rotation_is_named(tmp_path: Path, line: str) -> None:
     file = tmp_path / "poses.txt"
     file.write_text(f"0 1 2 3 0 0 0 1\n{line}\n")
-    with pytest.raises(SegslamError, match=r"poses\.txt:2: the quaternion is no rotation"):
+    with pytest.raises(SegslamError, match=r"poses\.txt:2: the quaternion is not a rotation"):
         trajectory.read_poses(file)
 
 

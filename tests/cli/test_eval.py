@@ -61,7 +61,7 @@ def test_rows_of_another_number_cannot_be_matched_but_stamps_can(
     tum = ("--estimate", tmp_path / "estimate_tum.txt", "--reference", tmp_path / "truth_tum.txt")
     assert _eval(*tum) == 0
     printed = capsys.readouterr()
-    assert "scored 40 poses; the estimate has 40, the reference 60" in printed.err
+    assert "scored 40 poses; estimate 40, reference 60" in printed.err
     assert "absolute trajectory error after alignment" in printed.out
 
 
@@ -73,7 +73,7 @@ def test_figures_of_an_earlier_reference_do_not_stay(tmp_path: Path, capsys: pyt
     write_tum(tmp_path / "few.txt", *few)
     assert _eval(made.folder, "--reference", tmp_path / "few.txt", "--json") == 0
     printed = capsys.readouterr()
-    assert "scored 4 scans that have a reference pose, of 120" in printed.err
+    assert "scored the 4 of 120 scans that have a reference pose" in printed.err
     assert not {"num_loops_false", "loop_precision"} & json.loads(printed.out).keys()
     write_tum(tmp_path / "few.txt", few[0][:2], few[1][:2])
     assert _eval(made.folder, "--reference", tmp_path / "few.txt") == 2

@@ -25,7 +25,7 @@ def test_first_of_each_kind_is_told_and_the_rest_counted(capsys: pytest.CaptureF
             "at once, not at the end"
         )
         handler.print_counts()
-        assert capsys.readouterr().err == "segslam: 2 more like this one: WARNING: scan 3 is bad\n"
+        assert capsys.readouterr().err == "segslam: 2 more warnings like this: WARNING: scan 3 is bad\n"
         handler.print_counts()
         assert capsys.readouterr().err == "", "once"
     finally:
@@ -42,5 +42,5 @@ def test_many_bad_scans_make_two_lines(tmp_path: Path) -> None:
     told = [line for line in done.stderr.splitlines() if "none of its 50 points" in line]
     assert len(told) == 2
     assert "scan 1" in told[0]
-    assert told[1].startswith("segslam: 4 more like this one:")
+    assert told[1].startswith("segslam: 4 more warnings like this:")
     assert "5 scans skipped (unreadable or empty)" in done.stderr

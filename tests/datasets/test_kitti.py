@@ -83,7 +83,7 @@ def test_frames_select_by_number_without_the_last(tmp_path: Path, frames: str, n
         ("5", "A:B"),
         ("a:b", "A:B"),
         ("1:2:3", "A:B"),
-        ("20:30", r"no such scan, it has 0 to 12"),
+        ("20:30", r"no such scan, only 0 to 12"),
         ("4:4", "selects no scan"),
     ],
 )
@@ -248,7 +248,7 @@ def test_too_few_times_are_refused_with_both_numbers(tmp_path: Path) -> None:
 def test_broken_time_is_named_with_its_line(tmp_path: Path) -> None:
     folder = _write_sequence(tmp_path, [0, 1])
     (folder / "times.txt").write_text("0.0\nnan\n")
-    with pytest.raises(SegslamError, match=r"times\.txt:2: nan is no time"):
+    with pytest.raises(SegslamError, match=r"times\.txt:2: nan is not a time"):
         _open(tmp_path)
 
 

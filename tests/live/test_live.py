@@ -93,7 +93,7 @@ def test_a_file_is_taken_when_it_is_closed_or_renamed_and_once(tmp_path: Path) -
     source, waiting, stopped = FolderSource(tmp_path), Waiting(most=9), threading.Event()
     told: list[str] = []
     source.open(told.append)
-    assert "1 scans are in" in told[0]
+    assert "1 scans already in" in told[0]
     thread = threading.Thread(target=source.feed, args=(waiting, stopped))
     thread.start()
     try:

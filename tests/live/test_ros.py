@@ -182,7 +182,7 @@ def test_a_cloud_is_read_as_it_was_sent() -> None:
 
 def test_a_topic_is_named_from_the_root_and_checked() -> None:
     assert TopicSource("points").name == TopicSource("/points").name == "live/points"
-    with pytest.raises(SegslamError, match="--topic bad topic!: no name of a topic"):
+    with pytest.raises(SegslamError, match="--topic bad topic!: not a topic name"):
         TopicSource("bad topic!")
 
 

@@ -191,7 +191,7 @@ def test_a_full_standard_output_is_one_line(finished: Path, arguments: list[str]
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("segslam: ")
-    assert "standard output: cannot be written (No space left on device); send it elsewhere" in line
+    assert "standard output: cannot be written (No space left on device); redirect it elsewhere" in line
 
 
 def test_a_reader_that_goes_away_is_no_error_to_tell(finished: Path) -> None:

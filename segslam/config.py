@@ -43,10 +43,10 @@ USER_SETTINGS = (
     "map.voxel_m",
     "map.color",
 )
-"""The settings that most users need, the first of their sections. All others are for experts."""
+"""The settings for most users, the first ones of their sections. All others are for experts."""
 
 REMOVED = ("graph.systematic_drift",)
-"""Settings of older versions that are dropped with a warning, also from files and `--set`."""
+"""Settings of older versions that are ignored with a warning, also in files and `--set`."""
 
 
 def _label_from_name(value: object) -> object:
@@ -64,7 +64,7 @@ LabelName = Annotated[Label, BeforeValidator(_label_from_name), PlainSerializer(
 
 def _check_static(label: Label) -> Label:
     if label == Label.UNLABELLED or label >= Label.MOVING_CAR:
-        raise ValueError("only labelled things that stay where they are help to recognise a place")
+        raise ValueError("only static classes can be used to recognise a place")
     return label
 
 
@@ -137,7 +137,7 @@ class HealthConfig(Section):
     watch_scans: int = Field(
         20,
         ge=1,
-        description="after a repair every scan is registered, until this many in a row agree with odometry [chosen]",
+        description="after a repair, scans are registered until this many in a row are consistent with odometry [chosen]",
     )
     map_scans: int = Field(10, ge=1, description="number of scans in the local map of the check [chosen]")
     map_spacing_m: float = Field(
@@ -188,7 +188,7 @@ class KeyframeConfig(Section):
         "[chosen on KITTI, courtyard, NCLT]",
     )
     max_gathered: int = Field(
-        10, ge=0, description="largest number of neighbouring keyframes whose points are gathered [chosen]"
+        10, ge=0, description="largest number of neighbouring keyframes whose points are merged [chosen]"
     )
     resolution_m: float = Field(
         0.004, gt=0, description="grid to which the coordinates of keyframes are rounded (m) [chosen]"
@@ -239,16 +239,16 @@ class ProximityConfig(Section):
 
 
 class RetrievalConfig(Section):
-    """Loops with places that look alike, wherever odometry expects them."""
+    """Loop closing by place recognition, independent of drift."""
 
     enabled: bool = Field(
-        True, description="look for loops outside the search radius of proximity, among places that look alike [chosen]"
+        True, description="search loops also outside the search radius of proximity, by similarity of places [chosen]"
     )
 
 
 def _check_rising(bounds: tuple[float, float]) -> tuple[float, float]:
     if not 0 <= bounds[0] < bounds[1]:
-        raise ValueError("write the lower bound, at least 0, and then the upper one")
+        raise ValueError("give the lower bound, at least 0, then the upper bound")
     return bounds
 
 
@@ -256,9 +256,9 @@ Bounds = Annotated[tuple[float, float], AfterValidator(_check_rising)]
 
 
 class GeometricLabelsConfig(Section):
-    """Labels from shape alone. Heights are above the ground."""
+    """Labels from geometry alone. Heights are above the ground."""
 
-    max_range_m: float = Field(70.0, gt=0, le=200, description="points farther away stay unlabelled (m) [chosen]")
+    max_range_m: float = Field(70.0, gt=0, le=200, description="points farther away remain unlabelled (m) [chosen]")
     ground_cell_m: float = Field(1.0, ge=0.2, description="cell size of the ground surface (m) [chosen]")
     max_slope: float = Field(0.2, gt=0, description="largest slope of the ground between cells [chosen]")
     ground_height_m: float = Field(0.15, gt=0, description="points lower than this are ground (m) [chosen]")
@@ -614,7 +614,7 @@ class MapConfig(Section):
     view_range_m: float = Field(
         30.0,
         ge=0,
-        description="distance within which a keyframe can vote a voxel away; 0: no voxel is removed (m) [chosen]",
+        description="distance within which keyframes can see through a voxel; 0: no voxel is removed (m) [chosen]",
     )
     view_margin_m: float = Field(
         0.3,
@@ -656,44 +656,44 @@ class Config(Section):
 def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
     """The defaults, or `base`, changed by a YAML file and then by `section.key=value` texts.
 
-    Raises SegslamError that names the file and key for unreadable YAML, unknown keys and values out of range.
+    Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
     """
     values = _changed(base.model_dump(mode="json") if base else {}, _read_yaml(path) if path else {})
     for text in overrides:
         key, separator, value = text.partition("=")
         section, dot, name = key.strip().partition(".")
         if not separator or not dot or not name:
-            raise SegslamError(f"--set {text}: write it as section.key=value, for example keyframes.distance_m=1.5")
+            raise SegslamError(f"--set {text}: write section.key=value, for example keyframes.distance_m=1.5")
         section_values = values.setdefault(section, {})
         if not isinstance(section_values, dict):
             raise SegslamError(f"{path}: {section}: expected a section with keys, found {section_values!r}")
         try:
             section_values[name] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise SegslamError(f"--set {text}: the value is no valid YAML ({_one_line(error)})") from error
+            raise SegslamError(f"--set {text}: the value is not valid YAML ({_one_line(error)})") from error
     source = str(path) if path is not None else "--set"
     source = source if not (path and overrides) else f"{path} and --set"
     return _validate(_without_removed(values, source), source)
 
 
 def config_to_yaml(config: Config) -> str:
-    """Every setting as YAML that `load_config` reads back to an equal Config."""
+    """All settings as YAML, from which `load_config` makes an equal Config."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
 def config_from_yaml(text: str, source: str) -> Config:
-    """The Config that a text of this or an older version holds; `source` names it to a person.
+    """The Config in a text of this or an older version; `source` is its name in messages.
 
-    Settings that there are no longer are left out, with a warning. Raises SegslamError if it holds no Config.
+    Settings that no longer exist are ignored with a warning. Raises SegslamError if the text is not a Config.
     """
     known, gone = _known(_parse_yaml(text, source))
     if gone:
-        logger.warning("%s: left out what this version does not have: %s", source, ", ".join(gone))
+        logger.warning("%s: ignored settings that this version does not have: %s", source, ", ".join(gone))
     return _validate(known, source)
 
 
 def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
-    """The values without settings that older versions had and this one no longer needs."""
+    """The values without settings of older versions that no longer exist."""
     for key in REMOVED:
         section, _, name = key.partition(".")
         if isinstance(values.get(section), dict) and name in values[section]:
@@ -703,7 +703,7 @@ def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
 
 
 def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The settings that this version has, and the names of the others."""
+    """The settings of this version, and the names of the others."""
     known: dict[str, Any] = {}
     gone: list[str] = []
     for name, section in values.items():
@@ -719,7 +719,7 @@ def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
 
 
 def _changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """The values of all sections, with those keys replaced that the changes name."""
+    """The values of all sections, with the changed keys replaced."""
     keywise = {
         name: values[name] | section
         for name, section in changes.items()
@@ -737,10 +737,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 class _EachKeyOnce(yaml.SafeLoader):
-    """Refuses a key that is given twice, of which YAML's own loader takes the last."""
+    """Rejects duplicate keys; YAML's own loader uses the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """As of the loader. Raises ConstructorError with the line of the second."""
+        """As in the base class. Raises ConstructorError, with its line, for a duplicate key."""
         seen: set[str] = set()
         for key, _ in node.value:
             if key.value in seen:
@@ -754,7 +754,7 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     try:
         values = yaml.load(text, _EachKeyOnce)
     except yaml.YAMLError as error:
-        raise SegslamError(f"{source}: no valid YAML ({_one_line(error)})") from error
+        raise SegslamError(f"{source}: not valid YAML ({_one_line(error)})") from error
     if values is None:
         return {}
     if not isinstance(values, dict):
@@ -781,7 +781,7 @@ def _known_keys(location: tuple[int | str, ...]) -> str:
         section = fields[str(location[0])].annotation
         if isinstance(section, type) and issubclass(section, Section):
             fields = section.model_fields
-    return "known here: " + (", ".join(fields) or "none")
+    return "known keys: " + (", ".join(fields) or "none")
 
 
 def _one_line(error: Exception) -> str:

@@ -18,7 +18,7 @@ def test_settings_of_an_older_version_are_read_without_those_that_have_gone(capl
     older = text.replace("keyframes:\n", "keyframes:\n  shape: round\n") + "weather:\n  rain: true\n"
     assert config_from_yaml(older, "log.mcap") == config_from_yaml(text, "test")
     assert [record.getMessage() for record in caplog.records] == [
-        "log.mcap: left out what this version does not have: keyframes.shape, weather"
+        "log.mcap: ignored settings that this version does not have: keyframes.shape, weather"
     ]
     with pytest.raises(SegslamError, match=r"log\.mcap: keyframes\.distance_m: .* got -1"):
         config_from_yaml("keyframes: {distance_m: -1}", "log.mcap")

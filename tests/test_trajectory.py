@@ -94,7 +94,8 @@ def test_quaternion_that_is_no_rotation_is_named(tmp_path: Path, line: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"), [("", "contains no pose"), ("# nothing\n", "contains no pose"), ("1 2 3\n", "found 3 numbers")]
+    ("text", "complaint"),
+    [("", "contains no pose"), ("# nothing\n", "contains no pose"), ("1 2 3\n", "found 3 numbers")],
 )
 def test_file_without_poses_is_refused(tmp_path: Path, text: str, complaint: str) -> None:
     file = tmp_path / "poses.txt"

@@ -17,11 +17,11 @@ from segslam.config import USER_SETTINGS, Config, Section
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "options.md"
 INTRODUCTION = """# Every setting
 
-Generated from `segslam/config.py` by `python tools/options.py`; change it there.
+Generated from `segslam/config.py` by `python tools/options.py`; do not edit this page.
 
-Give what differs from the defaults in a YAML file, `--config strict.yaml`, or one setting after the other,
-`--set verify.min_overlap=0.4 --set map.color=height`. Unknown keys and values out of range are refused by name. A run
-keeps its settings in `config.yaml`, which `--config` reads again.
+Change settings with a YAML file that contains the differences from the defaults, `--config strict.yaml`, or one by one,
+`--set verify.min_overlap=0.4 --set map.color=height`. Unknown keys and values out of range are reported as errors. Each
+run stores its settings in `config.yaml`, which can be passed to `--config`.
 
 ```yaml
 verify:
@@ -31,10 +31,10 @@ keyframes:
 ```
 
 The source of a default is the paper (Yin et al., ICRA 2023), its authors' program, a library that uses the same value,
-a measurement, or a choice, with the data that decided it. [What decides a loop](decisions.md) has the numbers.
+a measurement, or a choice, with the data used. [Thresholds](decisions.md) has the numbers.
 """
 USERS = """
-## Settings that most users need
+## Settings for most users
 
 | setting | default | unit | allowed | meaning |
 |---|---|---|---|---|

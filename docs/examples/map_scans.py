@@ -1,4 +1,4 @@
-"""Map the scans of a folder, look at each step, and keep the trajectory.
+"""Map the scans of a folder, examine each step, and write the trajectory.
 
 python docs/examples/map_scans.py FOLDER poses.txt
 """

@@ -1,4 +1,4 @@
-"""Read a run's log: how its loops came out, and the cloud of one keyframe in the world.
+"""Read the log of a run: outcomes of its loop candidates, and the cloud of one keyframe in the world.
 
 python docs/examples/read_log.py RUN
 """

@@ -1,4 +1,4 @@
-"""Find the pose of one scan in another with no initial guess, from two arrays of x, y, z (and more) in files of NumPy.
+"""Find the pose of one scan in another without initial guess, from two .npy files with columns x, y, z (and more).
 
 python docs/examples/register_scans.py source.npy target.npy
 """

@@ -1,4 +1,4 @@
-"""Score any trajectory against the truth, both in KITTI's format, as `segslam eval --estimate --reference` does.
+"""Measure the error of a trajectory against ground truth, both in KITTI format, like `segslam eval --estimate A --reference B`.
 
 python docs/examples/score_trajectory.py poses_kitti.txt kitti/poses/00.txt
 """

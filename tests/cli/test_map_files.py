@@ -50,7 +50,7 @@ def test_export_tells_what_it_left_out(finished: Path, tmp_path: Path, capsys: p
     [
         (["map.stl"], "map.stl: unknown kind of map; its name must end in .ply, .pcd, .las, .laz, .png, .yaml"),
         (["no/such/map.ply"], "there is no folder"),
-        (["map.ply", "--set", "map.colour=height"], "unknown key map.colour; known here: voxel_m,"),
+        (["map.ply", "--set", "map.colour=height"], "unknown key map.colour; known keys: voxel_m,"),
         (["map.ply", "--set", "map.voxel_m=0"], "map.voxel_m: Input should be greater than or equal to 0.02, got 0"),
     ],
 )

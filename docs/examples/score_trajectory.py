@@ -1,4 +1,4 @@
-"""Measure the error of a trajectory against ground truth, both in KITTI format, like `segslam eval --estimate A --reference B`.
+"""Measure the error of a trajectory against ground truth, both in KITTI format, as `segslam eval` does.
 
 python docs/examples/score_trajectory.py poses_kitti.txt kitti/poses/00.txt
 """

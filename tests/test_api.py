@@ -48,7 +48,7 @@ def test_points_and_a_stamp_are_a_scan() -> None:
 
 
 @pytest.mark.parametrize("points", [np.zeros((4, 2)), np.zeros(6), [["x", "y", "z"]]])
-def test_what_are_no_points_is_refused(points: object) -> None:
+def test_other_arrays_than_points_are_rejected(points: object) -> None:
     with pytest.raises(segslam.SegslamError, match="points:"):
         segslam.Scan(points, 0)  # type: ignore[arg-type]
 

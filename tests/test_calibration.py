@@ -68,17 +68,17 @@ def test_a_drive_shows_the_angle_whichever_way_it_goes(direction: float) -> None
 
 
 @pytest.mark.parametrize("num", [0, 1, 2])
-def test_a_drive_shorter_than_a_pair_shows_nothing(num: int) -> None:
+def test_a_drive_shorter_than_a_pair_gives_no_angle(num: int) -> None:
     assert measured(2.0 * np.arange(num)) is None
 
 
-def test_a_standing_sensor_shows_nothing_however_long_its_jitter_grows() -> None:
+def test_a_standing_sensor_gives_no_angle_however_long_its_jitter_grows() -> None:
     places_m = 0.3 * np.tile([0.0, 1.0], 60)
     assert measured(places_m) is None
 
 
 @pytest.mark.parametrize("gap_m", [16.0, 31.0])
-def test_keyframes_farther_apart_than_a_pair_show_nothing(gap_m: float) -> None:
+def test_keyframes_farther_apart_than_a_pair_give_no_angle(gap_m: float) -> None:
     assert measured(gap_m * np.arange(40)) is None
 
 
@@ -88,25 +88,25 @@ def test_a_gap_in_the_drive_is_passed_over() -> None:
     assert found is None or found.angle_deg == pytest.approx(LOW_DEG, abs=0.03)
 
 
-def test_too_few_points_show_nothing() -> None:
+def test_too_few_points_give_no_angle() -> None:
     many = surface(seen(0.0, low_deg=0.1))
     few = surface(seen(0.0, low_deg=0.1)[: MIN_PAIRED // 2])
     assert register_with_angle(few, many, np.eye(4)) is None
     assert register_with_angle(many, few, np.eye(4)) is None
 
 
-def test_scans_that_do_not_meet_show_nothing() -> None:
+def test_scans_that_do_not_overlap_give_no_angle() -> None:
     far = geometry.transform(np.eye(3), [0.0, 0.0, 50.0])
     assert register_with_angle(surface(seen(0.0, low_deg=0.1)), surface(seen(5.0, low_deg=0.1)), far) is None
 
 
-def test_scans_of_one_place_do_not_know_the_angle() -> None:
+def test_scans_of_one_place_do_not_determine_the_angle() -> None:
     found = register_with_angle(surface(seen(0.0, low_deg=0.2, seed=1)), surface(seen(0.0, low_deg=0.2)), np.eye(4))
     assert found is None or np.degrees(found.sigma_rad) > 0.05
 
 
 @pytest.mark.parametrize(
-    ("metrics", "applied_deg", "said"),
+    ("metrics", "applied_deg", "expected"),
     [
         ({}, None, ""),
         ({"vertical_deg": 0.04, "vertical_sigma_deg": 0.01}, None, ""),
@@ -123,10 +123,10 @@ def test_scans_of_one_place_do_not_know_the_angle() -> None:
         ),
     ],
 )
-def test_only_a_significant_angle_is_told_with_the_setting_that_corrects_all_of_it(
-    metrics: dict[str, float], applied_deg: float | None, said: str
+def test_only_a_significant_angle_is_reported_with_the_setting_that_corrects_it(
+    metrics: dict[str, float], applied_deg: float | None, expected: str
 ) -> None:
-    assert vertical_angle_advice(metrics, SensorCalibrationConfig(vertical_angle_deg=applied_deg)) == said
+    assert vertical_angle_advice(metrics, SensorCalibrationConfig(vertical_angle_deg=applied_deg)) == expected
 
 
 @pytest.mark.data
@@ -134,7 +134,7 @@ def test_only_a_significant_angle_is_told_with_the_setting_that_corrects_all_of_
 def test_the_angle_that_readers_of_kitti_correct_is_found_in_its_scans(
     data_dir: Path, target: int, source: int
 ) -> None:
-    """One pair of real scans knows it to some 0.05 degrees; with and without the correction its error is the same."""
+    """One pair of real scans determines it to about 0.05 degrees, with and without the correction."""
     folder = data_dir / "kitti" / "sequences" / "00"
     T_camera_lidar = read_calibration(folder / "calib.txt")
     poses = lidar_from_camera(read_poses(data_dir / "kitti" / "poses" / "00.txt").T_a_b, T_camera_lidar)

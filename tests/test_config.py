@@ -13,7 +13,7 @@ def test_the_effective_settings_read_back_equal() -> None:
     assert config_from_yaml(config_to_yaml(config), "test") == config
 
 
-def test_settings_of_an_older_version_are_read_without_those_that_have_gone(caplog: pytest.LogCaptureFixture) -> None:
+def test_settings_of_an_older_version_are_read_without_removed_ones(caplog: pytest.LogCaptureFixture) -> None:
     text = config_to_yaml(load_config(None, ["keyframes.distance_m=3.5"]))
     older = text.replace("keyframes:\n", "keyframes:\n  shape: round\n") + "weather:\n  rain: true\n"
     assert config_from_yaml(older, "log.mcap") == config_from_yaml(text, "test")

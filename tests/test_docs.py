@@ -1,4 +1,4 @@
-"""The documents say what the code does: examples run, the options page is the code's, commands explain themselves."""
+"""The documents match the code: examples run, the options page is up to date, commands have help texts."""
 
 import json
 import re
@@ -62,9 +62,9 @@ def test_the_example_that_reads_a_log_counts_its_loops(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _run_example(monkeypatch, "read_log.py", make_run(tmp_path / "run").folder)
-    told = capsys.readouterr().out
-    assert "'accepted': 4" in told
-    assert "120 scans; keyframe 59 has 4 points" in told
+    output = capsys.readouterr().out
+    assert "'accepted': 4" in output
+    assert "120 scans; keyframe 59 has 4 points" in output
 
 
 @pytest.mark.data

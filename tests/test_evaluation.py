@@ -1,4 +1,4 @@
-"""Errors against evo and kiss_icp, against known answers, and where there is nothing to say."""
+"""Errors against evo and kiss_icp, against known answers, and undefined figures."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Loops that only the look of a place proposes: odometry is off by more than any search radius."""
+"""Loops found by place recognition only: the odometry error exceeds any search radius."""
 
 from functools import cache
 
@@ -26,7 +26,7 @@ def mapped(turn_deg: float, *settings: str) -> SlamResult:
     return slam.finish()
 
 
-def test_a_drive_whose_odometry_is_far_off_closes_by_the_look_of_its_places() -> None:
+def test_a_drive_whose_odometry_is_far_off_closes_by_place_recognition() -> None:
     truth = round_drive()[1]
     blind = mapped(FAR_DEG, "retrieval.enabled=false")
     assert not blind.closures()

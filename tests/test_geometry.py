@@ -58,7 +58,7 @@ def test_a_quarter_turn_to_the_left_takes_x_to_y() -> None:
     assert geometry.distance(T_a_b) == 1.0
 
 
-def test_nearest_rotation_mends_rounding_and_never_mirrors() -> None:
+def test_nearest_rotation_removes_rounding_and_never_mirrors() -> None:
     rounded = np.round(geometry.yaw(0.3), 4)
     mended = geometry.nearest_rotation(rounded)
     np.testing.assert_allclose(mended @ mended.T, np.eye(3), atol=EXACT)

@@ -1,4 +1,4 @@
-"""Real drives with default settings: where KISS-ICP slips, and where it is sound."""
+"""Real drives with default settings, with and without failures of KISS-ICP."""
 
 from functools import partial
 from pathlib import Path

@@ -54,7 +54,7 @@ def test_too_few_points_are_rejected(points: np.ndarray) -> None:
     assert found.reason is RejectReason.TOO_FEW_POINTS
 
 
-def test_scans_that_do_not_meet_are_rejected() -> None:
+def test_scans_that_do_not_overlap_are_rejected() -> None:
     rng = np.random.default_rng(1)
     seen = surface(corner(rng))
     found = refine(seen, seen, geometry.transform(np.eye(3), [500.0, 0.0, 0.0]), config=CONFIG)

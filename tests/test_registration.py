@@ -63,7 +63,7 @@ def test_a_gate_sees_the_refined_pose_too_which_moves_no_farther() -> None:
     assert seen[1][1] < 0.05
 
 
-def test_what_moves_is_in_neither_surface_nor_view() -> None:
+def test_moving_classes_are_in_neither_surface_nor_free_space() -> None:
     points = round_drive()[0][0].points
     labels = np.full(len(points), Label.BUILDING, dtype=np.uint8)
     ahead = points[:, 0] > 0.0
@@ -86,7 +86,7 @@ def test_the_view_of_gathered_points_is_that_of_the_scan_in_their_middle() -> No
 @pytest.mark.parametrize(
     "points", [np.empty((0, 3)), np.zeros((50, 3)), np.column_stack([np.linspace(5, 50, 500), np.zeros((500, 2))])]
 )
-def test_scans_that_say_nothing_are_rejected(points: np.ndarray) -> None:
+def test_scans_without_usable_points_are_rejected(points: np.ndarray) -> None:
     labels = np.ones(len(points), dtype=np.uint8)
     assert isinstance(register(points, points, source_labels=labels, target_labels=labels), Rejected)
     assert isinstance(register(points, points), Rejected)

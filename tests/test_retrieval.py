@@ -1,4 +1,4 @@
-"""Places by their look."""
+"""Place recognition."""
 
 import math
 
@@ -44,7 +44,7 @@ def test_a_place_is_found_under_any_yaw_and_a_sideways_shift(yaw_deg: float) -> 
     assert abs((apart_deg + 90.0) % 180.0 - 90.0) <= 3.0  # the yaw is known up to half a turn, in steps of 3 degrees
 
 
-def test_the_best_of_a_shortlist_come_first_and_older_places_may_be_asked_for_alone() -> None:
+def test_the_best_of_a_shortlist_come_first_and_it_may_be_limited_to_older_places() -> None:
     index = places(12)
     signature = signature_of_standing(street(5))
     found = index.shortlist(signature, most=4)
@@ -66,7 +66,7 @@ def test_a_signature_is_small_and_comes_back_from_its_bytes() -> None:
         PlaceSignature.from_bytes(data[1:])
 
 
-def test_the_ground_a_leaning_sensor_and_moving_things_do_not_change_a_place() -> None:
+def test_ground_tilt_and_moving_objects_do_not_change_a_signature() -> None:
     config = Config().geometric
     x, y = np.meshgrid(np.arange(-30, 30, 0.4), np.arange(-30, 30, 0.4))
     ground = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.8)])

@@ -1,4 +1,4 @@
-"""Continuous mapping: five minutes, or as long as SEGSLAM_SOAK_S says (3600 for the hour).
+"""Continuous mapping: five minutes, or SEGSLAM_SOAK_S seconds (3600 for the hour).
 
 SEGSLAM_SOAK_S=3600 bash tools/test.sh -m slow tests/test_soak.py
 """
@@ -33,7 +33,7 @@ FULL = 300
 
 
 class Rounds:
-    """The same round again and again, for as long as it is asked; a `Dataset`."""
+    """Repeats one round for a given time; a `Dataset`."""
 
     name = "rounds"
     labels = UNLABELLED
@@ -71,7 +71,7 @@ def _rss_mb(log: Path) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_mapping_goes_on_and_on_without_a_leak_a_lag_or_a_lost_record(tmp_path: Path) -> None:
+def test_continuous_mapping_has_no_leak_lag_or_lost_record(tmp_path: Path) -> None:
     rounds = Rounds(SECONDS)
     config = load_config(None, ["odometry.min_range_m=1", "proximity.min_travel_m=60"])
     slam = Slam(config, odometry=GivenOdometry(rounds.poses(), config.odometry))

@@ -1,4 +1,4 @@
-"""What is imported before a command says its first word: the larger libraries only where they are used."""
+"""Imports before the first message of a command: large libraries are imported only where they are used."""
 
 import json
 import subprocess
@@ -39,7 +39,7 @@ def test_help_and_version_import_no_library_but_typer(arguments: tuple[str, ...]
         (("replay", ".", "--out", "r", "--set", "odometry.size=1"), "unknown key odometry.size"),
     ],
 )
-def test_a_wrong_option_file_or_setting_is_told_before_the_work_is_loaded(
+def test_a_wrong_option_file_or_setting_is_reported_before_large_libraries_are_imported(
     arguments: tuple[str, ...], message: str
 ) -> None:
     status, modules, text = _imported(*arguments)
@@ -70,7 +70,7 @@ for command in json.loads(sys.argv[1]):
 """Each command until it writes to its terminal, in a copy of a process that has only loaded the command line."""
 
 
-def test_every_command_that_takes_long_says_a_word_before_it_loads_the_larger_libraries(tmp_path: Path) -> None:
+def test_every_long_command_prints_a_message_before_it_imports_large_libraries(tmp_path: Path) -> None:
     folder, file = str(tmp_path), str(tmp_path / "there.bin")
     Path(file).touch()
     commands = [

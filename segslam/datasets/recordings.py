@@ -202,9 +202,9 @@ def open_recording(
     source = _scans_folder(data) if kind == "generic" else data
     if kind == "generic":
         _check_one_kind(source)
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said), warnings.catch_warnings():
+        with contextlib.redirect_stdout(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings about kiss_icp's sources, which it parses to find its readers
             if kind == "mcap":
                 loader: Any = McapClouds(source, topic)
@@ -218,7 +218,7 @@ def open_recording(
             raise SegslamError(
                 f"{source}: its first scan has no readable points x y z; copy the file again, or remove it"
             ) from error
-        complaint = " ".join(said.getvalue().split()) if isinstance(error, SystemExit) else _reason(error)
+        complaint = " ".join(printed.getvalue().split()) if isinstance(error, SystemExit) else _reason(error)
         raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset") from error
     if num_scans == 0:
         raise SegslamError(f"{data}: the reader for {kind} data finds no scan in it; see --dataset")

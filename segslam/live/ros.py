@@ -97,15 +97,15 @@ class TopicSource:
         """Put the clouds of all publishers, until `stopped` is set."""
         executor = SingleThreadedExecutor(context=self._context)
         executor.add_node(self._node)
-        started, next_look, has_told = monotonic(), 0.0, False
+        started, next_look, has_listed = monotonic(), 0.0, False
         with suppress(ExternalShutdownException):
             while not stopped.is_set():
                 if monotonic() >= next_look:
                     self._follow_publishers(waiting)
                     next_look = monotonic() + LOOK_EVERY_S
-                if self._subscription is None and not has_told and monotonic() > started + PATIENCE_S:
+                if self._subscription is None and not has_listed and monotonic() > started + PATIENCE_S:
                     self._tell(f"{self._topic}: no publisher yet; {self._other_topics()}")
-                    has_told = True
+                    has_listed = True
                 executor.spin_once(timeout_sec=0.1)
             executor.shutdown()
             return ""

@@ -73,7 +73,7 @@ def test_a_list_can_be_cut_from_the_true_poses_and_sampled(data: Path, capsys: p
     assert json.loads(capsys.readouterr().out)["segregator"]["num_pairs"] == 2
 
 
-def test_the_report_tells_figures_paper_and_conditions_and_draws_failures(
+def test_the_report_has_figures_paper_and_conditions_and_draws_failures(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """GICP from the identity fails where 12 m and 40 degrees lie between the scans, which gives something to draw."""
@@ -121,7 +121,7 @@ def test_deterioration_takes_labels_from_one_scan_or_both(
     assert "| 100 | 0.0 | 0.0 |" in (tmp_path / "both" / "report.md").read_text()
 
 
-def test_timing_tells_the_time_of_each_stage(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_timing_prints_the_time_of_each_stage(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert bench("timing", data, "--json") == 0
     own = json.loads(capsys.readouterr().out)["segregator"]
     assert own["stage_ms"]["prepare_ms"] > 0
@@ -130,7 +130,7 @@ def test_timing_tells_the_time_of_each_stage(data: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "expected"),
     [
         (["--method", "magic"], "magic"),
         (["--min-m", "3"], "not both"),
@@ -140,11 +140,11 @@ def test_timing_tells_the_time_of_each_stage(data: Path, capsys: pytest.CaptureF
     ],
 )
 def test_bad_usage_is_named_in_one_line(
-    data: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+    data: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
 ) -> None:
     assert bench("pairs", data, *options) == 2
     message = capsys.readouterr().err.strip()
-    assert said in message
+    assert expected in message
     assert len(message.splitlines()) == 1
 
 

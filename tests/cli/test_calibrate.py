@@ -42,7 +42,7 @@ def calibrated(data: Path, capsys: pytest.CaptureFixture[str], *options: str) ->
     return json.loads(capsys.readouterr().out)
 
 
-def test_the_angle_is_measured_and_what_is_left_over_after_setting_it_is_none(
+def test_the_angle_is_measured_and_no_error_remains_after_setting_it(
     yard: Path, given: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = calibrated(yard, capsys)
@@ -63,13 +63,13 @@ def test_a_run_reports_the_angle_with_the_setting_that_corrects_it(
     assert run("map", yard, "--out", tmp_path / "run", *options) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["vertical_deg"] == pytest.approx(0.3, abs=0.06)
-    said = f"beams point {metrics['vertical_deg']:.2f} +- {metrics['vertical_sigma_deg']:.2f} degrees low; "
-    said += f"map again with --set sensor.vertical_angle_deg={metrics['vertical_deg']:.2f}"
-    assert said in capsys.readouterr().err
-    assert said in (tmp_path / "run" / "report.html").read_text()
+    expected = f"beams point {metrics['vertical_deg']:.2f} +- {metrics['vertical_sigma_deg']:.2f} degrees low; "
+    expected += f"map again with --set sensor.vertical_angle_deg={metrics['vertical_deg']:.2f}"
+    assert expected in capsys.readouterr().err
+    assert expected in (tmp_path / "run" / "report.html").read_text()
 
 
-def test_a_drive_too_short_for_the_angle_claims_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_drive_too_short_for_the_angle_gives_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_kitti_sequence(tmp_path, num_scans=6)
     found = calibrated(tmp_path, capsys)
     assert (found["vertical_deg"], found["sigma_deg"], found["num_pairs"]) == (None, None, 0)

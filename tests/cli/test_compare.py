@@ -43,7 +43,7 @@ def test_figures_and_picture_of_several_runs(
 
 
 @pytest.mark.parametrize(
-    ("second", "options", "said"),
+    ("second", "options", "expected"),
     [
         ("nowhere", (), "nowhere: no such file or folder"),
         ("one", (), "two or more different runs"),
@@ -51,12 +51,12 @@ def test_figures_and_picture_of_several_runs(
         ("two", ("--plot", "nowhere/both.png"), "there is no folder nowhere"),
     ],
 )
-def test_what_cannot_be_compared_is_told_in_one_line(
-    runs: list[Path], capsys: pytest.CaptureFixture[str], second: str, options: tuple[str, ...], said: str
+def test_runs_that_cannot_be_compared_are_reported_in_one_line(
+    runs: list[Path], capsys: pytest.CaptureFixture[str], second: str, options: tuple[str, ...], expected: str
 ) -> None:
     assert run("compare", runs[0], runs[0].parent / second, *options) == 2
     message = capsys.readouterr().err.strip()
-    assert said in message
+    assert expected in message
     assert len(message.splitlines()) == 1
 
 
@@ -91,6 +91,6 @@ def test_the_doctor_names_the_remedy_of_what_is_missing(
     monkeypatch.setattr(doctor, "_version", lambda name: None if name == "kiss-icp" else version(name))
     monkeypatch.setattr(doctor, "_loads", lambda name: name != "libGL.so.1")
     assert run("doctor") == 1
-    told = capsys.readouterr().out
-    assert "pip install kiss-icp" in told
-    assert "apt-get install libgl1" in told
+    output = capsys.readouterr().out
+    assert "pip install kiss-icp" in output
+    assert "apt-get install libgl1" in output

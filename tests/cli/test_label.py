@@ -23,7 +23,7 @@ SENSOR = {"field_of_view_deg": [-22.8, 22.5], "height": 64, "width": 1024}
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Scans whose intensities are the learning ids; the second has rows that are no return."""
+    """Scans whose intensities are the learning ids; the second has rows without return."""
     root = tmp_path_factory.mktemp("drive")
     for file in sorted(write_kitti_sequence(root, num_scans=NUM_SCANS).glob("*.bin")):
         returns = np.fromfile(file, "<f4").reshape(-1, 4)
@@ -70,7 +70,7 @@ def test_files_read_back_as_the_labels_a_row_for_each_of_the_scan(
     assert (again[1].labels != Label.UNLABELLED).mean() > 0.99
 
 
-def test_scores_tell_a_network_from_one_whose_classes_are_shifted_by_one(
+def test_scores_drop_for_a_network_whose_classes_are_shifted_by_one(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "shifted").mkdir()
@@ -112,18 +112,18 @@ def test_pictures_show_each_class_in_its_colour(
         assert (np.abs(picture - color).max(axis=-1) <= 1).sum() > 200, label
 
 
-def test_a_person_reads_a_line_for_each_class(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_has_a_line_for_each_class(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--labels", "true_labels", "--truth", "true_labels", "--pictures", 0)
     assert run("label", drive, "--out", tmp_path / "out", *options) == 0
-    told = capsys.readouterr()
-    assert "label: 3/3" in told.err
-    assert "building" in told.out
-    assert "mean IoU 1.000" in told.out
+    output = capsys.readouterr()
+    assert "label: 3/3" in output.err
+    assert "building" in output.out
+    assert "mean IoU 1.000" in output.out
     assert not list((tmp_path / "out").glob("*.png"))
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "expected"),
     [
         (("--labels", "none", "--write-as", "learning-0"), "learning-0 has no id for unlabelled"),
         (("--labels", "geometric", "--truth", "nowhere"), "--truth nowhere: no folder"),
@@ -131,20 +131,20 @@ def test_a_person_reads_a_line_for_each_class(drive: Path, tmp_path: Path, capsy
         (("--labels", "geometric", "--frames", "7:9"), "no such scan"),
     ],
 )
-def test_what_cannot_be_done_is_said(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], said: str
+def test_bad_usage_is_reported(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], expected: str
 ) -> None:
     assert run("label", drive, "--out", tmp_path / "out", *options) == 2
-    assert said in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
-def test_nothing_that_is_there_is_overwritten(drive: Path, tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(drive: Path, tmp_path: Path) -> None:
     (tmp_path / "000000.label").write_bytes(b"mine")
     assert run("label", drive, "--out", tmp_path, "--labels", "true_labels") == 2
     assert (tmp_path / "000000.label").read_bytes() == b"mine"
 
 
-def test_a_broken_scan_is_left_out_with_a_warning(
+def test_an_unreadable_scan_is_skipped_with_a_warning(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     root = tmp_path / "kitti"
@@ -176,7 +176,7 @@ def test_scores_are_intersections_over_unions_of_the_points_whose_class_is_known
 
 
 @pytest.mark.data
-def test_labels_by_shape_on_real_scans_score_as_measured(
+def test_geometric_labels_on_real_scans_score_as_measured(
     data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ("--labels", "geometric", "--frames", "0:1", "--truth", data_dir / "kitti/sequences/00/labels")

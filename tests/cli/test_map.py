@@ -48,7 +48,7 @@ def test_map_writes_a_whole_run_and_skips_the_bad_scan(
     assert metrics["num_motions_broken"] == 0, "a missing scan breaks nothing"
 
 
-def test_a_run_folder_is_never_written_over(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_folder_is_never_overwritten(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis.txt").write_text("results")
     assert run("map", kitti, "--out", tmp_path) == 2
     assert "not empty" in capsys.readouterr().err
@@ -56,7 +56,7 @@ def test_a_run_folder_is_never_written_over(kitti: Path, tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "expected"),
     [
         (["--set", "keyframes.distance=1"], "keyframes.distance"),
         (["--sequence", "07"], "07"),
@@ -67,18 +67,18 @@ def test_a_run_folder_is_never_written_over(kitti: Path, tmp_path: Path, capsys:
         (["--dataset", "kitty"], "kitty"),
     ],
 )
-def test_bad_usage_says_what_is_wrong_in_one_line_and_writes_nothing(
-    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+def test_bad_usage_is_reported_in_one_line_and_nothing_is_written(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
 ) -> None:
     out = tmp_path / "run"
     assert run("map", kitti, "--out", out, *options) == 2
     message = capsys.readouterr().err.strip()
-    assert said in message
+    assert expected in message
     assert len(message.splitlines()) == 1
     assert not out.exists()
 
 
-def test_an_odometry_is_taken_as_given(kitti: Path, tmp_path: Path) -> None:
+def test_a_given_odometry_is_used_unchanged(kitti: Path, tmp_path: Path) -> None:
     given = tmp_path / "given.txt"
     write_kitti(given, round_drive()[1].T_world_lidar)
     assert run("map", kitti, "--out", tmp_path / "run", "--odometry", given, "--quiet") == 0

@@ -38,15 +38,17 @@ def test_export_draws_the_map_before_and_after_loop_closing(
     assert json.loads(capsys.readouterr().out)["num_map_points"] > 0
 
 
-def test_export_tells_what_it_left_out(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_prints_the_number_of_removed_points(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("export", finished, tmp_path / "map.ply") == 0
-    told = capsys.readouterr().err
-    assert "0 points by class" in told
-    assert f"map in {tmp_path / 'map.ply'}" in told
+    output = capsys.readouterr().err
+    assert "0 points by class" in output
+    assert f"map in {tmp_path / 'map.ply'}" in output
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "output"),
     [
         (["map.stl"], "map.stl: unknown kind of map; its name must end in .ply, .pcd, .las, .laz, .png, .yaml"),
         (["no/such/map.ply"], "there is no folder"),
@@ -55,13 +57,13 @@ def test_export_tells_what_it_left_out(finished: Path, tmp_path: Path, capsys: p
     ],
 )
 def test_export_refuses_with_one_line(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], told: str
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], output: str
 ) -> None:
     status = run("export", finished, tmp_path / arguments[0], *arguments[1:])
     message = capsys.readouterr().err.strip().splitlines()[-1]
     assert status == 2
     assert message.startswith("segslam: ")
-    assert told in message
+    assert output in message
     assert list(tmp_path.iterdir()) == []
 
 
@@ -71,7 +73,7 @@ def test_an_unfinished_run_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "did not finish" in capsys.readouterr().err
 
 
-def test_map_writes_the_map_with_the_run_and_a_finished_run_is_given_what_it_lacks(
+def test_map_writes_the_map_with_the_run_and_adds_missing_maps_to_a_finished_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     kitti = tmp_path / "kitti"
@@ -85,7 +87,9 @@ def test_map_writes_the_map_with_the_run_and_a_finished_run_is_given_what_it_lac
     assert (out / "grid.pgm").is_file()
 
 
-def test_a_map_that_cannot_be_made_costs_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_that_cannot_be_made_does_not_affect_other_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def no_room(*_: object, **__: object) -> None:
         raise WorkFailed("no room")
 

@@ -46,7 +46,7 @@ def poses(graph: G2oGraph) -> np.ndarray:
 
 
 @pytest.mark.parametrize("robust", ["none", "huber", "cauchy", "geman-mcclure", "gnc", "consistent"])
-def test_exact_edges_bring_every_vertex_home(robust: str) -> None:
+def test_exact_edges_give_the_exact_poses(robust: str) -> None:
     graph, truth = square()
     result = optimize_graph(graph, robust=robust)
     np.testing.assert_allclose(poses(result.graph), truth, atol=1e-4)
@@ -115,7 +115,7 @@ def test_errors_are_half_the_chi_square_under_every_kernel(robust: str) -> None:
         assert found.robust_cost < (1.0 - 1e-6) * found.final_error
 
 
-def test_a_result_that_does_not_fit_says_so() -> None:
+def test_a_result_that_does_not_fit_is_reported() -> None:
     """Odometry is always kept: with one wrong motion, nothing fits."""
     graph, _ = square()
     wrong = graph.edges[20]
@@ -143,8 +143,8 @@ def test_fixed_vertices_stay_where_they_are() -> None:
         np.testing.assert_allclose(result.T_world_vertex[vertex], graph.T_world_vertex[vertex], atol=1e-2)
 
 
-def test_a_hopeless_guess_is_replaced_by_a_better_one() -> None:
-    """All vertices at one place with random headings: the nearest optimum is none of the graph's."""
+def test_a_bad_initial_guess_is_replaced() -> None:
+    """All vertices at one place with random headings: the nearest optimum is wrong."""
     graph, truth = square()
     rng = np.random.default_rng(3)
     guesses = {i: geometry.transform(geometry.yaw(rng.uniform(-np.pi, np.pi)), np.zeros(3)) for i in range(1, 36)}
@@ -200,7 +200,7 @@ def test_three_hundred_false_edges_of_a_published_graph_are_all_found(data_dir: 
     assert found.converged
 
 
-def test_the_command_prints_the_robust_cost_and_that_a_result_may_be_wrong(tmp_path: Path) -> None:
+def test_the_command_prints_the_robust_cost_and_reports_doubtful_results(tmp_path: Path) -> None:
     graph, _ = square()
     wrong = [Edge(e.a, e.b, np.eye(4), e.information) if e is graph.edges[20] else e for e in graph.edges]
     write_g2o(tmp_path / "in.g2o", G2oGraph(graph.T_world_vertex, wrong))

@@ -1,5 +1,5 @@
-"""What scripts count on, of every command: `--json` prints one object (`locate`: a list) alone, `--quiet` is heard only
-where it fails.
+"""Interface of every command for scripts: `--json` prints one object (`locate`: a list) alone, `--quiet` prints
+failures only.
 
 File descriptors are watched, so that what libraries print without Python counts too.
 """
@@ -45,7 +45,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _mapped(data: Path, out: Path) -> Path:
-    """The folder of a finished run, made without a word."""
+    """The folder of a finished run, made without output."""
     assert run("map", data, "--out", out, "--labels", "true_labels", "--quiet") == 0
     return out
 
@@ -116,7 +116,7 @@ def test_json_is_one_value_and_nothing_else(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_quiet_says_nothing_that_is_no_failure(
+def test_quiet_prints_failures_only(
     name: str,
     data: Path,
     finished: Path,
@@ -129,6 +129,6 @@ def test_quiet_says_nothing_that_is_no_failure(
     assert capfd.readouterr().err == ""
 
 
-def test_quiet_still_tells_of_a_failure(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_quiet_still_prints_a_failure(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert run("map", tmp_path / "nowhere", "--out", tmp_path / "out", "--quiet") == 2
     assert capfd.readouterr().err.startswith("segslam: ")

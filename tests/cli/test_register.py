@@ -42,7 +42,7 @@ def test_register_prints_the_pose_as_json(
     assert ("refine" in figures["seconds"]) == refine
 
 
-def test_a_rejection_is_an_answer_with_a_reason_a_line_and_a_status_of_its_own(
+def test_a_rejection_has_a_reason_one_line_and_exit_status_1(
     files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     np.save(tmp_path / "wall.npy", np.column_stack([np.full(500, 5.0), np.linspace(-9, 9, 500), np.zeros(500)]))
@@ -57,7 +57,7 @@ def test_a_rejection_is_an_answer_with_a_reason_a_line_and_a_status_of_its_own(
 
 
 def test_labels_are_taken_in_one_option_or_in_two(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
-    """Given the wrong way round: that their numbers do not fit is found only if both were taken."""
+    """Swapped labels: the wrong numbers are detected only if both files are read."""
     labels = files["target_labels"], files["source_labels"]
     for given in (["--labels", *labels], ["--labels", labels[0], "--labels", labels[1]]):
         assert run("register", files["source"], files["target"], *given) == 2
@@ -65,7 +65,7 @@ def test_labels_are_taken_in_one_option_or_in_two(files: dict[str, Path], capsys
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "expected"),
     [
         (["missing.bin", "{target}"], "missing.bin"),
         (["{source}", "{target}", "--method", "magic"], "magic"),
@@ -76,11 +76,11 @@ def test_labels_are_taken_in_one_option_or_in_two(files: dict[str, Path], capsys
     ],
 )
 def test_bad_input_is_named_in_one_line(
-    files: dict[str, Path], capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+    files: dict[str, Path], capsys: pytest.CaptureFixture[str], arguments: list[str], expected: str
 ) -> None:
     assert run("register", *(argument.format(**files) for argument in arguments)) == 2
     message = capsys.readouterr().err.strip()
-    assert said in message
+    assert expected in message
     assert len(message.splitlines()) == 1
 
 

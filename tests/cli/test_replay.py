@@ -62,7 +62,7 @@ def test_a_replay_with_the_same_settings_repeats_the_run(
     np.testing.assert_allclose(poses_before.T_world_lidar, poses_after.T_world_lidar, rtol=0, atol=1e-9)
 
 
-def test_other_settings_change_the_loops_and_the_change_is_told(
+def test_other_settings_change_the_loops_and_the_change_is_printed(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     overlaps = [a.outcome.alignment.overlap for a in _attempts(log) if isinstance(a.outcome, LoopClosure)]
@@ -72,8 +72,8 @@ def test_other_settings_change_the_loops_and_the_change_is_told(
     assert run("replay", log, "--out", out, "--config", strict) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["num_loops_lost"] > 0
-    told = f"{metrics['num_loops_won']} loops more, {metrics['num_loops_lost']} fewer"
-    assert told in capsys.readouterr().err
+    output = f"{metrics['num_loops_won']} loops more, {metrics['num_loops_lost']} fewer"
+    assert output in capsys.readouterr().err
     settings = read_log(out / "log.mcap").config
     assert settings.verify.min_overlap == pytest.approx(np.median(overlaps), abs=1e-5)
     assert settings.proximity == CONFIG.proximity, "what the log says and nobody changed stays"
@@ -98,7 +98,7 @@ def test_a_cut_log_is_replayed_up_to_the_cut(log: Path, tmp_path: Path) -> None:
     assert "recorded_ate_m" not in metrics
 
 
-def test_what_is_no_log_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_not_a_log_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "log.mcap").write_text("scans")
     assert run("replay", tmp_path / "log.mcap", "--out", tmp_path / "out") == 2
     assert "give the log.mcap of a run" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`segslam resume` and `map --dry-run` as typed: a run says itself how it began."""
+"""`segslam resume` and `map --dry-run` on the command line: data and options are read from the log."""
 
 import json
 import shutil
@@ -32,7 +32,7 @@ def whole(kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def cut(whole: Path, tmp_path: Path) -> Path:
-    """What is left of the run when the machine was switched off half-way."""
+    """The run after a power failure half-way."""
     out = tmp_path / "run"
     out.mkdir()
     log = (whole / "log.mcap").read_bytes()
@@ -64,9 +64,7 @@ def test_the_rate_of_a_resumed_run_is_that_of_the_scans_mapped_now(
     assert num_new / metrics["scans_per_second"] < metrics["seconds_total"]  # which has the reading of the log in it
 
 
-def test_data_that_are_gone_are_named(
-    kitti: Path, cut: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_missing_data_is_reported(kitti: Path, cut: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     log = (cut / "log.mcap").read_bytes()
     shutil.move(kitti, tmp_path / "away")
     try:

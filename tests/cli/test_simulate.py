@@ -21,7 +21,7 @@ def simulate(*arguments: object) -> int:
     return int(ended.value.code or 0)
 
 
-def test_it_writes_the_asked_number_of_scans(tmp_path, capsys):
+def test_it_writes_the_requested_number_of_scans(tmp_path, capsys):
     assert simulate(tmp_path / "out", "--frames", 2, "--sensor", "vlp16", "--sequence", "05") == 0
     dataset = open_dataset(tmp_path / "out", sequence="05")
     assert len(dataset) == 2
@@ -51,13 +51,13 @@ def test_it_follows_a_pose_file(tmp_path):
         (("--set", "cars=3"), "world.key=value"),
     ],
 )
-def test_bad_usage_is_refused_in_words(tmp_path, capsys, arguments, complaint):
+def test_bad_usage_is_reported(tmp_path, capsys, arguments, complaint):
     assert simulate(tmp_path / "out", *arguments) == 2
     assert complaint in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
-def test_what_is_there_is_kept_unless_overwriting_is_asked_for(tmp_path, capsys):
+def test_existing_data_is_kept_without_the_option_overwrite(tmp_path, capsys):
     asked = (tmp_path / "out", "--frames", 1, "--sensor", "vlp16", "--quiet")
     assert simulate(*asked) == 0
     assert simulate(*asked) == 2
@@ -77,11 +77,11 @@ def test_ctrl_c_leaves_a_shorter_sequence(tmp_path):
         try:
             wait_for(tmp_path / "sequences/00/velodyne/000003.bin")
             run.send_signal(signal.SIGINT)
-            _, said = run.communicate(timeout=60)
+            _, expected = run.communicate(timeout=60)
         finally:
             run.kill()
     assert run.returncode == 130
-    assert "scans are complete" in said
+    assert "scans are complete" in expected
     dataset = open_dataset(tmp_path, sequence="00")
     assert 4 <= len(dataset) < 5000
     assert [scan.index for scan in dataset] == list(range(len(dataset)))
@@ -95,7 +95,7 @@ def wait_for(file: Path) -> None:
     pytest.fail(f"{file} did not appear within a minute")
 
 
-def test_it_writes_only_the_scans_that_lists_of_pairs_name(tmp_path):
+def test_it_writes_only_the_scans_in_the_lists_of_pairs(tmp_path):
     (tmp_path / "pairs.txt").write_text("1 4\n4 2\n")
     chosen = ("--pairs", tmp_path / "pairs.txt", "--sample", 2)
     assert simulate(tmp_path / "some", *chosen, "--sensor", "vlp16", "--quiet") == 0

@@ -1,4 +1,4 @@
-"""Commands under a pseudo-terminal, as a person runs them: pipes hide what a progress bar does."""
+"""Commands under a pseudo-terminal, because a progress bar behaves differently in a pipe."""
 
 import json
 import re

@@ -10,7 +10,7 @@ def _warm_up() -> int:
     return int(ended.value.code or 0)
 
 
-def test_it_compiles_each_kernel_and_says_so(
+def test_it_compiles_each_kernel_and_reports_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(kernels, "are_built", lambda: False)
@@ -19,7 +19,7 @@ def test_it_compiles_each_kernel_and_says_so(
     assert f"{kernels.num_kernels()} kernels were compiled" in capsys.readouterr().err
 
 
-def test_it_says_when_there_is_nothing_to_compile(
+def test_it_reports_when_all_kernels_are_compiled(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(kernels, "are_built", lambda: True)

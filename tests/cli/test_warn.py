@@ -1,4 +1,4 @@
-"""What a person sees of warnings."""
+"""Printed warnings."""
 
 import logging
 import subprocess
@@ -13,7 +13,7 @@ from segslam.cli.warn import FirstOfEachKind
 pytestmark = pytest.mark.usefixtures("blank_reports")
 
 
-def test_first_of_each_kind_is_told_and_the_rest_counted(capsys: pytest.CaptureFixture[str]) -> None:
+def test_first_warning_of_each_kind_is_printed_and_the_others_counted(capsys: pytest.CaptureFixture[str]) -> None:
     handler = FirstOfEachKind()
     logger = logging.getLogger("segslam.test_warnings")
     logger.addHandler(handler)
@@ -39,8 +39,8 @@ def test_many_bad_scans_make_two_lines(tmp_path: Path) -> None:
         points.tofile(tmp_path / f"{number}.bin")
     command = [sys.executable, "-m", "segslam", "map", str(tmp_path), "--out", str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    told = [line for line in done.stderr.splitlines() if "none of its 50 points" in line]
-    assert len(told) == 2
-    assert "scan 1" in told[0]
-    assert told[1].startswith("segslam: 4 more warnings like this:")
+    output = [line for line in done.stderr.splitlines() if "none of its 50 points" in line]
+    assert len(output) == 2
+    assert "scan 1" in output[0]
+    assert output[1].startswith("segslam: 4 more warnings like this:")
     assert "5 scans skipped (unreadable or empty)" in done.stderr

@@ -91,7 +91,7 @@ def test_complete_graph_is_one_clique() -> None:
     assert [len(clique) for clique in search.cliques] == [500]
 
 
-def test_no_more_cliques_are_given_than_asked_for() -> None:
+def test_no_more_cliques_are_returned_than_requested() -> None:
     flags = ~np.eye(8, dtype=bool)
     flags[0, 1] = flags[1, 0] = flags[2, 3] = flags[3, 2] = False
     assert len(maximum_cliques(pack_rows(flags), max_cliques=3, max_nodes=ENOUGH).cliques) == 3
@@ -99,7 +99,7 @@ def test_no_more_cliques_are_given_than_asked_for() -> None:
 
 
 @pytest.mark.parametrize("max_nodes", [1, 10, 1000])
-def test_search_that_is_cut_short_says_so_and_gives_a_true_clique(max_nodes: int) -> None:
+def test_a_limited_search_is_reported_and_gives_a_clique(max_nodes: int) -> None:
     flags = random_graph(np.random.default_rng(1), 300, 0.7)
     for max_cliques in (1, 5):
         search = maximum_cliques(pack_rows(flags), max_cliques=max_cliques, max_nodes=max_nodes)

@@ -113,7 +113,7 @@ def test_poses_of_another_length_than_the_times_are_refused(tmp_path: Path) -> N
         _open(tmp_path)
 
 
-def test_a_file_of_three_values_a_point_is_no_scan(tmp_path: Path) -> None:
+def test_a_file_of_three_values_per_point_is_rejected(tmp_path: Path) -> None:
     """Even where its length fits: read by fours, x, y and z fall into every column by turns."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(12_000, 3)) * [20.0, 12.0, 0.8]
@@ -139,22 +139,22 @@ def test_no_real_scan_is_taken_for_one_of_other_columns(data_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("times", ["0 0.1 0.05 0.2", "0 0 0 0", "-1 -0.9 -0.8 -0.7"])
-def test_times_that_do_not_rise_are_refused_with_their_line(tmp_path: Path, times: str) -> None:
+def test_times_that_do_not_ascend_are_rejected_with_their_line(tmp_path: Path, times: str) -> None:
     (tmp_path / "times.txt").write_text(times.replace(" ", "\n"))
     with pytest.raises(SegslamError, match=r"times\.txt:[123]: .* times must ascend and not be negative"):
         read_stamps(tmp_path / "times.txt")
 
 
-def test_frames_that_the_data_do_not_have_are_told(caplog: pytest.LogCaptureFixture) -> None:
-    for frames, said in (("-1:3", "write A:B"), ("3:1", "selects no scan"), ("9:12", "has no such scan")):
-        with pytest.raises(SegslamError, match=said):
+def test_frames_that_the_data_does_not_have_are_reported(caplog: pytest.LogCaptureFixture) -> None:
+    for frames, expected in (("-1:3", "write A:B"), ("3:1", "selects no scan"), ("9:12", "has no such scan")):
+        with pytest.raises(SegslamError, match=expected):
             selected_rows(np.arange(4), frames, Path("drive"))
     assert len(selected_rows(np.arange(4), "0:100", Path("drive"))) == 4
     assert "the last scan of drive is 3" in caplog.text
 
 
 @pytest.mark.parametrize(("asked_deg", "applied_deg"), [(None, 0.205), (0.0, 0.0), (0.3, 0.3)])
-def test_scans_are_raised_by_the_angle_asked_for_and_by_default_by_kitti_s(
+def test_scans_are_raised_by_the_given_angle_and_by_default_by_kitti_s(
     tmp_path: Path, asked_deg: float | None, applied_deg: float
 ) -> None:
     folder = _write_sequence(tmp_path, [0])

@@ -1,4 +1,4 @@
-"""Ouster's packets in a pcap file, written here byte by byte as its manual says, and read as scans."""
+"""Ouster's packets in a pcap file, written byte by byte according to its manual, and read as scans."""
 
 import json
 import struct

@@ -44,7 +44,7 @@ def test_a_recording_gives_its_points_with_times_in_step_and_its_stamps(
 
 
 def _ate_m(folder: Path) -> float:
-    """Once the odometry knows the motion: the recording begins at full speed, and its first sweeps stay distorted."""
+    """Error without the first scans: the recording starts at full speed, and the first sweeps cannot be deskewed."""
     poses = read_poses(folder / "odometry_tum.txt")
     return trajectory_metrics(poses.T_a_b[8:], truth().T_world_lidar[8:])["ate_m"]
 
@@ -62,14 +62,16 @@ def test_times_of_points_make_the_map_of_a_recording_better(tmp_path: Path) -> N
     np.testing.assert_allclose(stamps_ns, FIRST_STAMP_NS + SWEEP_NS * np.arange(len(clouds())), rtol=0, atol=1_000)
 
 
-def test_a_recording_with_several_topics_asks_which(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recording_with_several_topics_needs_the_option_topic(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recording = write_mcap(tmp_path / "drive.mcap")
     for options in ((), ("--topic", "/camera")):
         assert run("map", recording, *options, "--out", tmp_path / "run") == 2
         assert f"--topic {OTHER_TOPIC}, --topic {TOPIC}" in capsys.readouterr().err
 
 
-def test_a_recording_without_an_index_says_what_makes_one(tmp_path: Path) -> None:
+def test_a_recording_without_an_index_is_reported_with_the_remedy(tmp_path: Path) -> None:
     recording = write_mcap(tmp_path / "drive.mcap")
     recording.write_bytes(recording.read_bytes()[:-100])
     with pytest.raises(SegslamError, match=r"drive\.mcap: .*no index.*mcap recover"):

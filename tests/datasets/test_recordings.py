@@ -22,7 +22,7 @@ def _write_clouds(folder: Path, num_clouds: int) -> Path:
     return folder
 
 
-def test_folder_of_clouds_opens_without_being_told_what_it_is(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_folder_of_clouds_is_detected(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     dataset = open_dataset(_write_clouds(tmp_path / "drive", 12))
     assert dataset.name == "generic/drive"
     assert [scan.index for scan in dataset] == list(range(12))
@@ -86,7 +86,7 @@ def test_named_data_set_brings_its_own_truth_and_times(tmp_path: Path) -> None:
 
 
 class _InOrder:
-    """A recording as kiss_icp reads messages: the next one, whichever is asked for; the third is broken."""
+    """A recording as kiss_icp reads messages: the next one, whatever the index; the third is unreadable."""
 
     def __init__(self) -> None:
         self.reset()
@@ -109,7 +109,7 @@ class _InOrder:
         return self._stamps
 
 
-def test_recording_read_in_order_gives_the_scan_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_recording_read_in_order_gives_the_requested_scan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("kiss_icp.datasets.dataset_factory", lambda *_, **__: _InOrder())
     dataset = open_dataset(tmp_path, dataset="rosbag", frames="3:")
     assert [(scan.index, scan.points[0, 0], scan.stamp_ns) for scan in dataset] == [
@@ -139,7 +139,9 @@ def test_times_of_another_number_are_refused(tmp_path: Path) -> None:
         ({"dataset": "kitti"}, "sequences/00: no such sequence"),
     ],
 )
-def test_folder_that_cannot_be_opened_says_why(tmp_path: Path, options: dict[str, str], complaint: str) -> None:
+def test_folder_that_cannot_be_opened_is_reported_with_the_reason(
+    tmp_path: Path, options: dict[str, str], complaint: str
+) -> None:
     with pytest.raises(SegslamError, match=complaint):
         open_dataset(tmp_path, **options)  # type: ignore[arg-type]
 

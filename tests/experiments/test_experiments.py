@@ -86,7 +86,7 @@ def test_lists_are_read_with_comments_and_json_brings_its_own_truth(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "said"),
+    ("name", "text", "expected"),
     [
         ("a.txt", "1 2\n3 x\n", "a.txt:2"),
         ("a.txt", "7\n", "a.txt:1"),
@@ -96,9 +96,9 @@ def test_lists_are_read_with_comments_and_json_brings_its_own_truth(tmp_path: Pa
         ("a.json", '[{"source": 1, "target": 2}]', "T_target_source"),
     ],
 )
-def test_a_broken_list_is_named_with_the_line(tmp_path: Path, name: str, text: str, said: str) -> None:
+def test_a_broken_list_is_named_with_the_line(tmp_path: Path, name: str, text: str, expected: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(SegslamError, match=said):
+    with pytest.raises(SegslamError, match=expected):
         read_pairs(tmp_path / name)
 
 
@@ -121,7 +121,7 @@ def test_the_truth_of_a_turned_source_carries_its_points_where_they_were() -> No
         np.testing.assert_allclose(geometry.apply(one.T_target_source, seen), geometry.apply(T_true, points), atol=1e-9)
 
 
-def test_labels_are_lost_in_the_asked_share_and_anew_at_each_draw() -> None:
+def test_labels_are_removed_in_the_given_share_independently_at_each_draw() -> None:
     labels = np.full(20_000, 13, np.uint8)
     lost = [ScanVariant(4, lost=0.3, draw=draw).remaining(labels) == 0 for draw in (0, 0, 1)]
     assert abs(lost[0].mean() - 0.3) < 0.02  # 6 standard deviations of a share of 20,000 draws
@@ -176,7 +176,7 @@ def test_figures_count_successes_wrong_poses_and_rejections_apart() -> None:
     assert [one.error_m for one in worst_failures(rows, 2)] == [3.0, 0.1]
 
 
-def test_the_paper_stands_beside_the_same_list_alone() -> None:
+def test_results_are_compared_with_the_paper_for_the_same_list_only() -> None:
     assert paper.success_percent("segregator", "kitti06_10to15", 2825) == 98.3
     assert paper.success_percent("segregator", "kitti06_10to15", 2824) is None  # another list under the same name
     assert paper.success_percent("gicp", "kitti06_10to15", 2825) is None
@@ -194,14 +194,14 @@ def test_the_paper_s_lists_have_as_many_pairs_as_its_table(data_dir: Path) -> No
             assert len(read_pairs(data_dir / "pairs" / f"kitti{sequence}_{band}.txt").pairs) == count
 
 
-def test_what_a_report_tells_of_its_conditions_names_no_folder(tmp_path: Path) -> None:
+def test_conditions_in_a_report_contain_no_folder(tmp_path: Path) -> None:
     job = Job(DataSource(tmp_path, labels=str(tmp_path / "predicted")), METHOD_NAMES, Config())
     lists = [PairList("list", np.array([[1, 70]]), 9)]
-    told = provenance.account("pairs", job, lists, results([row()], by="list"), options={"seed": 0})
-    assert str(tmp_path.parent) not in json.dumps(told)
-    assert any("SAMPLED: list 1 of 9" in note for note in told["notes"])
-    assert told["packages"]["numpy"] == np.__version__
-    assert not any("SIMULATED" in note for note in told["notes"])
+    output = provenance.account("pairs", job, lists, results([row()], by="list"), options={"seed": 0})
+    assert str(tmp_path.parent) not in json.dumps(output)
+    assert any("SAMPLED: list 1 of 9" in note for note in output["notes"])
+    assert output["packages"]["numpy"] == np.__version__
+    assert not any("SIMULATED" in note for note in output["notes"])
     (tmp_path / "simulation.json").write_text('{"seed": 7}')
     notes = provenance.account("pairs", job, lists, {}, options={})["notes"]
     assert any("SIMULATED (seed 7)" in note for note in notes)
@@ -229,7 +229,7 @@ def test_each_scan_is_prepared_once_though_many_pairs_have_it(counted: list[Scan
     assert {one.reason for one in rows} == {"bad_scan"}
 
 
-def test_a_benchmark_goes_on_where_it_was_stopped_and_is_refused_where_another_was(
+def test_a_benchmark_continues_where_it_stopped_and_not_in_the_folder_of_another(
     counted: list[ScanVariant], tmp_path: Path
 ) -> None:
     trials = pair_trials(cut_pairs(drive(80), name="cut", min_m=0.0, max_m=3.0), drive(80))

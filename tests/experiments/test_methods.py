@@ -44,7 +44,7 @@ def test_every_name_is_a_method() -> None:
 
 @pytest.mark.parametrize("name", METHOD_NAMES)
 def test_a_method_finds_the_pose_of_two_near_scans(name: str, parts: tuple[dict[str, Any], dict[str, Any]]) -> None:
-    """FPFH alone sees little in simulated streets, so that only the rule of success is asked of all."""
+    """FPFH alone is inaccurate in simulated streets, so only the success criterion is tested for all methods."""
     found = find_method(installed(name)).align(*parts, CONFIG, Stopwatch())
     assert not isinstance(found, Rejected)
     _, truth = round_drive()
@@ -57,7 +57,7 @@ def test_a_method_finds_the_pose_of_two_near_scans(name: str, parts: tuple[dict[
 
 
 @pytest.mark.parametrize("name", ["segregator-c2f", "gicp", "vgicp", "fgr"])
-def test_parts_that_travelled_to_another_process_give_the_same_pose(
+def test_parts_sent_to_another_process_give_the_same_pose(
     name: str, parts: tuple[dict[str, Any], dict[str, Any]]
 ) -> None:
     there = [{part: pickle.loads(pickle.dumps(one[part])) for part in METHODS[name].parts} for one in parts]

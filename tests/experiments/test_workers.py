@@ -20,7 +20,7 @@ from segslam.types import SegslamError
 distributed = pytest.importorskip("distributed")
 
 TIMES = {"ms", "cpu_ms", "label_ms", "prepare_ms", "match_ms", "refine_ms", "verify_ms", "peak_mb"}
-"""What no two runs have alike."""
+"""Columns that differ between runs."""
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +67,14 @@ def test_a_worker_that_is_killed_changes_nothing_in_the_table(
     assert table(in_order(read_rows(tmp_path / "details.csv"), job, trials)) == table(here)
 
 
-def test_no_cluster_at_the_address_is_said(job: Job, trials: list[Trial]) -> None:
+def test_a_missing_cluster_is_reported(job: Job, trials: list[Trial]) -> None:
     with pytest.raises(SegslamError, match="no answer"):
         next(run(job, trials, pool=Pool(scheduler="tcp://127.0.0.1:9")))
 
 
-def test_without_dask_it_says_what_to_install(job: Job, trials: list[Trial], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_dask_the_message_has_the_install_command(
+    job: Job, trials: list[Trial], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)  # as if it were not installed
     with pytest.raises(SegslamError, match=r"pip install 'dask>.*' 'distributed>"):
         next(run(job, trials, pool=Pool(workers=2)))

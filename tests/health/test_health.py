@@ -1,4 +1,4 @@
-"""Motions of an odometry that slips, jumps or loses its place are found by the scans, and repaired."""
+"""Wrong motions of an odometry are detected with the scans, and repaired."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -82,7 +82,7 @@ def test_a_jump_of_the_odometry_is_repaired(metres: float, degrees: float) -> No
     assert _worst_step_m(results) < 0.06
 
 
-def test_without_the_check_a_jump_stays() -> None:
+def test_without_the_check_a_jump_remains() -> None:
     config = load_config(None, ["health.check=false"])
     results = _registered(_checked(_slipped(metres=3.0), config), round_drive()[0][: SLIP_AT + 2])
     assert _worst_step_m(results) == pytest.approx(3.0, abs=0.01)
@@ -108,7 +108,7 @@ def _elsewhere(scan: Scan) -> Scan:
     return replace(scan, points=points.astype(np.float32), labels=np.zeros(20_000, np.uint8))
 
 
-def test_a_motion_that_nothing_supports_is_a_break_and_is_mended_when_the_map_is_seen_again() -> None:
+def test_an_unsupported_motion_is_a_break_and_is_repaired_when_the_map_is_visible_again() -> None:
     scans, truth = round_drive()
     given = [*scans[:20], _elsewhere(scans[20]), *scans[21:26]]
     results = _registered(_checked(truth.T_world_lidar), given)
@@ -147,14 +147,14 @@ def test_the_least_certain_of_several_motions_counts() -> None:
     assert least_informed(motions[:1]) is None
 
 
-def test_too_few_points_are_not_judged() -> None:
+def test_too_few_points_are_not_checked() -> None:
     scans, truth = round_drive()
     thin = [replace(scan, points=scan.points[::700], labels=scan.labels[::700]) for scan in scans[:10]]
     results = _registered(_checked(truth.T_world_lidar), thin)
     assert {result.motion.state for result in results if result.motion} == {MotionState.UNCHECKED}
 
 
-def test_recovery_without_a_guess_is_asked_only_where_guesses_fail() -> None:
+def test_recovery_without_initial_guess_runs_only_where_guesses_fail() -> None:
     asked = []
 
     def recover(source: np.ndarray, target: np.ndarray) -> Rejected:
@@ -182,7 +182,7 @@ def test_the_quick_check_measures_a_small_slip(moved_m: float) -> None:
 @pytest.mark.parametrize(
     "last", [SLIP_AT + 1, *(pytest.param(last, marks=pytest.mark.slow) for last in (15, SLIP_AT + 12))]
 )
-def test_a_checked_odometry_goes_on_where_it_was_restored(last: int) -> None:
+def test_a_checked_odometry_continues_after_restore(last: int) -> None:
     scans, _ = round_drive()
     poses = _slipped(metres=2.0)
     whole = _registered(_checked(poses), scans[:36])
@@ -243,7 +243,7 @@ def _tunnel_scan(index: int) -> Scan:
 
 
 def _into_a_tunnel(num_scans: int = 40) -> list[Scan]:
-    """The tunnel begins at scan 11, and the sensor goes on as before."""
+    """The tunnel begins at scan 11, and the sensor continues as before."""
     street = [replace(scan, index=row, stamp_ns=row * 100_000_000) for row, scan in enumerate(round_drive()[0][:11])]
     return street + [_tunnel_scan(row) for row in range(11, num_scans)]
 
@@ -258,7 +258,7 @@ def test_a_scan_of_a_smooth_tunnel_is_open_along_it_and_one_of_a_street_is_not()
     assert open_direction(local.make_surface(local.downsample(round_drive()[0][0].points))) is None
 
 
-def test_in_a_smooth_tunnel_the_last_motion_goes_on_and_is_reported_as_uncertain() -> None:
+def test_in_a_smooth_tunnel_the_last_motion_continues_and_is_reported_as_uncertain() -> None:
     odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
     results = _registered(odometry, _into_a_tunnel())
     motions = [result.motion for result in results[13:] if result.motion is not None]

@@ -1,1 +1,1 @@
-"""What several tests share: made-up drives, logs, networks and places; the run-time type check."""
+"""Shared by several tests: generated drives, logs, networks and places; the run-time type check."""

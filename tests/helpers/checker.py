@@ -1,4 +1,4 @@
-"""The run-time type check of the test run: beartype, with int where float is asked for, as PEP 484 has it."""
+"""The run-time type check of the test run: beartype, which accepts int for float, as in PEP 484."""
 
 from beartype import BeartypeConf, beartype
 

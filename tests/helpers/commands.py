@@ -13,7 +13,7 @@ def run(*arguments: object) -> int:
 
 
 def all_commands(command: object, name: str = "") -> list[tuple[str, object]]:
-    """Each command by its words."""
+    """Each command by its full name."""
     children = getattr(command, "commands", {})
     if not children:
         return [(name, command)]

@@ -1,4 +1,4 @@
-"""A short simulated drive, and an odometry of it that drifts: small enough for tests of the whole pipeline."""
+"""A short simulated drive with a drifting odometry, for tests of the whole pipeline."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import replace
@@ -66,14 +66,14 @@ def drifting(truth: Trajectory, *, turn_deg: float = 0.15, climb_m: float = 0.01
 
 
 def intensities(points: np.ndarray) -> np.ndarray:
-    """What made scans say of points: how far they are, in hundreds of metres, so that a row out of step shows."""
+    """Simulated intensities: ranges in hundreds of metres, so that misaligned rows are detected."""
     return np.linalg.norm(points, axis=1) / 100
 
 
 def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
     """The drive's first scans as sequence 00 of KITTI's format; returns the folder of the scans.
 
-    Their true labels lie in `true_labels`, where only those find them who ask.
+    The true labels are in `true_labels`, which is not searched by default.
     """
     folder = root / "sequences" / "00"
     (folder / "velodyne").mkdir(parents=True)

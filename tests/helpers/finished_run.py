@@ -1,4 +1,4 @@
-"""The folder of a run that never was: a drive around a block and a bit more, with known loops, false one included."""
+"""A generated run folder: a drive around a block and a little farther, with known loops, one of them false."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A viewer as Foxglove is one: it subscribes to all channels of a server and keeps what comes."""
+"""A viewer like Foxglove: subscribes to all channels of a server and stores the messages."""
 
 import json
 import struct
@@ -35,11 +35,11 @@ class Viewer(Thread):
                     if operation == 1:
                         self.messages[self._topic_of[subscription]].append((stamp_ns, message[MESSAGE.size :]))
 
-    def _hear(self, told: dict[str, Any], socket: ClientConnection) -> None:
-        if told["op"] != "advertise":
+    def _hear(self, output: dict[str, Any], socket: ClientConnection) -> None:
+        if output["op"] != "advertise":
             return
-        for channel in told["channels"]:
+        for channel in output["channels"]:
             self.channels[channel["topic"]] = channel
             self._topic_of[channel["id"]] = channel["topic"]
-        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in told["channels"]]
+        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in output["channels"]]
         socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))

@@ -19,7 +19,7 @@ class LiveCommand:
 
     def __init__(self, *arguments: object, **environment: str) -> None:
         words = [sys.executable, "-m", "segslam", "live", *map(str, arguments), "--json"]
-        self.told = ""
+        self.output = ""
         self._process = subprocess.Popen(
             words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment
         )
@@ -37,25 +37,25 @@ class LiveCommand:
         return self._process.pid
 
     def wait_for(self, text: str) -> None:
-        """Until a line with this text was told."""
+        """Wait until a line with this text was printed."""
         assert self._process.stderr
-        while text not in self.told:
+        while text not in self.output:
             line = self._process.stderr.readline()
-            assert line, f"ended: {self.told}"
-            self.told += line
+            assert line, f"ended: {self.output}"
+            self.output += line
 
     def signal(self, number: int = signal.SIGINT) -> None:
         self._process.send_signal(number)
 
     def ended(self) -> tuple[int, dict[str, Any]]:
         """Exit status, and the figures, empty if there are none."""
-        printed, told = self._process.communicate(timeout=120)
-        self.told += told
+        printed, output = self._process.communicate(timeout=120)
+        self.output += output
         return self._process.returncode, json.loads(printed) if printed else {}
 
 
 def write_scan(folder: Path, scan: Scan, name: str) -> None:
-    """As a recorder writes a scan that nobody shall read before it is whole."""
+    """Write a scan like a recorder: under a hidden name until it is complete."""
     part = folder / f".{name}.part"
     np.column_stack([scan.points, np.linalg.norm(scan.points, axis=1)]).astype("<f4").tofile(part)
     part.rename(folder / f"{name}.bin")

@@ -19,7 +19,7 @@ FIELDS = [PointField(name=axis, offset=4 * k, datatype=PointField.FLOAT32, count
 
 
 def publish(points: Path, every_s: float, reliability: str, first: int, last: int) -> None:
-    """One cloud after the other, and round again, from when somebody listens."""
+    """Publish the clouds in a loop as soon as there is a subscriber."""
     clouds = np.load(points)
     rclpy.init()
     node = rclpy.create_node("robot")

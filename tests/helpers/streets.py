@@ -1,4 +1,4 @@
-"""A made-up street corner for tests of alignment: walls with bays, ground, posts; points sampled from its surfaces."""
+"""Points sampled from a generated street corner for tests of registration: walls with bays, ground, posts."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Scans that arrive while they are mapped: what waits, what is dropped, which gaps there are, how a run ends."""
+"""Scans that arrive during mapping: waiting and dropped scans, gaps, and the end of a run."""
 
 import os
 import signal
@@ -65,7 +65,7 @@ def test_gaps_are_counted_by_stamp_with_the_scans_that_they_lack() -> None:
     assert rhythm.intervals(0, 1000 * INTERVAL_NS) == 10.0
 
 
-def test_stamps_go_on_where_the_clock_of_the_sender_is_set_back() -> None:
+def test_stamps_continue_when_the_clock_of_the_sender_is_set_back() -> None:
     rhythm = Rhythm()
     stamps = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
     again = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
@@ -88,12 +88,12 @@ def test_the_name_of_a_file_can_hold_its_stamp(name: str, stamp_ns: int | None) 
     assert stamp_of_name(name) == stamp_ns
 
 
-def test_a_file_is_taken_when_it_is_closed_or_renamed_and_once(tmp_path: Path) -> None:
+def test_a_file_is_read_once_when_it_is_closed_or_renamed(tmp_path: Path) -> None:
     write_scan(tmp_path, _scan(0, 0), "before")
     source, waiting, stopped = FolderSource(tmp_path), Waiting(most=9), threading.Event()
-    told: list[str] = []
-    source.open(told.append)
-    assert "1 scans already in" in told[0]
+    output: list[str] = []
+    source.open(output.append)
+    assert "1 scans already in" in output[0]
     thread = threading.Thread(target=source.feed, args=(waiting, stopped))
     thread.start()
     try:
@@ -136,7 +136,7 @@ def test_a_file_that_is_no_scan_is_a_bad_scan(tmp_path: Path) -> None:
         arrival.read(0, 0)
 
 
-def test_a_folder_that_goes_ends_the_stream_with_the_reason(tmp_path: Path) -> None:
+def test_a_removed_folder_ends_the_stream_with_the_reason(tmp_path: Path) -> None:
     folder = tmp_path / "scans"
     folder.mkdir()
     source = FolderSource(folder)
@@ -145,13 +145,13 @@ def test_a_folder_that_goes_ends_the_stream_with_the_reason(tmp_path: Path) -> N
     assert "is gone" in source.feed(Waiting(), threading.Event())
 
 
-def test_what_is_no_folder_cannot_be_watched(tmp_path: Path) -> None:
+def test_only_folders_can_be_watched(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match="cannot be watched"):
         FolderSource(tmp_path / "nowhere").open(print)
 
 
-def test_odometry_that_is_told_of_a_gap_predicts_by_the_velocity() -> None:
-    """In a corridor without an end only the prediction knows how far it went; walls alone hold the rest."""
+def test_odometry_that_knows_of_a_gap_predicts_by_the_velocity() -> None:
+    """In an endless corridor, only the prediction determines the distance travelled; the walls determine the rest."""
     rng = np.random.default_rng(0)
     along = rng.uniform(-60, 60, 20000)
     side, height = rng.choice([-3.0, 3.0], 20000), rng.uniform(0, 3, 20000)
@@ -183,8 +183,8 @@ def test_scans_are_mapped_as_they_appear_until_none_comes(tmp_path: Path) -> Non
         (folder / "broken.bin").write_bytes(b"x" * 23)
         record(folder, scans[4:], every_s=0.3, first=4)
         status, metrics = command.ended()
-    assert status == 0, command.told
-    assert "no scan for 3 s" in command.told
+    assert status == 0, command.output
+    assert "no scan for 3 s" in command.output
     assert metrics["num_scans_arrived"] == 9
     assert metrics["num_scans"] + metrics["num_scans_skipped"] + metrics["num_scans_dropped"] == 9
     assert metrics["latency_ms"]["median"] > 0
@@ -201,13 +201,13 @@ def test_a_signal_ends_a_live_run_with_all_its_results(tmp_path: Path, number: i
         record(folder, list(round_drive()[0][:3]), every_s=0.5)
         command.signal(number)
         status, metrics = command.ended()
-    assert status == 0, command.told
+    assert status == 0, command.output
     assert metrics["num_scans"] + metrics["num_scans_dropped"] == 3
     assert (run / "report.html").is_file()
 
 
 @pytest.mark.slow
-def test_odometry_that_dies_leaves_a_finished_run_and_is_told(tmp_path: Path) -> None:
+def test_odometry_that_dies_leaves_a_finished_run_and_is_reported(tmp_path: Path) -> None:
     folder, run = tmp_path / "scans", tmp_path / "run"
     folder.mkdir()
     with LiveCommand(folder, "--out", run, *SETTINGS) as command:
@@ -218,7 +218,7 @@ def test_odometry_that_dies_leaves_a_finished_run_and_is_told(tmp_path: Path) ->
                 os.kill(pid, signal.SIGKILL)
         status, metrics = command.ended()
     assert status == 2
-    assert "the odometry process has ended" in command.told
+    assert "the odometry process has ended" in command.output
     assert metrics["num_scans"] >= 1
     assert (run / "report.html").is_file()
 
@@ -231,7 +231,7 @@ def test_without_a_scan_nothing_is_left_behind(tmp_path: Path) -> None:
     with LiveCommand(tmp_path, "--out", tmp_path / "run", "--idle", "0.5", "--quiet") as command:
         status, metrics = command.ended()
     assert (status, metrics) == (2, {})
-    assert "no scan was mapped (no scan for 0.5 s)" in command.told
+    assert "no scan was mapped (no scan for 0.5 s)" in command.output
     assert not (tmp_path / "run").exists()
 
 
@@ -248,7 +248,7 @@ def test_the_same_scans_live_and_offline_close_the_same_loops_on_the_same_trajec
             sleep(1.5)
         command.signal(signal.SIGINT)
         status, metrics = command.ended()
-    assert status == 0, command.told
+    assert status == 0, command.output
     if metrics["num_scans_dropped"]:
         pytest.skip("the machine dropped scans")
     (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.9f}\n" for scan in scans))

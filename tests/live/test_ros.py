@@ -1,4 +1,4 @@
-"""ROS 2 over loopback: a robot in one process, `segslam live --topic` in another, and who listens here."""
+"""ROS 2 over loopback: a robot in one process, `segslam live --topic` in another, and a subscriber in this one."""
 
 import os
 import signal
@@ -38,7 +38,7 @@ SETTINGS = ("--set", "odometry.min_range_m=1")
 
 @pytest.fixture(autouse=True)
 def own_domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody else's robots, and none of these on the network."""
+    """A separate ROS domain, on this machine only."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
@@ -114,7 +114,7 @@ def robot(clouds: Path, *, every_s: float, reliability: str, first: int, last: i
 def test_a_publisher_is_followed_through_its_death_and_every_cloud_accounted_for(
     clouds: Path, tmp_path: Path, listener: Listener
 ) -> None:
-    """The second publisher is best effort, which a reliable subscription would not hear."""
+    """The second publisher is best effort; a reliable subscription would not receive from it."""
     with LiveCommand("--topic", TOPIC, "--out", tmp_path / "run", *SETTINGS) as command:
         command.wait_for("waiting for scans")
         sent = 0
@@ -131,8 +131,8 @@ def test_a_publisher_is_followed_through_its_death_and_every_cloud_accounted_for
         saved = listener.call_save_map()
         command.signal(signal.SIGINT)
         status, metrics = command.ended()
-    assert status == 0, command.told
-    assert command.told.count("subscribed (") == 2, command.told
+    assert status == 0, command.output
+    assert command.output.count("subscribed (") == 2, command.output
     assert metrics["num_scans_arrived"] == metrics["num_scans"] + metrics["num_scans_dropped"]
     assert 4 <= metrics["num_scans_arrived"] <= sent
     assert metrics["num_gaps"] >= 1  # between the two publishers
@@ -163,7 +163,7 @@ def test_a_pose_and_a_map_are_published_as_they_are(listener: Listener) -> None:
     np.testing.assert_array_equal(CloudReader()(cloud)[0], drawn.points)
 
 
-def test_a_map_that_cannot_be_saved_is_an_answer_with_the_reason(listener: Listener) -> None:
+def test_a_map_that_cannot_be_saved_is_reported_with_the_reason(listener: Listener) -> None:
     def save() -> str:
         raise SegslamError("there is no keyframe yet")
 
@@ -186,7 +186,7 @@ def test_a_topic_is_named_from_the_root_and_checked() -> None:
         TopicSource("bad topic!")
 
 
-def test_reliability_is_that_which_hears_all_publishers() -> None:
+def test_reliability_is_compatible_with_all_publishers() -> None:
     reliable, best_effort = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
     assert _common_reliability([reliable, reliable]) == reliable
     assert _common_reliability([reliable, best_effort]) == best_effort
@@ -197,9 +197,9 @@ def test_a_source_that_is_paused_takes_no_cloud() -> None:
 
     from segslam.live.waiting import Waiting
 
-    told: list[str] = []
+    output: list[str] = []
     source, waiting = TopicSource("/points"), Waiting()
-    source.open(told.append)
+    source.open(output.append)
     try:
         message = point_cloud2(np.ones((2, 3)), np.zeros(2, np.uint8), frame="lidar", stamp_ns=5)
         for value in (True, False):
@@ -211,7 +211,7 @@ def test_a_source_that_is_paused_takes_no_cloud() -> None:
         source.close()
     assert not refused.successful
     assert waiting.num_arrived == 1
-    assert told[-2:] == ["/points: paused", "/points: running"]
+    assert output[-2:] == ["/points: paused", "/points: running"]
 
 
 @pytest.mark.parametrize("sources", [(), ("--topic", "/points", ".")])

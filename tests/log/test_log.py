@@ -93,7 +93,7 @@ def test_result_read_again_is_that_written(steps: list[Step], tmp_path: Path) ->
 def test_a_log_of_an_older_version_with_a_channel_more_is_read(
     steps: list[Step], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Older logs hold samples of the angles left over in the sensor before the result."""
+    """Logs of older versions contain samples of residual sensor angles before the result."""
     result = made_result(steps)
     angles = {"title": "segslam.Angles", "type": "object", "properties": {"travel_m": {"type": "number"}}}
     own = schema.json_schemas()
@@ -223,7 +223,7 @@ def test_settings_and_versions_are_in_the_metadata(steps: list[Step], tmp_path: 
 @given(st.lists(st.tuples(*[st.integers(-(2**29), 2**29)] * 3), max_size=50), st.sampled_from([0.004, 2.0**-8, 1.0]))
 def test_points_on_the_grid_come_back_exactly(steps: list[tuple[int, int, int]], resolution_m: float) -> None:
     points = (np.array(steps).reshape(-1, 3) * resolution_m).astype(np.float32)
-    on_grid = np.abs(points / np.float32(resolution_m)) < 2**22  # float32 tells neighbours on the grid apart
+    on_grid = np.abs(points / np.float32(resolution_m)) < 2**22  # float32 resolves neighbours on the grid
     points = points[on_grid.all(axis=1)]
     labels = np.arange(len(points), dtype=np.uint8)
     again, labels_again = points_and_labels(keyframe_points(_keyframe(points, labels), resolution_m=resolution_m))
@@ -248,7 +248,7 @@ def test_intensities_come_back_to_the_byte_and_stay_so(greatest: float) -> None:
     np.testing.assert_array_equal(intensities(_sent(once)), once)  # a replay of a replay loses nothing more
 
 
-def test_intensities_that_are_no_numbers_or_negative_are_zero() -> None:
+def test_intensities_that_are_negative_or_not_finite_are_zero() -> None:
     np.testing.assert_array_equal(intensities(_sent(np.array([np.nan, -3.0, np.inf, 4.0]))), [0.0, 0.0, 0.0, 4.0])
     np.testing.assert_array_equal(intensities(_sent(np.zeros(3))), np.zeros(3))
 

@@ -1,4 +1,4 @@
-"""A log that was cut, damaged, or is none of this version's; disks that fail and people that press Ctrl-C."""
+"""Logs that are cut, damaged or of another version; failing disks and Ctrl-C."""
 
 import signal
 from concurrent.futures import ThreadPoolExecutor
@@ -151,7 +151,7 @@ def _foreign(path: Path, metadata: dict[str, dict[str, str]], step_schema: bytes
     return path
 
 
-def test_somebody_elses_mcap_is_refused(tmp_path: Path) -> None:
+def test_an_mcap_of_another_program_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match="not a log of segslam"):
         read_log(_foreign(tmp_path / "other.mcap", {"ros": {"distribution": "jazzy"}}))
 

@@ -20,15 +20,15 @@ pytestmark = pytest.mark.usefixtures("blank_reports")
 BY_INTENSITY = ("--set", "map.color=intensity")
 
 
-def _assert_told(scan: Scan, *, rtol: float = 1e-5) -> None:
+def _assert_known(scan: Scan, *, rtol: float = 1e-5) -> None:
     assert scan.intensities is not None
     assert scan.intensities.dtype == np.float32
     np.testing.assert_allclose(scan.intensities, intensities(scan.points.astype(float)), rtol=rtol)
 
 
-def test_kitti_scans_have_them_if_asked(tmp_path: Path) -> None:
+def test_kitti_scans_have_them_if_requested(tmp_path: Path) -> None:
     write_kitti_sequence(tmp_path, num_scans=1)
-    _assert_told(open_dataset(tmp_path, intensities=True)[0])
+    _assert_known(open_dataset(tmp_path, intensities=True)[0])
     assert open_dataset(tmp_path)[0].intensities is None
 
 
@@ -38,7 +38,7 @@ def test_recordings_have_them_without_what_returned_nothing(write, tmp_path: Pat
         write(tmp_path / f"drive.{'mcap' if write is write_mcap else 'bag'}"), topic=TOPIC, intensities=True
     )
     for row in (0, 3):
-        _assert_told(scans[row])
+        _assert_known(scans[row])
 
 
 @pytest.mark.parametrize("suffix", ["ply", "pcd"])
@@ -84,11 +84,11 @@ def test_the_map_has_each_points_intensity_and_its_colour(mapped: Path, tmp_path
     assert run("export", mapped, *files, "--set", "map.voxel_m=0.02", "--set", "map.view_range_m=0", "--quiet") == 0
     ply, pcd = (o3d.t.io.read_point_cloud(str(file)).point for file in files[:2])
     laz = laspy.read(files[2])
-    told, colors = ply.intensity.numpy().ravel(), ply.colors.numpy()
-    np.testing.assert_array_equal(told, pcd.intensity.numpy().ravel())
-    np.testing.assert_allclose(np.asarray(laz.intensity) / 65535, told / told.max(), atol=0.01)
-    assert 0.1 < told.min() * 100 < 5.0 < 40.0 < told.max() * 100 < 51.0  # ranges, up to map.max_range_m
-    green = colors[np.argsort(told), 1].astype(int)  # of viridis, from violet to yellow, it only grows
+    values, colors = ply.intensity.numpy().ravel(), ply.colors.numpy()
+    np.testing.assert_array_equal(values, pcd.intensity.numpy().ravel())
+    np.testing.assert_allclose(np.asarray(laz.intensity) / 65535, values / values.max(), atol=0.01)
+    assert 0.1 < values.min() * 100 < 5.0 < 40.0 < values.max() * 100 < 51.0  # ranges, up to map.max_range_m
+    green = colors[np.argsort(values), 1].astype(int)  # of viridis, from violet to yellow, it only grows
     assert (np.diff(green) >= 0).all()
     assert green[0] < 10 < 220 < green[-1]
 
@@ -108,7 +108,7 @@ def test_a_replay_keeps_them(mapped: Path, tmp_path: Path) -> None:
             np.testing.assert_array_equal(again.keyframe.intensities, step.keyframe.intensities)
 
 
-def test_a_log_without_them_says_how_it_would_have_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_without_them_is_reported_with_the_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     without = make_run(tmp_path / "run").folder
     assert run("export", without, tmp_path / "map.ply", *BY_INTENSITY, "--quiet") == 2
     (message,) = capsys.readouterr().err.splitlines()

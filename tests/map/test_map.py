@@ -36,7 +36,7 @@ def _share_in(points: np.ndarray, wanted: np.ndarray) -> float:
     return float(np.mean(distance_m < 0.2))
 
 
-def test_what_others_saw_through_is_left_out_and_all_else_stays(tmp_path: Path) -> None:
+def test_voxels_that_others_saw_through_are_removed_and_all_others_stay(tmp_path: Path) -> None:
     without, _ = _map_points(tmp_path, thing_in=None)
     points, summary = _map_points(tmp_path)
     assert _share_in(points, thing()) < 0.02
@@ -50,7 +50,7 @@ def test_without_views_the_thing_stays(tmp_path: Path) -> None:
     assert _share_in(points, thing()) == 1.0
 
 
-def test_points_of_moving_classes_are_left_out_without_any_view(tmp_path: Path) -> None:
+def test_points_of_moving_classes_are_removed_without_any_view(tmp_path: Path) -> None:
     placed = placed_keyframes()
     labels = placed[2][0].labels
     labels[labels == Label.CAR] = Label.MOVING_CAR
@@ -191,12 +191,12 @@ def test_the_grid_is_free_in_the_yard_occupied_at_its_walls_and_unknown_beyond(t
     assert (255 - 254) / 255 < about["free_thresh"] < (255 - 205) / 255 < about["occupied_thresh"] < 1.0
 
 
-def test_a_name_that_is_no_maps_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_kind_of_map_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match=r"map\.stl: unknown kind of map; its name must end in \.ply, \.pcd"):
         write_map(placed_keyframes(), [tmp_path / "map.stl"], config=CONFIG)
 
 
-def test_nothing_to_map_is_told_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_nothing_to_map_is_reported_and_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match="nothing to map"):
         write_map([], [tmp_path / "map.ply"], config=CONFIG)
     assert list(tmp_path.iterdir()) == []

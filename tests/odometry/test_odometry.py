@@ -99,7 +99,7 @@ def test_a_sweep_too_large_for_the_shared_memory_is_aligned_like_any_other(monke
         np.testing.assert_array_equal(found, [apart.register(scan).T_odom_lidar for scan in scans])
 
 
-def test_a_process_that_was_killed_is_told_of_with_the_remedy() -> None:
+def test_a_process_that_was_killed_is_reported_with_the_remedy() -> None:
     scan = _street(1)[0]
     odometry = OdometryApart(CONFIG)
     odometry.register(scan)
@@ -120,10 +120,10 @@ def test_points_out_of_range_leave_with_their_labels() -> None:
 
 def test_intensities_go_with_their_points_through_the_process_apart() -> None:
     scan = _street(1)[0]
-    told = replace(scan, intensities=np.linalg.norm(scan.points, axis=1).astype(np.float32))
+    measured = replace(scan, intensities=np.linalg.norm(scan.points, axis=1).astype(np.float32))
     given = GivenOdometry(_trajectory(np.eye(4)[None]), CONFIG)
     with OdometryApart(CONFIG) as apart:
-        for result in (apart.register(told), given.register(told)):
+        for result in (apart.register(measured), given.register(measured)):
             np.testing.assert_allclose(result.intensities, np.linalg.norm(result.points, axis=1), rtol=1e-6)
             assert 0 < len(result.points) < len(scan.points), "those out of range have gone"
     assert KissOdometry(CONFIG).register(scan).intensities is None

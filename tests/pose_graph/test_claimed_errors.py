@@ -85,7 +85,7 @@ def test_squared_errors_are_what_the_information_claims(stage: str) -> None:
     assert (squared < CHI2_95).mean() > 0.8
 
 
-def test_closures_of_one_place_err_together_as_much_as_their_edges_claim() -> None:
+def test_mean_error_of_closures_of_one_place_matches_their_information() -> None:
     """The graph adds up the six closures of each target as if they were independent; they share that scan, and the rays
     that the sensor bends. Bounds as above: 36 pairs are no more draws for being grouped. Single ones err less.
     """
@@ -121,7 +121,7 @@ def _odometry() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("length", [1, 8])
-def test_odometry_errs_as_much_as_its_edges_claim(length: int) -> None:
+def test_odometry_errors_match_the_information_of_the_edges(length: int) -> None:
     """Single edges, and chains of 8 (17 m). Identities would claim a ten-thousandth of it, sigmas thrice as large nine
     times as much.
 

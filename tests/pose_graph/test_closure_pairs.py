@@ -114,7 +114,10 @@ def test_a_loop_of_two_closures_is_as_unlikely_as_gtsam_finds_it() -> None:
 
 
 def test_the_loops_of_true_closures_follow_the_chi_square_that_they_claim() -> None:
-    """400 independent pairs, a drive each. The drift's own turn, left out, false far below what 400 can tell."""
+    """400 independent pairs, a drive each.
+
+    The rotation of the drift is omitted; its effect is not measurable with 400 pairs.
+    """
     rng = np.random.default_rng(2)
     T_world = drive(120)
     drawn = []
@@ -148,7 +151,7 @@ def test_the_tangent_of_a_product_is_exact_up_to_half_a_turn(angle_rad: float) -
         np.testing.assert_allclose(found, tangent, atol=1e-7)
 
 
-def test_half_a_turn_between_two_closures_is_no_agreement() -> None:
+def test_closures_half_a_turn_apart_are_not_consistent() -> None:
     T_world = drive()
     rng = np.random.default_rng(4)
     turned = geometry.transform(geometry.yaw(np.pi), [0.0, 0.0, 0.0])
@@ -176,13 +179,13 @@ def test_without_closures_none_is_chosen() -> None:
     assert largest(odometry(drive(), np.random.default_rng(0)), []).shape == (0,)
 
 
-def test_one_closure_agrees_with_itself() -> None:
+def test_one_closure_is_consistent_with_itself() -> None:
     rng = np.random.default_rng(0)
     T_world = drive()
     assert largest(odometry(T_world, rng), [closure(T_world, 3, 103, rng)]).tolist() == [True]
 
 
-def test_the_largest_set_is_looked_for_among_those_asked_for() -> None:
+def test_the_largest_set_is_searched_among_the_given_closures() -> None:
     agree = np.eye(6, dtype=bool)
     agree[:3, :3] = agree[3:5, 3:5] = True
     assert largest_consistent(agree, np.ones(6, dtype=bool)).tolist() == [True] * 3 + [False] * 3

@@ -109,7 +109,7 @@ def test_closures_pull_the_drift_back(robust: str) -> None:
 
 
 def test_a_closure_points_from_source_to_target() -> None:
-    """The one closure of a chain that says nothing itself decides: T_world_source = T_world_target T_target_source."""
+    """A closure on a chain without information determines the pose: T_world_source = T_world_target T_target_source."""
     loose = GraphConfig(odometry_sigma_m=100.0, odometry_sigma_deg=90.0, robust="none", closure_sigma_m=1e-3)
     T_target_source = geometry.transform(geometry.yaw(0.7), [1.0, 2.0, 0.3])
     graph = graph_of(circle(5, rounds=0.1), [closure(4, 0, T_target_source)], loose)
@@ -117,7 +117,7 @@ def test_a_closure_points_from_source_to_target() -> None:
     np.testing.assert_allclose(graph.T_world_keyframe(4), T_target_source, atol=1e-3)
 
 
-def test_a_closure_told_from_the_other_end_is_its_inverse() -> None:
+def test_a_closure_from_the_other_end_is_its_inverse() -> None:
     swapped = [closure(c.target_id, c.source_id, geometry.inverse(c.T_target_source)) for c in TRUE_LOOPS]
     config = GraphConfig(robust="none", final="none")
     first, second = graph_of(DRIFT, TRUE_LOOPS, config), graph_of(DRIFT, swapped, config)
@@ -129,7 +129,7 @@ def test_a_closure_told_from_the_other_end_is_its_inverse() -> None:
 
 @pytest.mark.parametrize("most_paired", [0, 1_000])
 @pytest.mark.parametrize("final", ["gnc", "consistent"])
-def test_the_end_rejects_false_closures_and_keeps_true_ones(
+def test_the_final_optimisation_rejects_false_closures_and_keeps_true_ones(
     final: str, most_paired: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("segslam.pose_graph.final.MAX_PAIRED", most_paired)
@@ -143,7 +143,7 @@ def test_the_end_rejects_false_closures_and_keeps_true_ones(
 
 
 @pytest.mark.parametrize("final", ["gnc", "consistent"])
-def test_the_end_keeps_true_closures_among_twice_as_many_false_ones(final: str) -> None:
+def test_the_final_optimisation_keeps_true_closures_among_twice_as_many_false_ones(final: str) -> None:
     rng = np.random.default_rng(0)
     false = []
     for _ in range(2 * len(LOOPS)):
@@ -156,7 +156,7 @@ def test_the_end_keeps_true_closures_among_twice_as_many_false_ones(final: str) 
 
 
 @pytest.mark.parametrize("final", ["gnc", "consistent"])
-def test_the_end_may_refuse_all(final: str) -> None:
+def test_the_final_optimisation_may_reject_all(final: str) -> None:
     estimate = graph_of(TRUTH, FALSE_LOOPS, GraphConfig(final=final)).finish()
     assert set(estimate.closure_weights.values()) == {0.0}
     assert greatest_error_m(TRUTH, estimate) < 1e-6, "odometry was right, and is what is left"
@@ -309,7 +309,7 @@ def test_the_least_noise_is_added_to_a_closures_covariance() -> None:
     np.testing.assert_allclose(np.linalg.inv(found), covariance + np.diag(sigmas**2), rtol=1e-4)
 
 
-def test_a_closure_that_knows_nothing_of_one_direction_constrains_the_others() -> None:
+def test_a_closure_without_information_in_one_direction_constrains_the_others() -> None:
     information = np.diag([1e6, 1e6, 1e6, 0.0, 1e4, 1e4])  # a corridor along x
     found = closure_information(information, CONFIG)
     assert np.linalg.eigvalsh(found).min() > 0.0
@@ -445,7 +445,7 @@ def test_the_end_is_the_batch_optimum(tmp_path: Path) -> None:
     assert end.error == pytest.approx(factors.error(optimum), rel=1e-6)
 
 
-def test_true_edges_err_as_much_as_they_claim(tmp_path: Path) -> None:
+def test_errors_of_true_edges_match_their_information(tmp_path: Path) -> None:
     """Odometry and closures drawn from their noise: at the truth each has a chi-square of 6 degrees of freedom."""
     rng = np.random.default_rng(0)
     T_odom = [TRUTH[0]]

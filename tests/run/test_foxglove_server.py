@@ -51,7 +51,7 @@ def test_a_viewer_is_offered_every_channel_of_a_log_and_gets_what_is_sent() -> N
         assert viewer.messages[schema.MEMORY][0] == (7, b'{"rss_mb": 1}')
 
 
-def test_who_subscribes_later_is_sent_the_last_map() -> None:
+def test_late_subscribers_receive_the_last_map() -> None:
     with FoxgloveServer("0") as server:
         for stamp_ns in (1, 2):
             server.send_map(np.full((3, 3), stamp_ns, float), np.zeros(3, np.uint8), stamp_ns)
@@ -117,17 +117,17 @@ def test_a_port_alone_is_on_loopback(address: str, expected: tuple[str, int]) ->
 
 
 @pytest.mark.parametrize("address", ["", "here", "8765:", "70000", "-1"])
-def test_what_is_no_port_is_refused(address: str) -> None:
+def test_an_invalid_port_is_rejected(address: str) -> None:
     with pytest.raises(SegslamError, match="give a port"):
         parse_address(address)
 
 
-def test_a_port_that_is_taken_is_told() -> None:
+def test_a_port_in_use_is_reported() -> None:
     with FoxgloveServer("0") as server, pytest.raises(SegslamError, match="cannot listen there"):
         FoxgloveServer(server.url.rpartition("/")[2])
 
 
-def test_without_the_package_one_line_says_how_to_get_it(
+def test_without_the_package_one_line_has_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = make_run(tmp_path / "run").folder

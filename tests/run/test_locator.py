@@ -53,7 +53,7 @@ def test_a_scan_of_another_town_is_not_found(run: Path) -> None:
         assert found.reason.value
 
 
-def test_signatures_are_in_the_log_and_made_anew_where_it_has_none(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_signatures_are_in_the_log_and_computed_if_it_has_none(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded = read_log(run / "log.mcap").keyframes()
     stored = [recorded[number].place for number in range(len(recorded))]
     assert all(place is not None and len(place) == 1440 for place in stored)
@@ -65,7 +65,7 @@ def test_signatures_are_in_the_log_and_made_anew_where_it_has_none(run: Path, mo
         assert (signature.spectrum.ravel() == spectrum).all()
 
 
-def test_the_run_is_only_read(run: Path) -> None:
+def test_the_run_is_not_changed(run: Path) -> None:
     before = {file: file.read_bytes() for file in run.iterdir() if file.is_file()}
     Locator.from_run(run).locate(round_drive()[0][52].points)
     assert {file: file.read_bytes() for file in run.iterdir() if file.is_file()} == before
@@ -109,7 +109,7 @@ def test_the_command_prints_a_pose_a_scan_and_fails_where_it_finds_none(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "output"),
     [
         (["missing.npy"], "missing.npy: no such file"),
         (["--dataset", "nclt"], "--dataset nclt: only kitti"),
@@ -117,12 +117,12 @@ def test_the_command_prints_a_pose_a_scan_and_fails_where_it_finds_none(
     ],
 )
 def test_bad_usage_of_the_command_is_one_line(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], told: str
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], output: str
 ) -> None:
     scan = tmp_path / "a.npy"
     np.save(scan, round_drive()[0][55].points)
     assert commands.run("locate", run, scan, *arguments) == 2
-    assert told in capsys.readouterr().err
+    assert output in capsys.readouterr().err
 
 
 def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

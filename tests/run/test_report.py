@@ -1,4 +1,4 @@
-"""The report: one file, whole, readable by a browser, saying what the run's files say."""
+"""The report: one complete HTML file with the figures of the run's files."""
 
 import base64
 import re
@@ -152,16 +152,16 @@ def test_unfinished_run_is_refused(tmp_path: Path) -> None:
         write_report(make_run(tmp_path / "run", finished=False).folder)
 
 
-def test_command_writes_the_page_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_the_page_and_prints_its_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = make_run(tmp_path / "run").folder
-    for arguments, status, said in (
+    for arguments, status, expected in (
         (["report", str(folder)], 0, f"report written to {folder / 'report.html'}\n"),
         (["report", str(tmp_path / "nowhere")], 2, "nowhere: no such folder"),
     ):
         with pytest.raises(SystemExit) as ended:
             cli.main(arguments)
         assert int(ended.value.code or 0) == status
-        assert said in capsys.readouterr().err
+        assert expected in capsys.readouterr().err
     assert (folder / "report.html").stat().st_size > 10_000
 
 

@@ -1,4 +1,4 @@
-"""A run that was killed goes on from its last complete step, and ends as if nothing had happened."""
+"""A killed run is resumed after its last complete step, and ends like an uninterrupted run."""
 
 import errno
 import json
@@ -172,7 +172,7 @@ def test_a_run_killed_before_its_report_gets_it_on_resuming(kitti: Path, whole: 
     _resumed_as_whole(kitti, whole, tmp_path / "run")
 
 
-def test_resuming_a_finished_run_says_so_and_changes_nothing(
+def test_resuming_a_finished_run_is_reported_and_changes_nothing(
     kitti: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {file.name: file.read_bytes() for file in whole.iterdir()}
@@ -188,7 +188,7 @@ def _one_line(metrics: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "expected"),
     [
         (["--set", "verify.min_overlap=0.77"], "verify.min_overlap: 0.77 now"),
         (["--labels", "none"], "--labels: none now"),
@@ -196,10 +196,10 @@ def _one_line(metrics: bytes) -> bytes:
     ],
 )
 def test_a_run_is_resumed_as_it_began_or_not_at_all(
-    kitti: Path, whole: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+    kitti: Path, whole: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
 ) -> None:
     assert run("map", kitti, "--out", whole, "--resume", *OPTIONS, *options) == 2
-    assert said in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
 
 
 def test_other_data_under_the_same_name_are_refused_and_the_log_stays(
@@ -214,7 +214,7 @@ def test_other_data_under_the_same_name_are_refused_and_the_log_stays(
     assert (out / "log.mcap").read_bytes() == log
 
 
-def test_a_run_that_is_going_on_is_left_alone(
+def test_a_run_in_progress_is_not_resumed(
     kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with LogWriter(tmp_path / "log.mcap", config=read_log(whole / "log.mcap").config):

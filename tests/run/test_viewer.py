@@ -1,4 +1,4 @@
-"""What a viewer is given of a run; and that its absence is told."""
+"""Data that a viewer receives from a run; a missing viewer is reported."""
 
 import shutil
 import subprocess
@@ -43,7 +43,7 @@ def test_mapping_can_be_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_the_viewer_is_found_beside_python_though_not_on_the_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """And where it does not start, the first line of its complaint is told."""
+    """If it does not start, the first line of its error is printed."""
 
     def spawn(_: RecordingStream) -> None:
         raise RuntimeError(f"found {shutil.which('rerun')}\nand how to install it, in many lines")
@@ -63,7 +63,7 @@ def _entities(file: Path) -> set[str]:
     return {line.partition(":")[0] for line in listed.splitlines() if line.startswith("/")}
 
 
-def test_without_the_viewer_one_line_says_how_to_install_it(
+def test_without_the_viewer_one_line_has_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_log(tmp_path / "log.mcap", [])
@@ -87,7 +87,7 @@ def test_without_a_display_the_viewer_is_refused_at_once(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_viewer_that_takes_nothing_more_is_not_waited_for_without_end(
+def test_waiting_for_a_stuck_viewer_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def flush(_: RecordingStream, *, timeout_sec: float) -> None:

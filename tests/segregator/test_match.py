@@ -243,7 +243,7 @@ def test_ground_keeps_a_level_scene_from_being_turned_over() -> None:
 
 
 def test_repeated_structure_gives_several_different_hypotheses_with_the_truth_first() -> None:
-    """A row of like trees fits itself when moved on by one tree; one more thing tells which is right."""
+    """A row of identical trees matches itself when shifted by one tree; one more object makes the pose unique."""
     trees = np.array(
         [[8.0 * k, 0.0, 0.0] for k in range(6)] + [[8.0 * k, 9.0, 0.0] for k in range(6)] + [[3.0, 4.0, 0.0]]
     )

@@ -206,7 +206,7 @@ def test_points_on_a_line_or_in_a_spot_are_degenerate(solver: str, spread: list[
     assert solve(points, points, config=SegregatorConfig(solver=solver)).reason is RejectReason.DEGENERATE
 
 
-def test_rows_that_agree_on_nothing_are_degenerate() -> None:
+def test_inconsistent_rows_are_degenerate() -> None:
     source, target = np.random.default_rng(0).uniform(-50, 50, size=(2, 4, 3))
     assert solve(source, target).reason is RejectReason.DEGENERATE
 

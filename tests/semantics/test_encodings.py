@@ -1,4 +1,4 @@
-"""The numberings of SemanticKITTI's classes, and telling which one a file uses."""
+"""The encodings of SemanticKITTI's classes, and their detection."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_id_of_no_class_is_named(value: int, encoding: Encoding) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["raw", "learning", "learning-0"])
-def test_a_street_tells_its_encoding(encoding: Encoding) -> None:
+def test_a_street_determines_its_encoding(encoding: Encoding) -> None:
     assert detect_encoding(_of_classes(STREET, encoding)) == encoding
 
 
@@ -65,7 +65,7 @@ def test_a_street_tells_its_encoding(encoding: Encoding) -> None:
     ("ids", "encoding"),
     [([0, 40], "raw"), ([0, 252], "raw"), ([9, 19], "learning"), ([9, 20, 22], "learning"), ([0, 80], "raw")],
 )
-def test_one_id_can_tell(ids: list[int], encoding: Encoding) -> None:
+def test_one_id_can_determine_the_encoding(ids: list[int], encoding: Encoding) -> None:
     assert detect_encoding(_histogram(dict.fromkeys(ids, 100))) == encoding
 
 
@@ -78,7 +78,7 @@ def test_one_id_can_tell(ids: list[int], encoding: Encoding) -> None:
         {0: 60, 12: 500, 14: 400},  # no road in either reading
     ],
 )
-def test_ambiguous_ids_are_asked_about_with_the_reason(points_of_id: dict[int, int]) -> None:
+def test_ambiguous_ids_are_reported_with_the_reason(points_of_id: dict[int, int]) -> None:
     with pytest.raises(SegslamError, match=r"they fit .* and .*--encoding raw\|learning\|learning-0"):
         detect_encoding(_histogram(points_of_id))
 

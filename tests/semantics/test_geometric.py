@@ -63,14 +63,14 @@ def _shares(labels, truth, points):
 
 
 @pytest.mark.parametrize("yaw_deg", [0, 17, 45, 90, 200])
-def test_the_things_of_a_small_world_are_told_apart_from_any_side(yaw_deg):
+def test_the_objects_of_a_small_world_are_classified_from_any_side(yaw_deg):
     points, truth = _world()
     turned = points @ yaw(np.radians(yaw_deg)).T
     shares = _shares(geometric_labels(turned, config=CONFIG), truth, points)
     assert min(shares.values()) > 0.9, shares
 
 
-def test_a_leaning_sensor_sees_the_same_things():
+def test_a_tilted_sensor_gives_the_same_labels():
     points, truth = _world()
     c, s = np.cos(0.3), np.sin(0.3)
     leaning = points @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).T

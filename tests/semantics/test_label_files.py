@@ -32,7 +32,7 @@ def test_labels_beside_the_scans_are_found_by_themselves(tmp_path: Path) -> None
     np.testing.assert_array_equal(source.read("000001", np.ones((3, 3))), [Label.CAR, Label.ROAD, Label.BUILDING])
 
 
-def test_without_label_files_the_shape_is_asked(tmp_path: Path) -> None:
+def test_without_label_files_labels_are_geometric(tmp_path: Path) -> None:
     source = open_labels("auto", beside=tmp_path, scan_names=NAMES, encoding=None)
     assert source.files is None
     assert source.geometric
@@ -40,7 +40,7 @@ def test_without_label_files_the_shape_is_asked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "geometric"), [("none", False), ("geometric", True)])
-def test_files_are_left_alone_when_not_asked_for(tmp_path: Path, name: str, geometric: bool) -> None:
+def test_files_are_not_read_unless_requested(tmp_path: Path, name: str, geometric: bool) -> None:
     _write(tmp_path / "labels", "000000", [10, 40])
     source = open_labels(name, beside=tmp_path, scan_names=NAMES, encoding=None)
     assert source.files is None
@@ -85,7 +85,7 @@ def test_id_of_another_encoding_is_the_scans_failure(tmp_path: Path) -> None:
         LabelFiles(tmp_path, "learning").read("000000", 2)
 
 
-def test_a_broken_file_does_not_keep_the_others_from_telling_the_encoding(tmp_path: Path) -> None:
+def test_an_invalid_file_does_not_prevent_detection_of_the_encoding(tmp_path: Path) -> None:
     _write(tmp_path / "labels", "000000", [10, 40])
     (tmp_path / "labels" / "000001.label").write_bytes(b"123")
     source = open_labels("auto", beside=tmp_path, scan_names=NAMES, encoding=None)
@@ -104,15 +104,17 @@ def test_folder_without_a_label_for_any_scan_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "expected"),
     [(["1", "2", "3"], r"mine"), (["1", "2"], r"mine.1\.label and .*mine.2\.label"), (["1"], r"mine.1\.label")],
 )
 def test_undecided_encoding_names_the_files_or_their_folder_and_the_option(
-    tmp_path: Path, names: list[str], said: str
+    tmp_path: Path, names: list[str], expected: str
 ) -> None:
     for name in names:
         _write(tmp_path / "mine", name, [0, 0, 0])
-    with pytest.raises(SegslamError, match=said + r": the numbering of the classes cannot be detected .*--encoding"):
+    with pytest.raises(
+        SegslamError, match=expected + r": the numbering of the classes cannot be detected .*--encoding"
+    ):
         open_labels("mine", beside=tmp_path, scan_names=names, encoding=None)
 
 
@@ -123,7 +125,7 @@ def test_missing_network_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["000000", "000020", "000030", "004413"])
-def test_each_real_prediction_tells_its_encoding_alone(data_dir: Path, name: str) -> None:
+def test_the_encoding_of_each_real_prediction_is_detected_from_one_file(data_dir: Path, name: str) -> None:
     sequence = data_dir / "kitti" / "sequences" / "00"
     source = open_labels("predicted_labels", beside=sequence, scan_names=[name], encoding=None)
     assert source.files == LabelFiles(sequence / "predicted_labels", "learning-0")

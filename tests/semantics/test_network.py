@@ -1,4 +1,4 @@
-"""Networks that the test makes itself: what they say reaches each point, and what does not fit is refused."""
+"""Generated networks: each point gets the class of its pixel, and mismatches are reported."""
 
 import json
 import logging
@@ -91,7 +91,7 @@ def _made(**options: Any) -> Callable[[Path], Path]:
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "expected"),
     [
         (lambda folder: folder / "none.onnx", r"none\.onnx: no such file"),
         (_without_settings, r"net\.yaml: cannot be read"),
@@ -116,10 +116,10 @@ def _made(**options: Any) -> Callable[[Path], Path]:
         (_made(votes={"window": 4}), r"net\.yaml: votes\.window: .*odd"),
     ],
 )
-def test_what_does_not_fit_is_refused_when_it_is_opened(
-    tmp_path: Path, make: Callable[[Path], Path], said: str
+def test_mismatches_are_reported_when_a_network_is_opened(
+    tmp_path: Path, make: Callable[[Path], Path], expected: str
 ) -> None:
-    with pytest.raises(SegslamError, match=said):
+    with pytest.raises(SegslamError, match=expected):
         open_network(make(tmp_path))
 
 
@@ -167,7 +167,7 @@ def test_late_labels_lose_the_rows_that_their_points_lose(tmp_path: Path) -> Non
     assert len(np.unique(expected)) == 3
 
 
-def test_unknown_intensities_are_zeros_and_that_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_unknown_intensities_are_zeros_with_one_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     points, _ = one_point_a_pixel()
     source = open_labels(f"network:{made_network(tmp_path)}", beside=tmp_path, scan_names=["0"], encoding=None)
     assert not source.geometric
@@ -187,9 +187,9 @@ def test_register_labels_both_scans_by_one_network(
     labels = ["--labels", f"network:{made_network(tmp_path)}"]
     options = [*labels, "--json"] if before else ["--json", *labels]
     assert run("register", tmp_path / "scan.npy", tmp_path / "scan.npy", *options) == 1, "no clusters in such a scan"
-    told = json.loads(capsys.readouterr().out)
-    assert set(told) >= {"accepted", "reason"}
-    assert told["seconds"]["label"] > 0
+    output = json.loads(capsys.readouterr().out)
+    assert set(output) >= {"accepted", "reason"}
+    assert output["seconds"]["label"] > 0
 
 
 def test_settings_in_the_documentation_are_complete(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def _with(architecture: dict[str, Any], classes: Any = None) -> Callable[[Path],
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "expected"),
     [
         (_without_classes, r"data_cfg\.yaml: no such file; .*semantic-kitti\.yaml"),
         (_imports_nothing, r"elsewhere/arch_cfg\.yaml: cannot be read"),
@@ -154,7 +154,7 @@ def _with(architecture: dict[str, Any], classes: Any = None) -> Callable[[Path],
     ],
 )
 def test_files_that_cannot_be_used_are_refused_with_the_reason(
-    tmp_path: Path, make: Callable[[Path], Path], said: str
+    tmp_path: Path, make: Callable[[Path], Path], expected: str
 ) -> None:
-    with pytest.raises(SegslamError, match=said):
+    with pytest.raises(SegslamError, match=expected):
         read_settings(make(tmp_path))

@@ -48,7 +48,7 @@ def test_each_pixel_shows_the_nearest_of_its_points() -> None:
     np.testing.assert_array_equal(projection.nearest, expected)
 
 
-def test_channels_are_normalised_in_the_order_asked_for_and_empty_pixels_are_zero() -> None:
+def test_channels_are_normalised_in_the_given_order_and_empty_pixels_are_zero() -> None:
     points, intensities = np.array([[3.0, 0.0, 4.0], [0.0, 5.0, 0.1]]), np.array([0.5, 1.0])
     backwards = NetworkSettings.model_validate(
         SETTINGS
@@ -61,7 +61,7 @@ def test_channels_are_normalised_in_the_order_asked_for_and_empty_pixels_are_zer
     assert np.count_nonzero(image.any(axis=0)) == 2
 
 
-def test_pixels_without_a_point_are_exactly_zero_in_every_channel_and_the_mask_tells_them() -> None:
+def test_pixels_without_a_point_are_exactly_zero_in_every_channel_including_the_mask() -> None:
     points = _scan(500)
     channels = {"channels": ["range", "x", "y", "z", "intensity", "mask"], "mean": [9, 8, 7, 6, 5, 0], "std": [1] * 6}
     settings = NetworkSettings.model_validate(SETTINGS | channels)

@@ -1,4 +1,4 @@
-"""Runs that cannot be merged or localised in: one line, status 2, and nothing is left."""
+"""Runs that cannot be merged or used for localisation: one line, exit status 2, and no files."""
 
 import shutil
 from collections.abc import Callable
@@ -56,10 +56,10 @@ def test_a_run_that_is_not_whole_is_refused_by_name(
     make(bad)
     for arguments in (("merge", good, bad), ("merge", bad, good), ("localise", bad, tmp_path)):
         assert run(*arguments, "--out", out, "--quiet") == 2
-        told = capsys.readouterr().err.strip().splitlines()
-        assert len(told) == 1, told
-        assert str(bad) in told[0]
-        assert complaint in told[0]
+        output = capsys.readouterr().err.strip().splitlines()
+        assert len(output) == 1, output
+        assert str(bad) in output[0]
+        assert complaint in output[0]
         assert not out.exists()
 
 
@@ -74,14 +74,14 @@ def test_a_run_that_is_not_whole_is_refused_by_name(
         (("localise", "{good}", "nowhere"), "nowhere: no such file"),
     ],
 )
-def test_bad_usage_is_told_in_one_line(
+def test_bad_usage_is_reported_in_one_line(
     good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], complaint: str
 ) -> None:
     given = [argument.format(good=good) for argument in arguments]
     assert run(*given, "--out", tmp_path / "out", "--quiet") == 2
-    told = capsys.readouterr().err.strip().splitlines()
-    assert len(told) == 1, told
-    assert complaint in told[0]
+    output = capsys.readouterr().err.strip().splitlines()
+    assert len(output) == 1, output
+    assert complaint in output[0]
     assert not (tmp_path / "out").exists()
 
 

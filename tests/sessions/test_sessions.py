@@ -93,10 +93,10 @@ def test_both_commands_work_in_a_terminal(days: Days, tmp_path: Path) -> None:
         ("merge", monday, friday, "--out", str(tmp_path / "both"), "--map"),
         ("localise", monday, str(days.friday_scans), "--out", str(tmp_path / "there")),
     ):
-        status, told = in_terminal("-m", "segslam", *command)
-        assert status == 0, told
-        assert "Traceback" not in told
-        shown += told
+        status, output = in_terminal("-m", "segslam", *command)
+        assert status == 0, output
+        assert "Traceback" not in output
+        shown += output
     assert "44/44" in shown  # steps of both sessions
     assert "loops between sessions: " in shown
     assert "localised in the old map: 100.0 %" in shown
@@ -157,7 +157,7 @@ def _contents(folder: Path) -> dict[str, str]:
     return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(folder.iterdir())}
 
 
-def test_missing_scans_are_no_harm(days: Days, tmp_path: Path) -> None:
+def test_missing_scans_do_not_affect_the_result(days: Days, tmp_path: Path) -> None:
     gap = write_day(tmp_path / "gap", day=1, first=0, num_scans=18, without=range(6, 12))
     run_there = segslam.localise(days.monday.folder, gap, tmp_path / "run")
     assert run_there.reference is not None

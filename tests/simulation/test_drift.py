@@ -1,4 +1,4 @@
-"""What bends a sweep: the asked spread and memory, and each bend against its exact form."""
+"""Distortions of a sweep: spread and correlation time as configured, each compared with its exact form."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_an_azimuth_error_swings_ahead_left_and_behind_right():
     np.testing.assert_allclose(swung - points, [[0, 0.02, 0], [0, 0.02, 0], [0, 0, 0], [0, 0, 0]], atol=1e-12)
 
 
-def test_errors_have_the_asked_spread_and_memory():
+def test_errors_have_the_given_spread_and_correlation_time():
     config = SensorConfig(
         sweep_rotation_sigma_deg=0.5,
         sweep_translation_sigma_m=0.1,

@@ -1,4 +1,4 @@
-"""Labels as wrong as asked, in regions and at edges, and never of a class that moves."""
+"""Label errors as configured, in regions and at edges, and without moving classes."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def wall_and_car() -> tuple[np.ndarray, np.ndarray]:
     return points, np.where(car, Label.CAR, Label.BUILDING).astype(np.uint8)
 
 
-def test_no_error_asked_for_means_none():
+def test_zero_settings_change_no_label():
     points, labels = wall_and_car()
     np.testing.assert_array_equal(network_like(points, labels, config=NONE, rng=np.random.default_rng(0)), labels)
 
@@ -28,7 +28,7 @@ def test_moving_things_look_like_standing_ones():
     np.testing.assert_array_equal(network_like(points, moving, config=NONE, rng=np.random.default_rng(0)), labels)
 
 
-def test_the_asked_share_is_lost():
+def test_the_given_share_is_lost():
     points, labels = wall_and_car()
     config = NONE.model_copy(update={"lost": 0.3})
     guessed = network_like(points, labels, config=config, rng=np.random.default_rng(0))

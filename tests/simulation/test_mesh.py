@@ -102,7 +102,7 @@ def test_lorries_are_longer_and_taller_than_cars():
 
 
 def test_a_wall_has_no_holes_and_relief_along_the_street():
-    """Rays square to it all meet it, some nearer, some farther: bays tell how far along the street one is."""
+    """Perpendicular rays all meet it at different ranges: bays make positions along the street distinguishable."""
     part = buildings.building(np.random.default_rng(1), 20.0, 10.0)
     x, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-9.7, 9.7, 200), np.linspace(0.1, 3.0, 30)))
     origins = np.column_stack([x, np.full(len(x), -10.0), z])

@@ -71,7 +71,7 @@ def test_a_perfect_sensor_sees_level_ground_at_its_own_height(bare_world):
     np.testing.assert_allclose(points[near_road, 2], -1.73, atol=2e-3)
 
 
-def test_range_noise_has_the_asked_spread(bare_world):
+def test_range_noise_has_the_given_spread(bare_world):
     truth = scan_of(bare_world, perfect()).points
     noisy = scan_of(bare_world, perfect(range_sigma_m=0.05)).points
     assert len(truth) == len(noisy)
@@ -99,7 +99,7 @@ def test_beam_errors_last_from_sweep_to_sweep_and_change_with_the_seed(bare_worl
     assert not np.array_equal(*errors)
 
 
-def test_dropout_loses_the_asked_share(street):
+def test_dropout_loses_the_given_share(street):
     kept = len(scan_of(street, perfect(dropout=0.3)).points) / len(scan_of(street, perfect()).points)
     assert abs(kept - 0.7) < 0.01  # some 120,000 draws
 

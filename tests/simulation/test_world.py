@@ -1,4 +1,4 @@
-"""The streets: level under the car, nothing in its way, the same from the same seed, and changing where asked."""
+"""The streets: level under the car, free of obstacles, reproducible from the seed, and following the settings."""
 
 import numpy as np
 import pytest
@@ -128,7 +128,7 @@ def test_each_knob_governs_its_own_class(loop, world, knob, label):
     assert after < 0.5 * before  # signs stand on poles
 
 
-def test_rows_of_equal_trees_are_equally_spaced_and_alike():
+def test_rows_of_equal_trees_are_equally_spaced_and_identical():
     poses = np.tile(np.eye(4), (200, 1, 1))
     poses[:, 0, 3] = np.arange(200)
     config = STILL.model_copy(update={"equal_tree_rows": True, "shrubs": 0.0, "cars": 0.0, "built": 0.0, "trees": 10.0})
@@ -145,7 +145,7 @@ def test_rows_of_equal_trees_are_equally_spaced_and_alike():
     assert np.ptp([np.ptp(trunk[:, 2]) for trunk in trunks]) < 1e-9
 
 
-def test_parked_cars_are_gone_at_the_second_visit_where_asked(world, loop):
+def test_parked_cars_are_gone_at_the_second_visit_if_configured(world, loop):
     """The shared street of the loop is driven at its start, in its middle and at its end."""
     poses, time_s = loop
     changing = build_world(poses, time_s, config=STILL.model_copy(update={"parked_cars_gone": 1.0}), seed=1)

@@ -1,4 +1,4 @@
-"""What an optional package is missing for is told with a command that installs it."""
+"""Messages about missing optional packages contain a command that installs them."""
 
 import sys
 import tomllib
@@ -22,10 +22,10 @@ def _declared(extra: str) -> list[Requirement]:
 @pytest.mark.parametrize("extra", sorted(set(PROJECT["optional-dependencies"]) - {"dev"}))
 def test_the_command_names_the_packages_of_the_extra_in_the_versions_that_were_tested(extra: str) -> None:
     """Not segslam's own extra: PyPI has no segslam to take it from."""
-    told = how_to_install(extra)
-    assert told.startswith("pip install ")
-    assert "segslam" not in told
-    packages = {found.name: found.specifier for found in map(Requirement, told.replace("'", "").split()[2:])}
+    output = how_to_install(extra)
+    assert output.startswith("pip install ")
+    assert "segslam" not in output
+    packages = {found.name: found.specifier for found in map(Requirement, output.replace("'", "").split()[2:])}
     assert packages == {wanted.name: wanted.specifier for wanted in _declared(extra)}
 
 
@@ -34,7 +34,7 @@ def test_requirements_are_those_of_the_project() -> None:
     assert core == {Requirement(line).name for line in PROJECT["dependencies"]}
 
 
-def test_las_and_ros_messages_say_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_las_and_ros_messages_have_the_install_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clouds, "find_spec", lambda _: None)
     with pytest.raises(SegslamError, match=r"pip install 'laspy<.*' 'lazrs<"):
         clouds.check_las(tmp_path / "map.laz")

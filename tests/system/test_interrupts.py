@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: one line, what is kept, and how to go on."""
+"""Ctrl-C at any moment: one line with the kept results and the command that continues."""
 
 import shlex
 import signal
@@ -53,7 +53,7 @@ print("went on")
 
 
 def run(*arguments: object) -> int:
-    """Exit status of a command line, whose words are those of the process."""
+    """Exit status of a command line, which is also that of the process."""
     words = [str(argument) for argument in arguments]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["segslam", *words])
@@ -99,7 +99,7 @@ def interrupt_after(num_scans: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(map_module, "progress", interrupted)
 
 
-def test_a_run_that_was_stopped_goes_on_by_the_command_that_is_told(
+def test_an_interrupted_run_continues_with_the_printed_command(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["map", data, "--out", tmp_path / "a run"]
@@ -107,10 +107,10 @@ def test_a_run_that_was_stopped_goes_on_by_the_command_that_is_told(
         interrupt_after(2, patch)
         assert run(*command, "--quiet") == 130
     (line,) = capsys.readouterr().err.splitlines()
-    told = line.partition("continue with: segslam ")[2]
+    output = line.partition("continue with: segslam ")[2]
     assert line.startswith("segslam: stopped: ")
-    assert shlex.split(told)[:2] == ["resume", str(tmp_path / "a run")]
-    assert run(*shlex.split(told), "--json") == 0
+    assert shlex.split(output)[:2] == ["resume", str(tmp_path / "a run")]
+    assert run(*shlex.split(output), "--json") == 0
     assert '"num_scans": 5' in capsys.readouterr().out
 
 
@@ -190,12 +190,12 @@ def test_a_real_ctrl_c_ends_in_one_line_and_leaves_no_half_file(
             while not _has_begun(tmp_path / begun) and process.poll() is None:
                 time.sleep(0.01)
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=60)
+            _, expected = process.communicate(timeout=60)
         finally:
             process.kill()
-    assert process.returncode == 130, said
-    *_, line = said.splitlines()
+    assert process.returncode == 130, expected
+    *_, line = expected.splitlines()
     assert line.startswith("segslam: stopped: ")
     assert kept in line
-    assert "Traceback" not in said
+    assert "Traceback" not in expected
     assert not [file for file in tmp_path.rglob("*") if file.suffix == ".part" or ".map-" in file.name]

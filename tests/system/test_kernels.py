@@ -31,7 +31,7 @@ def test_a_build_compiles_all_kernels_once_and_is_remembered(monkeypatch: pytest
     assert len(list(tmp_path.rglob("*.nbi"))) == len(names)
 
 
-def test_a_process_that_fails_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_failing_process_is_reported_with_the_reason(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(kernels, "num_kernels", lambda _: 1)
     monkeypatch.setattr(kernels, "_stamp", lambda _: tmp_path / "stamp")

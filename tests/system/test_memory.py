@@ -19,7 +19,7 @@ print(faults() - before)
 
 
 def _faults(keep: str) -> int:
-    """Pages that the system cleared anew for 50 times six arrays of a scan's size."""
+    """Page faults of 50 times six arrays of a scan's size."""
     program = FAULTS.format(keep=keep)
     return int(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout)
 

@@ -47,7 +47,7 @@ def test_items_are_made_while_others_are_worked_on_and_no_more_than_may_wait() -
     assert made == list(range(9))
 
 
-def test_items_are_made_by_the_thread_that_asks_and_worked_on_by_one_other() -> None:
+def test_items_are_produced_by_the_calling_thread_and_processed_by_one_other() -> None:
     def items() -> Iterator[int]:
         for _ in range(6):
             yield threading.get_ident()

@@ -63,7 +63,7 @@ def test_a_link_stays_a_link(tmp_path: Path) -> None:
     assert (tmp_path / "real.txt").read_text() == "after"
 
 
-def test_what_is_no_regular_file_is_never_replaced(
+def test_only_regular_files_are_replaced(
     graph: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     os.mkfifo(tmp_path / "pipe.ply")
@@ -138,7 +138,7 @@ def test_a_simulation_on_a_full_disk_ends_with_whole_scans_and_says_how_to_begin
 def test_a_benchmark_on_a_full_disk_leaves_no_half_file(
     drive: Path, tmp_path: Path, option: str, size: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Neither rows nor report fit, or only the rows; then the same command goes on."""
+    """Neither rows nor report fit, or only the rows; then the same command continues."""
     target = {"--details": tmp_path / "rows.csv", "--out": tmp_path / "report"}[option]
     bench = (
         "bench",
@@ -194,7 +194,7 @@ def test_a_full_standard_output_is_one_line(finished: Path, arguments: list[str]
     assert "standard output: cannot be written (No space left on device); redirect it elsewhere" in line
 
 
-def test_a_reader_that_goes_away_is_no_error_to_tell(finished: Path) -> None:
+def test_a_closed_pipe_is_not_reported_as_an_error(finished: Path) -> None:
     command = f"{sys.executable} -m segslam eval {finished} --json | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
     assert done.stderr == ""

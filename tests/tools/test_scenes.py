@@ -1,4 +1,4 @@
-"""Verification away from the street: nothing may be accepted that is wrong, and nearly all that is right."""
+"""Verification in scenes other than streets: no wrong pose is accepted, and nearly all correct ones are."""
 
 import math
 from functools import cache
@@ -58,7 +58,7 @@ def _is_wrong(found: Alignment | Rejected) -> bool:
     ("scene", "sensor", "noise_m"),
     [("corridor", "64", 0.03), ("garage", "16", 0.01), ("parking lot", "non-repeating", 0.03)],
 )
-def test_nothing_wrong_is_accepted_and_what_is_right_is_kept(scene: str, sensor: str, noise_m: float) -> None:
+def test_no_wrong_pose_is_accepted_and_correct_ones_are_kept(scene: str, sensor: str, noise_m: float) -> None:
     _check(scene, sensor, noise_m, count=4, kept=0.7)
 
 

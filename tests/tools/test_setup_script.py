@@ -1,4 +1,4 @@
-"""`tools/setup.sh` chooses an interpreter that segslam runs on, or says what to install."""
+"""`tools/setup.sh` chooses an interpreter that segslam supports, or prints what to install."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 SCRIPT = Path(__file__).resolve().parents[2] / "tools" / "setup.sh"
 FUTURE = '#!/bin/sh\n[ "$1" = --version ] && { echo Python 3.14.0; exit 0; }\nexit 1\n'
-"""A python3 that is too new: it fails where it is asked whether it will do."""
+"""A python3 that is too new: the check of its version fails."""
 
 
 def _sourced(folder: Path, call: str) -> subprocess.CompletedProcess[str]:
@@ -31,7 +31,7 @@ def test_an_older_interpreter_is_taken_where_python3_is_too_new(tmp_path: Path) 
     assert ended.stdout.split() == ["python3.12"], ended.stderr
 
 
-def test_where_there_is_none_the_message_says_what_to_install(tmp_path: Path) -> None:
+def test_without_an_interpreter_the_message_says_what_to_install(tmp_path: Path) -> None:
     _write(tmp_path / "python3", FUTURE)
     ended = _sourced(tmp_path, "python_packages")
     assert ended.returncode == 1

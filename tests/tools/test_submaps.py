@@ -1,4 +1,4 @@
-"""Real submaps of thin scans, revisited in reverse."""
+"""Real submaps of sparse scans, revisited in reverse."""
 
 from pathlib import Path
 

@@ -88,8 +88,8 @@ def test_a_residual_is_measured_by_the_roughness_of_the_rougher_scan() -> None:
     assert found.residual_ratio == pytest.approx(found.rms_m / max(rough[0].roughness_m, smooth[0].roughness_m))
 
 
-def test_a_noisier_sensor_is_judged_by_its_own_noise() -> None:
-    """10 cm of range noise raise residual and roughness alike; a wrong pose stays wrong."""
+def test_limits_adapt_to_a_noisier_sensor() -> None:
+    """10 cm of range noise increase residual and roughness equally; a wrong pose is still rejected."""
     T_wrong = geometry.transform(np.eye(3), [1.5, 0.0, 0.0])
     for sigma_m in (0.01, 0.1):
         rng = np.random.default_rng(4)
@@ -139,7 +139,7 @@ def test_a_coarse_pose_is_rejected_early_beyond_three_times_the_free_space_allow
 
 
 @pytest.mark.data
-def test_real_pairs_are_believed_at_the_true_pose_and_not_a_car_s_length_away(real_pairs) -> None:
+def test_real_pairs_are_accepted_at_the_true_pose_and_not_a_car_s_length_away(real_pairs) -> None:
     for pair in real_pairs.pairs:
         scans = [_prepared(real_pairs.points(index)) for index in (pair.source, pair.target)]
         right = agreement(scans[0], scans[1], pair.T_target_source, config=CONFIG)

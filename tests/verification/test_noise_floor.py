@@ -12,7 +12,7 @@ CONFIG = Config()
 
 
 class _Drive:
-    """Scans of one place, a neighbour 1 m on; counts which are asked for."""
+    """Scans of one place, neighbours 1 m apart; records which are requested."""
 
     def __init__(self, sigma_m: float, *, slip_m: float = 0.0) -> None:
         rng = np.random.default_rng(5)
@@ -52,7 +52,7 @@ def test_the_same_calls_give_the_same_floor() -> None:
     assert [one.at(at) for at in (60, 70, 90)] == [other.at(at) for at in (60, 70, 90)]
 
 
-def test_where_odometry_slipped_neighbours_tell_nothing() -> None:
+def test_neighbours_are_ignored_where_odometry_failed() -> None:
     assert _Drive(0.02, slip_m=15.0).noise().at(101) == SINGLE_PAIR
 
 

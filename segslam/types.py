@@ -22,7 +22,7 @@ from segslam.system.short_repr import Record
 Points = Float[np.ndarray, "_ 3"]
 """Points, a row each, in metres."""
 Labels = UInt8[np.ndarray, "_"]
-"""SemanticKITTI learning ids, one a point."""
+"""SemanticKITTI learning ids, one per point."""
 ScanLabels = Labels | Callable[[], Labels]
 """The labels of a scan, or a function that computes them, as for a network."""
 Transform = Float[np.ndarray, "4 4"]
@@ -124,7 +124,7 @@ class Scan(Record):
     times: Vector
     """Per point, 0 at the sweep's start to 1 at its end; empty if unknown or already motion-compensated."""
     intensities: Vector | None
-    """Per point, in the sensor's own unit; None if unknown or not asked for."""
+    """Per point, in the sensor's own unit; None if unknown or not requested."""
     kept: Mask | None
     """Rows of the file that the points were read from; None for all rows."""
 

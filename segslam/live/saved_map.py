@@ -1,4 +1,4 @@
-"""The map so far, written to a file while the run goes on."""
+"""The map so far, written to a file during the run."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

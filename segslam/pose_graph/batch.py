@@ -87,7 +87,7 @@ def _possible(robust: Robust, graph: G2oGraph, problem: FileProblem) -> Robust:
         )
     logger.warning(
         "edges between consecutive ids alone do not connect this graph, so there is no odometry to compare closures "
-        "by: --robust %s is used in place of consistent",
+        "by: --robust %s is used instead of consistent",
         FALLBACK,
     )
     return FALLBACK

@@ -98,7 +98,7 @@ def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Value
         if _is_certain(problem, candidates[0]):
             return candidates[0]
     if len(problem.closures) > MAX_PAIRED:
-        logger.info("more than %d closures: graduated non-convexity in place of pairwise consistency", MAX_PAIRED)
+        logger.info("more than %d closures: graduated non-convexity instead of pairwise consistency", MAX_PAIRED)
         return solve(truncated, start)
     odometry, closures = problem.chain()
     consistent = consistent_pairs(odometry, closures, problem.inlier_bound)

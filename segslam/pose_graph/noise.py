@@ -83,7 +83,7 @@ def is_positive_semidefinite(matrix: Information) -> bool:
 def inlier_bound(probability: float, *, error_allowance: float = 1.0) -> float:
     """Squared whitened error (chi-square, not half of it) that a correct edge is below with this probability.
 
-    `error_allowance`: when errors are so many times as large as claimed.
+    `error_allowance`: tolerated ratio of real to modelled errors.
     """
     return error_allowance**2 * float(chdtri(DEGREES_OF_FREEDOM, 1.0 - probability))
 

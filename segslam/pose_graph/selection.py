@@ -1,7 +1,7 @@
 """Inliers among closures, from the largest pairwise-consistent set.
 
 The largest consistent set holds the inliers unless outliers that are consistent with the rest, as a repeated street
-makes them, outnumber the true closures of their place. Then the true ones are left over, are consistent too, and lower
+makes them, outnumber the true closures of their place. Then the true closures are rejected, are consistent too, and lower
 the cost when they take the place of the outliers.
 """
 
@@ -17,7 +17,7 @@ from segslam.types import Mask
 MAX_TRIALS = 10
 """Chosen: each takes some optimisations; there are hardly more places with so many rejected closures."""
 MIN_GROUP = 3
-"""Chosen: a smaller group hardly ever has a lower cost than the change of odometry that it asks for."""
+"""Chosen: a smaller group hardly ever has a lower cost than the change of odometry that it requires."""
 NEARLY_ALL = 0.9
 """Chosen: a true closure is consistent with all other true ones but one in a hundred; with half of them, outliers are
 too."""

@@ -76,7 +76,7 @@ class Network:
     def _check_output(self, output: np.ndarray, what: str, allowed: list[tuple[int, ...]]) -> None:
         if output.shape not in allowed:
             expected = " or ".join(_shape(shape) for shape in allowed)
-            raise _misfit(self._model, f"gives {what} of {_shape(output.shape)}", f"asks for {expected}")
+            raise _misfit(self._model, f"gives {what} of {_shape(output.shape)}", f"requires {expected}")
 
 
 def open_network(model: Path) -> Network:

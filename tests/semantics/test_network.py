@@ -98,7 +98,7 @@ def _made(**options: Any) -> Callable[[Path], Path]:
         (_truncated, r"net\.onnx: onnxruntime cannot load it"),
         (_weights_elsewhere, r"in a separate file, net\.onnx\.data: put it beside.*external_data=False"),
         (_two_inputs, r"takes the inputs a: tensor\(float\), b: tensor\(float\); expected a single input"),
-        (_made(classes=["road", "car"]), r"gives logits of 1 x 3 x 16 x 90, but net\.yaml asks for 1 x 2 x 16 x 90"),
+        (_made(classes=["road", "car"]), r"gives logits of 1 x 3 x 16 x 90, but net\.yaml requires 1 x 2 x 16 x 90"),
         (_made(height=32), r"takes an image of 1 x 5 x 16 x 90, but net\.yaml makes one of 1 x 5 x 32 x 90"),
         (
             _made(channels=["range", "x", "y", "z"], mean=[0] * 4, std=[1] * 4),
@@ -127,7 +127,7 @@ def test_ids_of_another_shape_are_refused_with_both_shapes(tmp_path: Path) -> No
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, (1, 5, HEIGHT, WIDTH))
     ids = helper.make_tensor_value_info("ids", TensorProto.INT64, None)
     graph = helper.make_graph([helper.make_node("ArgMax", ["image"], ["ids"], axis=3, keepdims=0)], "g", [image], [ids])
-    with pytest.raises(SegslamError, match=r"class ids of 1 x 5 x 16, but net\.yaml asks for 1 x 16 x 90 or"):
+    with pytest.raises(SegslamError, match=r"class ids of 1 x 5 x 16, but net\.yaml requires 1 x 16 x 90 or"):
         open_network(save_network(tmp_path, graph))
 
 

@@ -1,4 +1,4 @@
-"""Each benchmark runs to its end, on a pair or two or on twenty scans, and its figures are those of what it was given."""
+"""Each benchmark runs to completion, on one or two pairs or on twenty scans, and its figures match its input."""
 
 import json
 import shutil

@@ -1,1 +1,1 @@
-"""Labels by shape: the parts of the benchmark."""
+"""Parts of the benchmark of geometric labels."""

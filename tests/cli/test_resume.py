@@ -97,7 +97,7 @@ def test_a_dry_run_shows_what_was_found_and_writes_nothing(
     assert (found["data"], found["num_scans"], found["first_scan"], found["last_scan"]) == ("kitti/00", 6, 2, 7)
     assert found["scans_per_second"] == pytest.approx(1 / 0.3)
     assert found["num_true_poses"] == 6
-    assert found["labels"] == "by shape"
+    assert found["labels"] == "geometric"
     assert found["first_usable_scan"]["num_points"] > 1000
     assert found["changed_settings"] == {"keyframes.distance_m": "4.0"}
     assert run(*arguments) == 0

@@ -194,7 +194,7 @@ def test_one_bad_scan_is_named_and_the_others_read(
         dataset[1]
     with caplog.at_level(logging.WARNING):
         assert [scan.index for scan in dataset] == [0, 2]
-    assert "scan 1 left out" in caplog.text
+    assert "scan 1 skipped" in caplog.text
 
 
 def test_scan_that_vanishes_is_a_bad_scan(tmp_path: Path) -> None:

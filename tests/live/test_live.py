@@ -142,7 +142,7 @@ def test_a_removed_folder_ends_the_stream_with_the_reason(tmp_path: Path) -> Non
     source = FolderSource(folder)
     source.open(print)
     folder.rmdir()
-    assert "is gone" in source.feed(Waiting(), threading.Event())
+    assert "was removed" in source.feed(Waiting(), threading.Event())
 
 
 def test_only_folders_can_be_watched(tmp_path: Path) -> None:

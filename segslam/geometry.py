@@ -56,7 +56,11 @@ def tangent(*, rotation_rad: Triple, translation_m: Triple) -> Tangent:
 def exp(xi: Tangent) -> Transform:
     """The rigid transform of a tangent; inverse of `log`."""
     phi, rho = xi[:3], xi[3:]
-    return transform(ScipyRotation.from_rotvec(phi).as_matrix(), _left_jacobian(phi) @ rho)
+    theta = float(np.linalg.norm(phi))
+    cross = _cross(phi)
+    # 1 - cos(theta) as a square: exact for small angles
+    a, b = (1.0, 0.5) if theta < 1e-8 else (math.sin(theta) / theta, 2.0 * (math.sin(theta / 2.0) / theta) ** 2)
+    return transform(np.eye(3) + a * cross + b * cross @ cross, _left_jacobian(phi) @ rho)
 
 
 def log(T_a_b: Transform) -> Tangent:
@@ -71,8 +75,23 @@ def scaled(T_a_b: Transform, factor: float) -> Transform:
 
 
 def angle(T_a_b: Transform) -> float:
-    """Angle of the rotation (rad), 0 to pi: arccos((tr R - 1) / 2), exact near 0."""
-    return float(ScipyRotation.from_matrix(T_a_b[:3, :3]).magnitude())
+    """Angle of the rotation (rad), 0 to pi, from its sine and cosine: exact near 0 and near pi."""
+    (a, b, c), (d, e, f), (g, h, i) = T_a_b[:3, :3].tolist()
+    return math.atan2(math.hypot(h - f, c - g, d - b), a + e + i - 1.0)
+
+
+def quaternion(R_a_b: Rotation) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation, from the largest of the four; of either sign."""
+    (a, b, c), (d, e, f), (g, h, i) = R_a_b.tolist()
+    rows = (
+        (1.0 + a - e - i, b + d, c + g, h - f),
+        (b + d, 1.0 - a + e - i, f + h, c - g),
+        (c + g, f + h, 1.0 - a - e + i, d - b),
+        (h - f, c - g, d - b, 1.0 + a + e + i),
+    )
+    x, y, z, w = max(rows, key=lambda row: math.hypot(*row))
+    length = math.hypot(x, y, z, w)
+    return x / length, y / length, z / length, w / length
 
 
 def distance(T_a_b: Transform) -> float:
@@ -107,13 +126,18 @@ def nearest_rotation(matrix: Rotation) -> Rotation:
 
 def _left_jacobian(phi: np.ndarray) -> Rotation:
     theta = float(np.linalg.norm(phi))
-    x, y, z = phi
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = _cross(phi)
     if theta < 1e-4:  # series: the closed form loses precision here; the next term is below 1e-17
         return np.eye(3) + cross / 2.0 + cross @ cross / 6.0
     a = (1.0 - math.cos(theta)) / theta**2
     b = (theta - math.sin(theta)) / theta**3
     return np.eye(3) + a * cross + b * cross @ cross
+
+
+def _cross(phi: np.ndarray) -> np.ndarray:
+    """The matrix of the cross product with a vector."""
+    x, y, z = phi.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def raise_beams(points: Points, angle_deg: float) -> Points:

@@ -57,20 +57,17 @@ def voxel_first(points: Points, voxel_m: float) -> Indices:
     return rows[hash_keys(keys)[1] == np.arange(len(keys))]
 
 
-def voxel_means(points: Points, voxel_m: float) -> Points:
+def voxel_means(points: Points, voxel_m: float, *, beyond_m: float = -1.0, within_m: float = math.inf) -> Points:
     """Mean (m, 3), float64, of the finite points in each occupied voxel; voxels are ordered by x, y, z.
 
-    The result does not depend on the order of float32 points: their sums are exact, except below 1e-5 m.
-    Raises ValueError as `voxel_first` does.
+    Only points strictly between two ranges count (`within_range`). The result does not depend on the order of float32
+    points: their sums are exact, but for coordinates below 1e-5 m. Raises ValueError as `voxel_first` does.
     """
-    points = points.compress(is_finite(points), axis=0)
-    keys, _ = _cell_keys(points, voxel_m)
-    _, first = hash_keys(keys)
-    occupied = np.flatnonzero(first == np.arange(len(keys)))
-    occupied = occupied[np.argsort(keys[occupied])]
-    voxel_of_first = np.empty(len(keys), np.int64)
-    voxel_of_first[occupied] = np.arange(len(occupied))
-    return group_means(points, voxel_of_first[first], len(occupied))
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    squared = beyond_m * abs(beyond_m), within_m**2
+    lows_m, highs_m = _bounds(points, *squared)
+    lows, extent = _grid(lows_m, highs_m, voxel_m)
+    return _voxel_means(points, *squared, voxel_m, lows, extent)
 
 
 def group_means(rows: np.ndarray, group: Indices, num_groups: int) -> np.ndarray:
@@ -107,17 +104,80 @@ def _cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]
     The numbers ascend with x, then y, then z. A margin around the points ensures that all neighbouring cells have
     distinct numbers.
     """
+    coordinates = np.ascontiguousarray(points.T)
+    no_points = np.zeros(3)
+    lows, (_, num_y, num_z) = _grid(
+        coordinates.min(axis=1) if len(points) else no_points,
+        coordinates.max(axis=1) if len(points) else no_points,
+        cell_m,
+    )
+    x, y, z = (
+        (np.floor(column / cell_m) - low).astype(np.int64) for column, low in zip(coordinates, lows, strict=True)
+    )
+    return (x * num_y + y) * num_z + z, (int(num_y * num_z), int(num_z))
+
+
+def _grid(lows_m: np.ndarray, highs_m: np.ndarray, cell_m: float) -> tuple[Indices, Indices]:
+    """Lowest cells and numbers of cells (3,) of a grid with room around points between two corners."""
     if cell_m <= 0:
         raise ValueError(f"voxel_m or radius_m must be above 0, got {cell_m}")
-    if not len(points):
-        return np.empty(0, np.int64), (1, 1)
-    columns = [np.floor(column / cell_m) for column in np.ascontiguousarray(points.T)]
-    lows = [column.min() - 1 for column in columns]
-    extent = [int(column.max() - low) + 2 for column, low in zip(columns, lows, strict=True)]
+    lows = np.floor(lows_m / cell_m) - 1
+    extent = [int(number) + 2 for number in np.floor(highs_m / cell_m) - lows]
     if math.prod(extent) > MAX_CELLS:
         raise ValueError(f"points span {extent} cells of {cell_m} m; remove far points or enlarge the cells")
-    x, y, z = ((column - low).astype(np.int64) for column, low in zip(columns, lows, strict=True))
-    return (x * extent[1] + y) * extent[2] + z, (extent[1] * extent[2], extent[2])
+    return lows.astype(np.int64), np.array(extent)
+
+
+@kernel("UniTuple(float64[::1], 2)(float64[:, ::1], float64, float64)")
+def _bounds(points, beyond_squared, within_squared):
+    """Least and greatest coordinates of the points between two ranges; zeros if there is none."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        if beyond_squared < x * x + y * y + z * z < within_squared:
+            low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
+            high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
+    if low[0] > high[0]:
+        return np.zeros(3), np.zeros(3)
+    return low, high
+
+
+@kernel("float64[:, ::1](float64[:, ::1], float64, float64, float64, int64[::1], int64[::1])")
+def _voxel_means(points, beyond_squared, within_squared, voxel_m, lows, extent):
+    """The mean point of each voxel; `lows` and `extent` are those of `_grid`."""
+    size = 16
+    while size < 2 * len(points):
+        size *= 2
+    table = np.full(size, EMPTY, np.int64)
+    keys = np.empty(len(points), np.int64)
+    sums = np.zeros((len(points), 4))
+    count = 0
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        if not beyond_squared < x * x + y * y + z * z < within_squared:
+            continue
+        i = int(np.floor(x / voxel_m)) - lows[0]
+        j = int(np.floor(y / voxel_m)) - lows[1]
+        key = (i * extent[1] + j) * extent[2] + int(np.floor(z / voxel_m)) - lows[2]
+        slot = _home(key, size)
+        while table[slot] != EMPTY and keys[table[slot]] != key:
+            slot = (slot + 1) & (size - 1)
+        if table[slot] == EMPTY:
+            table[slot] = count
+            keys[count] = key
+            count += 1
+        group = sums[table[slot]]
+        group[0] += x
+        group[1] += y
+        group[2] += z
+        group[3] += 1.0
+    means = np.empty((count, 3))
+    order = np.argsort(keys[:count])
+    for k in range(count):
+        group = sums[order[k]]
+        for axis in range(3):
+            means[k, axis] = group[axis] / group[3]
+    return means
 
 
 @kernel("int64(int64, int64)")
@@ -211,6 +271,22 @@ def _patch_covariances(points, starts, ends, rows):
         covariances[row, 0, 2] = covariances[row, 2, 0] = xz / n - mx * mz
         covariances[row, 1, 2] = covariances[row, 2, 1] = yz / n - my * mz
     return covariances
+
+
+@kernel("float64[:, :](float64[:, ::1], int64[:, ::1])")
+def patch_normals(points, patches):
+    """Unit normal of each patch, the rows (k,) of its points; zero if it is not unique."""
+    covariances = np.zeros((len(patches), 3, 3))
+    for row in range(len(patches)):
+        mean = np.zeros(3)
+        for k in patches[row]:
+            for axis in range(3):
+                mean[axis] += points[k, axis] / patches.shape[1]
+        for k in patches[row]:
+            for i in range(3):
+                for j in range(3):
+                    covariances[row, i, j] += (points[k, i] - mean[i]) * (points[k, j] - mean[j])
+    return _least_directions(covariances)
 
 
 @kernel("float64(float64[:, :])")

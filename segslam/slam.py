@@ -12,7 +12,7 @@ from time import monotonic
 import numpy as np
 
 from segslam.config import Config
-from segslam.health import least_informed
+from segslam.health import information_of
 from segslam.keyframes import Clouds, CloudStore, downsample_keyframe
 from segslam.loops import ROUNDS, LoopCloser
 from segslam.odometry import Odometry, OdometryResult
@@ -208,7 +208,7 @@ class Slam:
                 keyframe.id,
                 keyframe.T_odom_keyframe,
                 keyframe.travel_m,
-                information=least_informed(self._since_keyframe),
+                information=information_of(self._since_keyframe),
             )
             self._since_keyframe = []
             with watch("recognise"):

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from segslam import geometry
 
@@ -81,3 +82,14 @@ def test_what_was_unknown_stays_unknown_under_noise() -> None:
     known = np.diag([4.0, 0.0, 4.0, 4.0, 0.0, 4.0])
     noisier = geometry.with_noise(known, rotation_rad=0.5, translation_m=0.5)
     np.testing.assert_allclose(noisier, np.diag([2.0, 0.0, 2.0, 2.0, 0.0, 2.0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1e-5, 0.3, 2.0, np.pi - 1e-9, np.pi])
+def test_angle_and_quaternion_are_those_of_scipy(angle_rad: float) -> None:
+    rng = np.random.default_rng(0)
+    for axis in [*np.eye(3), *rng.normal(size=(20, 3))]:
+        rotation = Rotation.from_rotvec(angle_rad * axis / np.linalg.norm(axis))
+        T = geometry.transform(rotation.as_matrix(), 0.0)
+        assert geometry.angle(T) == pytest.approx(angle_rad, abs=1e-14)
+        assert abs(np.dot(geometry.quaternion(T[:3, :3]), rotation.as_quat())) == pytest.approx(1.0, abs=1e-14)
+        np.testing.assert_allclose(geometry.exp(np.r_[angle_rad * axis / np.linalg.norm(axis), 0, 0, 0]), T, atol=1e-14)

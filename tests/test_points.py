@@ -12,6 +12,7 @@ from segslam.points import (
     hash_keys,
     normals,
     patch_covariances,
+    patch_normals,
     radius_neighbours,
     voxel_first,
     voxel_means,
@@ -58,6 +59,20 @@ def test_voxel_means_of_float32_points_do_not_depend_on_their_order() -> None:
     points = (cloud(0, 50_000, 80.0)).astype(np.float32)
     order = np.random.default_rng(1).permutation(len(points))
     np.testing.assert_array_equal(voxel_means(points, 5.0), voxel_means(points[order], 5.0))
+
+
+def test_voxel_means_count_the_points_between_two_ranges_only() -> None:
+    points = cloud(0)
+    chosen = points[within_range(points, 2.0, 7.0)]
+    np.testing.assert_array_equal(voxel_means(points, 1.7, beyond_m=2.0, within_m=7.0), voxel_means(chosen, 1.7))
+    assert len(voxel_means(np.zeros((1, 3)), 1.0)) == 1
+    assert len(voxel_means(np.zeros((1, 3)), 1.0, beyond_m=0.0)) == 0
+
+
+def test_the_normal_of_a_patch_is_that_of_its_points() -> None:
+    points, patches = cloud(0), np.random.default_rng(0).integers(0, 400, (50, 10))
+    expected = [np.linalg.eigh(np.cov(points[patch].T))[1][:, 0] for patch in patches]
+    np.testing.assert_allclose(np.abs(np.sum(patch_normals(points, patches) * expected, axis=1)), 1.0, atol=1e-9)
 
 
 def test_points_that_are_not_finite_are_in_no_voxel() -> None:

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
+import small_gicp
 from helpers.streets import corner, small_move
 
 from segslam import geometry
 from segslam.config import RefineConfig
-from segslam.refinement import Surface, downsample, make_surface, refine
+from segslam.refinement import LightSurface, Surface, downsample, make_surface, refine
 from segslam.types import Registration, Rejected, RejectReason
 
 CONFIG = RefineConfig()
@@ -83,3 +84,21 @@ def test_real_pairs_are_refined_to_the_reference(real_pairs) -> None:
         metres, degrees = _error(pair.T_target_source, found.T_target_source)
         assert metres < 0.05, f"{pair.source} -> {pair.target}"
         assert degrees < 0.2, f"{pair.source} -> {pair.target}"
+
+
+def test_a_light_surface_has_the_normals_of_a_surface() -> None:
+    thinned = downsample(corner(np.random.default_rng(0)), config=CONFIG)
+    light, whole = LightSurface(thinned), make_surface(thinned, config=CONFIG)
+    rows = np.array([5, 3, 200, 3])
+    for asked in (rows, np.arange(len(thinned))):  # the second time some are known
+        found = light.normals_at(asked)
+        np.testing.assert_allclose(np.abs(np.sum(found * whole.normals[asked], axis=1)), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(light.nearest(thinned[rows] + 0.01)[0], rows)
+
+
+def test_a_thinned_cloud_has_the_mean_point_of_each_voxel_in_range() -> None:
+    points = np.random.default_rng(0).uniform(-80, 80, (20_000, 3)).astype(np.float32)
+    near = points[np.linalg.norm(points, axis=1) < CONFIG.max_range_m].astype(np.float64)
+    expected = small_gicp.voxelgrid_sampling(near, CONFIG.voxel_m, 1).points()[:, :3]
+    found = downsample(points, config=CONFIG)
+    np.testing.assert_allclose(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], atol=1e-5)

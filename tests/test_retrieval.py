@@ -89,6 +89,16 @@ def test_ground_tilt_and_moving_objects_do_not_change_a_signature() -> None:
     assert (passing.spectrum == signature_of(points, labels, config=config).spectrum).all()
 
 
+def test_points_outside_the_image_do_not_change_a_signature() -> None:
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-60, 60, (40_000, 2)), rng.normal(-1.7, 0.02, 40_000)])
+    points = np.vstack([street(3), ground]).astype(np.float32)
+    near = points[np.abs(points[:, :2]).max(axis=1) < 33.0]
+    config = Config().geometric
+    whole, cut = (signature_of(some, np.zeros(len(some), np.uint8), config=config) for some in (points, near))
+    assert whole.to_bytes() == cut.to_bytes()
+
+
 def test_scans_without_points_have_a_signature() -> None:
     empty = np.empty((0, 3), np.float32)
     signature = signature_of(empty, np.empty(0, np.uint8), config=Config().geometric)

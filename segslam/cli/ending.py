@@ -75,6 +75,11 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         lines.append(
             f"odometry: {broken} break{'s' * (broken != 1)}, i.e. motions not supported by the scans; see the report"
         )
+    if rejected_motions := metrics.get("num_motions_rejected"):
+        lines.append(
+            f"odometry: {rejected_motions} motion{'s' * (rejected_motions != 1)} rejected by the optimiser: "
+            "loops contradict the odometry there; see the report"
+        )
     if "ate_m" in metrics:
         lines.append(
             f"error after alignment: {metrics['ate_m']:.3f} m, odometry only: {metrics['odometry_ate_m']:.3f} m"

@@ -1,5 +1,5 @@
 """Health of the odometry: motions are checked against the scans, and repaired if the scans contradict them."""
 
-from segslam.health.checked import CheckedOdometry, Recover, least_informed
+from segslam.health.checked import CheckedOdometry, Recover, information_of
 
-__all__ = ["CheckedOdometry", "Recover", "least_informed"]
+__all__ = ["CheckedOdometry", "Recover", "information_of"]

@@ -9,6 +9,7 @@ with nearly no information.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -18,8 +19,9 @@ from segslam.health.check import nudge, open_direction
 from segslam.health.history import LONG_GAP, LOST_SCANS, History, Intervals
 from segslam.health.local_map import Fit, LocalMap
 from segslam.health.restored import rows_in_maps
+from segslam.health.unseen import Unseen, moved_along
 from segslam.odometry import Odometry, OdometryResult, deskew_scan
-from segslam.refinement import Surface
+from segslam.refinement import LightSurface, Surface
 from segslam.trajectory import Poses
 from segslam.types import (
     Alignment,
@@ -50,10 +52,6 @@ SUDDEN_M, SUDDEN_RAD = 0.5, np.radians(5.0)
 """Chosen: a motion that differs by more than this from the previous one is checked, however short it is."""
 CHECK_EVERY = 10
 """Chosen: at least every tenth scan is checked, because a stuck odometry reports no motion."""
-UNSEEN_SHARE = 0.7
-"""Chosen: standard deviation of a predicted motion in a direction that the scans do not constrain, as a share of it."""
-SEEN_M, SEEN_RAD = 0.05, np.radians(0.2)
-"""Chosen: standard deviations of such a motion in the other directions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +61,25 @@ class _Found:
     T_map_lidar: Transform
     fit: Fit
     registration: Registration
+
+
+class _Seen:
+    """A scan: all its points, the thinned ones, and their surface, which is made when it is asked for."""
+
+    def __init__(self, points: Points, local: LocalMap) -> None:
+        self._local = local
+        self.points = points
+        self.thinned = local.downsample(points)
+
+    @cached_property
+    def light(self) -> LightSurface:
+        """For the quick check."""
+        return LightSurface(self.thinned)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """For a registration."""
+        return self._local.make_surface(self.thinned)
 
 
 class CheckedOdometry:
@@ -80,16 +97,19 @@ class CheckedOdometry:
         self._lost: LocalMap | None = None
         """The map before a break, as long as scans are tried against it."""
         self._history = History(config.health)
-        self._anchor: tuple[Transform, Surface] | None = None
+        self._anchor: tuple[Transform, LightSurface] | None = None
         """Pose and surface of the last checked scan."""
         self._T_odom_last = np.eye(4)
-        self._T_before_last = self._T_steady = np.eye(4)
-        """Motion between the last two scans, per interval of the sensor; and the last one confirmed by the scans."""
+        self._T_before_last = np.eye(4)
+        """Motion between the last two scans, per interval of the sensor."""
+        self._unseen = Unseen()
         self._intervals = 1.0
         """Intervals from the last scan to this one, if scans between them are known to be lost."""
         self._pace = Intervals()
         self._num_unchecked = 0
         """Number of scans since the last checked one."""
+        self._has_motion = False
+        """Whether any motion is known; the first has no prediction, and the odometry is easily wrong there."""
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
         """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry."""
@@ -131,11 +151,24 @@ class CheckedOdometry:
         self._map, self._lost = fill(rows.now), None if rows.lost is None else fill(rows.lost)
         checked = max(row for row, motion in enumerate(motions) if row == 0 or motion.state != MotionState.UNCHECKED)
         self._num_unchecked = len(motions) - 1 - checked
-        surface = self._map.make_surface(self._map.downsample(self._points(T_odom_lidar, checked, scan_of)))
-        self._anchor = T_odom_lidar[checked], surface
+        thinned = self._map.downsample(self._points(T_odom_lidar, checked, scan_of))
+        self._anchor = T_odom_lidar[checked], LightSurface(thinned)
         self._T_odom_last = T_odom_lidar[-1]
-        if len(T_odom_lidar) > 1:
-            self._T_before_last = self._T_steady = geometry.inverse(T_odom_lidar[-2]) @ T_odom_lidar[-1]
+        self._has_motion = len(T_odom_lidar) > 1
+        if self._has_motion:
+            self._T_before_last = geometry.inverse(T_odom_lidar[-2]) @ T_odom_lidar[-1]
+            self._restore_unseen(T_odom_lidar, motions, scan_of)
+
+    def _restore_unseen(self, T_odom_lidar: Poses, motions: Sequence[Motion], scan_of: Callable[[int], Scan]) -> None:
+        """The way that was predicted in the tunnel where the last scans were taken, if they were."""
+        seen = max((row for row, motion in enumerate(motions) if not _is_predicted(motion)), default=0)
+        T_motion = geometry.inverse(T_odom_lidar[max(seen - 1, 0)]) @ T_odom_lidar[seen]
+        way_m = float(np.linalg.norm(np.diff(T_odom_lidar[seen:, :3, 3], axis=0), axis=1).sum())
+        last = len(motions) - 1
+        direction = None
+        if seen < last:
+            direction = open_direction(LightSurface(self._map.downsample(self._points(T_odom_lidar, last, scan_of))))
+        self._unseen.restore(T_motion, way_m if direction is not None else 0.0, direction)
 
     def _points(self, T_odom_lidar: Poses, row: int, scan_of: Callable[[int], Scan]) -> Points:
         """The cropped points of an earlier scan, motion-compensated as before."""
@@ -148,9 +181,17 @@ class CheckedOdometry:
 
     def _checked(self, proposed: OdometryResult, gap: float) -> tuple[Transform, Motion]:
         if self._anchor is None:
-            self._take(proposed.T_odom_lidar, self._map.downsample(proposed.points), proposed.points, None)
+            self._take(proposed.T_odom_lidar, _Seen(proposed.points, self._map))
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         T_predicted_lidar = geometry.inverse(self._T_odom_last @ self._T_before_last) @ proposed.T_odom_lidar
+        if not self._has_motion and self._inner.is_from_scans and _are_different(T_predicted_lidar):
+            scan = _Seen(proposed.points, self._map)
+            T_odom_better = self._better_first(proposed.T_odom_lidar, scan)
+            if T_odom_better is not None:
+                self._has_motion = True
+                self._history.watch()
+                return self._registered(proposed.T_odom_lidar, scan, None, gap, also=[T_odom_better])
+        self._has_motion = True
         self._num_unchecked += 1
         is_suspect = (
             self._num_unchecked >= CHECK_EVERY
@@ -163,48 +204,68 @@ class CheckedOdometry:
         if not (is_suspect or is_far or geometry.angle(T_anchor_lidar) >= np.radians(self._keyframes.angle_deg)):
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
-        thinned = self._map.downsample(proposed.points)
-        if min(len(thinned), len(self._anchor[1])) < self._min_points:  # too sparse for a check
+        scan = _Seen(proposed.points, self._map)
+        if min(len(scan.thinned), len(self._anchor[1])) < self._min_points:  # too sparse for a check
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
-        surface = self._map.make_surface(thinned)
-        direction = open_direction(surface)
+        direction = open_direction(scan.light)
         if direction is not None:
             self._history.watch()
         if not self._history.is_watching:
-            found = nudge(thinned, self._anchor[1], T_anchor_lidar)
+            found = nudge(scan.thinned, self._anchor[1], T_anchor_lidar)
             self._history.note_check(found)
             if found is not None and not self._history.is_watching:
-                self._take(proposed.T_odom_lidar, thinned, proposed.points, surface)
-                self._T_steady = self._since_last(proposed.T_odom_lidar)
+                self._take(proposed.T_odom_lidar, scan)
+                self._unseen.note_seen(self._since_last(proposed.T_odom_lidar))
                 moved_deg = float(np.degrees(found.moved_rad))
                 return proposed.T_odom_lidar, Motion(MotionState.CONFIRMED, found.moved_m, moved_deg, found.overlap)
-        return self._registered(proposed, thinned, surface, direction, gap)
+        return self._registered(proposed.T_odom_lidar, scan, direction, gap)
+
+    def _better_first(self, T_odom_proposed: Transform, scan: _Seen) -> Transform | None:
+        """Another pose of the second scan, found with no guess, which fits the first better; None if there is none."""
+        if len(scan.thinned) < self._min_points or len(self._map) == 0:
+            return None
+        found = self._recovered(self._map, scan)
+        T_map_proposed = geometry.inverse(self._map.T_odom_map) @ T_odom_proposed
+        if found is None or not _are_different(geometry.inverse(T_map_proposed) @ found.T_map_lidar):
+            return None
+        is_better = found.fit.overlap > self._map.fit(scan.surface, T_map_proposed).overlap
+        return self._map.T_odom_map @ found.T_map_lidar if is_better else None
 
     def _registered(
-        self, proposed: OdometryResult, thinned: Points, surface: Surface, direction: Direction | None, gap: float
+        self,
+        T_odom_proposed: Transform,
+        scan: _Seen,
+        direction: Direction | None,
+        gap: float,
+        *,
+        also: Sequence[Transform] = (),
     ) -> tuple[Transform, Motion]:
         """The scan's pose in the local map, or in the map before a break, or a guess.
 
         In a `direction` that the scan does not constrain, its position is predicted from the last confirmed motion.
+        `also`: further initial guesses.
         """
-        T_odom_proposed = proposed.T_odom_lidar
-        T_before_last = self._T_before_last if direction is None else self._T_steady
+        T_before_last = self._T_before_last if direction is None else self._unseen.T_steady
         T_odom_predicted = _exact(self._T_odom_last @ geometry.scaled(T_before_last, gap))
-        guesses = [T_odom_proposed, T_odom_predicted, self._T_odom_last]
+        guesses = [T_odom_proposed, T_odom_predicted, self._T_odom_last, *also]
         before_break = self._lost
-        found = self._found_again(surface, proposed.points, guesses) if direction is None else None
+        found = self._found_again(scan, guesses) if direction is None else None
         if found is not None and before_break is not None:
             self._map, self._lost = before_break, None
         else:
-            found = self._best(self._map, surface, guesses) or self._recovered(self._map, surface, proposed.points)
+            found = self._best(self._map, scan, guesses) or self._recovered(self._map, scan)
+        is_at_an_end = direction is not None or self._unseen.direction is not None
+        if found is None and is_at_an_end and gap <= LONG_GAP:
+            T_odom_guess = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
+            return self._at_an_end(T_odom_guess, scan, direction)
         if found is None and direction is not None:
-            return self._break(T_odom_predicted, thinned, proposed.points, surface)
+            return self._break(T_odom_predicted, scan)
         if found is None:
-            return self._unsupported(T_odom_proposed, T_odom_predicted, thinned, proposed.points, surface)
+            return self._unsupported(T_odom_proposed, T_odom_predicted, scan)
         T_odom_lidar = _exact(self._map.T_odom_map @ found.T_map_lidar)
         if direction is not None:
             T_odom_along = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
-            T_odom_lidar = _moved_along(direction, T_odom_lidar, T_odom_along)
+            T_odom_lidar = moved_along(direction, T_odom_lidar, T_odom_along)
         off = geometry.inverse(T_odom_proposed) @ T_odom_lidar
         moved_m, moved_rad = geometry.distance(off), geometry.angle(off)
         state = self._history.note_registration(moved_m, moved_rad, found.fit)
@@ -214,10 +275,11 @@ class CheckedOdometry:
             state, T_odom_lidar = MotionState.CONFIRMED, T_odom_proposed  # the odometry uses more than these scans
         information = None
         if direction is None:
-            self._T_steady = self._since_last(T_odom_lidar)
+            self._unseen.note_seen(self._since_last(T_odom_lidar))
         elif state is not MotionState.CONFIRMED:
-            state, information = MotionState.BROKEN, _open_information(direction, self._T_steady)
-        self._take(T_odom_lidar, thinned, proposed.points, surface)
+            state = MotionState.BROKEN
+            information = self._unseen.note_predicted(self._way_m(T_odom_lidar), direction, is_registered=True)
+        self._take(T_odom_lidar, scan)
         if state is not MotionState.CONFIRMED:
             T_before_lidar = _exact(self._since_last(T_odom_lidar))
             self._inner.follow(self._map.scans, T_odom_lidar, T_before_lidar)
@@ -226,32 +288,27 @@ class CheckedOdometry:
         return T_odom_lidar, Motion(state, moved_m, moved_deg, fit.overlap, fit.rms_m, information=information)
 
     def _unsupported(
-        self,
-        T_odom_proposed: Transform,
-        T_odom_predicted: Transform,
-        thinned: Points,
-        points: Points,
-        surface: Surface,
+        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: _Seen
     ) -> tuple[Transform, Motion]:
         """A motion that no registration supports: that of the odometry, if steady and with some overlap; else a break.
 
         Sparse scans cannot always be registered; this alone is no evidence against the odometry.
         """
-        found = self._map.fit(surface, geometry.inverse(self._map.T_odom_map) @ T_odom_proposed)
+        found = self._map.fit(scan.surface, geometry.inverse(self._map.T_odom_map) @ T_odom_proposed)
         off = geometry.inverse(T_odom_predicted) @ T_odom_proposed
         if found.overlap >= LEAST_SUPPORTED and not _is_sudden(off):
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
-        return self._break(T_odom_predicted, thinned, points, surface)
+        return self._break(T_odom_predicted, scan)
 
-    def _best(self, local: LocalMap, surface: Surface, T_odom_guesses: list[Transform]) -> _Found | None:
+    def _best(self, local: LocalMap, scan: _Seen, T_odom_guesses: list[Transform]) -> _Found | None:
         """The registration with the largest overlap, from distinct guesses; None if none has the usual fit."""
         T_map_odom = geometry.inverse(local.T_odom_map)
         best: _Found | None = None
         for T_map_guess in _different([T_map_odom @ T_odom_guess for T_odom_guess in T_odom_guesses]):
-            registration = local.register(surface, T_map_guess)
+            registration = local.register(scan.surface, T_map_guess)
             if isinstance(registration, Registration):
                 found = _Found(
-                    registration.T_target_source, local.fit(surface, registration.T_target_source), registration
+                    registration.T_target_source, local.fit(scan.surface, registration.T_target_source), registration
                 )
                 if best is None or found.fit.overlap > best.fit.overlap:
                     best = found
@@ -261,29 +318,46 @@ class CheckedOdometry:
             return None
         return best
 
-    def _recovered(self, local: LocalMap, surface: Surface, points: Points) -> _Found | None:
+    def _recovered(self, local: LocalMap, scan: _Seen) -> _Found | None:
         """The pose without initial guess, verified like a loop and then registered; None if there is none."""
-        alignment = self._recover(points, local.cloud(self._keyframes.dense_voxels))
+        alignment = self._recover(scan.points, local.cloud(self._keyframes.dense_voxels))
         if isinstance(alignment, Rejected):
             return None
-        return self._best(local, surface, [local.T_odom_map @ alignment.fine.T_target_source])
+        return self._best(local, scan, [local.T_odom_map @ alignment.fine.T_target_source])
 
-    def _found_again(self, surface: Surface, points: Points, T_odom_guesses: list[Transform]) -> _Found | None:
+    def _found_again(self, scan: _Seen, T_odom_guesses: list[Transform]) -> _Found | None:
         """The pose in the map before the last break, if the break was within the last `LOST_SCANS`."""
         if self._lost is None:
             return None
         self._history.scans_lost += 1
-        if found := self._best(self._lost, surface, T_odom_guesses):
+        if found := self._best(self._lost, scan, T_odom_guesses):
             return found
-        if self._history.scans_lost % RECOVER_EVERY == 0 and (found := self._recovered(self._lost, surface, points)):
+        if self._history.scans_lost % RECOVER_EVERY == 0 and (found := self._recovered(self._lost, scan)):
             return found
         if self._history.scans_lost >= LOST_SCANS:
             self._lost = None
         return None
 
-    def _break(
-        self, T_odom_lidar: Transform, thinned: Points, points: Points, surface: Surface
+    def _at_an_end(
+        self, T_odom_predicted: Transform, scan: _Seen, direction: Direction | None
     ) -> tuple[Transform, Motion]:
+        """The predicted pose where a tunnel begins or ends between two scans, which have nothing in common."""
+        overlap = self._map.fit(scan.surface, geometry.inverse(self._map.T_odom_map) @ T_odom_predicted).overlap
+        information = self._unseen.note_predicted(self._way_m(T_odom_predicted), direction, is_registered=False)
+        self._begin_anew(T_odom_predicted, scan, self._unseen.T_steady)
+        return T_odom_predicted, Motion(MotionState.BROKEN, overlap=overlap, information=information)
+
+    def _way_m(self, T_odom_lidar: Transform) -> float:
+        return geometry.distance(geometry.inverse(self._T_odom_last) @ T_odom_lidar)
+
+    def _break(self, T_odom_lidar: Transform, scan: _Seen) -> tuple[Transform, Motion]:
+        """A guess that nothing supports."""
+        self._begin_anew(T_odom_lidar, scan, np.eye(4))
+        self._unseen.note_seen(np.eye(4))
+        sigmas = geometry.tangent(rotation_rad=BREAK_SIGMA_RAD, translation_m=BREAK_SIGMA_M)
+        return T_odom_lidar, Motion(MotionState.BROKEN, information=np.diag(sigmas**-2.0))
+
+    def _begin_anew(self, T_odom_lidar: Transform, scan: _Seen, T_before_lidar: Transform) -> None:
         """Start a new local map at a guess; the old one is kept for some time."""
         if self._lost is None:
             self._lost, self._map = self._map, self._map.empty_copy()
@@ -291,29 +365,13 @@ class CheckedOdometry:
         else:
             self._map.clear()
         self._history.watch()
-        self._take(T_odom_lidar, thinned, points, surface)
-        self._inner.follow(self._map.scans, T_odom_lidar, np.eye(4))
-        sigmas = geometry.tangent(rotation_rad=BREAK_SIGMA_RAD, translation_m=BREAK_SIGMA_M)
-        return T_odom_lidar, Motion(MotionState.BROKEN, information=np.diag(sigmas**-2.0))
+        self._take(T_odom_lidar, scan)
+        self._inner.follow(self._map.scans, T_odom_lidar, T_before_lidar)
 
-    def _take(self, T_odom_lidar: Transform, thinned: Points, points: Points, surface: Surface | None) -> None:
+    def _take(self, T_odom_lidar: Transform, scan: _Seen) -> None:
         """Make the scan the reference of the next check, and add it to the local map."""
-        self._anchor = T_odom_lidar, surface or self._map.make_surface(thinned)
-        self._map.add(T_odom_lidar, thinned, points)
-
-
-def _moved_along(direction: Direction, T_odom_lidar: Transform, T_odom_along: Transform) -> Transform:
-    """A pose, with its position along a direction in its own frame replaced by that of another pose."""
-    apart = (geometry.inverse(T_odom_lidar) @ T_odom_along)[:3, 3]
-    return T_odom_lidar @ geometry.transform(np.eye(3), direction * (direction @ apart))
-
-
-def _open_information(direction: Direction, T_predicted: Transform) -> Information:
-    """Information of a motion predicted along a direction that the new scan does not constrain."""
-    sigma_m = max(UNSEEN_SHARE * geometry.distance(T_predicted), 0.1)
-    covariance = np.diag(geometry.tangent(rotation_rad=SEEN_RAD, translation_m=SEEN_M) ** 2)
-    covariance[3:, 3:] += sigma_m**2 * np.outer(direction, direction)
-    return np.linalg.inv(covariance)
+        self._anchor = T_odom_lidar, scan.light
+        self._map.add(T_odom_lidar, scan.thinned, scan.points)
 
 
 def _exact(T_a_b: Transform) -> Transform:
@@ -334,17 +392,29 @@ def _is_sudden(T_predicted_lidar: Transform) -> bool:
     return geometry.distance(T_predicted_lidar) > SUDDEN_M or bool(geometry.angle(T_predicted_lidar) > SUDDEN_RAD)
 
 
+def _are_different(T_a_b: Transform) -> bool:
+    """Whether two poses are so far from each other that a registration may lead to different results."""
+    return geometry.distance(T_a_b) > DIFFERENT_M or bool(geometry.angle(T_a_b) > DIFFERENT_RAD)
+
+
 def _different(guesses: list[Transform]) -> list[Transform]:
     """The guesses without those near an earlier one."""
     kept: list[Transform] = []
     for guess in guesses:
-        offsets = [geometry.inverse(other) @ guess for other in kept]
-        if all(geometry.distance(o) > DIFFERENT_M or geometry.angle(o) > DIFFERENT_RAD for o in offsets):
+        if all(_are_different(geometry.inverse(other) @ guess) for other in kept):
             kept.append(guess)
     return kept
 
 
-def least_informed(motions: Sequence[Motion]) -> Information | None:
-    """The information of the least certain motion; None if the noise model of odometry applies to all."""
+def _is_predicted(motion: Motion) -> bool:
+    """Whether a motion was predicted in a tunnel."""
+    return motion.state is MotionState.BROKEN and motion.information is not None and not motion.is_break
+
+
+def information_of(motions: Sequence[Motion]) -> Information | None:
+    """The information of motions in a row, from those that have their own; None where none has.
+
+    Their covariances are added: the motions between two keyframes are too short for their lever arms to matter.
+    """
     own = [motion.information for motion in motions if motion.information is not None]
-    return min(own, key=lambda information: float(np.trace(information))) if own else None
+    return np.linalg.inv(sum(np.linalg.inv(information) for information in own)) if own else None

@@ -121,7 +121,9 @@ def _poses(T_frame_each: np.ndarray) -> list[Pose]:
 
 
 def _pose(T_frame_body: Transform) -> Pose:
-    return _poses(T_frame_body[np.newaxis])[0]
+    tx, ty, tz = T_frame_body[:3, 3].tolist()
+    x, y, z, w = geometry.quaternion(T_frame_body[:3, :3])
+    return Pose(position=Vector3(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 
 def _timestamp(stamp_ns: int) -> Timestamp:

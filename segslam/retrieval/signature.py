@@ -16,7 +16,7 @@ from scipy.fft import rfft2
 from scipy.ndimage import map_coordinates
 
 from segslam.config import GeometricLabelsConfig
-from segslam.points import voxel_first
+from segslam.points import hash_keys, voxel_first
 from segslam.semantics.ground_surface import heights_above_ground, turned, upright
 from segslam.system.short_repr import Record
 from segslam.types import Label, Labels, Points, SegslamError
@@ -39,6 +39,8 @@ GROUND_M = 0.4
 CIRCLES = ((8.0, 6), (16.0, 10))
 """Radius (m) and number of additional viewpoints around the sensor; chosen on scan 4413 of KITTI 00, 12 m beside the
 path of a map."""
+REACH_M = (HALF + 0.5) * CELL_M
+"""Points farther from the sensor than this, in x or in y, are outside the image."""
 
 # All but the last two are chosen on the real places of KITTI 05; 00 was not used.
 
@@ -67,7 +69,7 @@ def signature_of(points: Points, labels: Labels, *, config: GeometricLabelsConfi
 
     The sensor may be tilted: the ground is estimated and removed.
     """
-    return signature_of_standing(_standing(points, labels, config))
+    return signature_of_standing(_standing(points, labels, config, reach_m=REACH_M))
 
 
 def signatures_around(points: Points, labels: Labels, *, config: GeometricLabelsConfig) -> tuple[PlaceSignature, ...]:
@@ -75,21 +77,29 @@ def signatures_around(points: Points, labels: Labels, *, config: GeometricLabels
 
     The weight of a point decreases with its distance, so the signature changes over 10 m.
     """
-    standing = _standing(points, labels, config)
+    standing = _standing(points, labels, config, reach_m=REACH_M + CIRCLES[-1][0])
     return tuple(signature_of_standing(standing - centre) for centre in _centres())
 
 
-def _standing(points: Points, labels: Labels, config: GeometricLabelsConfig) -> Points:
-    """Static points above the ground, in a level frame."""
-    still = points.compress((labels < Label.MOVING_CAR) & np.isfinite(points).all(axis=1), axis=0)
-    if not len(still):
-        return still
+def _standing(points: Points, labels: Labels, config: GeometricLabelsConfig, *, reach_m: float) -> Points:
+    """Static points above the ground in a level frame, all of those with x and y below `reach_m`.
+
+    The ground is followed outwards from the sensor, so points two cells farther do not change the heights of these.
+    """
+    still = points.compress(labels < Label.MOVING_CAR, axis=0)
     thinned = still[voxel_first(still, CELL_M / 2)].astype(np.float64)
+    if not len(thinned):
+        return thinned
     level = turned(thinned, upright(thinned))
+    edge_m = reach_m + 2 * config.ground_cell_m
+    near = level.compress((np.abs(level[:, 0]) <= edge_m) & (np.abs(level[:, 1]) <= edge_m), axis=0)
     heights = heights_above_ground(
-        level, cell_m=config.ground_cell_m, max_range_m=config.max_range_m, max_slope=config.max_slope
+        near,
+        cell_m=config.ground_cell_m,
+        max_range_m=min(config.max_range_m, edge_m + config.ground_cell_m),
+        max_slope=config.max_slope,
     )
-    return level[heights > GROUND_M]
+    return near[heights > GROUND_M]
 
 
 @cache
@@ -116,8 +126,9 @@ def _image(points: Points) -> Float[np.ndarray, "size size"]:
     cells = np.rint(points / CELL_M).astype(np.int64)
     cells = cells[(np.abs(cells[:, :2]) <= HALF).all(axis=1)]
     width = 2 * HALF + 1
-    voxels = np.unique(((cells[:, 0] + HALF) * width + cells[:, 1] + HALF) * 2**16 + cells[:, 2] + 2**15)
-    counts = np.bincount(voxels >> 16, minlength=width * width).reshape(width, width)
+    voxels = ((cells[:, 0] + HALF) * width + cells[:, 1] + HALF) * 2**16 + cells[:, 2] + 2**15
+    occupied = voxels[hash_keys(voxels)[1] == np.arange(len(voxels))]
+    counts = np.bincount(occupied >> 16, minlength=width * width).reshape(width, width)
     return (np.sqrt(np.minimum(counts, MAX_LEVELS)) * _window()).astype(np.float32)
 
 

@@ -35,6 +35,7 @@ FIGURES = {
     "num_candidates": "loop candidates tried",
     "num_motions_repaired": "motions of the odometry replaced by registrations",
     "num_motions_broken": "breaks: motions not supported by the scans",
+    "num_motions_rejected": "motions of the odometry rejected by the optimiser, because loops contradict them",
     "num_loops_accepted": "loops accepted",
     "localised_percent": "scans localised in the old map (%)",
     "num_sessions": "sessions merged",

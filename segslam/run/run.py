@@ -201,6 +201,7 @@ class Run:
             "num_keyframes": len(result.keyframe_rows),
             "num_motions_repaired": _count(result, MotionState.REPAIRED, MotionState.REJOINED),
             "num_motions_broken": _count(result, MotionState.BROKEN),
+            "num_motions_rejected": len(result.estimate.motion_weights),
             "num_candidates": len(result.attempts),
             "num_loops_accepted": len(closures),
             "num_loops_switched_off": len(result.estimate.rejected),

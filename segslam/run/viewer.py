@@ -7,7 +7,18 @@ import rerun.blueprint as rrb
 from segslam import geometry
 from segslam.log.drawing import ACCEPTED_COLOR, PATH_GROWTH, REJECTED_COLORS
 from segslam.semantics.class_colors import COLORS
-from segslam.types import BadScan, GraphEstimate, Keyframe, Label, LoopAttempt, Rejected, Step, Transform
+from segslam.types import (
+    BadScan,
+    GraphEstimate,
+    Keyframe,
+    Label,
+    LoopAttempt,
+    Motion,
+    MotionState,
+    Rejected,
+    Step,
+    Transform,
+)
 
 WORLD, LIDAR, TIMES = "world", "world/lidar", "stage_ms"
 CORRECTED_COLOR, ODOMETRY_COLOR, MOVING_COLOR = "#00a0ff", "#ff9000", "#ff2a2a"
@@ -23,6 +34,12 @@ STAGE_COLORS = {
     "optimize": "#ff4f3f",
 }
 """Fixed colours, because automatic ones may be similar."""
+MOTION_COLORS = {
+    MotionState.REPAIRED: "#D55E00",
+    MotionState.REJOINED: "#D55E00",
+    MotionState.BROKEN: "#CC0000",
+}
+"""Colours of the scans whose motions are marked; others are not."""
 SCANS_TIMED = 300
 """Number of latest scans whose times are drawn."""
 
@@ -61,6 +78,8 @@ class Scene:
             self._add_keyframe(step.keyframe)
         if step.estimate is not None:
             self._correct(step.estimate)
+        if step.motion is not None and step.motion.state in MOTION_COLORS:
+            self._add_motion(step, step.motion)
         self._viewer.log(LIDAR, _pose(self._T_world_odom @ step.T_odom_lidar), rr.TransformAxes3D(3.0))
         for attempt in step.attempts:
             self._add_attempt(attempt)
@@ -93,13 +112,35 @@ class Scene:
         if len(self._T_odom_keyframe) >= PATH_GROWTH * self._num_on_paths:
             self._draw_paths()
 
+    def _add_motion(self, step: Step, motion: Motion) -> None:
+        """Mark the scan after a motion that was repaired or is a guess, in the frame of the last keyframe."""
+        moved = (
+            "" if motion.moved_m is None else f", by {motion.moved_m:.2f} m and {motion.moved_deg or 0.0:.1f} degrees"
+        )
+        T_keyframe_lidar = geometry.inverse(self._T_odom_keyframe[-1]) @ step.T_odom_lidar
+        mark = rr.Points3D(
+            [T_keyframe_lidar[:3, 3]],
+            colors=[_rgb(MOTION_COLORS[motion.state])],
+            radii=0.4,
+            labels=[f"{motion.state}{moved}"],
+            show_labels=False,
+        )
+        self._viewer.log(f"{WORLD}/keyframes/{len(self._T_odom_keyframe) - 1}/motions/{step.scan_index}", mark)
+
     def _correct(self, estimate: GraphEstimate) -> None:
         """Move the clouds to the current poses of their keyframes."""
         for keyframe_id, T_world_keyframe in estimate.T_world_keyframe.items():
             self._T_world_keyframe[keyframe_id] = T_world_keyframe
             self._viewer.log(f"{WORLD}/keyframes/{keyframe_id}", _pose(T_world_keyframe))
         self._T_world_odom = self._T_world_keyframe[-1] @ geometry.inverse(self._T_odom_keyframe[-1])
+        self._draw_rejected(estimate)
         self._draw_paths()
+
+    def _draw_rejected(self, estimate: GraphEstimate) -> None:
+        """The motions of the odometry that the optimiser rejected."""
+        ends = [[self._T_world_keyframe[number][:3, 3] for number in pair] for pair in estimate.motion_weights]
+        color = _rgb(MOTION_COLORS[MotionState.BROKEN])
+        self._viewer.log(f"{WORLD}/motions_rejected", rr.LineStrips3D(ends, colors=[color] * len(ends)))
 
     def _add_attempt(self, attempt: LoopAttempt) -> None:
         candidate, outcome = attempt.candidate, attempt.outcome

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam.config import Config
-from segslam.health import least_informed
+from segslam.health import information_of
 from segslam.log import RunLog, read_log
 from segslam.proximity import BREAK_TRAVEL_M
 from segslam.registration import shape_labels
@@ -67,7 +67,7 @@ def read_session(folder: Path) -> Session:
         if step.keyframe is not None:
             T_odom.append(step.keyframe.T_odom_keyframe)
             travel_m.append(step.keyframe.travel_m)
-            informations.append(least_informed(since))
+            informations.append(information_of(since))
             since = []
     if list(estimate) != list(range(len(T_odom))):
         raise SegslamError(f"{log.path}: damaged, poses of {len(estimate)} keyframes for {len(T_odom)}; replay it")

@@ -12,10 +12,11 @@ from helpers.drives import STEP_M, drifting, round_drive
 from segslam import geometry
 from segslam.config import Config, load_config
 from segslam.evaluation import trajectory_metrics
-from segslam.health import CheckedOdometry, least_informed
+from segslam.health import CheckedOdometry, information_of
 from segslam.health.check import nudge, open_direction
 from segslam.health.local_map import LocalMap
 from segslam.odometry import GivenOdometry, KissOdometry, OdometryResult
+from segslam.refinement import LightSurface
 from segslam.registration import register
 from segslam.slam import Slam
 from segslam.types import Motion, MotionState, Rejected, RejectReason, Scan, Trajectory
@@ -82,6 +83,24 @@ def test_a_jump_of_the_odometry_is_repaired(metres: float, degrees: float) -> No
     assert _worst_step_m(results) < 0.06
 
 
+class _LikeKiss(GivenOdometry):
+    """Poses that are given, as if they came from the scans."""
+
+    is_from_scans = True
+
+
+@pytest.mark.parametrize("metres", [-2.5, 0.0])
+def test_a_wrong_first_motion_is_repaired_and_a_right_one_is_kept(metres: float) -> None:
+    scans, truth = round_drive()
+    trajectory = replace(truth, T_world_lidar=_slipped(metres=metres, at=1))
+    odometry = CheckedOdometry(_LikeKiss(trajectory, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, scans[:3])
+    motion = results[1].motion
+    assert motion is not None
+    assert (motion.state is MotionState.REPAIRED) == (metres != 0.0)
+    assert _worst_step_m(results[:2]) < 0.06
+
+
 def test_without_the_check_a_jump_remains() -> None:
     config = load_config(None, ["health.check=false"])
     results = _registered(_checked(_slipped(metres=3.0), config), round_drive()[0][: SLIP_AT + 2])
@@ -139,12 +158,11 @@ def test_a_keyframe_follows_a_break_and_its_motion_has_nearly_no_information() -
     assert [step.motion.state for step in steps if step.motion][20] is MotionState.BROKEN
 
 
-def test_the_least_certain_of_several_motions_counts() -> None:
-    certain, vague = np.eye(6), 1e-3 * np.eye(6)
-    motions = [Motion(MotionState.CONFIRMED), Motion(MotionState.BROKEN, information=vague)]
-    motions.append(Motion(MotionState.BROKEN, information=certain))
-    assert least_informed(motions) is vague
-    assert least_informed(motions[:1]) is None
+def test_the_uncertainties_of_several_motions_add_up() -> None:
+    motions = [Motion(MotionState.CONFIRMED)]
+    motions += [Motion(MotionState.BROKEN, information=information * np.eye(6)) for information in (1.0, 0.25)]
+    np.testing.assert_allclose(information_of(motions), np.eye(6) / 5.0)
+    assert information_of(motions[:1]) is None
 
 
 def test_too_few_points_are_not_checked() -> None:
@@ -171,7 +189,7 @@ def test_recovery_without_initial_guess_runs_only_where_guesses_fail() -> None:
 def test_the_quick_check_measures_a_small_slip(moved_m: float) -> None:
     scans, truth = round_drive()
     local = LocalMap(CONFIG.health, CONFIG.refine)
-    target = local.make_surface(local.downsample(scans[0].points))
+    target = LightSurface(local.downsample(scans[0].points))
     T_target_source = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[1]
     slip = geometry.transform(np.eye(3), [moved_m, 0.0, 0.0])
     found = nudge(local.downsample(scans[1].points), target, T_target_source @ slip)
@@ -252,10 +270,10 @@ def test_a_scan_of_a_smooth_tunnel_is_open_along_it_and_one_of_a_street_is_not()
     local = LocalMap(CONFIG.health, CONFIG.refine)
     R = geometry.yaw(0.3)
     tunnel = (_tunnel_scan(0).points @ R.T).astype(np.float32)
-    direction = open_direction(local.make_surface(local.downsample(tunnel)))
+    direction = open_direction(LightSurface(local.downsample(tunnel)))
     assert direction is not None
     assert abs(direction @ R[:, 0]) > 0.999
-    assert open_direction(local.make_surface(local.downsample(round_drive()[0][0].points))) is None
+    assert open_direction(LightSurface(local.downsample(round_drive()[0][0].points))) is None
 
 
 def test_in_a_smooth_tunnel_the_last_motion_continues_and_is_reported_as_uncertain() -> None:
@@ -266,6 +284,31 @@ def test_in_a_smooth_tunnel_the_last_motion_continues_and_is_reported_as_uncerta
     assert all(motion.information is not None for motion in motions)
     steps = [geometry.inverse(before.T_odom_lidar) @ after.T_odom_lidar for before, after in pairwise(results[13:])]
     np.testing.assert_allclose([T[0, 3] for T in steps], STEP_M, rtol=0.1)
+    way_m = geometry.distance(geometry.inverse(results[10].T_odom_lidar) @ results[-1].T_odom_lidar)
+    information = information_of([result.motion for result in results[11:] if result.motion is not None])
+    assert information is not None
+    sigmas_m = np.sqrt(np.diag(np.linalg.inv(information)))[3:]
+    assert sigmas_m[0] == pytest.approx(0.7 * way_m, rel=0.05), "the error grows with the way, not with its root"
+    assert max(sigmas_m[1:]) < 1.0
+
+
+def test_the_scan_behind_a_tunnel_continues_the_drive_without_a_break() -> None:
+    street = round_drive()[0]
+    behind = [replace(scan, index=row, stamp_ns=row * 100_000_000) for row, scan in enumerate(street[60:66], start=20)]
+    odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, [*_into_a_tunnel(20), *behind])
+    assert not any(result.motion.is_break for result in results if result.motion)
+    exit_motion = results[20].motion
+    assert exit_motion is not None
+    assert exit_motion.state is MotionState.BROKEN
+    sigmas = np.sqrt(np.diag(np.linalg.inv(exit_motion.information)))
+    assert sigmas[3] > 2.0, "metres along the tunnel"
+    assert sigmas[4] < 0.5
+    assert {result.motion.state for result in results[21:] if result.motion} <= {
+        MotionState.CONFIRMED,
+        MotionState.REFINED,
+        MotionState.REPAIRED,
+    }
 
 
 def test_a_given_odometry_is_kept_in_a_smooth_tunnel() -> None:

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.made_logs import made_steps, write_log
 
-from segslam.types import Step
+from segslam.types import Motion, MotionState, Step
 
 RecordingStream = pytest.importorskip("rerun").RecordingStream
 
@@ -29,6 +30,23 @@ def test_a_run_is_saved_for_rerun_with_its_clouds_paths_and_loops(steps: list[St
     assert keyframes <= entities
     assert sum(entity.startswith("/world/loops/") for entity in entities) == len(attempts)
     assert {"/world/trajectory", "/world/odometry", "/world/lidar", "/stage_ms/odometry"} <= entities
+
+
+def test_motions_that_were_repaired_or_broken_or_rejected_are_marked(steps: list[Step], tmp_path: Path) -> None:
+    made = list(steps)
+    states = {10: MotionState.REPAIRED, 20: MotionState.BROKEN, 30: MotionState.CONFIRMED}
+    for row, state in states.items():
+        made[row] = replace(made[row], motion=Motion(state, 0.4, 2.0, 0.9))
+    last = max(row for row, step in enumerate(made) if step.estimate is not None)
+    estimate = made[last].estimate
+    assert estimate is not None
+    made[last] = replace(made[last], estimate=replace(estimate, motion_weights={(0, 1): 0.0}))
+    write_log(tmp_path / "log.mcap", made)
+    assert run("view", tmp_path, "--save", tmp_path / "run.rrd", "--quiet") == 0
+    entities = _entities(tmp_path / "run.rrd")
+    marked = {entity.rpartition("/")[2] for entity in entities if "/motions/" in entity}
+    assert marked == {str(made[row].scan_index) for row in (10, 20)}
+    assert "/world/motions_rejected" in entities
 
 
 def test_mapping_can_be_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

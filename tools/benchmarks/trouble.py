@@ -1,4 +1,4 @@
-"""Trouble injected into a simulated drive: error with and without it.
+"""Trouble injected into a simulated drive, and thinner sensors on it: errors and loops with and without it.
 
 Example: python -m tools.benchmarks.trouble DRIVE --sequence 06 --frames 0:300 --out trouble.json
 DRIVE is a folder that `segslam simulate` made. Every row is mapped with default settings.
@@ -16,9 +16,14 @@ from segslam.config import Config, load_config
 from segslam.datasets import open_dataset
 from segslam.evaluation import trajectory_metrics
 from segslam.odometry import GivenOdometry
+from segslam.run.accuracy import accuracy
+from segslam.semantics.late import of_rows
 from segslam.slam import Slam
 from segslam.types import Scan, Trajectory
 from tools.benchmarks import common
+
+BEAM_GAP_DEG = 0.04
+"""Least gap between the points of two beams of the simulated sensor."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,39 @@ def _in_tube(scan: Scan, rng: np.random.Generator) -> Scan:
     )
 
 
+def with_beams(drive: Drive, every: int) -> Drive:
+    """One beam of so many is kept; gaps between the elevations of the points divide the beams."""
+
+    def thinned(scan: Scan) -> Scan:
+        elevation = np.degrees(np.arctan2(scan.points[:, 2], np.linalg.norm(scan.points[:, :2], axis=1)))
+        order = np.argsort(elevation)
+        beam = np.empty(len(order), dtype=int)
+        beam[order] = np.cumsum(np.diff(elevation[order], prepend=elevation[order[0]]) > BEAM_GAP_DEG)
+        return _kept(scan, beam % every == 0)
+
+    return Drive(lambda: (thinned(scan) for scan in drive.scans()), drive.T_world_lidar)
+
+
+def with_view(drive: Drive, degrees: float) -> Drive:
+    """The sensor sees a sector ahead only."""
+
+    def cut(scan: Scan) -> Scan:
+        azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+        return _kept(scan, np.abs(azimuth) <= degrees / 2)
+
+    return Drive(lambda: (cut(scan) for scan in drive.scans()), drive.T_world_lidar)
+
+
+def _kept(scan: Scan, kept: np.ndarray) -> Scan:
+    return replace(
+        scan,
+        points=scan.points[kept],
+        labels=of_rows(scan.labels, kept),
+        times=scan.times[kept] if len(scan.times) else scan.times,
+        intensities=None,
+    )
+
+
 def kidnapped(drive: Drive, first: int, to: int) -> Drive:
     """After one scan the sensor is lifted, and put down at a later place of the drive."""
     return without(drive, first, to - first)
@@ -130,10 +168,13 @@ def mapped(drive: Drive, config: Config) -> dict[str, float]:
     for scan in scans:
         slam.process(scan)
     result = slam.finish()
+    found = accuracy(result, replace(result.trajectory, T_world_lidar=drive.T_world_lidar))
     states = [str(motion.state) for motion in result.motions]
     return {
         "ate_m": trajectory_metrics(result.trajectory.T_world_lidar, drive.T_world_lidar)["ate_m"],
         "odometry_ate_m": trajectory_metrics(result.odometry.T_world_lidar, drive.T_world_lidar)["ate_m"],
+        "num_motions_rejected": len(result.estimate.motion_weights),
+        **{name: value for name, value in found.items() if "loop" in name},
     } | {name: states.count(name) for name in ("repaired", "rejoined", "broken")}
 
 
@@ -162,6 +203,8 @@ def main() -> None:
         "turn of 40 degrees": lambda: turned(plain, at, 40.0),
         "truck for 50 m": lambda: beside_a_truck(plain, at, 50.0),
         "tunnel of 100 m": lambda: in_tunnel(plain, at, 100.0),
+        "16 beams": lambda: with_beams(plain, 4),
+        "40 degrees of view": lambda: with_view(plain, 40.0),
         "kidnapped": lambda: kidnapped(plain, at, arguments.put_down),
         "given odometry, no jump": lambda: with_jump(plain, at, 0.0),
         "given odometry, jump of 3 m": lambda: with_jump(plain, at, 3.0),

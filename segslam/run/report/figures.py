@@ -143,12 +143,17 @@ def _plot_from_above(axes: Axes, paths: Iterable[Line]) -> None:
 
 
 def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:
-    """Mark repaired motions of the odometry, and breaks."""
-    for name, color, marker, states in (
-        ("motion repaired", "#D55E00", ".", (MotionState.REPAIRED, MotionState.REJOINED)),
-        ("break", "#CC0000", "x", (MotionState.BROKEN,)),
+    """Mark motions of the odometry that were repaired, unsupported by the scans, or rejected by the optimiser."""
+
+    def rows_of(*states: MotionState) -> list[int]:
+        return [row for row, motion in enumerate(run.result.motions) if motion.state in states]
+
+    rejected = [int(run.result.keyframe_rows[after]) for _, after in run.result.estimate.motion_weights]
+    for name, color, marker, rows in (
+        ("motion repaired", "#D55E00", ".", rows_of(MotionState.REPAIRED, MotionState.REJOINED)),
+        ("break", "#CC0000", "x", rows_of(MotionState.BROKEN)),
+        ("motion rejected", "#CC0000", "+", rejected),
     ):
-        rows = [row for row, motion in enumerate(run.result.motions) if motion.state in states]
         if rows:
             label = f"{name} ({len(rows)})"
             axes.plot(*T_corrected[rows, :2, 3].T, marker, color=color, markersize=7, zorder=4, label=label)

@@ -1,0 +1,61 @@
+"""Motions that the scans do not constrain in one direction, as in a tunnel: predicted from the last confirmed one.
+
+The speed at the entrance of a tunnel is known, and how it changes inside is not. So the error of the position is
+proportional to the way through the tunnel, and its standard deviation too: the variances of the motions, which the
+pose graph adds up, grow from one to the next. Closures that span the tunnel then correct its end most, as a steady
+braking or acceleration would.
+"""
+
+import numpy as np
+
+from segslam import geometry
+from segslam.types import Direction, Information, Transform
+
+UNSEEN_SHARE = 0.7
+"""Chosen: standard deviation of the predicted distance in the direction that is not constrained, as a share of it."""
+LEAST_M = 0.1
+"""Chosen: least standard deviation of one such motion along the open direction."""
+SEEN_M, SEEN_RAD = 0.05, np.radians(0.2)
+"""Chosen: standard deviations of such a motion in the other directions."""
+ENTERED_M, ENTERED_RAD = 0.3, np.radians(2.0)
+"""Chosen: the same where the scene changes at the ends of a tunnel, and the prediction alone continues."""
+
+
+class Unseen:
+    """The last confirmed motion, and the distance since then along the direction that is not constrained."""
+
+    def __init__(self) -> None:
+        self.T_steady: Transform = np.eye(4)
+        """The last confirmed motion, per interval of the sensor."""
+        self.direction: Direction | None = None
+        """The direction that the last scan did not constrain, in its frame; None if it constrained all."""
+        self._way_m = 0.0
+
+    def note_seen(self, T_motion: Transform) -> None:
+        """The scans showed a motion of one interval."""
+        self.T_steady, self.direction, self._way_m = T_motion, None, 0.0
+
+    def note_predicted(self, way_m: float, direction: Direction | None, *, is_registered: bool) -> Information:
+        """The information of a motion of this length (m) that was predicted along `direction`, or that of the last.
+
+        `is_registered`: whether the scans showed the other directions.
+        """
+        along = self.direction if direction is None else direction
+        assert along is not None, "a motion is predicted in a tunnel, or at its end"
+        before_m, self._way_m = self._way_m, self._way_m + way_m
+        variance = max(UNSEEN_SHARE**2 * (self._way_m**2 - before_m**2), LEAST_M**2)
+        self.direction = direction
+        rotation_rad, translation_m = (SEEN_RAD, SEEN_M) if is_registered else (ENTERED_RAD, ENTERED_M)
+        covariance = np.diag(geometry.tangent(rotation_rad=rotation_rad, translation_m=translation_m) ** 2)
+        covariance[3:, 3:] += variance * np.outer(along, along)
+        return np.linalg.inv(covariance)
+
+    def restore(self, T_motion: Transform, way_m: float, direction: Direction | None) -> None:
+        """Go on after a stop: the last motion, and the way predicted since the last motion that was seen."""
+        self.T_steady, self._way_m, self.direction = T_motion, way_m, direction
+
+
+def moved_along(direction: Direction, T_odom_lidar: Transform, T_odom_along: Transform) -> Transform:
+    """A pose, with its position along a direction in its own frame replaced by that of another pose."""
+    apart = (geometry.inverse(T_odom_lidar) @ T_odom_along)[:3, 3]
+    return T_odom_lidar @ geometry.transform(np.eye(3), direction * (direction @ apart))

@@ -1,8 +1,8 @@
 """Inliers among closures, from the largest pairwise-consistent set.
 
 The largest consistent set holds the inliers unless outliers that are consistent with the rest, as a repeated street
-makes them, outnumber the true closures of their place. Then the true closures are rejected, are consistent too, and lower
-the cost when they take the place of the outliers.
+makes them, outnumber the true closures of their place. Then the true closures are rejected, are consistent too, and
+lower the cost when they take the place of the outliers.
 """
 
 import gtsam

@@ -15,7 +15,7 @@ from segslam.cli.compiling import compile_kernels
 from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, say
 from segslam.cli.ending import finish
 from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
-from segslam.cli.live_status import LiveFigures, Status
+from segslam.cli.live_status import LiveFigures, Status, too_slow
 from segslam.cli.run_options import MapFileOption, ViewOption, WithMapOption, chosen_maps
 from segslam.cli.view import check_display, close_scene, open_scene
 from segslam.errors import SegslamError, WorkFailed
@@ -170,10 +170,10 @@ def map_live(
         for file in map_files:
             file.parent.mkdir(parents=True, exist_ok=True)
 
-        def more(_: object) -> dict[str, Any]:
-            return figures.metrics(ended)
-
-        finish(run, None, map_files=map_files, json=json, quiet=quiet, more=more, search_s=FINAL_SEARCH_S)
+        more = figures.metrics(ended)
+        finish(run, None, map_files=map_files, json=json, quiet=quiet, more=lambda _: more, search_s=FINAL_SEARCH_S)
+        if advice := too_slow(more, settings.odometry.voxel_size_m):
+            say(advice, quiet=quiet)
     return ended.why if ended.failed else ""
 
 

@@ -14,6 +14,7 @@ from helpers.live_command import LiveCommand, record, write_scan
 from helpers.terminal import in_terminal
 
 from segslam import geometry
+from segslam.cli.live_status import too_slow
 from segslam.config import Config, OdometryConfig
 from segslam.evaluation import trajectory_metrics
 from segslam.live import FolderSource
@@ -317,3 +318,10 @@ def test_loops_that_are_not_tried_in_time_are_searched_at_the_end() -> None:
     assert sum(isinstance(attempt.outcome, LoopClosure) for attempt in result.attempts) >= 1
     error_m = trajectory_metrics(result.trajectory.T_world_lidar, truth.T_world_lidar)["ate_m"]
     assert error_m < trajectory_metrics(result.odometry.T_world_lidar, truth.T_world_lidar)["ate_m"] / 2
+
+
+def test_a_faster_odometry_is_recommended_where_many_scans_were_dropped() -> None:
+    assert too_slow({"num_scans_dropped": 1, "num_scans_arrived": 100}, 1.0) == ""
+    advice = too_slow({"num_scans_dropped": 30, "num_scans_arrived": 100}, 0.4)
+    assert advice.startswith("30 of 100 scans were dropped")
+    assert "--set odometry.voxel_size_m=0.6 " in advice

@@ -20,7 +20,18 @@ from segslam.config import Config
 from segslam.experiments.pairs import PairList
 from segslam.simulation import made_up_drive
 from segslam.trajectory import camera_from_lidar, write_kitti
-from tools.benchmarks import label_maps, locate, peers, real_pairs, recognition, scenes, sequences, submaps, trouble
+from tools.benchmarks import (
+    label_maps,
+    locate,
+    odometry,
+    peers,
+    real_pairs,
+    recognition,
+    scenes,
+    sequences,
+    submaps,
+    trouble,
+)
 from tools.benchmarks import map as map_benchmark
 from tools.benchmarks.back_end import __main__ as back_end
 from tools.benchmarks.labels import __main__ as labels
@@ -145,6 +156,13 @@ def test_map_counts_what_moves_and_what_stands(call: Call, mapped: Path, data: P
     assert figures["num_keyframes"] == NUM_SCANS
     assert figures["moving"] == 0  # the drive has no moving cars
     assert figures["standing_lost_percent"] < 5.0
+
+
+def test_odometry_compares_voxel_sizes_and_another_library(call: Call, data: Path) -> None:
+    rows = call(odometry, data, "--sequence", "00", "--voxels", "1,2")["rows"]
+    assert [row["odometry"] for row in rows] == ["KISS-ICP, 1 m", "KISS-ICP, 2 m", "small_gicp VGICP"]
+    assert all(row["ate_m"] < 2.0 for row in rows)
+    assert all(row["median_ms"] > 0 for row in rows)
 
 
 def test_trouble_is_applied_to_the_drive_that_is_mapped(call: Call, data: Path) -> None:

@@ -18,7 +18,7 @@ REACHES_M = (1.0, 1.0, 0.5)
 RESIDUAL_SCALE_M = 0.1
 """Scale of the Cauchy weights; residuals of planar surfaces in voxels of 0.5 m are half of it."""
 NUM_NORMALS = 1000
-"""Chosen: the smallest share changes by a tenth at most with the normals of all points (KITTI 00, NCLT)."""
+"""Chosen: with the normals of all points the smallest share changes by 5 % at most (KITTI 00, NCLT, courtyard)."""
 LEAST_CONSTRAINT = 0.02
 """Chosen: smallest mean squared cosine between a direction and the normals of a scan; 1/3 if all directions are equal.
 Measured: at least 0.109 in KITTI's scans, 0.063 in NCLT's, 0.166 in the courtyard's; 0.058 in a simulated tunnel with

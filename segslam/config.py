@@ -482,7 +482,7 @@ class VerifyConfig(Section):
     )
     max_hypotheses: int = Field(3, ge=1, description="number of coarse poses tried, the best first [chosen]")
     max_plan_hypotheses: int = Field(
-        2, ge=0, description="number of poses tried after these, from aligning the two floor plans [chosen]"
+        6, ge=0, description="number of poses tried after these, from aligning the two floor plans [chosen]"
     )
     min_inliers: int = Field(
         3, ge=0, description="smallest number of clique members consistent with a coarse pose [chosen]"
@@ -491,6 +491,13 @@ class VerifyConfig(Section):
         0.5,
         gt=0,
         description="distance to the other scan within which a point overlaps it (m) [chosen: refine.voxel_m]",
+    )
+    min_weak_support: float = Field(
+        0.2,
+        ge=0,
+        le=1,
+        description="smallest share of matching points, relative to the overlap, among points facing the direction in "
+        "which they constrain the pose least [chosen on courtyard and simulated corridors]",
     )
     max_range_m: float = Field(
         50.0,

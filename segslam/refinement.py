@@ -23,6 +23,8 @@ STANDING_NORMAL_Z = math.cos(math.radians(45.0))
 """Chosen: points on steeper surfaces are above ground (`standing`)."""
 ROUGHNESS_REACH, LEAST_ROUGHNESS = 1.6, 0.02
 """Chosen, in voxels: farther neighbours are on other surfaces; a roughness below the second value is rounding."""
+SETTLED_M, SETTLED_RAD = 0.02, math.radians(0.1)
+"""Chosen: one in ten sparse scans oscillates by less between two sets of pairs."""
 UNOBSERVED = 0.01
 """Chosen: a ratio of variances below this means unobserved; a smooth tunnel has 0.001, from GICP's tangents."""
 
@@ -149,27 +151,23 @@ def refine(
     `information` is the scaled Hessian of the last stage, limited by the noise common to all points. In directions of
     translation that the points do not constrain, its standard deviation is the last search distance. `rms_m` is point
     to plane. Rejects TOO_FEW_POINTS, and REFINEMENT_DIVERGED if no pairs remain or, with `must_converge`, if the last
-    stage does not converge: one in ten sparse scans oscillates by centimetres between two sets of pairs.
+    stage does not converge and as many iterations again move the pose by more than `SETTLED_M` or `SETTLED_RAD`.
     """
     if min(len(source), len(target)) < config.min_points:
         sizes = f"{len(source)} and {len(target)} points, {config.min_points} needed"
         return Rejected(RejectReason.TOO_FEW_POINTS, sizes)
     for correspondence_m in config.correspondence_m:
-        result = small_gicp.align(
-            target.cloud,
-            source.cloud,
-            target.tree,
-            T_target_source,
-            max_correspondence_distance=correspondence_m,
-            max_iterations=config.max_iterations,
-            num_threads=1,
-        )
+        result = _aligned(source, target, T_target_source, correspondence_m, config)
         T_target_source = result.T_target_source
         if result.num_inliers < config.min_points or not np.isfinite(T_target_source).all():
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"{result.num_inliers} pairs at {correspondence_m} m")
     if must_converge and not result.converged:
-        detail = f"still moving after {config.max_iterations} iterations at {correspondence_m} m"
-        return Rejected(RejectReason.REFINEMENT_DIVERGED, detail)
+        result = _aligned(source, target, T_target_source, correspondence_m, config)
+        moved = geometry.inverse(T_target_source) @ result.T_target_source
+        T_target_source = result.T_target_source
+        if not (geometry.distance(moved) < SETTLED_M and geometry.angle(moved) < SETTLED_RAD):
+            detail = f"still moving after {config.max_iterations} iterations at {correspondence_m} m"
+            return Rejected(RejectReason.REFINEMENT_DIVERGED, detail)
     to_point, to_plane = target.distances_m(geometry.apply(T_target_source, source.points))
     paired = to_plane[to_point < config.correspondence_m[-1]]
     return Registration(
@@ -178,6 +176,20 @@ def refine(
         num_inliers=int(result.num_inliers),
         rms_m=float(np.sqrt(np.mean(paired**2))),
         information=_information((result.H + result.H.T) / 2 * config.information_scale, config),
+    )
+
+
+def _aligned(
+    source: Surface, target: Surface, T_target_source: Transform, within_m: float, config: RefineConfig
+) -> Any:
+    return small_gicp.align(
+        target.cloud,
+        source.cloud,
+        target.tree,
+        T_target_source,
+        max_correspondence_distance=within_m,
+        max_iterations=config.max_iterations,
+        num_threads=1,
     )
 
 
@@ -193,6 +205,18 @@ def observability(information: Information, *, config: RefineConfig) -> tuple[fl
         return 0.0, np.array([1.0, 0.0, 0.0])
     variances, directions = np.linalg.eigh(covariance[3:, 3:] - config.shared_noise_m**2 * np.eye(3))
     return float(max(variances[0], 0.0) / variances[2]), directions[:, 2]
+
+
+def weakest_level(information: Information) -> Direction:
+    """Level direction of the largest variance of the translation, of unit length, in the source's frame (z up).
+
+    Heights are left out: places repeat along the ground, as the doors of a corridor do.
+    """
+    try:
+        covariance = np.linalg.inv(information)[3:5, 3:5]
+    except np.linalg.LinAlgError:
+        return np.array([1.0, 0.0, 0.0])
+    return np.array([*np.linalg.eigh(covariance)[1][:, 1], 0.0])
 
 
 def _information(hessian: Information, config: RefineConfig) -> Information:

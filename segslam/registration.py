@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from time import perf_counter
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -35,6 +36,8 @@ SHIFTS_M = tuple(sign * float(shift_m) for shift_m in range(1, 9) for sign in (-
 """Chosen: shifts along the weak direction where rivals are searched; refinement finds rivals within 0.5 m."""
 SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
 """Chosen: poses closer to each other than this are the same."""
+MOST_PLANS = 24
+"""Chosen: floor-plan poses looked through for those near the prior, 1 ms each."""
 
 
 @runtime_checkable
@@ -44,6 +47,11 @@ class Gate(Protocol):
     def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
         """`slack_m`: distance by which refinement may still move the pose."""
         ...
+
+
+def anywhere(T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+    """The gate of scans without prior knowledge."""
+    return None
 
 
 class Stopwatch:
@@ -135,7 +143,7 @@ def register_prepared(
     target: PreparedScan,
     *,
     config: Config,
-    gate: Gate = lambda T_target_source, *, slack_m: None,
+    gate: Gate = anywhere,
     floor: gates.NoiseFloor = gates.SINGLE_PAIR,
     watch: Stopwatch | None = None,
 ) -> Alignment | Rejected:
@@ -149,7 +157,7 @@ def register_prepared(
     allowed = gates.limits(floor, config=config.verify)
     trial = _Trial(source, target, config, gate, floor, allowed, watch or Stopwatch())
     rejections = []
-    for coarse in _coarse(source, target, config=config, watch=trial.watch):
+    for coarse in _coarse(trial):
         outcome = coarse if isinstance(coarse, Rejected) else trial.outcome(coarse)
         if isinstance(outcome, Found):
             return _unless_ambiguous(outcome, trial)
@@ -163,7 +171,7 @@ class Found(NamedTuple):
     alignment: Alignment
     agreement: gates.Agreement
     weak_direction: Direction
-    """Direction in the source's frame in which the scans constrain the pose least."""
+    """Level direction in the source's frame in which the scans constrain the pose least."""
 
 
 class _Trial(NamedTuple):
@@ -212,24 +220,40 @@ class _Trial(NamedTuple):
         rejected = gates.rejection(found, self.limits)
         if rejected is not None:
             return rejected
-        observability, weak_direction = refinement.observability(fine.information, config=self.config.refine)
+        observability, _ = refinement.observability(fine.information, config=self.config.refine)
+        weak_direction = refinement.weakest_level(fine.information)
+        unsupported = self._unsupported(fine.T_target_source, weak_direction, found.overlap)
+        if unsupported is not None:
+            return unsupported
         alignment = Alignment(
             coarse, fine, found.overlap, found.rms_m, found.free_space_violation, observability=observability
         )
         return Found(alignment, found, weak_direction)
+
+    def _unsupported(self, T_target_source: Transform, direction: Direction, overlap: float) -> Rejected | None:
+        """Rejects a pose along whose weak direction nothing matches, such as one slid along a corridor."""
+        scans = self.source.surface, self.target.surface
+        support = gates.weak_support(*scans, T_target_source, direction, config=self.config.verify)
+        least = self.config.verify.min_weak_support * overlap
+        if support >= least:
+            return None
+        return Rejected(RejectReason.LOW_OVERLAP, f"{support:.3f} < {least:.3f} along the weakest direction")
 
 
 def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
     """The best of a pose and its rivals; AMBIGUOUS if a different pose fits almost as well.
 
     Rivals are searched if the scans constrain the pose badly in some direction, as along a tunnel, or fit less well
-    than neighbouring keyframes do.
+    than neighbouring keyframes do. In the second case poses that the prior excludes are rivals too: a pose that fits
+    no better than wrong ones is not proven by being near the prior.
     """
     config = trial.config.verify
-    if found.alignment.observability >= config.well_observed and gates.is_certain(found.agreement, trial.floor):
+    certain = gates.is_certain(found.agreement, trial.floor)
+    if certain and found.alignment.observability >= config.well_observed:
         return found.alignment
-    passed, loose = [found], trial._replace(limits=trial.limits.loosened())
-    for coarse in _rivals(found, trial):
+    loose = trial._replace(limits=trial.limits.loosened(), gate=trial.gate if certain else anywhere)
+    passed = [found]
+    for coarse in _rivals(found, loose):
         if not _is_near(coarse.T_target_source, passed):
             rival = loose.outcome(coarse)
             if isinstance(rival, Found) and not _is_near(rival.alignment.fine.T_target_source, passed):
@@ -239,8 +263,8 @@ def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
         apart = geometry.inverse(best.alignment.fine.T_target_source) @ others[0].alignment.fine.T_target_source
         beside = f"{others[0].agreement.mismatch:.3f} {geometry.distance(apart):.1f} m off"
         return Rejected(RejectReason.AMBIGUOUS, f"mismatch {best.agreement.mismatch:.3f}, and {beside}")
-    rejected = gates.rejection(best.agreement, trial.limits)
-    return best.alignment if rejected is None else rejected
+    far = trial.gate(best.alignment.fine.T_target_source, slack_m=0.0)
+    return far or gates.rejection(best.agreement, trial.limits) or best.alignment
 
 
 def _rivals(found: Found, trial: _Trial) -> Iterator[Registration]:
@@ -249,7 +273,7 @@ def _rivals(found: Found, trial: _Trial) -> Iterator[Registration]:
     for shift_m in SHIFTS_M:
         shift = geometry.transform(np.eye(3), shift_m * found.weak_direction)
         yield replace(pose, T_target_source=pose.T_target_source @ shift)
-    yield from _plans(trial.source, trial.target, num_poses=trial.config.verify.max_rivals, watch=trial.watch)
+    yield from _plans(trial, num_poses=trial.config.verify.max_rivals)
 
 
 def _is_near(T_target_source: Transform, others: Sequence[Found]) -> bool:
@@ -258,21 +282,34 @@ def _is_near(T_target_source: Transform, others: Sequence[Found]) -> bool:
     return any(geometry.distance(T) < SAME_POSE_M and geometry.angle(T) < SAME_POSE_RAD for T in apart)
 
 
-def _coarse(
-    source: PreparedScan, target: PreparedScan, *, config: Config, watch: Stopwatch
-) -> Iterator[Registration | Rejected]:
-    """Hypotheses from clusters and features, then from floor plans if the vertical of both scans is known."""
-    with watch("match"):
-        ranked = segregator.hypotheses(source.description, target.description, config=config.segregator)
-    yield from [ranked] if isinstance(ranked, Rejected) else ranked[: config.verify.max_hypotheses]
-    yield from _plans(source, target, num_poses=config.verify.max_plan_hypotheses, watch=watch)
+def _coarse(trial: _Trial) -> Iterator[Registration | Rejected]:
+    """Hypotheses from clusters and features, then from floor plans.
+
+    Poses that the prior excludes are skipped and not counted: in symmetric places, such as a corridor, most poses
+    that fit are turned by 180 degrees or far along it.
+    """
+    config = trial.config
+    with trial.watch("match"):
+        ranked = segregator.hypotheses(trial.source.description, trial.target.description, config=config.segregator)
+    if isinstance(ranked, Rejected):
+        yield ranked
+    else:
+        possible = [coarse for coarse in ranked if _is_possible(coarse, trial)]
+        yield from (possible or ranked[:1])[: config.verify.max_hypotheses]
+    yield from _plans(trial, num_poses=config.verify.max_plan_hypotheses)
 
 
-def _plans(source: PreparedScan, target: PreparedScan, *, num_poses: int, watch: Stopwatch) -> list[Registration]:
-    """Poses that align the two floor plans; none if the vertical of a scan is unknown."""
-    source_up, target_up = segregator.upward(source.description), segregator.upward(target.description)
-    if num_poses == 0 or source_up is None or target_up is None:
+def _plans(trial: _Trial, *, num_poses: int) -> list[Registration]:
+    """Poses near the prior that align the two floor plans."""
+    if num_poses == 0:
         return []
+    source, target = trial.source, trial.target
     standing = source.surface.standing, target.surface.standing
-    with watch("match"):
-        return list(segregator.plan_hypotheses(*standing, source_up, target_up, num_poses=num_poses))
+    verticals = segregator.vertical(source.description), segregator.vertical(target.description)
+    with trial.watch("match"):
+        ranked = segregator.plan_hypotheses(*standing, *verticals, num_poses=max(MOST_PLANS, num_poses))
+        return list(islice((coarse for coarse in ranked if _is_possible(coarse, trial)), num_poses))
+
+
+def _is_possible(coarse: Registration, trial: _Trial) -> bool:
+    return trial.gate(coarse.T_target_source, slack_m=trial.config.verify.max_coarse_fine_m) is None

@@ -5,7 +5,7 @@ from helpers.streets import corner, small_move
 
 from segslam import geometry
 from segslam.config import RefineConfig
-from segslam.refinement import LightSurface, Surface, downsample, make_surface, refine
+from segslam.refinement import UNOBSERVED, LightSurface, Surface, downsample, make_surface, observability, refine
 from segslam.types import Registration, Rejected, RejectReason
 
 CONFIG = RefineConfig()
@@ -63,14 +63,58 @@ def test_scans_that_do_not_overlap_are_rejected() -> None:
     assert found.reason is RejectReason.REFINEMENT_DIVERGED
 
 
-def test_a_last_stage_that_does_not_converge_is_rejected() -> None:
+@pytest.mark.parametrize(("coarse_m", "is_settled"), [(0.2, True), (0.6, False)])
+def test_a_last_stage_that_does_not_converge_is_rejected_if_it_still_moves(coarse_m: float, is_settled: bool) -> None:
+    """One iteration is never enough to converge; from near by the next one moves by millimetres."""
     rng = np.random.default_rng(0)
-    T_coarse = small_move(rng, rotation_deg=0.7, translation_m=0.2)
+    T_coarse = geometry.transform(geometry.yaw(np.radians(0.7)), [coarse_m, 0.0, 0.0])
     config = RefineConfig(max_iterations=1, correspondence_m=(0.5,))
     found = refine(surface(corner(rng)), surface(corner(rng)), T_coarse, config=config)
-    assert isinstance(found, Rejected)
-    assert found.reason is RejectReason.REFINEMENT_DIVERGED
-    assert found.detail == "still moving after 1 iterations at 0.5 m"
+    if is_settled:
+        assert isinstance(found, Registration)
+        assert geometry.distance(found.T_target_source) < 0.05
+    else:
+        assert isinstance(found, Rejected)
+        assert found.reason is RejectReason.REFINEMENT_DIVERGED
+        assert found.detail == "still moving after 1 iterations at 0.5 m"
+
+
+def _tunnel(rng: np.random.Generator) -> np.ndarray:
+    """A smooth tunnel along x, 8 m wide: nothing shows where along it a scan was taken."""
+    x = rng.uniform(-30.0, 30.0, (3, 8000))
+    across, up = rng.uniform(-4.0, 4.0, 8000), rng.uniform(-1.7, 4.0, (2, 8000))
+    sides = [
+        np.column_stack([x[0], across, np.full(8000, -1.7)]),
+        np.column_stack([x[1], np.full(8000, -4.0), up[0]]),
+        np.column_stack([x[2], np.full(8000, 4.0), up[1]]),
+    ]
+    return np.concatenate(sides) + rng.normal(0.0, 0.01, (24_000, 3))
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 35.0])
+def test_along_a_smooth_tunnel_the_information_is_that_of_the_search(yaw_deg: float) -> None:
+    """Without that, points that slide along smooth walls claim to know the position along the tunnel to 5 cm."""
+    rng = np.random.default_rng(0)
+    T_target_source = geometry.transform(geometry.yaw(np.radians(yaw_deg)), 0.0)
+    source = surface(geometry.apply(geometry.inverse(T_target_source), _tunnel(rng)))
+    found = refine(source, surface(_tunnel(rng)), T_target_source, config=CONFIG)
+    assert isinstance(found, Registration)
+    axes = T_target_source[:3, :3].T @ np.eye(3)[:, :2]
+    covariance = np.linalg.inv(found.information)[3:, 3:]
+    sigma_m = np.sqrt(np.einsum("ik,ij,jk->k", axes, covariance, axes))
+    assert sigma_m[0] >= CONFIG.correspondence_m[-1]
+    assert sigma_m[1] < 0.1
+    ratio, direction = observability(found.information, config=CONFIG)
+    assert ratio < UNOBSERVED
+    assert abs(direction @ axes[:, 0]) > 0.99
+
+
+def test_a_corner_is_held_in_all_directions() -> None:
+    rng = np.random.default_rng(0)
+    found = refine(surface(corner(rng)), surface(corner(rng)), np.eye(4), config=CONFIG)
+    assert isinstance(found, Registration)
+    assert observability(found.information, config=CONFIG)[0] > UNOBSERVED
+    assert np.sqrt(np.diag(np.linalg.inv(found.information))[3:]).max() < 0.1
 
 
 @pytest.mark.data

@@ -1,11 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.drives import round_drive
+from helpers.rooms import ground_and_walls
 
-from segslam import geometry
+from segslam import geometry, segregator
 from segslam.config import Config
 from segslam.registration import PreparedScan, Stopwatch, prepare_scan, register, register_prepared
 from segslam.types import Alignment, Label, Rejected, RejectReason
+from segslam.verification import gates
 from segslam.verification.free_space import observe_free_space
 
 CONFIG = Config()
@@ -59,8 +63,45 @@ def test_a_gate_sees_the_refined_pose_too_which_moves_no_farther() -> None:
     found = register_prepared(source, target, config=CONFIG, gate=gate)
     assert isinstance(found, Rejected)
     assert found.detail == "refined"
-    assert [slack_m for slack_m, _ in seen[:2]] == [CONFIG.verify.max_coarse_fine_m, 0.0]
-    assert seen[1][1] < 0.05
+    slack_m, error_m = zip(*seen, strict=True)
+    assert slack_m[0] == CONFIG.verify.max_coarse_fine_m
+    assert error_m[slack_m.index(0.0)] < 0.05
+
+
+def test_poses_that_the_prior_excludes_do_not_use_up_the_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a corridor, where the poses that fit best are turned round."""
+    source, target, T_target_source = _round_pair()
+    (right, *_) = segregator.hypotheses(source.description, target.description, config=CONFIG.segregator)
+    turned = replace(right, T_target_source=right.T_target_source @ geometry.transform(geometry.yaw(np.pi), 0.0))
+    ranked = [turned] * CONFIG.verify.max_hypotheses + [right]
+    monkeypatch.setattr(segregator, "hypotheses", lambda *_, **__: ranked)
+    config = Config.model_validate({"verify": {"max_plan_hypotheses": 0}})
+
+    def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
+        turn_deg = _error(T_target_source, pose)[1]
+        return Rejected(RejectReason.FAR_FROM_PRIOR) if turn_deg > 20.0 else None
+
+    assert isinstance(register_prepared(source, target, config=config, gate=gate), Alignment)
+
+
+@pytest.mark.parametrize(("is_certain", "reason"), [(False, RejectReason.AMBIGUOUS), (True, None)])
+def test_a_pose_that_fits_badly_has_rivals_that_the_prior_excludes(
+    is_certain: bool, reason: RejectReason | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A yard that looks the same turned by 180 degrees; the prior excludes the pose that is turned."""
+    points, labels = ground_and_walls()
+    rng = np.random.default_rng(0)
+    source, target = (
+        prepare_scan((points + rng.normal(0.0, 0.03, points.shape)).astype(np.float32), labels, config=CONFIG)
+        for _ in range(2)
+    )
+    monkeypatch.setattr(gates, "is_certain", lambda *_: is_certain)
+
+    def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
+        return Rejected(RejectReason.FAR_FROM_PRIOR) if geometry.angle(pose) > 0.5 else None
+
+    found = register_prepared(source, target, config=CONFIG, gate=gate)
+    assert (found.reason if isinstance(found, Rejected) else None) is reason
 
 
 def test_moving_classes_are_in_neither_surface_nor_free_space() -> None:

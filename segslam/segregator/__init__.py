@@ -1,7 +1,7 @@
 """Segregator: global registration of two labelled scans from semantic clusters and point features."""
 
 from segslam.segregator.describe import describe
-from segslam.segregator.match import hypotheses, match, upward
+from segslam.segregator.match import hypotheses, match, vertical
 from segslam.segregator.plan import plan_hypotheses
 
-__all__ = ["describe", "hypotheses", "match", "plan_hypotheses", "upward"]
+__all__ = ["describe", "hypotheses", "match", "plan_hypotheses", "vertical"]

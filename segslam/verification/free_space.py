@@ -79,13 +79,18 @@ def _row_height(elevation_rad: Vector, column: Indices) -> float:
     return next((row_rad for row_rad, found in zip(ROWS_RAD, detail, strict=True) if found >= MIN_DETAIL), ROWS_RAD[-1])
 
 
-def violation(points: Points, seen: FreeSpace, T_view_points: Transform, *, config: VerifyConfig) -> float:
+def violation(
+    points: Points, seen: FreeSpace, T_view_points: Transform, *, config: VerifyConfig, is_coarse: bool = False
+) -> float:
     """Share, 0 to 1, of the points that lie in front of all returns around their direction.
 
-    Only directions with a return count; 0 where there is none.
+    Only directions with a return count; 0 where there is none. The margin of a coarse pose, which may be off by more
+    than a narrow place allows, is `free_space_margin_m` everywhere.
     """
     moved = geometry.apply(T_view_points, points).astype(np.float32)
     margin_m = min(max(SHARE_OF_PATH * seen.free_path_m, MIN_MARGIN_M), config.free_space_margin_m)
+    if is_coarse:
+        margin_m = config.free_space_margin_m
     margins = np.array([margin_m, config.free_space_margin_ratio])
     num_violations, num_seen = _count_violations(moved, seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
     return num_violations / num_seen if num_seen else 0.0

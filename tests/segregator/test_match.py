@@ -1,5 +1,6 @@
 """Matching two descriptions: known answers, symmetries, failures, real scans."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -8,7 +9,7 @@ import pytest
 
 from segslam import geometry
 from segslam.config import SegregatorConfig
-from segslam.segregator.match import hypotheses, match
+from segslam.segregator.match import hypotheses, match, vertical
 from segslam.types import Description, Label, Registration, Rejected, RejectReason, Transform
 
 NO_ROWS = np.empty((0, 3))
@@ -291,3 +292,15 @@ def test_every_solver_finds_the_pose(solver: str, rotation: str) -> None:
     metres, degrees = error(match(source, seen_again(source, 14), config=config), T_TRUE)
     assert metres < 0.15
     assert degrees < 0.6
+
+
+def test_little_ground_turns_the_vertical_little_and_much_ground_decides_it() -> None:
+    leaning = np.array([math.sin(math.radians(20.0)), 0.0, math.cos(math.radians(20.0))])
+    nothing = np.empty((0, 3, 3)), np.empty(0)
+    turns_deg = []
+    for count in (0, 2, 400):
+        up = vertical(description(NO_ROWS, *nothing, np.zeros((count, 3)), np.tile(leaning, (count, 1))))
+        turns_deg.append(math.degrees(math.acos(min(up[2], 1.0))))
+    assert turns_deg[0] == 0.0
+    assert turns_deg[1] == pytest.approx(4.0, abs=0.5), "two of ten votes"
+    assert turns_deg[2] == pytest.approx(20.0, abs=0.5)

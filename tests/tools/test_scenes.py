@@ -12,6 +12,7 @@ from segslam.registration import PreparedScan, prepare_scan, register_prepared, 
 from segslam.simulation.scene_sensors import SENSORS, scan_points
 from segslam.simulation.scenes import SCENES, corridor
 from segslam.types import Alignment, Registration, Rejected
+from segslam.verification.gates import weak_support
 from tools.benchmarks import scenes
 
 CONFIG = Config()
@@ -30,7 +31,7 @@ def _corridor_scan(x: float) -> PreparedScan:
 def _from(T_target_source: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> Alignment | Rejected:
     """What becomes of one coarse pose, the only one that is tried."""
     coarse = Registration(T_target_source, 9, 9, 0.1, np.eye(6))
-    monkeypatch.setattr(registration, "_coarse", lambda *_, **__: iter([coarse]))
+    monkeypatch.setattr(registration, "_coarse", lambda _: iter([coarse]))
     return register_prepared(_corridor_scan(SOURCE_X), _corridor_scan(TARGET_X), config=CONFIG)
 
 
@@ -38,6 +39,23 @@ def _from(T_target_source: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> Align
 def test_a_pose_slid_along_a_corridor_is_not_accepted(slid_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
     found = _from(geometry.transform(np.eye(3), [SOURCE_X - TARGET_X + slid_m, 0.0, 0.0]), monkeypatch)
     assert not _is_wrong(found), found
+
+
+def test_along_a_corridor_the_doors_must_match() -> None:
+    """The walls match at any shift; the recesses of the doors, 3 m apart, at the true one only."""
+    source, target = _corridor_scan(SOURCE_X).surface, _corridor_scan(TARGET_X).surface
+    support = {
+        slid_m: weak_support(
+            source,
+            target,
+            geometry.transform(np.eye(3), [SOURCE_X - TARGET_X + slid_m, 0.0, 0.0]),
+            np.array([1.0, 0.0, 0.0]),
+            config=CONFIG.verify,
+        )
+        for slid_m in (0.0, 1.26, -1.26)
+    }
+    assert support[0.0] > 0.4
+    assert max(support[1.26], support[-1.26]) < 0.15
 
 
 def test_a_pose_turned_round_in_a_corridor_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:

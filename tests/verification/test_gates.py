@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,6 +110,19 @@ def test_limits_follow_the_neighbours_of_the_run() -> None:
     assert better.min_overlap == CONFIG.min_overlap
     assert better.max_residual_ratio == pytest.approx(0.7 * CONFIG.max_residual_ratio)
     assert better.max_free_space_violation == CONFIG.max_free_space_violation
+
+
+def test_scans_that_overlap_as_neighbours_do_must_fit_nearly_as_well() -> None:
+    floor = NoiseFloor(overlap=0.8, residual_ratio=0.7, free_space_violation=0.0)
+    allowed = limits(floor, config=CONFIG)
+    most = allowed.max_residual_ratio, allowed.max_free_space_violation
+    assert allowed.at(0.4) == allowed.at(0.1) == pytest.approx(most), "up to half of the overlap of neighbours"
+    assert allowed.at(0.8) == allowed.at(0.95) == pytest.approx((0.85 * most[0], 0.5 * most[1]))
+    between = Agreement(overlap=0.8, rms_m=0.1, residual_ratio=0.9 * most[0], free_space_violation=0.0)
+    rejected = rejection(between, allowed)
+    assert rejected is not None
+    assert rejected.reason is RejectReason.HIGH_RESIDUAL
+    assert rejection(replace(between, overlap=0.4), allowed) is None
 
 
 def test_neighbours_that_share_their_points_do_not_make_the_limit_stricter_than_other_scans_can_reach() -> None:

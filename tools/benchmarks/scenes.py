@@ -6,7 +6,7 @@
 Each true pair is two scans of one place, each false pair two scans of different places, both with the prior that a run
 would have: for false pairs a prior that puts the places beside each other. Default settings. Prints a row for each
 combination: false acceptances, true pairs with an overlap above 0.4 at the true pose, and how many of them are kept.
-Settings were chosen on even seeds; report odd ones.
+Settings were chosen on even seeds and on seed 1; report others.
 """
 
 import math

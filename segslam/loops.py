@@ -72,7 +72,7 @@ class LoopCloser:
         """Note the result of an optimisation: closures with weight shorten the chains between keyframes."""
         self._detector.note_estimate(weights)
 
-    def look_again(self, watch: Stopwatch, *, end_s: float = math.inf) -> Iterator[LoopAttempt]:
+    def search_again(self, watch: Stopwatch, *, end_s: float = math.inf) -> Iterator[LoopAttempt]:
         """Try the pairs proposed from the final poses that were not tried before, up to a limit of their number.
 
         No further keyframe is started after `end_s`, by time.monotonic.

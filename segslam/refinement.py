@@ -111,11 +111,11 @@ def merge(clouds: Sequence[Points], *, config: RefineConfig) -> Points:
     return voxel_means(np.vstack(clouds), config.voxel_m).astype(np.float32)
 
 
-def make_surface(thinned: Points, *, config: RefineConfig) -> Surface:
+def make_surface(downsampled: Points, *, config: RefineConfig) -> Surface:
     """The surface through downsampled points. It may be empty; `refine` then rejects."""
-    cloud = small_gicp.PointCloud(thinned.astype(np.float64))
+    cloud = small_gicp.PointCloud(downsampled.astype(np.float64))
     tree = small_gicp.KdTree(cloud)
-    if len(thinned) < config.min_points:
+    if len(downsampled) < config.min_points:
         return Surface(cloud, tree, LEAST_ROUGHNESS * config.voxel_m)
     small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, 1)
     return Surface(cloud, tree, _roughness(cloud, tree, config.voxel_m))

@@ -18,7 +18,7 @@ from segslam.loops import ROUNDS, LoopCloser
 from segslam.odometry import Odometry, OdometryResult
 from segslam.pose_graph import Graph, PoseGraph
 from segslam.registration import Labeller, Stopwatch, shape_labels
-from segslam.semantics.late import made
+from segslam.semantics.late import computed
 from segslam.slam_result import SlamResult as SlamResult
 from segslam.tracker import Tracked as Tracked
 from segslam.tracker import Tracker
@@ -130,7 +130,7 @@ class Slam:
             is_due=lambda: optimize,
         )
 
-    def go_on(self, scan_of: Callable[[int], Scan]) -> None:
+    def resume(self, scan_of: Callable[[int], Scan]) -> None:
         """Prepare `process` to continue after `repeat`.
 
         `scan_of` reads the scan of a step, counted from 0, if needed.
@@ -173,7 +173,7 @@ class Slam:
         estimate = self.graph.finish()
         for _ in range(ROUNDS):
             self._loops.note_estimate(estimate.closure_weights)
-            found = list(self._loops.look_again(Stopwatch(), end_s=end_s))
+            found = list(self._loops.search_again(Stopwatch(), end_s=end_s))
             late += found
             if not any(isinstance(attempt.outcome, LoopClosure) for attempt in found):
                 break
@@ -226,7 +226,7 @@ class Slam:
     def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:
         """A keyframe of this scan, downsampled; geometric labels are computed if it has none."""
         with tracked.watch("label"):
-            labels = made(registered.labels)
+            labels = computed(registered.labels)
             is_unlabelled = not labels.any()
             if is_unlabelled:
                 labels = self._labeller(registered.points)

@@ -72,8 +72,8 @@ class Submaps:
         return 1 if self._is_dense([self._clouds().cloud(keyframe_id)[0]]) else self._config.keyframes.max_gathered + 1
 
     def _is_dense(self, clouds: list[Points]) -> bool:
-        thinned = refinement.downsample(np.vstack(clouds), config=self._config.refine)
-        return len(thinned) >= self._config.keyframes.dense_voxels
+        downsampled = refinement.downsample(np.vstack(clouds), config=self._config.refine)
+        return len(downsampled) >= self._config.keyframes.dense_voxels
 
     def _neighbours(self, keyframe_id: int, newest_id: int) -> Iterator[int]:
         """Keyframes around one, nearest first, that odometry connects to it without a break."""

@@ -54,9 +54,9 @@ def test_repeating_the_steps_gives_the_same_attempts_and_poses(run: tuple[list[S
     assert [[_told(attempt.outcome) for attempt in step.attempts] for step in again] == outcomes
 
 
-@pytest.mark.parametrize(("most_waiting", "slow"), [(1, "tracking"), (8, "closing"), (8, "neither")])
+@pytest.mark.parametrize(("max_waiting", "slow"), [(1, "tracking"), (8, "closing"), (8, "neither")])
 def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
-    run: tuple[list[Step], SlamResult], most_waiting: int, slow: str
+    run: tuple[list[Step], SlamResult], max_waiting: int, slow: str
 ) -> None:
     steps, result = run
     slam = drifting_slam()
@@ -70,7 +70,7 @@ def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
         time.sleep(0.02 * (slow == "closing"))
         return slam.close_loops(scan)
 
-    for step, expected in zip(in_other_thread(tracked(), closed, most_waiting=most_waiting), steps, strict=True):
+    for step, expected in zip(in_other_thread(tracked(), closed, max_waiting=max_waiting), steps, strict=True):
         assert step.scan_index == expected.scan_index
         np.testing.assert_array_equal(step.T_odom_lidar, expected.T_odom_lidar)
         assert (step.keyframe is None) == (expected.keyframe is None)

@@ -162,13 +162,13 @@ def _run(
     **settings: Any,
 ) -> None:
     """Register the pairs, print the results, and write the report if a folder is given."""
-    from segslam.experiments.paper import beside_paper
+    from segslam.experiments.paper import with_paper_values
     from segslam.experiments.provenance import account
     from segslam.experiments.report_tables import overall, plain
     from segslam.experiments.summary import results
 
     rows = run_trials(job, trials, options)
-    found = beside_paper(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
+    found = with_paper_values(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
     if options.out is not None:
         workers = "of a Dask cluster" if options.scheduler else options.workers
         asked = {"sample": options.sample, "seed": options.seed, "workers": workers, **settings}

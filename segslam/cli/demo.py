@@ -41,7 +41,7 @@ def demo(
     begin_again = f"to start again, remove {out}"
     when_stopped(begin_again)
     sensor = simulation.SensorConfig(name=SENSOR, axis_wander_sigma_deg=AXIS_WANDER_DEG, axis_wander_s=AXIS_WANDER_S)
-    drive = simulation.made_up_drive(scale=SCALE)
+    drive = simulation.example_drive(scale=SCALE)
     simulation.prepare_folder(data, SEQUENCE, overwrite=False)
     config = simulation.SimulationConfig(sensor=sensor)
     written = simulation.write_drive(data, SEQUENCE, drive, config=config, seed=SEED)

@@ -123,19 +123,19 @@ def _labelled(scans: "Dataset", true_scans: "Dataset | None", config: "Config") 
     from time import perf_counter
 
     from segslam.registration import shape_labels
-    from segslam.semantics.late import made
+    from segslam.semantics.late import computed
     from segslam.types import BadScan
 
     for row in range(len(scans)):
         try:
             scan = scans[row]
-            truth = None if true_scans is None else made(true_scans[row].labels)
+            truth = None if true_scans is None else computed(true_scans[row].labels)
         except BadScan as error:
             logging.getLogger(__name__).warning("%s; skipped", error)
             yield None
             continue
         started = perf_counter()
-        labels = made(scan.labels)
+        labels = computed(scan.labels)
         if scans.labels.geometric and not labels.any():
             labels = shape_labels(scan.points, config=config)
         yield Labelled(row, scan, labels, truth, perf_counter() - started)

@@ -63,7 +63,7 @@ def _read(
     from segslam.datasets.kitti import VERTICAL_ANGLE_DEG
     from segslam.datasets.scans import make_scan
     from segslam.semantics.label_files import encoding_of, read_labels
-    from segslam.semantics.late import made
+    from segslam.semantics.late import computed
     from segslam.types import SegslamError
 
     if dataset not in (None, "kitti"):
@@ -79,7 +79,7 @@ def _read(
             check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
         ids = read_labels(Path(labels) / f"{scan.stem}.label", len(points), encoding or encoding_of(files))
     ready = make_scan(scan, 0, 0, points, ids, vertical_angle_deg=angle_deg)
-    return ready.points, None if labels == "geometric" else made(ready.labels)
+    return ready.points, None if labels == "geometric" else computed(ready.labels)
 
 
 def _figures(found: "Located | Rejected") -> dict[str, Any]:

@@ -115,7 +115,7 @@ def _read(
     from segslam.datasets.scans import make_scan
     from segslam.registration import shape_labels
     from segslam.semantics.label_files import encoding_of, open_labels, read_labels
-    from segslam.semantics.late import made
+    from segslam.semantics.late import computed
     from segslam.types import SegslamError
 
     if dataset not in (None, "kitti"):
@@ -147,7 +147,10 @@ def _read(
     ]
     with watch("label"):
         return [
-            (scan.points, shape_labels(scan.points, config=config) if words[0] == "geometric" else made(scan.labels))
+            (
+                scan.points,
+                shape_labels(scan.points, config=config) if words[0] == "geometric" else computed(scan.labels),
+            )
             for scan in scans
         ]
 

@@ -57,7 +57,7 @@ def simulate(
     from segslam import simulation
 
     config = simulation.simulation_config(sensor, settings or ())
-    drive = simulation.made_up_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
+    drive = simulation.example_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
     driven = simulation.in_lane(drive, left_m=lane, reverse=reverse)
     total = min(frames or len(drive.time_s), len(drive.time_s))
     only = _named(pairs, total, sample=sample) if pairs else None

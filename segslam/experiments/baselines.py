@@ -32,8 +32,8 @@ KISS_VOXEL_M = 0.3
 class GicpScan:
     """A downsampled cloud with covariances, search tree and voxel map. It is pickled as its points."""
 
-    def __init__(self, thinned: Points) -> None:
-        self.cloud = small_gicp.PointCloud(thinned)
+    def __init__(self, downsampled: Points) -> None:
+        self.cloud = small_gicp.PointCloud(downsampled)
         self.tree = small_gicp.KdTree(self.cloud)
         small_gicp.estimate_normals_covariances(self.cloud, self.tree, GICP_NEIGHBOURS, 1)
         self.voxels = small_gicp.GaussianVoxelMap(VGICP_VOXEL_M)

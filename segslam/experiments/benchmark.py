@@ -18,7 +18,7 @@ from segslam.system.whole_files import write_whole
 from segslam.types import SegslamError
 
 ROWS_FILE = "details.csv"
-ASKED_FILE = "asked.json"
+IDENTITY_FILE = "asked.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,21 +64,21 @@ def _work(job: Job, trials: Sequence[Trial], pool: Pool) -> Iterator[list[Row]]:
 
 def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
     """The rows of finished trials; raises SegslamError if they belong to another benchmark."""
-    asked = _asked(job, trials)
-    file = folder / ASKED_FILE
+    identity = _identity(job, trials)
+    file = folder / IDENTITY_FILE
     try:
         folder.mkdir(parents=True, exist_ok=True)
         before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
         if before is None:
-            write_whole(file, json.dumps(asked, indent=1) + "\n")
+            write_whole(file, json.dumps(identity, indent=1) + "\n")
     except OSError as error:
         raise SegslamError(f"{file}: cannot be read or written ({reason(error)}); choose another --out") from error
     except ValueError as error:
         raise SegslamError(f"{file}: is not JSON ({error}); choose another --out") from error
     if before is None:
         return []
-    for key in asked:
-        if before.get(key) != asked[key]:
+    for key in identity:
+        if before.get(key) != identity[key]:
             raise SegslamError(f"{folder}: contains a benchmark with other {key}; choose another --out, or delete it")
     rows = read_rows(folder / ROWS_FILE) if (folder / ROWS_FILE).exists() else []
     return _of_whole_trials([row for row in rows if row.reason != LOST_WORKER], job)
@@ -90,7 +90,7 @@ def _of_whole_trials(rows: list[Row], job: Job) -> list[Row]:
     return [row for some in trials if {one.method for one in some} == set(job.methods) for row in some]
 
 
-def _asked(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:
+def _identity(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:
     """Everything that identifies a benchmark, in readable form."""
     digest = hashlib.sha256()
     for trial in trials:

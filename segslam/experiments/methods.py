@@ -41,8 +41,8 @@ class Method:
 class SurfaceScan:
     """Surface and free space of a scan, for refinement and verification. It is pickled as its points."""
 
-    def __init__(self, thinned: Points, free_space: FreeSpace, config: RefineConfig) -> None:
-        self.surface = refinement.make_surface(thinned, config=config)
+    def __init__(self, downsampled: Points, free_space: FreeSpace, config: RefineConfig) -> None:
+        self.surface = refinement.make_surface(downsampled, config=config)
         self.free_space = free_space
         self._config = config
 

@@ -89,7 +89,7 @@ def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
     return SUCCESS_PERCENT[method][name][place]
 
 
-def beside_paper(
+def with_paper_values(
     results: dict[str, dict[str, Any]], *, experiment: str, sequence: str, lists: Sequence[PairList]
 ) -> dict[str, dict[str, Any]]:
     """The results with the paper's values for the same method and pairs under the key `paper`.

@@ -54,7 +54,7 @@ def tables(report: dict[str, Any]) -> list[Table]:
         made.append(_errors(results, by))
     made.append(overall(results))
     if any("paper" in own for own in results.values()):
-        made.append(_beside_paper(results))
+        made.append(_paper_comparison(results))
     return [*made, _stages(results)]
 
 
@@ -153,7 +153,7 @@ def _figures_table(caption: str, titles: dict[str, str], results: dict[str, Any]
     return Table(caption, ("method", *titles.values()), rows)
 
 
-def _beside_paper(results: dict[str, Any]) -> Table:
+def _paper_comparison(results: dict[str, Any]) -> Table:
     rows: list[tuple[str, ...]] = []
     for method, own in results.items():
         for key, title in PAPER_FIGURES.items():

@@ -13,10 +13,10 @@ from tempfile import TemporaryDirectory
 
 from segslam.config import MapConfig
 from segslam.map.clouds import LasCloud, PcdCloud, PlyCloud, check_las
-from segslam.map.gathered import Gathered
 from segslam.map.grid import Grid
 from segslam.map.part import Extent, MapFile, Part
 from segslam.map.picture import Picture
+from segslam.map.store import MapStore
 from segslam.system.interrupts import removed_when_stopped
 from segslam.system.whole_files import check_target, whole_file
 from segslam.types import Keyframe, SegslamError, Transform
@@ -79,19 +79,19 @@ def write_map(
         check_target(file)
     with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name, removed_when_stopped(Path(name)):
         scratch = Path(name)
-        gathered = Gathered(scratch, config)
+        store = MapStore(scratch, config)
         for keyframe, T_world_keyframe in placed:
-            gathered.add(keyframe, T_world_keyframe)
-        extent = gathered.extent()
+            store.add(keyframe, T_world_keyframe)
+        extent = store.extent()
         if extent is None:
             raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
-        parts = show(gathered.parts(), gathered.num_tiles)
+        parts = show(store.parts(), store.num_tiles)
         num_points = _write(parts, extent, files, scratch=scratch / "files", config=config)
     return MapSummary(
-        num_keyframes=gathered.num_keyframes,
+        num_keyframes=store.num_keyframes,
         num_points=num_points,
-        num_moving_points=gathered.num_moving_points,
-        num_voxels_seen_through=gathered.num_voxels_seen_through,
+        num_moving_points=store.num_moving_points,
+        num_voxels_seen_through=store.num_voxels_seen_through,
     )
 
 

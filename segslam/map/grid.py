@@ -82,7 +82,7 @@ class Grid:
         rows, columns = np.nonzero(cells == UNKNOWN)
         centres = corner(part.tile)[:2] + (np.column_stack([columns, rows]) + 0.5) * (TILE_M / self._cells)
         free = np.zeros(len(centres), bool)
-        for passed in self._extent.sights.free(part.tile, centres):
+        for passed in self._extent.free_ranges.free(part.tile, centres):
             free |= passed
         cells[rows[free], columns[free]] = FREE
         return cells

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from segslam.config import MapConfig
-from segslam.map.sights import Sights
+from segslam.map.free_ranges import FreeRanges
 from segslam.map.tiles import Tile
 from segslam.semantics.class_colors import Colors
 from segslam.types import Labels, Points, Vector
@@ -28,7 +28,7 @@ class Extent:
     """Positions of the keyframes in the world, in order (m)."""
     span: tuple[float, float]
     """Both ends of the colour scale, for heights or intensities."""
-    sights: Sights
+    free_ranges: FreeRanges
     """Free space observed by the keyframes."""
 
 

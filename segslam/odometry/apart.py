@@ -55,11 +55,11 @@ class _AlignerApart:
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
         """T_odom_lidar of the next sweep, `gap` intervals after the previous one."""
-        return self._asked(gap, points)
+        return self._request(gap, points)
 
     def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
         """As `KissAligner.restore`."""
-        self._asked(T_odom_lidar, points)
+        self._request(T_odom_lidar, points)
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
@@ -67,7 +67,7 @@ class _AlignerApart:
         """As `Odometry.follow`."""
         self._exchange((list(scans), T_odom_lidar, T_before_lidar))
 
-    def _asked(self, known: Transform | float, points: Points | None) -> Transform:
+    def _request(self, known: Transform | float, points: Points | None) -> Transform:
         """The pose from the other process; `known` is the pose of the sweep, or the gap before it."""
         sent: Points | int | None = points
         if points is not None and len(points) <= len(self._shared):

@@ -132,7 +132,7 @@ class Run:
                 raise _other_data(recorded.path, f"has scan {scan.index} at {stamp_ns} ns, the data {scan.stamp_ns} ns")
             return scan
 
-        self._slam.go_on(scan_of)
+        self._slam.resume(scan_of)
         self._log.move(recorded.path)
         self.num_scans_resumed = len(taken)
         self._started_mapping = perf_counter()
@@ -144,8 +144,8 @@ class Run:
 
         Scans are read by the calling thread and tracked in a second; a third closes loops and logs the steps.
         """
-        tracked = in_other_thread(self._read(dataset), self._track, most_waiting=1)
-        return in_other_thread(tracked, self._done, most_waiting=MOST_WAITING)
+        tracked = in_other_thread(self._read(dataset), self._track, max_waiting=1)
+        return in_other_thread(tracked, self._done, max_waiting=MOST_WAITING)
 
     def follow(self, tracked: Tracked | BadScan, *, tries_loops: bool = True) -> Step | BadScan:
         """Close loops for a scan tracked by the caller, and log the step."""
@@ -158,7 +158,7 @@ class Run:
     def repeat(self, steps: Iterator[Step]) -> Iterator[Step]:
         """Repeat the steps of a log, starting from the keyframes; this thread reads the log, another works."""
         return in_other_thread(
-            steps, lambda recorded: self._logged(self._slam.repeat(recorded)), most_waiting=MOST_WAITING
+            steps, lambda recorded: self._logged(self._slam.repeat(recorded)), max_waiting=MOST_WAITING
         )
 
     def take(self, steps: Iterator[tuple[Step, int, bool]]) -> Iterator[Step]:
@@ -168,7 +168,7 @@ class Run:
             step, below, optimize = item
             return self._logged(self._slam.take(step, below=below, optimize=optimize))
 
-        return in_other_thread(steps, taken, most_waiting=MOST_WAITING)
+        return in_other_thread(steps, taken, max_waiting=MOST_WAITING)
 
     def finish(self, *, search_s: float = math.inf) -> tuple[SlamResult, dict[str, Any]]:
         """Final optimisation; writes all results. Returns the result and the figures that need no reference.

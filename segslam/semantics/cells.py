@@ -5,7 +5,7 @@ import numpy as np
 from segslam.types import IndexPairs, Points, Vector
 
 
-def cells_above(points: Points, cell_m: float, *, border: int) -> tuple[IndexPairs, Vector, tuple[int, int]]:
+def grid_cells(points: Points, cell_m: float, *, border: int) -> tuple[IndexPairs, Vector, tuple[int, int]]:
     """The cell (n, 2) of each point, the corner of the grid (m), and the number of rows and columns.
 
     The grid contains all points and a margin of `border` empty cells.

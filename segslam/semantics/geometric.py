@@ -7,7 +7,7 @@ import numpy as np
 
 from segslam.config import GeometricLabelsConfig
 from segslam.points import within_range
-from segslam.semantics.cells import cells_above
+from segslam.semantics.cells import grid_cells
 from segslam.semantics.ground_surface import heights_above_ground, turned, upright
 from segslam.semantics.solids import Pieces, pieces
 from segslam.semantics.uprights import NUM_SLICES, on_thin_uprights
@@ -50,7 +50,7 @@ def _poles(points: Points, heights: Vector, config: GeometricLabelsConfig) -> La
     low, high = config.band_m
     slice_m = (high - low) / NUM_SLICES
     ring = round(config.pole_clear_m / COLUMN_M)
-    cells, _, shape = cells_above(points, COLUMN_M, border=ring)
+    cells, _, shape = grid_cells(points, COLUMN_M, border=ring)
     thin = on_thin_uprights(
         cells,
         np.floor((heights - low) / slice_m).astype(np.int64),

@@ -3,7 +3,7 @@
 from segslam.types import Labels, Mask, ScanLabels
 
 
-def made(labels: ScanLabels) -> Labels:
+def computed(labels: ScanLabels) -> Labels:
     """The labels, computed now if necessary."""
     return labels() if callable(labels) else labels
 

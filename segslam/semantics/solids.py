@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import label
 
-from segslam.semantics.cells import cells_above
+from segslam.semantics.cells import grid_cells
 from segslam.system.kernels import kernel
 from segslam.types import Indices, Mask, Points, Vector
 
@@ -35,7 +35,7 @@ class Pieces:
 
 def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
     """The segments of the chosen points of a level cloud."""
-    cells, _, shape = cells_above(points, CELL_M, border=1)
+    cells, _, shape = grid_cells(points, CELL_M, border=1)
     occupied = np.zeros(shape, bool)
     occupied[cells[chosen, 0], cells[chosen, 1]] = True
     grid, num_pieces = label(occupied, structure=EIGHT_NEIGHBOURS)

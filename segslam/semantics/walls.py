@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from segslam.semantics.cells import cells_above
+from segslam.semantics.cells import grid_cells
 from segslam.system.kernels import kernel
 from segslam.types import Mask, Points, Vector
 
@@ -22,7 +22,7 @@ def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: 
     Each voxel is tested with its 8 neighbours: the standard deviation of the points perpendicular to their line must be
     below `thickness_m`, and one of the points must be higher than `min_top_m` above the ground.
     """
-    cells, corner, shape = cells_above(points, CELL_M, border=1)
+    cells, corner, shape = grid_cells(points, CELL_M, border=1)
     layers = np.clip(heights / LAYER_M, 0, NUM_LAYERS - 1).astype(np.int64)
     voxel, moments = _moments(points, layers, cells, corner, (NUM_LAYERS, *shape))
     top = np.full(shape, -np.inf)

@@ -84,7 +84,7 @@ class Placer:
             found = self._locator.locate(submap.points, submap.labels)
         if isinstance(found, Rejected):
             return (), found
-        return self._believed(_placement(keyframe_id, found))
+        return self._confirmed(_placement(keyframe_id, found))
 
     def _tracked(self, keyframe_id: int, since_m: float, watch: Stopwatch) -> Placement | Rejected:
         """The keyframe registered with the nearest ones of the map, starting at the odometry's prediction."""
@@ -146,7 +146,7 @@ class Placer:
         T_world_keyframe = T_world_target @ fine.T_target_source
         return Placement(keyframe_id, target_id, T_world_keyframe, fine.information, alignment, is_found=False)
 
-    def _believed(self, found: Placement) -> tuple[tuple[Placement, ...], Rejected | None]:
+    def _confirmed(self, found: Placement) -> tuple[tuple[Placement, ...], Rejected | None]:
         """The location with an earlier one that is consistent with it; it waits if there is none."""
         if self._last is not None and self._agree(self._last, found):
             return self._taken((found,)), None

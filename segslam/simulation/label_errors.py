@@ -47,15 +47,15 @@ class LabelErrorConfig(Section):
 
 def network_like(points: Points, labels: Labels, *, config: LabelErrorConfig, rng: np.random.Generator) -> Labels:
     """Simulated network labels (n,) for points (n, 3) of the LiDAR frame with known true labels."""
-    guessed = _standing(labels)
+    guessed = _static(labels)
     for _ in range(config.regions if len(points) else 0):
         _confuse_region(guessed, points, config.region_radius_m, rng)
-    guessed = _bled(guessed, points, config.bleeding, rng)
+    guessed = _blurred(guessed, points, config.bleeding, rng)
     guessed[rng.random(len(guessed)) < config.lost] = Label.UNLABELLED
     return guessed
 
 
-def _standing(labels: Labels) -> Labels:
+def _static(labels: Labels) -> Labels:
     """Labels with each moving class replaced by its static class: a single scan does not show motion."""
     table = np.arange(len(Label), dtype=np.uint8)
     table[list(STANDING)] = list(STANDING.values())
@@ -74,7 +74,7 @@ def _confuse_region(labels: Labels, points: Points, radius_m: float, rng: np.ran
             labels[rows[before == label]] = others[min(int(rng.geometric(0.6)) - 1, len(others) - 1)]
 
 
-def _bled(labels: Labels, points: Points, share: float, rng: np.random.Generator) -> Labels:
+def _blurred(labels: Labels, points: Points, share: float, rng: np.random.Generator) -> Labels:
     """Labels blurred over the edges of the range image, horizontally and vertically by one or two pixels."""
     row, column = _pixels(points)
     image = np.full(IMAGE, Label.UNLABELLED, dtype=np.uint8)

@@ -16,7 +16,7 @@ TURN_M = 5.0  # chosen: width of the Gaussian that rounds the corners
 SPEED_M_S, TURN_M_S2, PERIOD_S = 14.0, 5.0, 0.1  # chosen: top speed; lateral acceleration that limits speed in turns
 
 
-def made_up_loop(num_frames: int = 0, *, scale: float = 1.0) -> tuple[Poses, Vector]:
+def example_loop(num_frames: int = 0, *, scale: float = 1.0) -> tuple[Poses, Vector]:
     """Poses T_world_lidar (n, 4, 4) and times (n,) (s) of a drive at 10 Hz that revisits a street in both directions.
 
     The drive is one round and the shared street again, about 300 scans, or `num_frames` scans if that is more. `scale`

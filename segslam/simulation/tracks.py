@@ -7,7 +7,7 @@ import numpy as np
 
 from segslam import geometry
 from segslam.simulation.levelling import level, upright
-from segslam.simulation.routes import made_up_loop
+from segslam.simulation.routes import example_loop
 from segslam.trajectory import Poses, lidar_from_camera, read_poses
 from segslam.types import SegslamError, Transform, Vector
 
@@ -31,12 +31,12 @@ class Drive:
     calib: str
 
 
-def made_up_drive(num_frames: int = 0, *, scale: float = 1.0) -> Drive:
+def example_drive(num_frames: int = 0, *, scale: float = 1.0) -> Drive:
     """The generated loop with KITTI's nominal calibration: one round, or several if `num_frames` needs more.
 
     `scale` enlarges the blocks.
     """
-    return Drive(*made_up_loop(num_frames, scale=scale), NOMINAL_CALIB)
+    return Drive(*example_loop(num_frames, scale=scale), NOMINAL_CALIB)
 
 
 def in_lane(drive: Drive, *, left_m: float = 0.0, reverse: bool = False) -> Drive:

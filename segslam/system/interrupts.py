@@ -17,7 +17,7 @@ PATIENCE = 2
 """Number of Ctrl-C that end the command in order; the next one ends it at once. The log stays readable."""
 
 
-class _Heard:
+class _State:
     times = 0
     line = ""
     unfinished: ClassVar[set[Path]] = set()
@@ -25,22 +25,22 @@ class _Heard:
 
 def when_stopped(line: str) -> None:
     """Set the message printed if Ctrl-C ends the command: which results exist, and how to continue."""
-    _Heard.line = line
+    _State.line = line
 
 
 @contextmanager
 def removed_when_stopped(path: Path) -> Iterator[None]:
     """Have an unfinished file or folder removed also where Ctrl-C ends the process at once."""
-    _Heard.unfinished.add(path)
+    _State.unfinished.add(path)
     try:
         yield
     finally:
-        _Heard.unfinished.discard(path)
+        _State.unfinished.discard(path)
 
 
 def stop_line() -> str:
     """The message set by `when_stopped`."""
-    return f"segslam: stopped: {_Heard.line}"
+    return f"segslam: stopped: {_State.line}"
 
 
 def same_command_with(option: str) -> str:
@@ -55,7 +55,7 @@ def ctrl_c_in_order() -> Iterator[None]:
 
     An extension module that is interrupted while it is imported raises another error, or none.
     """
-    _Heard.times, _Heard.line = 0, "nothing was written"
+    _State.times, _State.line = 0, "nothing was written"
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
         yield
@@ -68,8 +68,8 @@ def ctrl_c_in_order() -> Iterator[None]:
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:
-    _Heard.times += 1
-    if _Heard.times > PATIENCE or _is_importing(frame):
+    _State.times += 1
+    if _State.times > PATIENCE or _is_importing(frame):
         _remove_unfinished()
         os.write(2, f"{stop_line()}\n".encode())
         os._exit(EXIT_STATUS)
@@ -78,7 +78,7 @@ def _interrupt(_: int, frame: FrameType | None) -> None:
 
 def _remove_unfinished() -> None:
     """Uses loaded modules only: an import may be in progress."""
-    for path in tuple(_Heard.unfinished):
+    for path in tuple(_State.unfinished):
         with suppress(OSError):
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)

@@ -16,10 +16,10 @@ def both(work: Callable[..., Done], first: tuple[Any, ...], second: tuple[Any, .
         return work(*first), other.result()
 
 
-def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, most_waiting: int) -> Iterator[Done]:
+def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, max_waiting: int) -> Iterator[Done]:
     """Apply `work` to each item in another thread; yields the results in order.
 
-    The calling thread produces the items, up to `most_waiting` ahead of the item in work. An exception of an item or of
+    The calling thread produces the items, up to `max_waiting` ahead of the item in work. An exception of an item or of
     `work` is raised in the order of the results. After it, after Ctrl-C, or if the caller stops early, no further item
     is started.
     """
@@ -39,7 +39,7 @@ def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, most
         try:
             for item in items:
                 waiting.append(thread.submit(unless_failed, item))
-                while waiting and (len(waiting) > most_waiting or waiting[0].done()):
+                while waiting and (len(waiting) > max_waiting or waiting[0].done()):
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

@@ -96,9 +96,9 @@ COMMANDS: dict[str, Callable[[Path, Path, Path], Words]] = {
 
 @pytest.fixture(autouse=True)
 def short_demo(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = simulation.made_up_drive()
+    drive = simulation.example_drive()
     short = replace(drive, T_world_lidar=drive.T_world_lidar[:2], time_s=drive.time_s[:2])
-    monkeypatch.setattr(simulation, "made_up_drive", lambda *_, **__: short)
+    monkeypatch.setattr(simulation, "example_drive", lambda *_, **__: short)
 
 
 def test_every_command_is_tried_here() -> None:

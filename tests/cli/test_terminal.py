@@ -17,13 +17,13 @@ from dataclasses import replace
 import segslam.simulation
 from segslam.cli import main
 
-real = segslam.simulation.made_up_drive
+real = segslam.simulation.example_drive
 
 def short_drive(*options, **more):
     drive = real(*options, **more)
     return replace(drive, T_world_lidar=drive.T_world_lidar[:NUM_SCANS], time_s=drive.time_s[:NUM_SCANS])
 
-segslam.simulation.made_up_drive = short_drive  # the demo's has hundreds of scans
+segslam.simulation.example_drive = short_drive  # the demo's has hundreds of scans
 if __name__ == "__main__":  # else the process of the odometry runs it too
     for command in json.load(open(sys.argv[1])):
         try:

@@ -183,7 +183,7 @@ def test_results_are_compared_with_the_paper_for_the_same_list_only() -> None:
     assert paper.success_percent("segregator", "cut_10to15", 2825) is None
     found = results([row(method="segregator", pairs="kitti06_10to15")], by="list")
     sampled = PairList("kitti06_10to15", np.array([[1, 70]]), 2825)
-    beside = paper.beside_paper(found, experiment="pairs", sequence="06", lists=[sampled])
+    beside = paper.with_paper_values(found, experiment="pairs", sequence="06", lists=[sampled])
     assert beside["segregator"]["by"][0]["paper"] == {"success_percent": 98.3}
 
 

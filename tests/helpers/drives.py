@@ -12,7 +12,7 @@ from segslam.config import load_config
 from segslam.datasets.kitti import read_calibration
 from segslam.odometry import GivenOdometry
 from segslam.semantics.encodings import RAW_OF_LABEL
-from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, made_up_drive, simulate_drive
+from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, example_drive, simulate_drive
 from segslam.simulation.drive import drive_sweeps
 from segslam.simulation.files import uncorrected
 from segslam.simulation.sensor import Sweep
@@ -84,7 +84,7 @@ def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
         rows = np.column_stack([uncorrected(scan.points), intensities(scan.points)])
         rows.astype("<f4").tofile(folder / "velodyne" / f"{scan.index:06d}.bin")
         RAW_OF_LABEL[scan.labels].astype("<u4").tofile(folder / "true_labels" / f"{scan.index:06d}.label")
-    (folder / "calib.txt").write_text(made_up_drive(1).calib)
+    (folder / "calib.txt").write_text(example_drive(1).calib)
     (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans))
     write_kitti(
         root / "poses" / "00.txt", camera_from_lidar(truth.T_world_lidar, read_calibration(folder / "calib.txt"))

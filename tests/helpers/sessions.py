@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam import geometry
-from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, made_up_drive, prepare_folder, write_drive
+from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, example_drive, prepare_folder, write_drive
 from segslam.simulation.tracks import Drive, in_lane
 from segslam.trajectory import Poses
 
@@ -41,4 +41,4 @@ def _block() -> Drive:
     poses: Poses = np.stack(
         [geometry.transform(geometry.yaw(a), [RADIUS_M * np.sin(a), -RADIUS_M * np.cos(a), 1.73]) for a in along]
     )
-    return Drive(poses, 0.2 * np.arange(len(along)), made_up_drive(1).calib)
+    return Drive(poses, 0.2 * np.arange(len(along)), example_drive(1).calib)

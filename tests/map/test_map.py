@@ -16,9 +16,9 @@ from segslam import geometry
 from segslam.config import MapConfig
 from segslam.map import MapSummary, write_map
 from segslam.map.before_after import BeforeAfter, most_changed
+from segslam.map.free_ranges import NUM_DIRECTIONS, free_range_m
 from segslam.map.from_above import LEAST_PX, LEGEND_PX, PATH, round_length_m
 from segslam.map.picture import MARGIN_M
-from segslam.map.sights import NUM_DIRECTIONS, free_range_m
 from segslam.semantics.class_colors import COLORS
 from segslam.types import GraphEstimate, Label, SegslamError
 

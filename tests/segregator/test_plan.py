@@ -102,5 +102,5 @@ def test_scans_that_share_nothing_but_walls_are_aligned_by_these(num_plans: int,
     assert isinstance(found, Alignment) == aligned
     if isinstance(found, Alignment):
         apart_m, apart_rad = _error(found.fine, T_target_source)
-        assert apart_m < 0.02  # the clouds are the same but for the way they were thinned
+        assert apart_m < 0.02  # the clouds are the same but for the way they were downsampled
         assert apart_rad < math.radians(0.2)

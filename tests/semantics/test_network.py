@@ -19,7 +19,7 @@ from segslam.config import OdometryConfig
 from segslam.datasets import open_dataset
 from segslam.odometry.sweep import deskew_scan
 from segslam.semantics.label_files import open_labels
-from segslam.semantics.late import made
+from segslam.semantics.late import computed
 from segslam.semantics.network import open_network
 from segslam.semantics.network_settings import read_settings
 from segslam.types import Label, SegslamError
@@ -144,7 +144,7 @@ def test_intensities_of_a_drive_reach_the_network(tmp_path: Path) -> None:
     np.column_stack([points, intensities]).astype(np.float32).tofile(velodyne / "0.bin")
     scan = open_dataset(tmp_path / "drive", labels=f"network:{made_network(tmp_path)}")[0]
     expected = LABELS[expected_classes(points, intensities)]
-    assert (made(scan.labels) == expected).mean() > 0.99  # float32 moves a few points over an edge
+    assert (computed(scan.labels) == expected).mean() > 0.99  # float32 moves a few points over an edge
     assert (expected == Label.CAR).any()
 
 
@@ -163,7 +163,7 @@ def test_late_labels_lose_the_rows_that_their_points_lose(tmp_path: Path) -> Non
     rows = np.flatnonzero((ranges_m > 10) & (ranges_m < 20))
     assert 100 < len(rows) == len(kept_points)
     expected = open_network(network).labels(returns[:, :3], returns[:, 3])[rows]
-    np.testing.assert_array_equal(made(labels), expected)
+    np.testing.assert_array_equal(computed(labels), expected)
     assert len(np.unique(expected)) == 3
 
 
@@ -172,7 +172,7 @@ def test_unknown_intensities_are_zeros_with_one_warning(tmp_path: Path, caplog: 
     source = open_labels(f"network:{made_network(tmp_path)}", beside=tmp_path, scan_names=["0"], encoding=None)
     assert not source.geometric
     with caplog.at_level(logging.WARNING):
-        labels = [made(source.read("0", points)) for _ in range(2)]
+        labels = [computed(source.read("0", points)) for _ in range(2)]
     assert caplog.text.count("receives zeros") == 1
     np.testing.assert_array_equal(labels[0], LABELS[expected_classes(points, np.zeros(len(points)))])
     np.testing.assert_array_equal(labels[0], labels[1])

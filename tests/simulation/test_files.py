@@ -14,8 +14,8 @@ from segslam.simulation import (
     WorldConfig,
     build_world,
     drive_sweeps,
+    example_drive,
     in_lane,
-    made_up_drive,
     prepare_folder,
     read_drive,
     write_drive,
@@ -32,7 +32,7 @@ CONFIG = SimulationConfig(sensor=SensorConfig(name="vlp16"))
 @pytest.fixture(scope="module")
 def drive() -> Drive:
     """Four scans spread over the made-up loop, where their cars are."""
-    whole = made_up_drive()
+    whole = example_drive()
     rows = [0, 60, 150, 220]
     return Drive(whole.T_world_lidar[rows], whole.time_s[rows], whole.calib)
 
@@ -106,7 +106,7 @@ def test_stopped_in_the_middle_it_is_a_shorter_sequence(drive, sweeps, tmp_path)
 
 
 def test_fewer_scans_are_the_same_scans(tmp_path):
-    drive = made_up_drive()
+    drive = example_drive()
     for name, count in (("a", 1), ("b", 2)):
         prepare_folder(tmp_path / name, "00", overwrite=False)
         list(write_drive(tmp_path / name, "00", drive, config=CONFIG, seed=4, num_frames=count))
@@ -205,7 +205,7 @@ def test_a_standing_car_is_a_drive_too(tmp_path):
 
 
 def test_two_drives_through_one_town_have_poses_in_one_frame(tmp_path):
-    drive = made_up_drive(3)
+    drive = example_drive(3)
     back = in_lane(drive, left_m=2.0, reverse=True)
     prepare_folder(tmp_path, "04", overwrite=False)
     list(write_drive(tmp_path, "04", drive, config=CONFIG, seed=0, driven=back, num_frames=2))

@@ -6,7 +6,7 @@ import pytest
 from segslam.simulation import (
     WorldConfig,
     build_world,
-    made_up_loop,
+    example_loop,
     make_sensor,
     read_drive,
     simulate_drive,
@@ -21,7 +21,7 @@ CAR_HALF_WIDTH_M = 0.95
 
 @pytest.fixture(scope="module")
 def loop():
-    return made_up_loop()
+    return example_loop()
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +188,7 @@ def test_a_world_of_one_pose_goes_on_both_ways():
     assert np.isfinite(hits.range_m).mean() > 0.8
 
 
-def test_the_made_up_loop_drives_a_street_in_both_directions_and_again(loop):
+def test_the_example_loop_drives_a_street_in_both_directions_and_again(loop):
     poses, time_s = loop
     assert 280 < len(poses) < 380
     np.testing.assert_allclose(np.diff(time_s), 0.1)
@@ -199,7 +199,7 @@ def test_the_made_up_loop_drives_a_street_in_both_directions_and_again(loop):
     assert (later & (away < 4.0) & (heading > 0.95)).any()
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert steps.max() < 1.5
-    assert len(made_up_loop(900)[0]) == 900
+    assert len(example_loop(900)[0]) == 900
 
 
 @pytest.mark.data

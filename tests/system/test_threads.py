@@ -7,9 +7,9 @@ import pytest
 from segslam.system.threads import both, in_other_thread
 
 
-@pytest.mark.parametrize("most_waiting", [1, 8])
+@pytest.mark.parametrize("max_waiting", [1, 8])
 @pytest.mark.parametrize("slow", ["making", "work", "asking"])
-def test_the_order_is_that_of_the_items_whichever_is_slow(most_waiting: int, slow: str) -> None:
+def test_the_order_is_that_of_the_items_whichever_is_slow(max_waiting: int, slow: str) -> None:
     def items() -> Iterator[int]:
         for item in range(20):
             time.sleep(0.002 * (slow == "making"))
@@ -20,7 +20,7 @@ def test_the_order_is_that_of_the_items_whichever_is_slow(most_waiting: int, slo
         return item * item
 
     done = []
-    for result in in_other_thread(items(), work, most_waiting=most_waiting):
+    for result in in_other_thread(items(), work, max_waiting=max_waiting):
         time.sleep(0.002 * (slow == "asking"))
         done.append(result)
     assert done == [item * item for item in range(20)]
@@ -40,7 +40,7 @@ def test_items_are_made_while_others_are_worked_on_and_no_more_than_may_wait() -
     def work(item: int) -> bool:
         return item > 0 or three_more.wait(10.0)
 
-    results = in_other_thread(items(), work, most_waiting=3)
+    results = in_other_thread(items(), work, max_waiting=3)
     assert next(results)
     assert len(made) == 4
     assert all(results)
@@ -52,7 +52,7 @@ def test_items_are_produced_by_the_calling_thread_and_processed_by_one_other() -
         for _ in range(6):
             yield threading.get_ident()
 
-    pairs = list(in_other_thread(items(), lambda maker: (maker, threading.get_ident()), most_waiting=2))
+    pairs = list(in_other_thread(items(), lambda maker: (maker, threading.get_ident()), max_waiting=2))
     assert {maker for maker, _ in pairs} == {threading.get_ident()}
     assert len({worker for _, worker in pairs} - {threading.get_ident()}) == 1
 
@@ -69,7 +69,7 @@ def test_failed_work_raises_in_its_turn_and_none_goes_on() -> None:
 
     done = []
     with pytest.raises(ArithmeticError):
-        done.extend(in_other_thread(range(100), work, most_waiting=2))
+        done.extend(in_other_thread(range(100), work, max_waiting=2))
     assert worked == [0, 1, 2, 3]
 
 
@@ -81,13 +81,13 @@ def test_what_was_made_before_a_failed_item_is_worked_on() -> None:
 
     worked = []
     with pytest.raises(ArithmeticError):
-        list(in_other_thread(items(), worked.append, most_waiting=4))
+        list(in_other_thread(items(), worked.append, max_waiting=4))
     assert worked == [1, 2][: len(worked)], "in order, and none twice; those that still waited are dropped"
 
 
 def test_an_early_end_stops_the_work() -> None:
     worked = []
-    results = in_other_thread(range(1_000_000), worked.append, most_waiting=3)
+    results = in_other_thread(range(1_000_000), worked.append, max_waiting=3)
     next(results)
     results.close()
     num_worked = len(worked)

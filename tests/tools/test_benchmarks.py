@@ -18,7 +18,7 @@ from helpers.finished_run import make_run
 from segslam import geometry
 from segslam.config import Config
 from segslam.experiments.pairs import PairList
-from segslam.simulation import made_up_drive
+from segslam.simulation import example_drive
 from segslam.trajectory import camera_from_lidar, write_kitti
 from tools.benchmarks import (
     label_maps,
@@ -97,7 +97,7 @@ def test_back_end_keeps_true_closures_and_lowers_the_error(call: Call, tmp_path:
     folder = tmp_path / "kitti" / "sequences" / "00"
     folder.mkdir(parents=True)
     (tmp_path / "kitti" / "poses").mkdir()
-    (folder / "calib.txt").write_text(made_up_drive(1).calib)
+    (folder / "calib.txt").write_text(example_drive(1).calib)
     angles = 2.0 * np.pi * np.arange(150) / 100
     poses = np.stack([geometry.transform(geometry.yaw(a), [48 * np.sin(a), 48 - 48 * np.cos(a), 0.0]) for a in angles])
     T_camera_lidar = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])

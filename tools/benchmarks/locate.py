@@ -18,7 +18,7 @@ from segslam.datasets import open_dataset
 from segslam.evaluation import PoseError
 from segslam.run.finished import read_run
 from segslam.run.locator import Locator
-from segslam.semantics.late import made
+from segslam.semantics.late import computed
 from segslam.types import Rejected
 from tools.benchmarks import common
 
@@ -49,7 +49,7 @@ def main() -> None:
         scan = data[row]
         T_true = T_of_query[int(scan.index or 0)]
         near = np.linalg.norm(T_keyframes[:, :3, 3] - T_true[:3, 3], axis=1).min() <= WITHIN_M
-        labels = made(scan.labels)
+        labels = computed(scan.labels)
         started, started_cpu = perf_counter(), process_time()
         found = locator.locate(scan.points, labels if labels.any() else None)
         seconds.append(perf_counter() - started)

@@ -23,7 +23,7 @@ from segslam import geometry, open_dataset
 from segslam.config import load_config
 from segslam.log import read_log
 from segslam.map import write_map
-from segslam.semantics.late import made
+from segslam.semantics.late import computed
 from segslam.types import Keyframe, Label, Transform
 from tools.benchmarks import common
 
@@ -77,7 +77,7 @@ def main() -> None:
         distance_m, match = cKDTree(scan.points).query(keyframe.points[near])
         if distance_m.max() > 0.02:
             parser.error(f"{given.data}: scan {scan.index} is not the one that the run mapped")
-        moves = made(scan.labels)[match] >= Label.MOVING_CAR
+        moves = computed(scan.labels)[match] >= Label.MOVING_CAR
         world = geometry.apply(T, keyframe.points[near].astype(np.float64))
         in_map = np.isin(_cells(world, config.map.voxel_m), kept)
         counts.update(moving=int(moves.sum()), moving_left=int((moves & in_map).sum()))

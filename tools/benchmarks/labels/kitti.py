@@ -12,7 +12,7 @@ from segslam.datasets import open_dataset
 from segslam.experiments.rows import Row
 from segslam.experiments.summary import figures, grouped
 from segslam.semantics import geometric_labels
-from segslam.semantics.late import made
+from segslam.semantics.late import computed
 from segslam.types import GROUND_LABELS, Label, Points
 from tools.benchmarks import real_pairs
 
@@ -30,7 +30,7 @@ def class_agreement(data: Path, config: Config) -> dict[str, dict[str, float]]:
     """Intersection over union of each class over the points whose truth is known: of scans 0, 1 and 2, and of all."""
     counts: dict[str, dict[str, np.ndarray]] = {"all": {name: np.zeros(2) for name in CLASSES}}
     for scan in open_dataset(data / "kitti", sequence="00", frames="0:3"):
-        true_labels = made(scan.labels)
+        true_labels = computed(scan.labels)
         known = true_labels != Label.UNLABELLED
         labels, truth = geometric_labels(scan.points, config=config.geometric)[known], true_labels[known]
         counts[f"scan {scan.index}"] = {}

@@ -18,7 +18,7 @@ import numpy as np
 from segslam import keep_freed_memory
 from segslam.config import Config, load_config
 from segslam.experiments.variations import pair_trials
-from segslam.semantics.late import made
+from segslam.semantics.late import computed
 from tools.benchmarks import common, real_pairs
 from tools.benchmarks.common import Row, markdown
 from tools.benchmarks.registration.ablation import Case, ablation
@@ -62,7 +62,7 @@ def speed_part(options: argparse.Namespace, config: Config) -> Tables:
     @cache
     def network(index: int) -> Labelled:
         scan = real_scan(options.data, index, labels="predicted_labels")
-        return scan.points, made(scan.labels)
+        return scan.points, computed(scan.labels)
 
     trials = pair_trials(real_pairs.predicted_pairs(options.data), None)
     real_cases: list[Case] = [(trial, network) for trial in trials]

@@ -19,7 +19,7 @@ REACH_M = 40.0
 """Chosen: at larger ranges, grazing beams leave gaps between rings that may hide obstacles."""
 
 
-class Sights:
+class FreeRanges:
     """The free range of each keyframe, by direction in the world."""
 
     def __init__(self, config: MapConfig) -> None:

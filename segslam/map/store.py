@@ -9,8 +9,8 @@ from segslam import geometry
 from segslam.config import MapConfig
 from segslam.map import colors
 from segslam.map.cleaning import moved
+from segslam.map.free_ranges import FreeRanges
 from segslam.map.part import Extent, Part
-from segslam.map.sights import Sights
 from segslam.map.tiles import Tile, Tiles, corner, distance_m
 from segslam.map.views import Views
 from segslam.points import within_range
@@ -18,7 +18,7 @@ from segslam.semantics.class_colors import Colors, of_classes
 from segslam.types import Keyframe, Label, Labels, SegslamError, Transform, Vector
 
 
-class Gathered:
+class MapStore:
     """Voxels by tile, and a range image of each keyframe."""
 
     def __init__(self, scratch: Path, config: MapConfig) -> None:
@@ -26,7 +26,7 @@ class Gathered:
         self._config = config
         self._tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
         self._views = Views(scratch / "views", spread_m=config.voxel_m)
-        self._sights = Sights(config)
+        self._free_ranges = FreeRanges(config)
         self._T_keyframe_world: list[Transform] = []
         self._places: list[np.ndarray] = []
         self._has_intensities = True
@@ -60,7 +60,7 @@ class Gathered:
         intensities = np.zeros(len(kept), np.float32) if keyframe.intensities is None else keyframe.intensities
         points = geometry.apply(T_world_keyframe, keyframe.points[kept].astype(np.float64))
         self._tiles.add(points, keyframe.labels[kept], intensities[kept])
-        self._sights.add(points, keyframe.labels[kept], T_world_keyframe[:3, 3])
+        self._free_ranges.add(points, keyframe.labels[kept], T_world_keyframe[:3, 3])
         self._views.add(keyframe.points)
         self._T_keyframe_world.append(geometry.inverse(T_world_keyframe))
         self._places.append(T_world_keyframe[:3, 3])
@@ -74,7 +74,14 @@ class Gathered:
         brightest = self._tiles.brightest if self._has_intensities else None
         path_m = np.array(self._places)
         return Extent(
-            west, east, south, north, brightest=brightest, path_m=path_m, span=self._span(), sights=self._sights
+            west,
+            east,
+            south,
+            north,
+            brightest=brightest,
+            path_m=path_m,
+            span=self._span(),
+            free_ranges=self._free_ranges,
         )
 
     def parts(self) -> Iterator[Part]:

@@ -24,7 +24,7 @@ from segslam.evaluation import (
 )
 from segslam.trajectory import read_poses
 
-REAL = [  # camera frame or ground-truth frame alike: each is scored against the official poses as it is
+REAL = [  # camera frame or ground-truth frame: each is scored against the official poses as it is
     ("KITTI_00_ORB", "00", 1.30),
     ("KITTI_00_SPTAM", "00", 3.74),
     ("simple_online_00", "00", 4.86),

@@ -64,7 +64,7 @@ def test_module_imports_from_lower_layers_only(file: Path) -> None:
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
-def test_library_is_imported_where_the_page_says(library: str) -> None:
+def test_library_is_imported_only_where_the_page_lists_it(library: str) -> None:
     importers = {_part(file) for file in FILES if any(name.split(".")[0] == library for name in _imports(file))}
     assert importers == LIBRARIES[library]
 

@@ -50,8 +50,8 @@ def test_repeating_the_steps_gives_the_same_attempts_and_poses(run: tuple[list[S
     again = [slam.repeat(step) for step in steps]
     repeated = slam.finish()
     np.testing.assert_allclose(repeated.trajectory.T_world_lidar, result.trajectory.T_world_lidar, atol=1e-9)
-    outcomes = [[_told(attempt.outcome) for attempt in step.attempts] for step in steps]
-    assert [[_told(attempt.outcome) for attempt in step.attempts] for step in again] == outcomes
+    outcomes = [[_outcome(attempt.outcome) for attempt in step.attempts] for step in steps]
+    assert [[_outcome(attempt.outcome) for attempt in step.attempts] for step in again] == outcomes
 
 
 @pytest.mark.parametrize(("max_waiting", "slow"), [(1, "tracking"), (8, "closing"), (8, "neither")])
@@ -115,7 +115,7 @@ def _exactly(attempt: LoopAttempt) -> tuple[object, ...]:
     return (*pair, attempt.outcome.T_target_source.tolist(), attempt.outcome.information.tolist())
 
 
-def _told(outcome: LoopClosure | Rejected) -> str:
+def _outcome(outcome: LoopClosure | Rejected) -> str:
     if isinstance(outcome, Rejected):
         return f"{outcome.reason} {outcome.detail}"
     return np.array2string(outcome.T_target_source, precision=10)

@@ -144,11 +144,11 @@ def _described(
         outliers=tuple((edge.a, edge.b) for edge, out in zip(problem.closures, is_outlier, strict=True) if out),
         chi2_per_dof=chi2 / redundancy if redundancy > 0 else None,
         chi2_quantiles=(median, p95, most),
-        doubts=tuple(_doubts(found, chi2, redundancy, float(fitted.mean()) if len(fitted) else 1.0)),
+        doubts=tuple(_warnings(found, chi2, redundancy, float(fitted.mean()) if len(fitted) else 1.0)),
     )
 
 
-def _doubts(found: Search, chi2: float, redundancy: int, share: float) -> list[str]:
+def _warnings(found: Search, chi2: float, redundancy: int, share: float) -> list[str]:
     doubts = []
     if not found.converged:
         doubts.append("the search stopped before it converged")

@@ -14,7 +14,7 @@ from segslam.types import Label
 # Chosen: distances from the street's centre line to the centre of an object, or to the front of a house.
 LAMP_M, SIGN_M, TREE_M, HEDGE_M = 5.8, 6.2, 6.9, 7.9
 HOUSE_M, YARD_M, GARDEN_M, BACKDROP_M = (8.6, 13.0), (8.5, 12.0), (8.5, 18.0), (20.0, 50.0)
-# Chosen: mean number of bushes and trees on a lot in front of the house, in place of it, and behind it.
+# Chosen: mean number of bushes and trees on a lot in front of the house, on a lot without house, and behind the house.
 YARD_SHRUBS, GARDEN_SHRUBS, BACKDROP_SHRUBS = 1.5, 8.0, 3.5
 
 Maker = Callable[[np.random.Generator], Mesh]

@@ -85,11 +85,11 @@ def _through(heights: Vector, at: np.ndarray, shape: tuple[int, ...]) -> Raster:
     np.add.at(weight, (row, column), 1.0)
     surface = np.full(shape, heights.mean())
     for scale in SCALES_M:
-        left_over = np.zeros(shape)
-        np.add.at(left_over, (row, column), heights - map_coordinates(surface, at.T, order=1))
+        residual = np.zeros(shape)
+        np.add.at(residual, (row, column), heights - map_coordinates(surface, at.T, order=1))
         sigma = scale / (CELL_M * COARSE)
         spread = gaussian_filter(weight, sigma, truncate=3.0)
-        surface += gaussian_filter(left_over, sigma, truncate=3.0) / (spread + 0.02 / sigma)
+        surface += gaussian_filter(residual, sigma, truncate=3.0) / (spread + 0.02 / sigma)
     return surface
 
 

@@ -32,7 +32,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The true poses in place of KISS-ICP, which sees no motion between smooth walls."""
+    """The true poses instead of KISS-ICP, which detects no motion between smooth walls."""
     truth = Trajectory(np.arange(len(PLACES_M)), np.arange(len(PLACES_M)) * 10**8, POSES)
     monkeypatch.setattr("segslam.calibration.KissOdometry", lambda config: GivenOdometry(truth, config))
 

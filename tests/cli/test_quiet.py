@@ -103,7 +103,7 @@ def short_demo(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_every_command_is_tried_here() -> None:
     commands.add_all(cli.app)
-    elsewhere = {"live", "merge"}  # a source that goes on, and two longer drives: tests/live, tests/sessions
+    elsewhere = {"live", "merge"}  # an endless source, and two longer drives: tests/live, tests/sessions
     assert set(COMMANDS) | elsewhere == {name for name, _ in all_commands(get_command(cli.app))}
 
 

@@ -76,7 +76,7 @@ def test_other_settings_change_the_loops_and_the_change_is_printed(
     assert output in capsys.readouterr().err
     settings = read_log(out / "log.mcap").config
     assert settings.verify.min_overlap == pytest.approx(np.median(overlaps), abs=1e-5)
-    assert settings.proximity == CONFIG.proximity, "what the log says and nobody changed stays"
+    assert settings.proximity == CONFIG.proximity, "settings of the log that were not changed remain"
 
 
 def test_a_setting_that_acts_before_the_keyframes_is_refused_and_nothing_written(

@@ -108,7 +108,7 @@ def _one_return(column: int, beam: int, range_mm: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("profile", CHANNEL_BYTES)
-def test_beams_point_where_the_manual_says(tmp_path: Path, profile: str) -> None:
+def test_beam_directions_are_those_of_the_manual(tmp_path: Path, profile: str) -> None:
     """The turned sensor looks along +x at the middle of its turn, which goes clockwise; beams leave 15 mm out."""
     file = _record(tmp_path, profile, [_one_return(8, 0, 2000), _one_return(12, 0, 2000), _one_return(8, 1, 2000)])
     ahead, right, up = open_dataset(file)

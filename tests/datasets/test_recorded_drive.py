@@ -57,7 +57,7 @@ def test_times_of_points_make_the_map_of_a_recording_better(tmp_path: Path) -> N
         command = ("map", recording, "--topic", TOPIC, "--out", out, "--quiet")
         assert run(*command, "--set", f"odometry.deskew={deskew}") == 0
         errors_m[deskew] = _ate_m(out)
-    assert errors_m[True] < 0.8 * errors_m[False], "the first sweeps, which nothing can mend, are in both"
+    assert errors_m[True] < 0.8 * errors_m[False], "the first sweeps, which cannot be corrected, are in both"
     stamps_ns = read_poses(out / "odometry_tum.txt").stamp_ns
     np.testing.assert_allclose(stamps_ns, FIRST_STAMP_NS + SWEEP_NS * np.arange(len(clouds())), rtol=0, atol=1_000)
 

@@ -49,7 +49,7 @@ def made_network(
 
 
 def class_network(folder: Path, **changed: Any) -> Path:
-    """A network that takes learning ids in place of intensities, and gives them back: its logits are x c - c^2 / 2."""
+    """A network that takes learning ids as intensities, and returns them: its logits are x c - c^2 / 2."""
     ids = np.arange(20, dtype=np.float32)
     constants = [
         numpy_helper.from_array(ids[:, None, None, None], "kernel"),

@@ -288,7 +288,7 @@ def test_a_live_run_shows_how_it_stands_in_a_terminal(tmp_path: Path) -> None:
     assert "Traceback" not in shown
 
 
-def test_a_live_run_is_not_resumed_and_the_line_says_what_to_do(
+def test_a_live_run_is_not_resumed_and_the_message_has_the_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = LogWriter(tmp_path / "log.mcap", config=Config(), dataset="live/scans", options={"live": "live/scans"})
@@ -297,7 +297,7 @@ def test_a_live_run_is_not_resumed_and_the_line_says_what_to_do(
     assert f"segslam replay {tmp_path} --out NEW" in capsys.readouterr().err
 
 
-def test_without_ros_one_line_says_how_to_get_it(
+def test_without_ros_one_line_has_the_install_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("segslam.cli.live.find_spec", lambda name: None)

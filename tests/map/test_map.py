@@ -1,4 +1,4 @@
-"""The map of a yard whose keyframes are known: what is kept, what is left out, and what the files hold."""
+"""The map of a yard with known keyframes: kept points, removed points, and the content of the files."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -56,7 +56,7 @@ def test_kiss_follows_a_sensor_through_a_hall() -> None:
         points = geometry.apply(geometry.inverse(T_odom_lidar), _room(rng, 20_000))
         result = odometry.register(_scan(points, index=i))
     error = geometry.inverse(T_odom_lidar) @ result.T_odom_lidar
-    assert geometry.distance(error) < 0.1, "a tenth of a voxel: every scan samples the walls anew"
+    assert geometry.distance(error) < 0.1, "a tenth of a voxel: every scan samples the walls differently"
     assert np.degrees(geometry.angle(error)) < 0.2
 
 
@@ -194,7 +194,7 @@ def test_a_scan_without_a_given_pose_is_a_bad_scan(match: str) -> None:
         empty.register(_scan(points))
 
 
-def test_a_scan_without_a_point_in_range_is_a_bad_scan_and_the_next_one_goes_on() -> None:
+def test_a_scan_without_a_point_in_range_is_a_bad_scan_and_the_next_one_is_registered() -> None:
     points = _room(np.random.default_rng(0))
     odometry = KissOdometry(CONFIG)
     odometry.register(_scan(points))
@@ -204,7 +204,7 @@ def test_a_scan_without_a_point_in_range_is_a_bad_scan_and_the_next_one_goes_on(
 
 
 @pytest.mark.data
-def test_ten_real_scans_end_where_the_reference_says(data_dir: Path, real_pairs: object) -> None:
+def test_ten_real_scans_end_at_the_reference(data_dir: Path, real_pairs: object) -> None:
     (T_10_0,) = [pair.T_target_source for pair in real_pairs.pairs if (pair.source, pair.target) == (0, 10)]
     odometry = KissOdometry(CONFIG)
     for index in range(11):
@@ -228,7 +228,7 @@ def _street(num_scans: int) -> list[Scan]:
     return scans
 
 
-def test_restored_kiss_goes_on_to_the_bit_and_reads_only_scans_in_reach() -> None:
+def test_restored_kiss_continues_exactly_and_reads_only_scans_in_reach() -> None:
     config = ONE_THREAD.model_copy(update={"max_range_m": 15.4, "min_range_m": 1.0})
     scans, read = _street(34), []
 

@@ -45,9 +45,7 @@ def test_kitti_truth_is_found_by_scan_number_and_leaves_the_camera(tmp_path: Pat
     made = make_run(tmp_path / "run", with_truth=False)
     run = read_run(made.folder)
     assert run.reference is None
-    poses = np.tile(
-        np.eye(4), (FIRST_SCAN + NUM_SCANS + 30, 1, 1)
-    )  # the file starts at scan 0 and goes on after the run
+    poses = np.tile(np.eye(4), (FIRST_SCAN + NUM_SCANS + 30, 1, 1))  # the file starts at scan 0 and ends after the run
     poses[FIRST_SCAN:][:NUM_SCANS] = camera_from_lidar(made.truth.T_world_lidar, T_CAMERA_LIDAR)
     write_kitti(tmp_path / "truth.txt", poses)
     truth = true_poses(tmp_path / "truth.txt", run)

@@ -90,7 +90,7 @@ def test_loops_are_counted_by_outcome_and_the_false_one_is_shown(scored: Path) -
     loops = plots["Loops by outcome"]
     for label in ("accepted (3)", "false (1)", "small clique (5)", "low overlap (1)"):
         assert label in loops
-    assert "rejected by the optimiser" not in loops  # the graph's doubt about the false one adds nothing
+    assert "rejected by the optimiser" not in loops  # the low weight of the false one adds nothing
 
 
 def test_without_truth_nothing_is_compared_with_it(tmp_path: Path) -> None:

@@ -142,7 +142,7 @@ def test_a_run_that_lost_its_end_is_resumed(kitti: Path, whole: Path, tmp_path: 
     _resumed_as_whole(kitti, whole, _cut(whole, tmp_path / "run", log_bytes=size))
 
 
-def test_a_full_disk_ends_with_status_2_and_the_run_goes_on_when_there_is_room(
+def test_a_full_disk_ends_with_status_2_and_the_run_is_resumed_when_there_is_space(
     kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -152,7 +152,7 @@ def test_a_full_disk_ends_with_status_2_and_the_run_goes_on_when_there_is_room(
     _resumed_as_whole(kitti, whole, out)
 
 
-def test_results_that_find_no_room_end_with_status_2_and_the_run_goes_on(
+def test_results_without_disk_space_end_with_status_2_and_the_run_is_resumed(
     kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:

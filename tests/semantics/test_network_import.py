@@ -1,4 +1,4 @@
-"""The files that networks ship, read in place of a YAML file of one's own."""
+"""The files published with networks, read instead of a YAML file."""
 
 import re
 from collections.abc import Callable

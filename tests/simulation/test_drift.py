@@ -22,7 +22,7 @@ def test_no_error_changes_nothing():
     np.testing.assert_array_equal(distorted(points, fraction, NO_ERROR), points)
 
 
-def test_leftover_motion_moves_each_point_by_its_time_in_the_sweep():
+def test_uncompensated_motion_moves_each_point_by_its_time_in_the_sweep():
     """Against the exact rigid motion: second-order terms, (0.004 / 2)^2 of 60 m, are the tolerance."""
     points, fraction = around()
     motion = geometry.tangent(rotation_rad=[0.002, -0.001, 0.003], translation_m=[0.05, -0.02, 0.01])

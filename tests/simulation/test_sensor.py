@@ -55,7 +55,7 @@ def elevations_deg(points: np.ndarray) -> np.ndarray:
     ("name", "beams", "top_deg", "bottom_deg"),
     [("hdl64", 64, 2.0, -24.8), ("os1-64", 64, 22.5, -22.5), ("vlp16", 16, 15.0, -15.0)],
 )
-def test_a_sensor_looks_where_its_data_sheet_says(name, beams, top_deg, bottom_deg):
+def test_beam_directions_are_those_of_the_data_sheet(name, beams, top_deg, bottom_deg):
     sensor = make_sensor(perfect(name=name), seed=0)
     found = np.unique(np.round(elevations_deg(sensor.directions), 3))
     assert len(found) == beams

@@ -181,7 +181,7 @@ def test_simulate_drive_numbers_and_stamps_its_scans(loop):
     np.testing.assert_array_equal(scans[2].points, again[2].points)
 
 
-def test_a_world_of_one_pose_goes_on_both_ways():
+def test_the_street_of_a_single_pose_extends_both_ways():
     world = build_world(np.eye(4)[None], np.zeros(1), config=STILL, seed=0)
     hits = world.cast(np.eye(4), directions())
     assert (hits.labels == Label.ROAD).sum() > 400

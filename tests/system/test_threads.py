@@ -57,7 +57,7 @@ def test_items_are_produced_by_the_calling_thread_and_processed_by_one_other() -
     assert len({worker for _, worker in pairs} - {threading.get_ident()}) == 1
 
 
-def test_failed_work_raises_in_its_turn_and_none_goes_on() -> None:
+def test_failed_work_raises_in_order_and_stops_the_others() -> None:
     worked = []
 
     def work(item: int) -> int:

@@ -118,7 +118,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_simulation_on_a_full_disk_ends_with_whole_scans_and_says_how_to_begin_again(
+def test_a_simulation_on_a_full_disk_ends_with_whole_scans_and_the_command_to_start_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for number, size in enumerate((10, 400, 3000, 200_000)):  # settings, calibration, labels and points do not fit

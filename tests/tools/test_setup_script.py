@@ -31,7 +31,7 @@ def test_an_older_interpreter_is_taken_where_python3_is_too_new(tmp_path: Path) 
     assert ended.stdout.split() == ["python3.12"], ended.stderr
 
 
-def test_without_an_interpreter_the_message_says_what_to_install(tmp_path: Path) -> None:
+def test_without_an_interpreter_the_message_has_the_package_to_install(tmp_path: Path) -> None:
     _write(tmp_path / "python3", FUTURE)
     ended = _sourced(tmp_path, "python_packages")
     assert ended.returncode == 1

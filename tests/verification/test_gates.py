@@ -147,7 +147,7 @@ def test_a_coarse_pose_is_rejected_early_beyond_three_times_the_free_space_allow
         target = _prepared(np.column_stack([flat * 20.0, height.ravel()]))
         outcomes[share] = early_rejection(source, target, np.eye(4), LIMITS, config=CONFIG)
     assert outcomes[0.0] is None
-    assert outcomes[0.05] is None, "more than allowed in the end, but refinement may mend it"
+    assert outcomes[0.05] is None, "more than allowed in the end, but refinement may correct it"
     assert outcomes[0.4] is not None
     assert outcomes[0.4].reason is RejectReason.FREE_SPACE_VIOLATED
 

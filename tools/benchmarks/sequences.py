@@ -54,7 +54,7 @@ def row_of(run: Path) -> dict[str, Any]:
         "travel_m": float(drive.travel_m[-1]),
         "odometry": errors(drive.odometry, drive),
         "loops": drive.loops(),
-        "worth": {**odometry_calibration(drive), "closures": closure_calibration(drive, drive.closures)},
+        "noise": {**odometry_calibration(drive), "closures": closure_calibration(drive, drive.closures)},
     }
     kinds = {
         "found": drive.closures,
@@ -75,7 +75,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         "|" + "---|" * 11,
     ]
     for row in rows:
-        found, loops, worth = row["found"], row["loops"], row["worth"]
+        found, loops, noise = row["found"], row["loops"], row["noise"]
         cells = [
             row["run"],
             _number(row["odometry"]["ate_m"]),
@@ -87,7 +87,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             _number(row["exact"]["ate_m"]),
             _number(row["ate_by_exact"]),
             f"{_number(row['exact_everywhere']['ate_m'])} ({row['exact_everywhere']['closures']})",
-            f"{', '.join(_number(worth[f'chain_{k}']) for k in (1, 10, 100))}; {_number(worth['closures'])}",
+            f"{', '.join(_number(noise[f'chain_{k}']) for k in (1, 10, 100))}; {_number(noise['closures'])}",
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -28,7 +28,7 @@ class FolderSender:
         self._files: deque[Path] = deque()
 
     def wait_for_listener(self) -> None:
-        """Nobody to wait for."""
+        """No receiver to wait for."""
 
     def send(self, points: np.ndarray, stamp_ns: int) -> None:
         """Write a scan under a hidden name, and rename it when it is whole."""

@@ -1,4 +1,4 @@
-"""What each addition is worth: the coarse pose with one thing taken away, on pairs where it could matter."""
+"""Ablation: the coarse pose with one component removed, on pairs where it could matter."""
 
 from collections.abc import Callable
 from functools import cache

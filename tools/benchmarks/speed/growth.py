@@ -36,7 +36,7 @@ STEP_M = 2.0
 LAP = 500
 """Keyframes of a round of a town block; every later round closes loops with the one before."""
 ROUNDS = 4
-"""Of one block, before a drive goes on to the next."""
+"""Rounds of one block before the drive moves to the next."""
 AWAY = 100
 """Keyframes from a block to the next."""
 SIGMA_RAD, SIGMA_M = 0.002, 0.02

@@ -1,1 +1,1 @@
-"""What measures the tables of the documentation: `python -m tools.benchmarks.NAME --help` at the root of a checkout."""
+"""Benchmarks behind the tables of the documentation: `python -m tools.benchmarks.NAME --help` at the root of a checkout."""

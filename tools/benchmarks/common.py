@@ -13,7 +13,7 @@ from segslam.experiments.provenance import commit, machine
 from segslam.types import Transform
 
 RIGHT_M, RIGHT_DEG = 0.5, 2.0
-"""Chosen: a refined pose that is farther off has found another minimum; right ones are off by centimetres."""
+"""Chosen: a refined pose with a larger error is in another minimum; correct ones have errors of centimetres."""
 
 Row = dict[str, Any]
 """A line of a table."""
@@ -48,7 +48,7 @@ def markdown(title: str, rows: Sequence[Row]) -> str:
 
 
 def is_right(T_error: Transform) -> bool:
-    """Whether the error of a refined pose is that of a right one."""
+    """True if the error of a refined pose is that of a correct one."""
     return PoseError.of(T_error).within(RIGHT_M, RIGHT_DEG)
 
 

@@ -1,8 +1,8 @@
-"""Labels from shape against true labels, over a whole drive: maps of a simulated round with 16 and with 64 beams.
+"""Geometric labels compared with true labels over a simulated drive with 16 and with 64 beams.
 
     python -m tools.benchmarks.label_maps WORK --out FILE.json [--sensor vlp16 --sensor hdl64] [--frames 346] [--seed 3]
 
-WORK is a folder for scans and runs; what is there already is used again. Both maps of a drive share one odometry.
+WORK is a folder for scans and runs; existing scans and runs are reused. Both maps of a drive share one odometry.
 """
 
 import json

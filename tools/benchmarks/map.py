@@ -1,4 +1,4 @@
-"""How much of what moves a map leaves out, and how much of what stands: a simulated run against its true labels.
+"""Share of moving and of static points that a map omits: a simulated run compared with its true labels.
 
 Moving classes are hidden from the map first, so that the views of other keyframes alone decide:
 

@@ -1,6 +1,6 @@
 """Whole sequences by segslam and by kiss-slam, on the same scans: errors against the truth, closures, time.
 
-kiss-slam pins NumPy below 2.3, so it lives in an environment of its own:
+kiss-slam requires NumPy below 2.3, so it needs a separate environment:
 
     python -m venv peers && peers/bin/pip install kiss-slam==0.0.2 pillow matplotlib
     segslam simulate D --sequence 06 --poses 06.txt --seed 11
@@ -8,7 +8,7 @@ kiss-slam pins NumPy below 2.3, so it lives in an environment of its own:
     python -m tools.benchmarks.peers SCANS --kiss-slam peers/bin/kiss_slam_pipeline --work R --out F.json
 
 SCANS is a folder of scans with poses.txt; kiss-slam reads the scans alone.
-What is in the folder `--work` from an earlier call is not made again.
+Results of an earlier call in the folder `--work` are reused.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Does verification hold away from the street? Scenes x sensors x noise, pairs of one place and pairs of two places.
+"""Verification in scenes other than streets: scenes x sensors x noise, pairs of one place and pairs of two places.
 
     python -m tools.benchmarks.scenes --out FILE.json [--pairs 200] [--scenes corridor,garage] [--sensors 16,64]
         [--noise 0.01,0.03,0.1] [--seed 0]
@@ -83,7 +83,7 @@ def _heights(scene: Scene) -> np.ndarray:
 
 
 class Judge:
-    """What a run would make of pairs of a place."""
+    """Registers and verifies pairs like a run."""
 
     def __init__(self, floor: NoiseFloor, config: Config) -> None:
         self._floor, self._config = floor, config

@@ -1,7 +1,7 @@
-"""What the back end makes of whole drives: errors, closures, what exact closures would give, what edges claim.
+"""Back end on whole drives: errors, closures, comparison with exact closures, calibration of edges.
 
-Odometry and closures come from each run's log, so one run of `segslam map` serves any number of settings. Beside the
-closures that were found stand exact ones: at the same places, and wherever two keyframes lie within 6 m.
+Odometry and closures come from each run's log, so one run of `segslam map` is sufficient for many settings. The found
+closures are compared with exact ones: at the same places, and for all keyframes within 6 m of each other.
 
     segslam simulate D --sequence 06 --poses 06.txt --seed 11 --set sensor.vertical_angle_error_deg=0.35
     segslam map D --sequence 06 --out runs/06

@@ -79,7 +79,7 @@ def _hidden(scan: Scan) -> Scan:
 
 
 def in_tunnel(drive: Drive, first: int, metres: float) -> Drive:
-    """A smooth tube of 5 m radius around the sensor, in which nothing shows a motion along it."""
+    """A smooth tube of 5 m radius around the sensor, without features along it."""
     last = _row_after(drive, first, metres)
     rng = np.random.default_rng(0)
 
@@ -158,7 +158,7 @@ def with_jump(drive: Drive, first: int, metres: float) -> Drive:
 
 
 def mapped(drive: Drive, config: Config) -> dict[str, float]:
-    """Errors, and how the motions were judged."""
+    """Errors, and states of the motions."""
     odometry = None
     scans = list(drive.scans())
     if drive.given is not None:
@@ -183,7 +183,7 @@ def main() -> None:
     parser.add_argument("drive", type=Path)
     parser.add_argument("--sequence", default="06")
     parser.add_argument("--frames")
-    parser.add_argument("--at", type=int, default=150, help="row where the trouble begins")
+    parser.add_argument("--at", type=int, default=150, help="row where the disturbance begins")
     parser.add_argument("--put-down", type=int, default=850, help="row where a kidnapped sensor is put down")
     parser.add_argument("--only", nargs="*", help="rows by name")
     common.add_settings(parser)

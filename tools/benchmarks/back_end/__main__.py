@@ -1,7 +1,8 @@
-"""The back end alone, on the shape of real drives: proposals, graph, outliers, time. No scan is needed.
+"""Benchmark of the back end on real trajectories, without scans: proposals, graph, outliers, time.
 
-Where two keyframes lie within reach of each other in the (levelled) truth, a closure is the truth with noise; elsewhere
-none is found. Outliers are a share of all closures. Beside each drive stands the result of exact closures there.
+If two keyframes are within reach of each other in the (levelled) ground truth, their closure is the true pose with
+noise; otherwise there is none. Outliers are a share of all closures. Each result is compared with that of exact
+closures.
 
     python -m tools.benchmarks.back_end ../shared/data --out back_end.json --sequence 00 --sequence 08 --seeds 3
 """

@@ -1,4 +1,4 @@
-"""Squared errors of true edges by what they claim: mean chi-squares per degree of freedom, 1 where they are right."""
+"""Calibration of edges: mean chi-square per degree of freedom of true edges; 1 if the noise model is correct."""
 
 from collections.abc import Iterable
 
@@ -11,11 +11,11 @@ from segslam.types import LoopClosure
 from tools.benchmarks.back_end.drives import CONFIG, Drive
 
 LENGTHS = (1, 10, 100)
-"""Of chains, in keyframes."""
+"""Lengths of chains in keyframes."""
 
 
 def odometry_calibration(drive: Drive) -> dict[str, float | None]:
-    """Of chains of each length that begin at every keyframe; None where the drive is shorter."""
+    """Mean chi-square of odometry chains of each length; None if the drive is shorter."""
     summed = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(_carried(drive), axis=0)])
     back = adjoints(np.linalg.inv(drive.odometry))
     found: dict[str, float | None] = {}
@@ -33,7 +33,7 @@ def odometry_calibration(drive: Drive) -> dict[str, float | None]:
 
 
 def closure_calibration(drive: Drive, closures: Iterable[LoopClosure]) -> float | None:
-    """Of closures as the graph weighs them; None without any."""
+    """Mean chi-square of closures with the weights of the graph; None without closures."""
     chi2 = [
         _chi2(
             loop.T_target_source,

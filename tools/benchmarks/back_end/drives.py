@@ -1,4 +1,4 @@
-"""Keyframes of real drives: levelled truth, and an odometry that is measured, or errs as the graph expects or fears."""
+"""Keyframes of real drives: levelled ground truth, and measured or simulated odometry."""
 
 import itertools
 from collections.abc import Iterable
@@ -20,9 +20,9 @@ from segslam.types import Alignment, LoopClosure, Registration
 CONFIG = Config()
 CLOSURE_SIGMAS = geometry.tangent(rotation_rad=np.radians(0.1), translation_m=0.05)
 STEP_SIGMAS = geometry.tangent(rotation_rad=np.radians(0.03), translation_m=0.02)
-"""Of drifting odometry, per root of a metre."""
+"""Noise of drifting odometry per square root of a metre."""
 RATE_SIGMAS = geometry.tangent(rotation_rad=np.radians(0.0005), translation_m=0.004)
-"""Of its slowly varying error, per metre."""
+"""Standard deviation of its slowly varying error, per metre."""
 RATE_MEMORY_M = 200.0
 
 
@@ -39,24 +39,24 @@ class Drive:
         return {"ate_m": metrics["ate_m"], "height_m": metrics["height_m"]}
 
     def closure(self, source: int, target: int, rng: np.random.Generator) -> LoopClosure:
-        """The truth between two keyframes, with noise."""
+        """The true relative pose of two keyframes, with noise."""
         return closure(source, target, geometry.inverse(self.truth[target]) @ self.truth[source], rng)
 
 
 def closure(source: int, target: int, T_target_source: np.ndarray, rng: np.random.Generator) -> LoopClosure:
-    """A loop with the noise that it claims."""
+    """A loop with noise according to its information."""
     return exact_closure(source, target, T_target_source @ geometry.exp(CLOSURE_SIGMAS * rng.normal(size=6)))
 
 
 def exact_closure(source: int, target: int, T_target_source: np.ndarray) -> LoopClosure:
-    """A loop that claims the noise of the others."""
+    """An exact loop with the information of a noisy one."""
     registration = Registration(T_target_source, 0, 0, 0.0, np.diag(CLOSURE_SIGMAS**-2.0))
     alignment = Alignment(registration, registration, 1.0, 0.0, 0.0)
     return LoopClosure(source, target, T_target_source, registration.information, alignment)
 
 
 def exact(loops: Iterable[LoopClosure], truth: np.ndarray) -> list[LoopClosure]:
-    """Loops between the same keyframes, as the truth has them."""
+    """Exact loops between the same keyframes."""
     return [
         exact_closure(loop.source_id, loop.target_id, geometry.inverse(truth[loop.target_id]) @ truth[loop.source_id])
         for loop in loops
@@ -93,7 +93,7 @@ def drifting(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def claimed(truth: np.ndarray, rng: np.random.Generator, *, times: float) -> np.ndarray:
-    """Odometry with the errors that the graph's noise model claims, so many times as large."""
+    """Odometry with errors of `times` the graph's noise model."""
     poses = [truth[0]]
     for T_a, T_b in itertools.pairwise(truth):
         T_a_b = geometry.inverse(T_a) @ T_b

@@ -1,4 +1,4 @@
-"""False closures among true ones: alone, in groups anywhere, in groups where the detector would look."""
+"""False closures among true ones: single, in groups anywhere, in groups near the prior."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from segslam.types import LoopClosure
 from tools.benchmarks.back_end.drives import CONFIG, Drive, closure
 
 KINDS = ("random", "grouped", "nearby")
-"""Pairs alone and anywhere; groups with one error anywhere; groups that a short way along the road explains."""
+"""Single pairs anywhere; groups with a common error anywhere; groups displaced along the road."""
 NEARBY_M = 25.0
 SLIDE_M = (5.0, 20.0)
 
@@ -38,7 +38,7 @@ def finished(drive: Drive, true: Sequence[LoopClosure], false: Sequence[LoopClos
 
 
 def draw_outliers(drive: Drive, kind: str, num: int, rng: np.random.Generator) -> list[LoopClosure]:
-    """So many false closures, all of a group of 5 to 15 neighbours with one error."""
+    """`num` false closures, in groups of 5 to 15 neighbours with a common error."""
     found: list[LoopClosure] = []
     while len(found) < num:
         found += _group(drive, kind, 1 if kind == "random" else int(rng.integers(5, 16)), rng)
@@ -57,7 +57,7 @@ def _group(drive: Drive, kind: str, length: int, rng: np.random.Generator) -> It
 
 
 def _nearby(drive: Drive, source: int, length: int, rng: np.random.Generator) -> Iterator[LoopClosure]:
-    """The truth, slid along the road; nothing where no other visit is within reach."""
+    """True closures displaced along the road; none without another visit within reach."""
     old = np.flatnonzero(drive.travel_m[:source] < drive.travel_m[source] - CONFIG.proximity.min_travel_m)
     near = old[np.linalg.norm(drive.truth[old, :3, 3] - drive.truth[source, :3, 3], axis=1) < NEARBY_M]
     if len(near):
@@ -78,7 +78,7 @@ def _moved_along(
     length: int,
     rng: np.random.Generator,
 ) -> Iterator[LoopClosure]:
-    """The closures of a group that drives on together, the target one forwards (1) or backwards (-1)."""
+    """The closures of a group of consecutive keyframes; the target moves forwards (1) or backwards (-1)."""
     for k in range(length):
         seen = target + direction * k
         if 0 <= seen < source - 10:

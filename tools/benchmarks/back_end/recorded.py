@@ -1,4 +1,4 @@
-"""Runs of `segslam map` as drives: keyframes, true poses and closures from the log, no scan is needed."""
+"""Runs of `segslam map` as drives: keyframes, true poses and closures from the log, without scans."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ class Recorded(Drive):
     closures: list[LoopClosure]
 
     def points_of(self, keyframe_id: int) -> Points:
-        """Of a keyframe, in its frame."""
+        """Points of a keyframe, in its frame."""
         return self.keyframes[keyframe_id].points
 
     def loops(self) -> dict[str, float]:
@@ -39,7 +39,7 @@ def read_recorded(run: Path) -> Recorded:
     log = read_log(run / "log.mcap")
     reference = log.reference()
     if reference is None:
-        raise SegslamError(f"{run}: the log holds no true poses; name a run of data that has some")
+        raise SegslamError(f"{run}: the log contains no true poses; give a run of data with ground truth")
     row_of_scan = {int(scan): row for row, scan in enumerate(reference.scan_index)}
     steps = list(log.steps())
     keyframes = [step.keyframe for step in steps if step.keyframe is not None]
@@ -54,7 +54,7 @@ def read_recorded(run: Path) -> Recorded:
 
 
 def exact_everywhere(drive: Drive) -> list[LoopClosure]:
-    """The true motion to the nearest older keyframe, wherever one lies within reach."""
+    """True closures to the nearest older keyframe, for all keyframes with one within reach."""
     closures, last_m = [], -np.inf
     for source, travel_m in enumerate(drive.travel_m):
         old = np.flatnonzero(drive.travel_m < travel_m - REVISIT_M)

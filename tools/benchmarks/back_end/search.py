@@ -1,4 +1,4 @@
-"""Proposals as while driving, closures where the truth is within reach; what another search at the end would add."""
+"""Proposals during the drive, with true closures within reach; and the gain of another search at the end."""
 
 import time
 from collections.abc import Iterator
@@ -15,13 +15,13 @@ from segslam.types import LoopClosure
 from tools.benchmarks.back_end.drives import CONFIG, Drive
 
 REACH_M = 8.0
-"""As far apart as two keyframes are registered without fail."""
+"""Distance up to which two keyframes are always registered."""
 MAX_ROUNDS = 3
 
 
 @dataclass
 class Search:
-    """A drive that is searched for loops."""
+    """Search for loops in a drive."""
 
     drive: Drive
     rng: np.random.Generator
@@ -31,7 +31,7 @@ class Search:
     tried: set[tuple[int, int]] = field(default_factory=set)
 
     def look(self, keyframe_id: int) -> int:
-        """Tries what is proposed for one keyframe and was not tried before; gives the number of closures found."""
+        """Try new candidates of one keyframe; returns the number of closures found."""
         found = []
         for candidate in self.detector.candidates(keyframe_id, self.graph.T_world_keyframes, self.graph.travel_m):
             pair = (keyframe_id, candidate.target_id)

@@ -1,4 +1,4 @@
-"""How good the labels from shape alone are: per class, and by the registrations they make possible.
+"""Accuracy of geometric labels: per class, and by the registrations with them.
 
     python -m tools.benchmarks.labels DATA [--set verify.max_plan_hypotheses=0] [--pictures FOLDER] --out FILE.json
 

@@ -22,7 +22,7 @@ from tools.benchmarks import real_pairs
 BANDS_M = ((5.0, 10.0), (10.0, 15.0))
 MIN_GAP = 40
 TUNING_SEED = 1
-"""Settings were chosen on the pairs that this seed draws; they are left out of what others draw."""
+"""Settings were chosen on the pairs drawn with this seed; other seeds exclude them."""
 
 
 def draw_pairs(reference: Trajectory, num_pairs: int, seed: int) -> dict[str, PairList]:
@@ -43,7 +43,7 @@ def draw_pairs(reference: Trajectory, num_pairs: int, seed: int) -> dict[str, Pa
 def courtyard(
     data: Path, config: Config, *, methods: Sequence[str], num_pairs: int, seed: int, pictures: Path | None
 ) -> dict[str, dict[str, Any]]:
-    """Figures of the methods for each band; times hold all that is done to a pair, labelling and description too."""
+    """Figures of the methods for each band; times include labelling and description of both scans."""
     source = DataSource(data / "courtyard", labels="geometric")
     dataset, _ = open_once(source)
     assert dataset.reference is not None

@@ -1,4 +1,4 @@
-"""Labels from shape on real scans of KITTI: against the truth of each class, and by the registrations they allow."""
+"""Geometric labels on real scans of KITTI: accuracy per class, and registrations with them."""
 
 import time
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ def class_agreement(data: Path, config: Config) -> dict[str, dict[str, float]]:
 
 
 def speed(points: Points, config: Config, repeats: int = 21) -> dict[str, float]:
-    """Milliseconds to label a scan, by the thread's own clock and by the wall's, and in sorts of as many numbers."""
+    """Milliseconds to label a scan: CPU time of the thread, wall time, and relative to sorting as many numbers."""
     keys = np.random.default_rng(0).random(len(points))
     clocks: dict[str, list[float]] = {"thread": [], "wall": [], "sort": []}
     geometric_labels(points, config=config.geometric)

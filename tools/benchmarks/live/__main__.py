@@ -1,11 +1,11 @@
-"""A live run measured: latency, lag, memory, what was dropped, and the same scans mapped offline.
+"""Benchmark of live runs: latency, lag, memory, dropped scans, and comparison with an offline run.
 
 python -m tools.benchmarks.live SCANS --out DIR --every 0.5                      a folder that fills, each scan once
 python -m tools.benchmarks.live SCANS --out DIR --every 0.5 --offline            and the same scans by `segslam map`
 python -m tools.benchmarks.live SCANS --out DIR --every 0.1 --seconds 60 --ros reliable      a ROS 2 topic, on loopback
 python -m tools.benchmarks.live SCANS --out DIR --every 1 --seconds 3600     the hour: latency and memory must be flat
 
-With --seconds the scans are sent forth and back until the time is over. Figures go to DIR/bench.json.
+With --seconds the scans are sent forwards and backwards until the time is over. Figures go to DIR/bench.json.
 """
 
 import csv
@@ -35,7 +35,7 @@ OWN_DOMAIN = {"ROS_DOMAIN_ID": "87", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST
 
 
 def rows_sent(num_scans: int, num_sent: int | None) -> Iterator[int]:
-    """Each scan once, or forth and back so often that so many are sent."""
+    """Each scan once, or forwards and backwards until `num_sent` are sent."""
     if num_sent is None:
         return iter(range(num_scans))
     return islice(cycle(chain(range(num_scans), range(num_scans - 2, 0, -1))), num_sent)

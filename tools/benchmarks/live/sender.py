@@ -1,4 +1,4 @@
-"""Where the scans of a benchmark go: into a folder, or to a ROS 2 topic."""
+"""Senders of scans: into a folder, or to a ROS 2 topic."""
 
 from array import array
 from collections import deque
@@ -21,7 +21,7 @@ class FolderSender:
     """Writes .bin files named by their stamp in ns, and the times.txt that an offline run of the folder needs."""
 
     def __init__(self, folder: Path, *, keeps: int | None = None) -> None:
-        """Of the files the last `keeps` are left, where that is not None: an hour would fill a disk."""
+        """Only the last `keeps` files are kept, unless it is None."""
         folder.mkdir()
         self._folder = folder
         self._keeps = keeps

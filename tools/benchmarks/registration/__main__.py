@@ -1,4 +1,4 @@
-"""How well, how fast and how honestly two scans are registered: Markdown and JSON.
+"""Accuracy, speed and consistency of the registration of two scans: Markdown and JSON.
 
     python -m tools.benchmarks.registration DATA --cache DIR --out FILE.json
         [--parts real,simulated,negatives,speed,ablation] [--sequences 00,08] [--sample 20] [--seed 11] [--yaws 24]
@@ -6,7 +6,7 @@
 
 DATA is the folder of real data. Simulated scans, at real poses of the sequences named and in a usual and a hard world,
 are made where they are needed and kept in DIR, some 1.5 MB each. The gates of `VerifyConfig` and the noise of
-`RefineConfig` and `SegregatorConfig` were chosen on sequences 00 and 08 with seed 11: judge them on others.
+`RefineConfig` and `SegregatorConfig` were chosen on sequences 00 and 08 with seed 11: evaluate them on others.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""One registration, judged by the truth; and what many of them come to."""
+"""One registration compared with ground truth, and statistics of many."""
 
 import math
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from tools.benchmarks.common import RIGHT_DEG, RIGHT_M
 from tools.benchmarks.registration.scans import Labelled
 
 LOST = PoseError(math.inf, math.inf)
-"""Of a registration that was rejected."""
+"""Error of a rejected registration."""
 
 
 def error(T_estimate: Transform, T_true: Transform) -> PoseError:
@@ -41,19 +41,19 @@ def preparer(scan: Callable[[int], Labelled], config: Config) -> Callable[[int],
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """A pair whose pose is known, put through everything."""
+    """A pair with known pose, processed by all stages."""
 
     coarse: PoseError
-    """Of the best hypothesis, before anything is checked."""
+    """Error of the best hypothesis before verification."""
     refined: PoseError
-    """Of the same, refined."""
+    """Error of the best hypothesis after refinement."""
     outcome: Alignment | Rejected
     fine: PoseError
-    """Of the pose accepted."""
+    """Error of the accepted pose."""
     coarse_squared: float
-    """Squared error of the best hypothesis by the information that it claims; NaN where there is none."""
+    """Squared error of the best hypothesis, whitened by its information; NaN without one."""
     fine_squared: float
-    """The same of the pose accepted."""
+    """The same for the accepted pose."""
     seconds: dict[str, float]
 
     @property
@@ -62,12 +62,12 @@ class Attempt:
 
     @property
     def wrong(self) -> bool:
-        """Accepted, and not what the paper calls a success."""
+        """Accepted, but not a success by the criterion of the paper."""
         return self.accepted and not self.fine.success
 
     @property
     def lost(self) -> bool:
-        """Turned down although the best hypothesis led to the right pose."""
+        """Rejected although refinement of the best hypothesis is correct."""
         return not self.accepted and self.refined.within(RIGHT_M, RIGHT_DEG)
 
 

@@ -1,4 +1,4 @@
-"""Real scans that do not overlap: every pair there is, of KITTI 00 and between the courtyard and KITTI."""
+"""Real scans that do not overlap: all pairs of KITTI 00, and pairs of courtyard and KITTI."""
 
 from collections import Counter
 from functools import partial
@@ -14,7 +14,7 @@ from tools.benchmarks.registration.attempts import error, preparer
 from tools.benchmarks.registration.scans import by_shape, courtyard_points, kitti_pose, real_indices, real_scan
 
 MEET_M = 60.0
-"""Scans of KITTI 00 nearer than this share a street corner at least; they are no negatives."""
+"""Scans of KITTI 00 nearer than this share a street corner; they are not negatives."""
 KITTI_ERR_M, KITTI_ERR_DEG = 3.0, 3.0
 """Chosen: KITTI's ground truth is off by up to 2.2 m and 1.7 degrees between scans 3-10 and 94-95, some 80 m apart, by
 three independent signs: the pairs' own poses close triangles to 0.12 m, tree by tree and corner by corner the clouds

@@ -1,4 +1,4 @@
-"""The scans that registration is measured on: real ones (KITTI, a courtyard), simulated ones with exact poses."""
+"""Scans for the benchmark of registration: real ones (KITTI, a courtyard), simulated ones with exact poses."""
 
 import hashlib
 from collections.abc import Callable
@@ -46,7 +46,7 @@ MIN_GAP = 50
 
 
 class SimulatedPlace:
-    """Scans at the real poses of a KITTI sequence, levelled, in one made-up world; made on demand, kept in `cache`."""
+    """Scans at the real poses of a KITTI sequence, levelled, in one generated world; made on demand and stored in `cache`."""
 
     def __init__(self, data: Path, sequence: str, world: str, *, seed: int, cache: Path) -> None:
         self.name = f"{sequence} {world}"
@@ -127,7 +127,7 @@ def real_scan(data: Path, index: int, *, labels: str = "none") -> Scan:
 
 
 def kitti_pose(data: Path, source: int, target: int) -> Transform:
-    """T_target_source by KITTI's own ground truth of 00, which errs by up to 1.6 m, more between scans far apart."""
+    """T_target_source by KITTI's own ground truth of 00, which has errors of up to 1.6 m, and more between distant scans."""
     dataset, row_of_scan = open_once(real_pairs.kitti(data, "none"))
     assert dataset.reference is not None
     T_world_lidar = dataset.reference.T_world_lidar
@@ -145,7 +145,7 @@ def courtyard_points(data: Path, index: int) -> Points:
 
 
 def by_shape(points_of: Callable[[int], Points], config: Config) -> Callable[[int], Labelled]:
-    """The same scans with labels by shape alone."""
+    """The same scans with geometric labels."""
 
     def scan(index: int) -> Labelled:
         points = points_of(index)

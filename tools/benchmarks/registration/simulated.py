@@ -1,4 +1,4 @@
-"""Simulated pairs at real poses: success by distance, what the gates let through and lose, the errors claimed."""
+"""Simulated pairs at real poses: success by distance, false acceptances and rejections, consistency of the information."""
 
 import sys
 from collections import Counter
@@ -15,7 +15,7 @@ from tools.benchmarks.registration.attempts import Attempt, attempt, percent, pr
 from tools.benchmarks.registration.scans import BANDS_M, Labelled, SimulatedPlace, by_shape
 
 NEGATIVE_M = 100.0
-"""Scans farther apart share nothing within the range that is aligned."""
+"""Scans farther apart do not overlap within the registered range."""
 CHI2_95 = 12.592
 """0.95 quantile of chi-square with 6 degrees of freedom."""
 
@@ -63,7 +63,7 @@ def _negatives(
     config: Config,
     rng: np.random.Generator,
 ) -> Counter[str]:
-    """What becomes of random pairs that share nothing: reasons, and how many were accepted."""
+    """Outcomes of random pairs without overlap: reasons, and number of acceptances."""
     apart = [(a, b) for a in indices for b in indices if a != b and place.distance_m(a, b) > NEGATIVE_M]
     outcomes: Counter[str] = Counter()
     for row in rng.choice(len(apart), min(count, len(apart)), replace=False):
@@ -98,7 +98,7 @@ def _gates(trials: list[Attempt], negatives: Counter[str]) -> dict[str, object]:
 
 
 def _information(trials: list[Attempt]) -> dict[str, object]:
-    """Squared errors by the information claimed, of right poses: 6 in the mean, 95 % below the bound, if it is true."""
+    """Whitened squared errors of correct poses: mean 6 and 95 % below the bound if the information is correct."""
     coarse = np.array([trial.coarse_squared for trial in trials if trial.coarse.success])
     fine = np.array([trial.fine_squared for trial in trials if trial.fine.within(RIGHT_M, RIGHT_DEG)])
     return {

@@ -1,4 +1,4 @@
-"""What each stage takes, beside small_gicp on the same pair; what a description and 6,000 correspondences take."""
+"""Time of each stage compared with small_gicp on the same pair; size of descriptions; time for 6,000 correspondences."""
 
 import dataclasses
 from collections.abc import Callable, Iterable

@@ -1,4 +1,4 @@
-"""How fast, in how much memory, and how both grow; beside bare KISS-ICP and KISS-SLAM. Writes JSON.
+"""Speed, memory and their growth, compared with KISS-ICP and KISS-SLAM. Writes JSON.
 
     python -m tools.benchmarks.speed DATA --sequence 06 --frames 0:400 --out speed.json
     python -m tools.benchmarks.speed DATA --only latency start --out speed.json --against before.json

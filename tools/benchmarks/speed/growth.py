@@ -43,7 +43,7 @@ SIGMA_RAD, SIGMA_M = 0.002, 0.02
 
 
 def graph(num_poses: int, num_closures: int, *, false_share: float, seed: int = 0) -> G2oGraph:
-    """Rounds of one circle, each a little higher, as odometry that drifts sees them; some closures are lies."""
+    """Rounds of one circle, each a little higher, with drifting odometry; some closures are false."""
     rng = np.random.default_rng(seed)
     true = _rounds(num_poses)
     information = np.diag(geometry.tangent(rotation_rad=SIGMA_RAD, translation_m=SIGMA_M) ** -2.0)
@@ -59,7 +59,7 @@ def graph(num_poses: int, num_closures: int, *, false_share: float, seed: int = 
 
 
 def optimisation(num_poses: int, num_closures: int, *, false_share: float) -> dict[str, Any]:
-    """Seconds, memory of the process so far, and closures switched off."""
+    """Seconds, peak memory of the process, and rejected closures."""
     made = graph(num_poses, num_closures, false_share=false_share)
     before = time.process_time()
     found = optimize_graph(made, robust="gnc")
@@ -76,7 +76,7 @@ def optimisation(num_poses: int, num_closures: int, *, false_share: float) -> di
 
 
 class Drive(Slam):
-    """Where the loops that are tried come from the truth, give or take some noise: no scan is aligned."""
+    """A pipeline whose loops are true poses with noise: no scans are registered."""
 
     def __init__(self, T_world_true: np.ndarray) -> None:
         config = Config()

@@ -1,4 +1,4 @@
-"""Scans per second of `segslam map` and of what it is compared with, in turn, on the same scans; and its memory."""
+"""Scans per second of `segslam map` and of other programs on the same scans, run in turn; memory of `segslam map`."""
 
 import json
 import os

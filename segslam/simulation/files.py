@@ -114,7 +114,7 @@ def write_sequence(
                 done += 1
                 yield done
     except OSError as error:
-        raise WorkFailed(f"{folder}: stopped after {done} scans ({reason(error)}); free space on the disk") from error
+        raise WorkFailed(f"{folder}: stopped after {done} scans ({reason(error)}); free space there") from error
 
 
 def _write_scan(folder: Path, name: str, one: Sweep) -> None:

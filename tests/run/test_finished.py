@@ -99,7 +99,7 @@ def test_folder_without_a_whole_run_is_refused(tmp_path: Path) -> None:
     middle = len(content) // 2
     content[middle : middle + 2000] = bytes(2000)
     (damaged / "log.mcap").write_bytes(content)
-    with pytest.raises(SegslamError, match=rf"log\.mcap: damaged, \d+ of its {NUM_SCANS} steps are readable"):
+    with pytest.raises(SegslamError, match=rf"log\.mcap: damaged, only \d+ of its {NUM_SCANS} steps are readable"):
         read_run(damaged)
     made = make_run(tmp_path / "run")
     (made.folder / "metrics.json").write_text("{")

@@ -1,1 +1,1 @@
-"""Benchmarks behind the tables of the documentation: `python -m tools.benchmarks.NAME --help` at the root of a checkout."""
+"""Benchmarks for the tables of the documentation: `python -m tools.benchmarks.NAME --help` in the root of a checkout."""

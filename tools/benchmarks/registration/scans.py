@@ -46,7 +46,7 @@ MIN_GAP = 50
 
 
 class SimulatedPlace:
-    """Scans at the real poses of a KITTI sequence, levelled, in one generated world; made on demand and stored in `cache`."""
+    """Scans at the real poses of a KITTI sequence, levelled, in one generated world; made on demand, kept in `cache`."""
 
     def __init__(self, data: Path, sequence: str, world: str, *, seed: int, cache: Path) -> None:
         self.name = f"{sequence} {world}"
@@ -127,7 +127,7 @@ def real_scan(data: Path, index: int, *, labels: str = "none") -> Scan:
 
 
 def kitti_pose(data: Path, source: int, target: int) -> Transform:
-    """T_target_source by KITTI's own ground truth of 00, which has errors of up to 1.6 m, and more between distant scans."""
+    """T_target_source from KITTI's ground truth of 00; errors up to 1.6 m, larger between distant scans."""
     dataset, row_of_scan = open_once(real_pairs.kitti(data, "none"))
     assert dataset.reference is not None
     T_world_lidar = dataset.reference.T_world_lidar

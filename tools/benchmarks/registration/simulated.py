@@ -1,4 +1,4 @@
-"""Simulated pairs at real poses: success by distance, false acceptances and rejections, consistency of the information."""
+"""Simulated pairs at real poses: success by distance, false acceptances and rejections, calibration."""
 
 import sys
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Time of each stage compared with small_gicp on the same pair; size of descriptions; time for 6,000 correspondences."""
+"""Time of each stage compared with small_gicp on the same pair; size of descriptions; 6,000 correspondences."""
 
 import dataclasses
 from collections.abc import Callable, Iterable

@@ -1,1 +1,1 @@
-"""Benchmarks for the tables of the documentation: `python -m tools.benchmarks.NAME --help` in the root of a checkout."""
+"""Benchmarks for the tables in the documentation: `python -m tools.benchmarks.NAME --help` in the root folder."""

@@ -46,7 +46,7 @@ MIN_GAP = 50
 
 
 class SimulatedPlace:
-    """Scans at the real poses of a KITTI sequence, levelled, in one generated world; made on demand, kept in `cache`."""
+    """Scans at the real poses of a KITTI sequence, levelled, in one generated world; cached in `cache`."""
 
     def __init__(self, data: Path, sequence: str, world: str, *, seed: int, cache: Path) -> None:
         self.name = f"{sequence} {world}"

@@ -70,7 +70,7 @@ class Surface:
 
 
 class LightSurface:
-    """Downsampled points (n, 3) with their search tree; normals are computed for the points that are asked for.
+    """Downsampled points (n, 3) with their search tree; normals are computed for the requested points only.
 
     Enough for quick checks of a pose; it takes a third of the time of a `Surface`.
     """

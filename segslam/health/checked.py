@@ -64,7 +64,7 @@ class _Found:
 
 
 class _Seen:
-    """A scan: all its points, the thinned ones, and their surface, which is made when it is asked for."""
+    """A scan: all its points, its downsampled points, and their surface, which is computed on use."""
 
     def __init__(self, points: Points, local: LocalMap) -> None:
         self._local = local

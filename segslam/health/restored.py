@@ -42,8 +42,8 @@ def rows_in_maps(
     for row, motion in enumerate(motions):
         if row > 0 and motion.state == MotionState.UNCHECKED:
             continue
-        begins_anew = motion.state == MotionState.BROKEN and motion.rms_m is None
-        is_registered = motion.rms_m is not None or begins_anew
+        restarts = motion.state == MotionState.BROKEN and motion.rms_m is None
+        is_registered = motion.rms_m is not None or restarts
         if row > 0 and not is_registered:
             history.note_moved(motion.moved_m or 0.0, np.radians(motion.moved_deg or 0.0), motion.overlap or 0.0)
         if is_registered and not history.is_watching:
@@ -52,7 +52,7 @@ def rows_in_maps(
             history.scans_lost += 1
         if motion.state == MotionState.REJOINED and lost is not None:
             (local, rows), lost = lost, None
-        elif begins_anew:
+        elif restarts:
             if lost is None:
                 lost, history.scans_lost = (local, rows), 0
             local, rows = empty(), deque[int](maxlen=map_scans)

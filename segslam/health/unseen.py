@@ -51,7 +51,7 @@ class Unseen:
         return np.linalg.inv(covariance)
 
     def restore(self, T_motion: Transform, way_m: float, direction: Direction | None) -> None:
-        """Go on after a stop: the last motion, and the way predicted since the last motion that was seen."""
+        """Continue after a stop with the last motion, and the travel predicted since the last observed motion."""
         self.T_steady, self._way_m, self.direction = T_motion, way_m, direction
 
 

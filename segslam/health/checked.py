@@ -344,7 +344,7 @@ class CheckedOdometry:
         """The predicted pose where a tunnel begins or ends between two scans, which have nothing in common."""
         overlap = self._map.fit(scan.surface, geometry.inverse(self._map.T_odom_map) @ T_odom_predicted).overlap
         information = self._unseen.note_predicted(self._way_m(T_odom_predicted), direction, is_registered=False)
-        self._begin_anew(T_odom_predicted, scan, self._unseen.T_steady)
+        self._restart(T_odom_predicted, scan, self._unseen.T_steady)
         return T_odom_predicted, Motion(MotionState.BROKEN, overlap=overlap, information=information)
 
     def _way_m(self, T_odom_lidar: Transform) -> float:
@@ -352,12 +352,12 @@ class CheckedOdometry:
 
     def _break(self, T_odom_lidar: Transform, scan: _Seen) -> tuple[Transform, Motion]:
         """A guess that nothing supports."""
-        self._begin_anew(T_odom_lidar, scan, np.eye(4))
+        self._restart(T_odom_lidar, scan, np.eye(4))
         self._unseen.note_seen(np.eye(4))
         sigmas = geometry.tangent(rotation_rad=BREAK_SIGMA_RAD, translation_m=BREAK_SIGMA_M)
         return T_odom_lidar, Motion(MotionState.BROKEN, information=np.diag(sigmas**-2.0))
 
-    def _begin_anew(self, T_odom_lidar: Transform, scan: _Seen, T_before_lidar: Transform) -> None:
+    def _restart(self, T_odom_lidar: Transform, scan: _Seen, T_before_lidar: Transform) -> None:
         """Start a new local map at a guess; the old one is kept for some time."""
         if self._lost is None:
             self._lost, self._map = self._map, self._map.empty_copy()

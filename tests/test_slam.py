@@ -126,7 +126,7 @@ def test_a_scan_that_is_not_later_than_the_last_is_refused_and_forgotten() -> No
     slam = drifting_slam()
     slam.process(scans[1])
     for older in (scans[1], scans[0]):
-        with pytest.raises(BadScan, match=rf"scan {older.index}: its stamp .* is not later than {scans[1].stamp_ns}"):
+        with pytest.raises(BadScan, match=rf"scan {older.index}: its stamp .* is not later than .*{scans[1].stamp_ns}"):
             slam.process(older)
     slam.process(scans[2])
     assert slam.finish().trajectory.scan_index.tolist() == [1, 2]

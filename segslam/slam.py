@@ -209,6 +209,7 @@ class Slam:
                 keyframe.T_odom_keyframe,
                 keyframe.travel_m,
                 information=information_of(self._since_keyframe),
+                stamp_ns=keyframe.stamp_ns,
             )
             self._since_keyframe = []
             with watch("recognise"):

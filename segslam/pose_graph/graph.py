@@ -5,7 +5,6 @@ keyframes with 396 closures take about 15 ms per iteration, and two or three ite
 several closures are collected before an optimisation.
 """
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +16,14 @@ from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import noise
 from segslam.pose_graph.breaks import is_break, relinked
-from segslam.pose_graph.closure_pairs import consistent_pairs, largest_consistent, pairwise_chi2
+from segslam.pose_graph.closure_pairs import consistent_pairs, largest_consistent
 from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors, values_of
 from segslam.pose_graph.final import Measured, solve_consistent, solve_gnc
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
 from segslam.pose_graph.levenberg_marquardt import search
-from segslam.pose_graph.motions import without
+from segslam.pose_graph.motions import Found, without
 from segslam.pose_graph.rows import Rows
+from segslam.pose_graph.steady_drift import noise_factor, steady_drift, turned
 from segslam.types import GraphEstimate, Information, LoopClosure, Mask, SegslamError, Transform, Vector
 
 RUNNING_TOLERANCE = 1e-3
@@ -66,6 +66,7 @@ class PoseGraph:
         self._num_closures_in_estimate = 0
         self._T_odom_last = np.eye(4)
         self._travel_m = Rows(np.empty(0))
+        self._time_s = Rows(np.empty(0))
 
     @property
     def num_keyframes(self) -> int:
@@ -101,6 +102,7 @@ class PoseGraph:
         travel_m: float,
         *,
         information: Information | None = None,
+        stamp_ns: int | None = None,
     ) -> None:
         """Add the next keyframe, with an odometry edge from the one before.
 
@@ -137,6 +139,7 @@ class PoseGraph:
         self._T_world.append(pose.matrix())
         self._T_odom_last = T_odom_keyframe
         self._travel_m.append(travel_m)
+        self._time_s.append(np.nan if stamp_ns is None else 1e-9 * stamp_ns)
 
     def add_closure(self, closure: LoopClosure) -> None:
         """Add a loop between two keyframes of the graph; the next optimisation uses it.
@@ -182,15 +185,9 @@ class PoseGraph:
 
         Drift is usual if its chi-square equals the number of degrees of freedom. Across a break nothing changes.
         """
-        edge = self._edge(closure)
-        first, last = sorted((edge.a, edge.b))
-        if any(is_break(motion) for motion in self._odometry[first:last]):
-            return
-        at_target = Edge(edge.a, edge.a, np.eye(4), noise.CERTAIN)
-        chi2 = float(pairwise_chi2(self._odometry, [edge, at_target])[0, 1])
-        factor = math.sqrt(chi2 / noise.DEGREES_OF_FREEDOM)
+        factor = noise_factor(self._odometry, self._edge(closure))
         if factor > 1.0:
-            self.use_odometry_noise(factor * self._config.odometry_sigma_m, factor * self._config.odometry_sigma_deg)
+            self._multiply_noise(factor)
 
     def optimize(self) -> GraphEstimate:
         """Optimise under the robust kernel from the last estimate, with a coarse tolerance."""
@@ -204,10 +201,14 @@ class PoseGraph:
         robust = self._optimize(FINAL_TOLERANCE)
         if self._config.final == "none":
             return robust
-        prior = gtsam.NonlinearFactorGraph()
-        prior.add(self._backbone.at(0))
+        final = self._solve_final()
+        if self._corrects_steady_drift(final.solution.weights):
+            final = self._solve_final()
+        return self._estimate(final.solution.search.error, final.solution.weights)
+
+    def _solve_final(self) -> Found:
         measured = Measured(
-            prior,
+            self._prior(),
             self._odometry,
             self._closures,
             self.travel_m,
@@ -221,7 +222,24 @@ class PoseGraph:
         self._rejected = final.rejected
         self._rebuild_backbone()
         self._take(final.solution.search.values)
-        return self._estimate(final.solution.search.error, final.solution.weights)
+        return final
+
+    def _corrects_steady_drift(self, weights: Vector) -> bool:
+        """Correct a steady drift of the heading, if that explains a drift beyond the tolerated errors."""
+        kept = [edge for edge, weight in zip(self._closures, weights, strict=True) if weight > 0.0]
+        growth = np.column_stack([np.diff(self.travel_m), np.nan_to_num(np.diff(self._time_s.all()))])
+        growth[np.array(self._has_own_information) | self._rejected_motions()] = 0.0
+        raised = self._config
+        self.use_odometry_noise(0.0, 0.0)
+        tolerated = self._config.error_allowance
+        found = steady_drift(self._prior(), self._kept_odometry(), kept, growth, self._values, tolerated=tolerated)
+        if found is None:
+            self.use_odometry_noise(raised.odometry_sigma_m, raised.odometry_sigma_deg)
+            return False
+        self._odometry = turned(self._odometry, growth, found.rates)
+        self._multiply_noise(found.noise_factor)
+        self._take(found.values)
+        return True
 
     def write_g2o(self, path: Path) -> None:
         """Poses, odometry and closures (without robust kernel) as g2o text."""
@@ -241,11 +259,17 @@ class PoseGraph:
     def _kept_odometry(self) -> list[Edge]:
         return without(self._odometry, self._rejected_motions())
 
+    def _multiply_noise(self, factor: float) -> None:
+        self.use_odometry_noise(factor * self._config.odometry_sigma_m, factor * self._config.odometry_sigma_deg)
+
+    def _prior(self) -> gtsam.NonlinearFactorGraph:
+        """The factor of the first pose."""
+        prior = gtsam.NonlinearFactorGraph()
+        prior.add(self._backbone.at(0))
+        return prior
+
     def _rebuild_backbone(self) -> None:
-        prior = self._backbone.at(0)
-        self._backbone = gtsam.NonlinearFactorGraph()
-        self._backbone.add(prior)
-        self._backbone.push_back(factor_graph(self._kept_odometry()))
+        self._backbone = joined(self._prior(), factor_graph(self._kept_odometry()))
 
     def _optimize(self, tolerance: float) -> GraphEstimate:
         found = search(joined(self._backbone, self._robust), self._linked(), tolerance=tolerance)

@@ -38,6 +38,7 @@ class Graph(Protocol):
         travel_m: float,
         *,
         information: Information | None = None,
+        stamp_ns: int | None = None,
     ) -> None:
         """Add the next keyframe, with an odometry edge from the previous one."""
         ...

@@ -67,11 +67,18 @@ class AnchoredGraph:
         travel_m: float,
         *,
         information: Information | None = None,
+        stamp_ns: int | None = None,
     ) -> None:
         """As `PoseGraph.add_keyframe`."""
         if keyframe_id == 0:
             information = np.zeros((6, 6))
-        self._graph.add_keyframe(keyframe_id + 1, T_odom_keyframe, travel_m + BREAK_TRAVEL_M, information=information)
+        self._graph.add_keyframe(
+            keyframe_id + 1,
+            T_odom_keyframe,
+            travel_m + BREAK_TRAVEL_M,
+            information=information,
+            stamp_ns=stamp_ns,
+        )
 
     def add_closure(self, closure: LoopClosure) -> None:
         """Raises SegslamError: a localised drive has no loops of its own."""

@@ -47,14 +47,22 @@ class LoopCloser:
         self._tried: set[tuple[int, int]] = set()
         self._is_finished = False
 
-    def add(self, T_odom_keyframe: Transform, *, labelled_by_shape: bool) -> PlaceSignature | None:
-        """Add the newest keyframe, which graph and clouds contain already; returns the signature of its place."""
+    def add(
+        self, T_odom_keyframe: Transform, *, labelled_by_shape: bool, recorded: bytes | None = None
+    ) -> PlaceSignature | None:
+        """Add the newest keyframe, which graph and clouds contain already; returns the signature of its place.
+
+        `recorded`: this signature, if it is known from a log.
+        """
         newest_id = len(self.submaps.T_odom)
         self.submaps.add(T_odom_keyframe, labelled_by_shape=labelled_by_shape)
         if not self._config.retrieval.enabled:
             return None
-        made = self.submaps.gathered(newest_id)
-        signature = signature_of(made.points, made.labels, config=self._config.geometric)
+        if recorded is None:
+            made = self.submaps.gathered(newest_id)
+            signature = signature_of(made.points, made.labels, config=self._config.geometric)
+        else:
+            signature = PlaceSignature.from_bytes(recorded)
         self._far.add(newest_id, signature)
         return signature
 

@@ -34,6 +34,9 @@ from segslam.verification.free_space import FreeSpace, observe_free_space
 Labeller = Callable[[Points], Labels]
 SHIFTS_M = tuple(sign * float(shift_m) for shift_m in range(1, 9) for sign in (-1.0, 1.0))
 """Chosen: shifts along the weak direction where rivals are searched; refinement finds rivals within 0.5 m."""
+SPARSE_MARGIN = 1.25
+"""Chosen: a rival is refined with all points if its mismatch after refinement with few is at most so many times the
+largest that makes a pose ambiguous."""
 SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
 """Chosen: poses closer to each other than this are the same."""
 MOST_PLANS = 24
@@ -207,6 +210,26 @@ class _Trial(NamedTuple):
         with self.watch("verify"):
             return self._verified(coarse, fine)
 
+    def settled(
+        self, coarse: Registration, few: refinement.Surface, known: Sequence[Found], most_mismatch: float
+    ) -> Registration | None:
+        """The pose to which a few points of the source lead; None if it is known or has a larger mismatch."""
+        if self.gate(coarse.T_target_source, slack_m=self.config.verify.max_coarse_fine_m):
+            return None
+        scans = self.source.observed, self.target.observed
+        with self.watch("verify"):
+            if gates.early_rejection(*scans, coarse.T_target_source, self.limits, config=self.config.verify):
+                return None
+        with self.watch("refine"):
+            fine = refinement.refine(
+                few, self.target.surface, coarse.T_target_source, config=self.config.refine, must_converge=False
+            )
+        if isinstance(fine, Rejected) or _is_near(fine.T_target_source, known):
+            return None
+        with self.watch("verify"):
+            found = gates.agreement(*scans, fine.T_target_source, config=self.config.verify)
+        return replace(coarse, T_target_source=fine.T_target_source) if found.mismatch <= most_mismatch else None
+
     def _verified(self, coarse: Registration, fine: Registration) -> Found | Rejected:
         config = self.config.verify
         moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ fine.T_target_source)
@@ -253,9 +276,12 @@ def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
         return found.alignment
     loose = trial._replace(limits=trial.limits.loosened(), gate=trial.gate if certain else anywhere)
     passed = [found]
+    few = refinement.sparse(trial.source.surface, config=trial.config.refine)
+    most = SPARSE_MARGIN * config.rival_ratio * found.agreement.mismatch
     for coarse in _rivals(found, loose):
-        if not _is_near(coarse.T_target_source, passed):
-            rival = loose.outcome(coarse)
+        settled = None if _is_near(coarse.T_target_source, passed) else loose.settled(coarse, few, passed, most)
+        if settled is not None:
+            rival = loose.outcome(settled)
             if isinstance(rival, Found) and not _is_near(rival.alignment.fine.T_target_source, passed):
                 passed.append(rival)
     best, *others = sorted(passed, key=lambda one: one.agreement.mismatch)

@@ -104,15 +104,16 @@ class Slam:
     def repeat(self, recorded: Step) -> Step:
         """As `process`, but from a recorded Step: repeat everything after the selection of the keyframe."""
         motion = recorded.motion or Motion(MotionState.UNCHECKED)
+        keyframe = None if recorded.keyframe is None else replace(recorded.keyframe, place=None)
         self._tracker.note(recorded)
         return self._advance(
-            recorded.scan_index, recorded.stamp_ns, recorded.T_odom_lidar, motion, recorded.keyframe, Stopwatch()
+            recorded.scan_index, recorded.stamp_ns, recorded.T_odom_lidar, motion, keyframe, Stopwatch()
         )
 
     def take(self, recorded: Step, *, below: int = 0, optimize: bool = False) -> Step:
-        """As `repeat`, but with the recorded loops; further loops are searched among keyframes with ids below `below`.
+        """As `repeat`, but with the recorded loops and places.
 
-        The graph is optimised only with `optimize`.
+        Further loops are searched among keyframes with ids below `below`. The graph is optimised only with `optimize`.
         """
 
         def attempts(keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
@@ -213,7 +214,11 @@ class Slam:
             )
             self._since_keyframe = []
             with watch("recognise"):
-                place = self._loops.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
+                place = self._loops.add(
+                    keyframe.T_odom_keyframe,
+                    labelled_by_shape=bool(keyframe.labelled_by_shape),
+                    recorded=keyframe.place,
+                )
             keyframe = replace(keyframe, place=None if place is None else place.to_bytes())
             if tries_loops:
                 attempts = (attempts_of or self._loops.attempt)(keyframe.id, watch)

@@ -1,15 +1,17 @@
 """Loops found by place recognition only: the odometry error exceeds any search radius."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from helpers.drives import drifting, round_drive
 
-from segslam.config import load_config
-from segslam.odometry import GivenOdometry
+from segslam import geometry
+from segslam.config import OdometryConfig, load_config
+from segslam.odometry import GivenOdometry, OdometryResult
 from segslam.slam import Slam
 from segslam.slam_result import SlamResult
-from segslam.types import LoopClosure, RejectReason
+from segslam.types import LoopClosure, Motion, MotionState, RejectReason, Scan, Trajectory
 
 FAR_DEG = 1.0
 """20 m off after a round of 113 m."""
@@ -59,3 +61,41 @@ def test_a_drive_whose_odometry_is_good_closes_by_proximity_as_before() -> None:
     assert pairs[0] == pairs[1]
     assert pairs[0]
     np.testing.assert_array_equal(before.trajectory.T_world_lidar, after.trajectory.T_world_lidar)
+
+
+class Carried(GivenOdometry):
+    """Odometry of a sensor that is carried elsewhere before one scan; that motion is unknown."""
+
+    def __init__(self, trajectory: Trajectory, config: OdometryConfig, *, first_after: int) -> None:
+        super().__init__(trajectory, config)
+        self._first_after = first_after
+
+    def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
+        found = super().register(scan, gap=gap)
+        if scan.index != self._first_after:
+            return found
+        return replace(found, motion=Motion(MotionState.BROKEN, information=1e-3 * np.eye(6)))
+
+
+def test_a_sensor_that_was_carried_to_an_older_place_is_found_there() -> None:
+    scans, truth = round_drive()
+    before, after = 30, 55  # in the second round, near scan 4 of the first
+    kept = [*range(before), *range(after, len(scans))]
+    odometry = drifting(truth)
+    T_odom = odometry.T_world_lidar.copy()
+    T_odom[after:] = T_odom[before - 1] @ geometry.inverse(T_odom[after]) @ T_odom[after:]
+    config = load_config(None, ["health.check=false"])
+    carried = Carried(replace(odometry, T_world_lidar=T_odom), config.odometry, first_after=after)
+    slam = Slam(config, odometry=carried)
+    for number in kept:
+        slam.process(scans[number])
+    result = slam.finish()
+    assert [motion.is_break for motion in result.motions].index(True) == before
+    assert len(result.closures()) >= 3
+    off_m = np.linalg.norm(result.trajectory.T_world_lidar[before:, :3, 3] - _from_first(truth)[after:], axis=1)
+    assert off_m.max() < 1.0
+
+
+def _from_first(truth: Trajectory) -> np.ndarray:
+    """(n, 3) positions in the frame of the first scan."""
+    return (geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar)[:, :3, 3]

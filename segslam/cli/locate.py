@@ -9,7 +9,7 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import EncodingOption, JsonOption, QuietOption, announce, print_out, progress, say
+from segslam.cli.console import EncodingOption, QuietOption, announce, print_out, progress, say
 
 if TYPE_CHECKING:
     from segslam.run.locator import Located, Locator
@@ -24,7 +24,10 @@ def locate(
         str, typer.Option(help="Labels: geometric, none, or a folder of .label files named like the scans.")
     ] = "geometric",
     encoding: EncodingOption = None,
-    json: JsonOption = False,
+    json: Annotated[
+        bool,
+        typer.Option("--json", help="Print a JSON list with one object per scan on standard output, and nothing else."),
+    ] = False,
     quiet: QuietOption = False,
 ) -> None:
     """Find the poses of single scans in a finished run, without an initial guess. Exit status 1 if none is found.

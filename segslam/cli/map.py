@@ -263,7 +263,8 @@ def map_scans(
         with apart or nullcontext():
             if recorded is not None:
                 _take_over(run, recorded, scans, watch, quiet=quiet)
-            interrupted = _process(run, scans, watch, quiet=quiet)
+            title = "map" if slam_of is None else "localise"
+            interrupted = _process(run, scans, watch, title=title, quiet=quiet)
         if interrupted and run.num_steps == 0:
             when_stopped("no scan was mapped, nothing was written")
             raise typer.Exit(EXIT_STATUS)
@@ -288,11 +289,13 @@ def _take_over(
         raise typer.Exit(EXIT_STATUS) from interrupt
 
 
-def _process(run: "Run", scans: "Dataset", watch: "Callable[[Step | BadScan], None]", *, quiet: bool) -> bool:
-    """Map every scan. Returns True if Ctrl-C ended it before the last one."""
+def _process(
+    run: "Run", scans: "Dataset", watch: "Callable[[Step | BadScan], None]", *, title: str, quiet: bool
+) -> bool:
+    """Map or localise every scan. Returns True if Ctrl-C ended it before the last one."""
     with suppress(KeyboardInterrupt):
         left = len(scans) - run.num_scans_resumed - run.num_scans_skipped
-        for step in progress(run.map(scans), total=left, title="map", quiet=quiet):
+        for step in progress(run.map(scans), total=left, title=title, quiet=quiet):
             watch(step)
         return False
     return True

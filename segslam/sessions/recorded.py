@@ -32,7 +32,7 @@ from segslam.types import (
 
 GAP_NS = 1_000_000_000
 """Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
-UNTIED = Motion(MotionState.BEGUN, information=np.zeros((6, 6)))
+UNTIED = Motion(MotionState.BEGUN, information=1e-12 * np.eye(6))
 """The motion to the first scan of a session, which is unknown."""
 
 

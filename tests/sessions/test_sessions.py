@@ -86,10 +86,12 @@ def test_scans_and_stamps_of_the_second_session_follow_the_first(days: Days, mer
 
 
 @pytest.mark.slow
-def test_both_commands_work_in_a_terminal(days: Days, tmp_path: Path) -> None:
+def test_every_command_works_in_a_terminal(days: Days, tmp_path: Path) -> None:
     monday, friday = str(days.monday.folder), str(days.friday.folder)
+    first_scan = str(days.friday_scans / "sequences" / "00" / "velodyne" / "000000.bin")
     shown = ""
     for command in (
+        ("locate", monday, first_scan),
         ("merge", monday, friday, "--out", str(tmp_path / "both"), "--map"),
         ("localise", monday, str(days.friday_scans), "--out", str(tmp_path / "there")),
     ):
@@ -97,7 +99,7 @@ def test_both_commands_work_in_a_terminal(days: Days, tmp_path: Path) -> None:
         assert status == 0, output
         assert "Traceback" not in output
         shown += output
-    assert "44/44" in shown  # steps of both sessions
+    assert all(title in shown for title in ("locate: 1/1", "merge: 44/44", "localise: 22/22"))
     assert "loops between sessions: " in shown
     assert "localised in the old map: 100.0 %" in shown
     assert (tmp_path / "both" / "map.ply").is_file()

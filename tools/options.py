@@ -17,7 +17,7 @@ from segslam.config import USER_SETTINGS, Config, Section
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "options.md"
 INTRODUCTION = """# Every setting
 
-Generated from `segslam/config.py` by `python tools/options.py`; do not edit this page.
+Generated from `segslam/config/sections.py` by `python tools/options.py`; do not edit this page.
 
 Change settings with a YAML file that contains the differences from the defaults, `--config strict.yaml`, or one by one,
 `--set verify.min_overlap=0.4 --set map.color=height`. Unknown keys and values out of range are reported as errors. Each

@@ -4,12 +4,8 @@ Most users need `USER_SETTINGS` only. Sources: the Segregator paper (Yin et al.,
 library that uses the value, measured (on what), or chosen (on what, where data decided).
 """
 
-import logging
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import yaml
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -17,13 +13,10 @@ from pydantic import (
     ConfigDict,
     Field,
     PlainSerializer,
-    ValidationError,
     model_validator,
 )
 
-from segslam.types import Label, SegslamError
-
-logger = logging.getLogger(__name__)
+from segslam.types import Label
 
 USER_SETTINGS = (
     "sensor.vertical_angle_deg",
@@ -44,9 +37,6 @@ USER_SETTINGS = (
     "map.color",
 )
 """The settings for most users, the first ones of their sections. All others are for experts."""
-
-REMOVED = ("graph.systematic_drift",)
-"""Settings of older versions that are ignored with a warning, also in files and `--set`."""
 
 
 def _label_from_name(value: object) -> object:
@@ -658,138 +648,3 @@ class Config(Section):
     graph: GraphConfig = GraphConfig()
     log: LogConfig = LogConfig()
     map: MapConfig = MapConfig()
-
-
-def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
-    """The defaults, or `base`, changed by a YAML file and then by `section.key=value` texts.
-
-    Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
-    """
-    values = _changed(base.model_dump(mode="json") if base else {}, _read_yaml(path) if path else {})
-    for text in overrides:
-        key, separator, value = text.partition("=")
-        section, dot, name = key.strip().partition(".")
-        if not separator or not dot or not name:
-            raise SegslamError(f"--set {text}: write section.key=value, for example keyframes.distance_m=1.5")
-        section_values = values.setdefault(section, {})
-        if not isinstance(section_values, dict):
-            raise SegslamError(f"{path}: {section}: expected a section with keys, found {section_values!r}")
-        try:
-            section_values[name] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise SegslamError(f"--set {text}: the value is not valid YAML ({_one_line(error)})") from error
-    source = str(path) if path is not None else "--set"
-    source = source if not (path and overrides) else f"{path} and --set"
-    return _validate(_without_removed(values, source), source)
-
-
-def config_to_yaml(config: Config) -> str:
-    """All settings as YAML, from which `load_config` makes an equal Config."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-
-
-def config_from_yaml(text: str, source: str) -> Config:
-    """The Config in a text of this or an older version; `source` is its name in messages.
-
-    Settings that no longer exist are ignored with a warning. Raises SegslamError if the text is not a Config.
-    """
-    known, gone = _known(_parse_yaml(text, source))
-    if gone:
-        logger.warning("%s: ignored settings that this version does not have: %s", source, ", ".join(gone))
-    return _validate(known, source)
-
-
-def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
-    """The values without settings of older versions that no longer exist."""
-    for key in REMOVED:
-        section, _, name = key.partition(".")
-        if isinstance(values.get(section), dict) and name in values[section]:
-            logger.warning("%s: %s no longer exists and is ignored", source, key)
-            values = values | {section: {k: v for k, v in values[section].items() if k != name}}
-    return values
-
-
-def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The settings of this version, and the names of the others."""
-    known: dict[str, Any] = {}
-    gone: list[str] = []
-    for name, section in values.items():
-        if name not in Config.model_fields:
-            gone.append(name)
-        elif isinstance(section, dict):
-            fields = type(getattr(Config(), name)).model_fields
-            gone += [f"{name}.{key}" for key in section if key not in fields]
-            known[name] = {key: value for key, value in section.items() if key in fields}
-        else:
-            known[name] = section
-    return known, gone
-
-
-def _changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """The values of all sections, with the changed keys replaced."""
-    keywise = {
-        name: values[name] | section
-        for name, section in changes.items()
-        if isinstance(section, dict) and isinstance(values.get(name), dict)
-    }
-    return values | changes | keywise
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
-    return _parse_yaml(text, str(path))
-
-
-class _EachKeyOnce(yaml.SafeLoader):
-    """Rejects duplicate keys; YAML's own loader uses the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """As in the base class. Raises ConstructorError, with its line, for a duplicate key."""
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
-            if isinstance(key, yaml.ScalarNode):
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-def _parse_yaml(text: str, source: str) -> dict[str, Any]:
-    try:
-        values = yaml.load(text, _EachKeyOnce)
-    except yaml.YAMLError as error:
-        raise SegslamError(f"{source}: not valid YAML ({_one_line(error)})") from error
-    if values is None:
-        return {}
-    if not isinstance(values, dict):
-        raise SegslamError(f"{source}: expected sections with keys, found {type(values).__name__}")
-    return values
-
-
-def _validate(values: dict[str, Any], source: str) -> Config:
-    try:
-        return Config.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            raise SegslamError(f"{source}: unknown key {key}; {_known_keys(first['loc'])}") from error
-        message = first["msg"].removeprefix("Value error, ")
-        got = "" if isinstance(first["input"], dict) else f", got {first['input']!r}"
-        raise SegslamError(f"{source}: {key}: {message}{got}") from error
-
-
-def _known_keys(location: tuple[int | str, ...]) -> str:
-    fields = Config.model_fields
-    if len(location) > 1 and location[0] in fields:
-        section = fields[str(location[0])].annotation
-        if isinstance(section, type) and issubclass(section, Section):
-            fields = section.model_fields
-    return "known keys: " + (", ".join(fields) or "none")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

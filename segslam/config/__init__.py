@@ -1,0 +1,43 @@
+"""All settings: their sections, with units, ranges and sources (`sections`), and their YAML (`files`)."""
+
+from segslam.config.files import config_from_yaml, config_to_yaml, load_config
+from segslam.config.sections import (
+    USER_SETTINGS,
+    Config,
+    GeometricLabelsConfig,
+    GraphConfig,
+    HealthConfig,
+    KeyframeConfig,
+    LabelName,
+    LogConfig,
+    MapConfig,
+    OdometryConfig,
+    ProximityConfig,
+    RefineConfig,
+    Section,
+    SegregatorConfig,
+    SensorCalibrationConfig,
+    VerifyConfig,
+)
+
+__all__ = [
+    "USER_SETTINGS",
+    "Config",
+    "GeometricLabelsConfig",
+    "GraphConfig",
+    "HealthConfig",
+    "KeyframeConfig",
+    "LabelName",
+    "LogConfig",
+    "MapConfig",
+    "OdometryConfig",
+    "ProximityConfig",
+    "RefineConfig",
+    "Section",
+    "SegregatorConfig",
+    "SensorCalibrationConfig",
+    "VerifyConfig",
+    "config_from_yaml",
+    "config_to_yaml",
+    "load_config",
+]

@@ -13,9 +13,9 @@ from segslam.cli.bench_options import (
     read_lists,
     reference_of,
     run_trials,
-    with_options,
 )
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
+from segslam.cli.shared_options import with_options
 
 if TYPE_CHECKING:
     from segslam.experiments.job import Job

@@ -1,10 +1,7 @@
 """Options and steps common to all commands of `segslam bench`: open, run, report."""
 
-import inspect
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from functools import wraps
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -94,33 +91,13 @@ class Options:
     quiet: QuietOption = False
 
 
-def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the fields of `Options` as its own options; they are passed as its parameter `options`."""
-    own = inspect.signature(command, eval_str=True)
-    shared = {field.name: (field.type, field.default) for field in fields(Options)}
-
-    @wraps(command)
-    def typed(**values: Any) -> None:
-        options = Options(**{name: values.pop(name) for name in shared})
-        announce(f"bench: opening {values.get('data', 'its data')}", quiet=options.quiet)
-        command(**values, options=options)
-
-    parameters = [parameter for name, parameter in own.parameters.items() if name != "options"]
-    parameters += [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
-        for name, (kind, default) in shared.items()
-    ]
-    kept = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
-    typed.__signature__ = own.replace(parameters=kept)  # type: ignore[attr-defined]
-    typed.__annotations__ = {parameter.name: parameter.annotation for parameter in kept}
-    return typed
-
-
 def make_job(data: Path, options: Options) -> "Job":
     """The job that the options describe. By default, methods that are not installed are skipped with a message."""
+    announce(f"bench: opening {data}", quiet=options.quiet)
     _one_thread_each()
     from segslam.config import load_config
-    from segslam.experiments.job import DataSource, Job
+    from segslam.datasets import DataSource
+    from segslam.experiments.job import Job
     from segslam.experiments.methods import find_method
 
     if options.details is not None:
@@ -144,7 +121,7 @@ def make_job(data: Path, options: Options) -> "Job":
         options.dataset,
         options.labels,
         options.encoding,
-        config.sensor.vertical_angle_deg,
+        vertical_angle_deg=config.sensor.vertical_angle_deg,
     )
     return Job(source, tuple(chosen), config)
 

@@ -12,11 +12,12 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, say
+from segslam.cli.console import announce, say
 from segslam.cli.ending import finish
-from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
+from segslam.cli.foxglove import serve_foxglove
 from segslam.cli.live_status import LiveFigures, Status, too_slow
-from segslam.cli.run_options import MapFileOption, ViewOption, WithMapOption, chosen_maps
+from segslam.cli.run_options import OutputOptions
+from segslam.cli.shared_options import with_options
 from segslam.cli.view import check_display, close_scene, open_scene
 from segslam.errors import SegslamError, WorkFailed
 from segslam.system.extras import how_to_install
@@ -44,8 +45,10 @@ FINAL_SEARCH_S = 60.0
 """Chosen: the last search for loops ends after this time, so that the results of a live run are soon complete."""
 
 
+@with_options
 def live(
     out: Annotated[Path, typer.Option(help="New folder for the run.")],
+    *,
     folder: Annotated[
         Path | None, typer.Argument(help="Folder into which a recorder writes scans (.bin .npy .ply .pcd).")
     ] = None,
@@ -56,26 +59,18 @@ def live(
         float | None, typer.Option(min=0.1, metavar="SECONDS", help="End after this time without a new scan.")
     ] = None,
     labels: Annotated[str, typer.Option("--labels", help="Labels: geometric (auto is the same) or none.")] = "auto",
-    config: ConfigOption = None,
-    settings: SetOption = None,
     preset: Annotated[str, typer.Option(help="Settings for an environment: driving, campus or indoor.")] = "driving",
-    with_map: WithMapOption = False,
-    map_file: MapFileOption = None,
-    view: ViewOption = False,
-    foxglove: FoxgloveOption = None,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    options: OutputOptions,
 ) -> None:
     """Map scans while they arrive. Ctrl-C or SIGTERM finishes the run.
 
     Example: segslam live /data/scans --out runs/now --idle 10
     """
-    if view:
+    quiet = options.quiet
+    if options.view:
         check_display()
-    from segslam.config import load_config
-
     _check_source(folder, topic, out)
-    settings_now = load_config(config, settings or ())
+    settings = options.load_config()
     if labels not in ("auto", "geometric", "none"):
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
     announce("live: starting", quiet=quiet)
@@ -85,20 +80,20 @@ def live(
 
         if preset not in SETTINGS:
             raise SegslamError(f"--preset {preset}: unknown preset; known: {', '.join(SETTINGS)}")
-        settings_now = load_config(config, settings or (), base=settings_of(cast("Preset", preset)))
+        settings = options.load_config(base=settings_of(cast("Preset", preset)))
     from segslam.run.folder import new_folder
 
-    map_names, map_files = chosen_maps(out, with_map=with_map, map_file=map_file)
-    angle_deg = settings_now.sensor.vertical_angle_deg or 0.0
-    sensor = settings_now.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
-    settings_now = settings_now.model_copy(update={"sensor": sensor})
-    source = _source(folder, topic, intensities=settings_now.map.color == "intensity", vertical_angle_deg=angle_deg)
-    scene = open_scene(None, view_every=settings_now.log.view_every) if view else None
+    map_names, map_files = options.maps(out)
+    angle_deg = settings.sensor.vertical_angle_deg or 0.0
+    sensor = settings.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
+    settings = settings.model_copy(update={"sensor": sensor})
+    source = _source(folder, topic, intensities=settings.map.color == "intensity", vertical_angle_deg=angle_deg)
+    scene = open_scene(None, view_every=settings.log.view_every) if options.view else None
     with ExitStack() as stack:
-        server = serve_foxglove(foxglove, stack, quiet=quiet)
+        server = serve_foxglove(options.foxglove, stack, quiet=quiet)
         out = new_folder(out)
         compile_kernels(quiet=quiet)
-        options = {
+        recorded = {
             "labels": labels,
             "live": source.name,
             "map_files": json_text.dumps([str(name) for name in map_names]),
@@ -106,14 +101,14 @@ def live(
         why = map_live(
             source,
             out,
-            settings=settings_now,
+            settings=settings,
             labeller=_unlabelled() if labels == "none" else None,
-            options=options,
+            options=recorded,
             idle_s=idle,
             map_files=map_files,
             scene=scene,
             server=server,
-            json=json,
+            json=options.json,
             quiet=quiet,
         )
     if scene:

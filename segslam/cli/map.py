@@ -12,39 +12,14 @@ import typer
 
 from segslam.cli.checks import check_exists, check_intensities, check_same, is_finished, log_to_resume
 from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import (
-    ConfigOption,
-    DatasetOption,
-    EncodingOption,
-    FramesOption,
-    JsonOption,
-    LabelsOption,
-    QuietOption,
-    SequenceOption,
-    SetOption,
-    announce,
-    print_json,
-    print_out,
-    progress,
-    say,
-)
+from segslam.cli.console import announce, print_json, print_out, progress, say
 from segslam.cli.ending import finish
 from segslam.cli.export import map_summary, write_maps
-from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
+from segslam.cli.foxglove import serve_foxglove
 from segslam.cli.given_odometry import given_odometry
 from segslam.cli.in_map import pipeline
-from segslam.cli.run_options import (
-    DataArgument,
-    DryRunOption,
-    MapFileOption,
-    OdometryOption,
-    PresetOption,
-    ResumeOption,
-    TopicOption,
-    ViewOption,
-    WithMapOption,
-    chosen_maps,
-)
+from segslam.cli.run_options import DataArgument, DryRunOption, RunOptions
+from segslam.cli.shared_options import with_options
 from segslam.cli.view import check_display, close_scene, open_scene
 from segslam.errors import SegslamError
 from segslam.system.interrupts import EXIT_STATUS, when_stopped
@@ -60,100 +35,78 @@ if TYPE_CHECKING:
     from segslam.types import BadScan, Step
 
 
+@with_options
 def map_command(
     data: DataArgument,
+    *,
     out: Annotated[
         Path | None, typer.Option(help="New folder for the run; with --resume the folder of the run.  [required]")
     ] = None,
-    dataset: DatasetOption = None,
-    sequence: SequenceOption = "00",
-    frames: FramesOption = None,
-    topic: TopicOption = "",
-    labels: LabelsOption = "auto",
-    encoding: EncodingOption = None,
-    odometry: OdometryOption = None,
-    config: ConfigOption = None,
-    settings: SetOption = None,
-    preset: PresetOption = "auto",
-    with_map: WithMapOption = False,
-    map_file: MapFileOption = None,
-    view: ViewOption = False,
-    foxglove: FoxgloveOption = None,
-    resume: ResumeOption = False,
+    options: RunOptions,
     dry_run: DryRunOption = False,
-    in_map: Annotated[Path | None, typer.Option(help="Localise in the map of this run (`segslam localise`).")] = None,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
 ) -> None:
     """Map scans: write the corrected trajectory, the loops, a log, a report and, with ground truth, the error.
 
     Example: segslam map kitti --sequence 00 --frames 0:1000 --out runs/00
     """
-    if view:
-        check_display()
-    from segslam.config import load_config
-
     if out is None and not dry_run:
         raise SegslamError("--out: give a new folder for the run, as in --out runs/00 (to look first: --dry-run)")
+    map_data(data, out or Path(), options, dry_run=dry_run)
+
+
+def map_data(
+    data: Path, folder: Path, options: RunOptions, *, dry_run: bool = False, in_map: Path | None = None
+) -> None:
+    """Map scans into a folder, or localise them in the map of the run `in_map`; `dry_run` prints what would be done."""
+    quiet = options.quiet
+    if options.view:
+        check_display()
     check_exists(data, "give the folder with sequences/ or with the scans")
-    recorded = log_to_resume(out) if resume and out else None
-    check_preset(preset, resumes=recorded is not None)
-    settings_now = load_config(config, settings or (), base=recorded.config if recorded else None)
+    recorded = log_to_resume(folder) if options.resume and not dry_run else None
+    check_preset(options.preset, resumes=recorded is not None)
+    settings = options.load_config(base=recorded.config if recorded else None)
     announce(f"map: opening {data}" if in_map is None else f"localise: reading the map of {in_map}", quiet=quiet)
     slam_of = pipeline(in_map)
-    from segslam.datasets import open_dataset
+    from segslam.run.map_folder import open_scans
 
-    folder = out or Path()
-    map_names, map_files = chosen_maps(folder, with_map=with_map, map_file=map_file)
-    by_intensity = settings_now.map.color == "intensity"
-    scans = open_dataset(
-        data,
-        sequence=sequence,
-        dataset=dataset,
-        labels=labels,
-        encoding=encoding,
-        frames=frames,
-        topic=topic,
-        intensities=by_intensity,
-        vertical_angle_deg=settings_now.sensor.vertical_angle_deg,
-    )
-    if by_intensity:
+    map_names, map_files = options.maps(folder)
+    scans = open_scans(options.source(data), settings)
+    if settings.map.color == "intensity":
         check_intensities(scans)
-    options = ({"in_map": str(in_map.expanduser().resolve())} if in_map else {}) | {
-        "frames": frames or "",
-        "topic": topic,
-        "labels": labels,
-        "encoding": encoding or "",
-        "odometry": str(odometry.resolve()) if odometry else "",
-    }
-    source = {"data": str(data.expanduser().resolve()), "dataset": dataset or "", "sequence": sequence}
-    given = given_odometry(odometry, scans, settings_now.odometry) if odometry else None
+    choices = ({"in_map": str(in_map.expanduser().resolve())} if in_map else {}) | options.choices()
+    given = given_odometry(options.odometry, scans, settings.odometry) if options.odometry else None
     if recorded is None:
-        settings_now = load_config(config, settings or (), base=preset_config(preset, scans, quiet=quiet))
+        settings = options.load_config(base=preset_config(options.preset, scans, quiet=quiet))
     if dry_run:
-        _show_dry_run(scans, settings_now, json=json, quiet=quiet)
+        _show_dry_run(scans, settings, json=options.json, quiet=quiet)
         return
     if recorded is not None:
-        check_same(recorded, settings_now, dataset=scans.name, options=options)
+        check_same(recorded, settings, dataset=scans.name, options=choices)
         if is_finished(recorded, scans):
-            _complete(recorded, map_files, config=settings_now.map, json=json, quiet=quiet)
+            _complete(recorded, map_files, config=settings.map, json=options.json, quiet=quiet)
             raise typer.Exit(0)
-    scene = open_scene(None, view_every=settings_now.log.view_every) if view else None
+    source = {
+        "data": str(data.expanduser().resolve()),
+        "dataset": options.dataset or "",
+        "sequence": options.sequence,
+        "map_files": json_text.dumps([str(name) for name in map_names]),
+    }
+    scene = open_scene(None, view_every=settings.log.view_every) if options.view else None
     with ExitStack() as stack:
-        server = serve_foxglove(foxglove, stack, quiet=quiet)
+        server = serve_foxglove(options.foxglove, stack, quiet=quiet)
         map_scans(
             scans,
             folder,
-            settings=settings_now,
+            settings=settings,
             odometry=given,
-            options=options | source | {"map_files": json_text.dumps([str(name) for name in map_names])},
+            options=choices | source,
             recorded=recorded,
             map_files=map_files,
             watch=scene.add if scene else _nobody,
             go_on=f"continue with: segslam resume {shlex.quote(str(folder))}",
             slam_of=slam_of,
             mirror=server.send if server else None,
-            json=json,
+            json=options.json,
             quiet=quiet,
         )
     if scene:

@@ -8,8 +8,8 @@ import typer
 
 from segslam.cli.checks import check_exists, log_to_resume
 from segslam.cli.console import JsonOption, QuietOption, announce
-from segslam.cli.map import map_command
-from segslam.cli.run_options import ViewOption
+from segslam.cli.map import map_data
+from segslam.cli.run_options import RunOptions, ViewOption
 from segslam.errors import SegslamError
 
 
@@ -40,9 +40,7 @@ def resume(
         Path(chosen["data"]),
         f"{recorded.path} was started with it. Restore it, or: segslam map DATA --out {run} --resume",
     )
-    map_command(
-        Path(chosen["data"]),
-        run,
+    options = RunOptions(
         dataset=chosen["dataset"] or None,
         sequence=chosen["sequence"],
         frames=chosen["frames"] or None,
@@ -53,7 +51,7 @@ def resume(
         map_file=[Path(name) for name in json_text.loads(chosen["map_files"])],
         view=view,
         resume=True,
-        in_map=Path(chosen["in_map"]) if chosen.get("in_map") else None,
         json=json,
         quiet=quiet,
     )
+    map_data(Path(chosen["data"]), run, options, in_map=Path(chosen["in_map"]) if chosen.get("in_map") else None)

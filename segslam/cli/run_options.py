@@ -1,13 +1,29 @@
 """Options common to all commands that make a run."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from segslam.cli.console import (
+    ConfigOption,
+    DatasetOption,
+    EncodingOption,
+    FramesOption,
+    JsonOption,
+    LabelsOption,
+    QuietOption,
+    SequenceOption,
+    SetOption,
+)
 from segslam.cli.export import WITH_MAP
+from segslam.cli.foxglove import FoxgloveOption
 from segslam.system.whole_files import check_target
+
+if TYPE_CHECKING:
+    from segslam.config import Config
+    from segslam.datasets import DataSource
 
 DataArgument = Annotated[Path, typer.Argument(help="Folder of scans, recording, or KITTI folder (with sequences/).")]
 TopicOption = Annotated[
@@ -37,14 +53,64 @@ MapFileOption = Annotated[
 ViewOption = Annotated[bool, typer.Option("--view", help="Show the run in the Rerun viewer while it is mapped.")]
 
 
-def chosen_maps(folder: Path, *, with_map: bool, map_file: Sequence[Path] | None) -> tuple[list[Path], list[Path]]:
-    """Map files as given, and as paths in the run folder. Raises SegslamError for a file that cannot be written."""
-    from segslam.map import check_names
+@dataclass(frozen=True)
+class OutputOptions:
+    """Settings, and what a run writes and shows beside its results: of `map`, `localise` and `live`."""
 
-    names = [*map(Path, WITH_MAP if with_map else ()), *(map_file or ())]
-    files = [folder / name for name in names]
-    check_names(files)
-    for file in files:
-        if folder not in file.parents:
-            check_target(file)
-    return names, files
+    config: ConfigOption = None
+    settings: SetOption = None
+    with_map: WithMapOption = False
+    map_file: MapFileOption = None
+    view: ViewOption = False
+    foxglove: FoxgloveOption = None
+    json: JsonOption = False
+    quiet: QuietOption = False
+
+    def load_config(self, *, base: "Config | None" = None) -> "Config":
+        """The settings. Raises SegslamError as `segslam.config.load_config`."""
+        from segslam.config import load_config
+
+        return load_config(self.config, self.settings or (), base=base)
+
+    def maps(self, folder: Path) -> tuple[list[Path], list[Path]]:
+        """Map files as given, and as paths in the run folder. Raises SegslamError if one cannot be written."""
+        from segslam.map import check_names
+
+        names = [*map(Path, WITH_MAP if self.with_map else ()), *(self.map_file or ())]
+        files = [folder / name for name in names]
+        check_names(files)
+        for file in files:
+            if folder not in file.parents:
+                check_target(file)
+        return names, files
+
+
+@dataclass(frozen=True)
+class RunOptions(OutputOptions):
+    """All options that `map` and `localise` share."""
+
+    dataset: DatasetOption = None
+    sequence: SequenceOption = "00"
+    frames: FramesOption = None
+    topic: TopicOption = ""
+    labels: LabelsOption = "auto"
+    encoding: EncodingOption = None
+    odometry: OdometryOption = None
+    preset: PresetOption = "auto"
+    resume: ResumeOption = False
+
+    def source(self, data: Path) -> "DataSource":
+        """What opens the scans."""
+        from segslam.datasets import DataSource
+
+        return DataSource(data, self.sequence, self.dataset, self.labels, self.encoding, self.frames, self.topic)
+
+    def choices(self) -> dict[str, str]:
+        """The options that a resumed run has to repeat, as the log keeps them."""
+        return {
+            "frames": self.frames or "",
+            "topic": self.topic,
+            "labels": self.labels,
+            "encoding": self.encoding or "",
+            "odometry": str(self.odometry.resolve()) if self.odometry else "",
+        }

@@ -1,5 +1,6 @@
 """Readers of scans from files and recordings, with one interface."""
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from segslam.datasets.kitti import is_kitti, open_kitti
@@ -7,7 +8,26 @@ from segslam.datasets.scans import Dataset
 from segslam.semantics.encodings import Encoding
 from segslam.types import SegslamError
 
-__all__ = ["Dataset", "open_dataset"]
+__all__ = ["DataSource", "Dataset", "open_dataset"]
+
+
+@dataclass(frozen=True, slots=True)
+class DataSource:
+    """Arguments of `open_dataset`, here or on another machine with the same files."""
+
+    data: Path
+    sequence: str = "00"
+    dataset: str | None = None
+    labels: str = "auto"
+    encoding: Encoding | None = None
+    frames: str | None = None
+    topic: str = ""
+    intensities: bool = False
+    vertical_angle_deg: float | None = None
+
+    def open(self) -> Dataset:
+        """Raises SegslamError as `open_dataset` does."""
+        return open_dataset(**asdict(self))
 
 
 def open_dataset(

@@ -4,11 +4,10 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 from segslam import geometry
 from segslam.config import Config
-from segslam.datasets import Dataset, open_dataset
+from segslam.datasets import Dataset, DataSource
 from segslam.evaluation import PoseError
 from segslam.experiments.estimate import Estimate
 from segslam.experiments.meter import Cost, measured
@@ -16,36 +15,12 @@ from segslam.experiments.methods import METHODS, Part, prepare_parts
 from segslam.experiments.rows import Row
 from segslam.experiments.trials import ScanVariant, Trial
 from segslam.registration import Stopwatch, shape_labels
-from segslam.semantics.encodings import Encoding
 from segslam.types import BadScan, Points, Rejected
 
 logger = logging.getLogger(__name__)
 
 BAD_SCAN = "bad_scan"
 """Reject reason of a row whose scan cannot be read."""
-
-
-@dataclass(frozen=True, slots=True)
-class DataSource:
-    """Arguments that open the data set, here or on another machine with the same files."""
-
-    data: Path
-    sequence: str = "00"
-    dataset: str | None = None
-    labels: str = "auto"
-    encoding: Encoding | None = None
-    vertical_angle_deg: float | None = None
-
-    def open(self) -> Dataset:
-        """Raises SegslamError as `open_dataset` does."""
-        return open_dataset(
-            self.data,
-            sequence=self.sequence,
-            dataset=self.dataset,
-            labels=self.labels,
-            encoding=self.encoding,
-            vertical_angle_deg=self.vertical_angle_deg,
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,12 +1,13 @@
 """Mapping of a data set into a run folder with one call."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from segslam.config import Config
-from segslam.datasets import Dataset, open_dataset
+from segslam.datasets import Dataset, DataSource
 from segslam.presets import extent_m, preset, preset_for
 from segslam.run.accuracy import accuracy
 from segslam.run.finished import FinishedRun, read_run
@@ -59,17 +60,7 @@ def map_folder(
     from segslam.run.report import write_report
 
     given, config = config, config or Config()
-    scans = open_dataset(
-        data,
-        sequence=sequence,
-        dataset=dataset,
-        labels=labels,
-        encoding=encoding,
-        frames=frames,
-        topic=topic,
-        intensities=config.map.color == "intensity",
-        vertical_angle_deg=config.sensor.vertical_angle_deg,
-    )
+    scans = open_scans(DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic), config)
     config = in_effect(given or preset(preset_for(extent_m(scans))), scans)
     folder = new_folder(Path(out))
     with Run(
@@ -91,6 +82,12 @@ def map_folder(
     write_metrics(folder, metrics)
     write_report(folder)
     return read_run(folder)
+
+
+def open_scans(source: DataSource, config: Config) -> Dataset:
+    """The scans as a run with these settings needs them: their vertical angle, and intensities if the map has them."""
+    by_intensity = config.map.color == "intensity"
+    return replace(source, intensities=by_intensity, vertical_angle_deg=config.sensor.vertical_angle_deg).open()
 
 
 def in_effect(settings: Config, scans: Dataset) -> Config:

@@ -15,10 +15,7 @@ from segslam.sessions.anchored import AnchoredGraph
 from segslam.sessions.placer import Placer
 from segslam.slam import Slam, SlamResult
 from segslam.trajectory import travelled_m
-from segslam.types import GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
-
-KEPT_WEIGHT = 0.5
-"""Placements with a smaller weight were rejected by the optimiser."""
+from segslam.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
 
 
 class Localiser(Slam):
@@ -67,7 +64,7 @@ class Localiser(Slam):
         travel_m = travelled_m(np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]))
         segment = np.cumsum([motion.is_break for motion in self._motions])
         distance_m = np.full(len(travel_m), np.inf)
-        kept = [number for number, weight in self._anchored.weights.items() if weight >= KEPT_WEIGHT]
+        kept = [number for number, weight in self._anchored.weights.items() if weight >= REJECTED_WEIGHT]
         placed = np.array([self._keyframe_rows[number] for number in sorted(kept)], dtype=int)
         for number in np.unique(segment[placed]):
             rows, own = np.flatnonzero(segment == number), placed[segment[placed] == number]

@@ -18,7 +18,7 @@ from segslam.run.run import Run
 from segslam.sessions.meeting import Meeting, Shown, attempt, meeting, not_shown
 from segslam.sessions.recorded import Session, Shift, next_shift, read_sessions, shifted_steps
 from segslam.slam import Slam, SlamResult
-from segslam.types import LoopAttempt, SegslamError, Step, Trajectory
+from segslam.types import REJECTED_WEIGHT, LoopAttempt, SegslamError, Step, Trajectory
 
 OPTIMIZE_EVERY = 25
 """Chosen: number of keyframes of a later session between two optimisations; odometry drifts little over 50 m."""
@@ -103,7 +103,7 @@ class Merged:
         return {
             "num_sessions": len(self.sessions),
             "num_loops_between": len(between),
-            "num_loops_between_switched_off": sum(weight < 0.5 for weight in between),
+            "num_loops_between_switched_off": sum(weight < REJECTED_WEIGHT for weight in between),
         }
 
 

@@ -10,6 +10,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation as ScipyRotation
 
+from segslam import geometry
 from segslam.trajectory import Poses
 from segslam.types import Vector
 
@@ -25,9 +26,7 @@ def upright(T_world_lidar: Poses) -> Poses:
     """The drive in a frame with z along the mean up direction of the sensor. It starts at the origin; yaw is kept."""
     up = T_world_lidar[:, :3, 2].mean(axis=0)
     up /= np.linalg.norm(up)
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    sine = np.linalg.norm(axis)
-    turn = ScipyRotation.from_rotvec(axis / max(sine, 1e-12) * np.arctan2(sine, up[2])).as_matrix()
+    turn = geometry.level(up)
     poses = T_world_lidar.copy()
     poses[:, :3, :3] = turn @ T_world_lidar[:, :3, :3]
     poses[:, :3, 3] = (T_world_lidar[:, :3, 3] - T_world_lidar[0, :3, 3]) @ turn.T

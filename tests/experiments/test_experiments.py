@@ -9,9 +9,10 @@ import pytest
 
 from segslam import geometry
 from segslam.config import Config
+from segslam.datasets import DataSource
 from segslam.experiments import paper, provenance
 from segslam.experiments.benchmark import run
-from segslam.experiments.job import DataSource, Job, SharedScan
+from segslam.experiments.job import Job, SharedScan
 from segslam.experiments.method_settings import METHOD_NAMES
 from segslam.experiments.pairs import PairList, cut_pairs, read_pairs, sample_pairs, true_poses
 from segslam.experiments.rows import Row, read_rows, write_rows

@@ -9,8 +9,9 @@ import pytest
 from helpers.drives import round_drive, write_kitti_sequence
 
 from segslam.config import Config
+from segslam.datasets import DataSource
 from segslam.experiments.benchmark import Pool, in_order, run
-from segslam.experiments.job import DataSource, Job
+from segslam.experiments.job import Job
 from segslam.experiments.pairs import PairList, cut_pairs
 from segslam.experiments.rows import Row, read_rows
 from segslam.experiments.trials import Trial

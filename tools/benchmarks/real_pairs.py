@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from segslam.config import Config
+from segslam.datasets import DataSource
 from segslam.experiments import benchmark
-from segslam.experiments.job import DataSource, Job
+from segslam.experiments.job import Job
 from segslam.experiments.pairs import PairList, read_pairs
 from segslam.experiments.rows import Row
 from segslam.experiments.trials import Trial

@@ -33,10 +33,9 @@ def finished(drive: Recorded, closures: list[LoopClosure]) -> dict[str, Any]:
     for closure in closures:
         graph.add_closure(closure)
     started = time.perf_counter()
-    weights = graph.finish().closure_weights.values()
+    rejected = graph.finish().rejected
     seconds = time.perf_counter() - started
-    switched_off = sum(weight < 0.5 for weight in weights)
-    return {**errors(graph.T_world_keyframes, drive), "switched_off": switched_off, "seconds": seconds}
+    return {**errors(graph.T_world_keyframes, drive), "switched_off": len(rejected), "seconds": seconds}
 
 
 def errors(poses: np.ndarray, drive: Recorded) -> dict[str, float]:

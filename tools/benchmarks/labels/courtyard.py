@@ -9,7 +9,8 @@ import numpy as np
 
 from segslam import geometry
 from segslam.config import Config
-from segslam.experiments.job import DataSource, open_once, points_of
+from segslam.datasets import DataSource
+from segslam.experiments.job import open_once, points_of
 from segslam.experiments.pairs import PairList, cut_pairs
 from segslam.experiments.rows import Row
 from segslam.experiments.summary import figures, grouped

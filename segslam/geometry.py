@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.types import Direction, Information, Points, Rotation, Tangent, Transform
+from segslam.types import Direction, Information, Points, Rotation, Tangent, Transform, Vector
 
 Triple = float | Sequence[float] | np.ndarray
 """Three numbers, or one for all three."""
@@ -138,6 +138,13 @@ def _cross(phi: np.ndarray) -> np.ndarray:
     """The matrix of the cross product with a vector."""
     x, y, z = phi.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def spherical(points: Points) -> tuple[Vector, Vector, Vector]:
+    """Range (m), elevation and azimuth (rad) of each point, of the dtype of `points`."""
+    x, y, z = points.T
+    level = np.hypot(x, y)
+    return np.hypot(level, z), np.arctan2(z, level), np.arctan2(y, x)
 
 
 def raise_beams(points: Points, angle_deg: float) -> Points:

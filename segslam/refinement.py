@@ -108,7 +108,7 @@ def downsample(points: Points, *, config: RefineConfig) -> Points:
     return voxel_means(points, config.voxel_m, beyond_m=0.0, within_m=config.max_range_m).astype(np.float32)
 
 
-def merge(clouds: Sequence[Points], *, config: RefineConfig) -> Points:
+def merge_clouds(clouds: Sequence[Points], *, config: RefineConfig) -> Points:
     """Downsampled clouds of the same frame merged: the mean point of each voxel, float32."""
     return voxel_means(np.vstack(clouds), config.voxel_m).astype(np.float32)
 

@@ -1,6 +1,6 @@
 """Checks before a run is mapped, resumed or replayed."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -47,6 +47,8 @@ def log_to_resume(folder: Path) -> "RunLog":
 
 def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options: Mapping[str, str]) -> None:
     """Raises SegslamError if a run would be resumed with other data, settings or options."""
+    from segslam.config import changed_settings
+
     for key, before, now in changed_settings(recorded.config, settings):
         raise SegslamError(
             f"{key}: {now} now, but {recorded.path} was started with {before}; a resumed run keeps its settings"
@@ -66,12 +68,3 @@ def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
     result = recorded.result()
     has_results = (recorded.path.parent / "report.html").is_file()  # the last file that a run writes
     return has_results and result is not None and bool(result[1].scan_index[-1] == scans.scan_index[-1])
-
-
-def changed_settings(before: "Config", now: "Config") -> "Iterator[tuple[str, object, object]]":
-    """`section.key` and both values, for each setting that differs."""
-    for section in type(now).model_fields:
-        old, new = getattr(before, section), getattr(now, section)
-        for key in type(new).model_fields:
-            if getattr(old, key) != getattr(new, key):
-                yield f"{section}.{key}", getattr(old, key), getattr(new, key)

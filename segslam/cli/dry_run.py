@@ -3,7 +3,6 @@
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from segslam.cli.checks import changed_settings
 from segslam.errors import BadScan, SegslamError
 
 if TYPE_CHECKING:
@@ -16,12 +15,13 @@ def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
     """Figures of the data set and of its first readable scan. Raises SegslamError if no scan is readable."""
     import numpy as np
 
-    from segslam.config import Config
+    from segslam import geometry
+    from segslam.config import Config, changed_settings
 
     (first_row, first), (last_row, last) = _first_usable(scans), _first_usable(scans, backwards=True)
     seconds = (last.stamp_ns - first.stamp_ns) / 1e9
-    ranges_m = np.linalg.norm(first.points, axis=1)
-    elevation_deg = np.degrees(np.arcsin(first.points[:, 2] / ranges_m))
+    ranges_m, elevations, _ = geometry.spherical(first.points)
+    elevation_deg = np.degrees(elevations)
     changed = {key: value for key, _, value in changed_settings(Config(), settings)}
     return {
         "data": scans.name,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import changed_settings, check_exists
+from segslam.cli.checks import check_exists
 from segslam.cli.compiling import compile_kernels
 from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, progress
 from segslam.cli.ending import finish
@@ -83,6 +83,7 @@ def replay(
 
 def _check_settings(settings_now: "Config", recorded: "RunLog") -> None:
     """Raises SegslamError for a change that would have no effect."""
+    from segslam.config import changed_settings
     from segslam.types import SegslamError
 
     for key, before, _ in changed_settings(recorded.config, settings_now):

@@ -1,6 +1,6 @@
 """All settings: their sections, with units, ranges and sources (`sections`), and their YAML (`files`)."""
 
-from segslam.config.files import config_from_yaml, config_to_yaml, load_config
+from segslam.config.files import changed_settings, config_from_yaml, config_to_yaml, load_config
 from segslam.config.sections import (
     USER_SETTINGS,
     Config,
@@ -37,6 +37,7 @@ __all__ = [
     "SegregatorConfig",
     "SensorCalibrationConfig",
     "VerifyConfig",
+    "changed_settings",
     "config_from_yaml",
     "config_to_yaml",
     "load_config",

@@ -1,7 +1,7 @@
 """Settings from YAML files and from texts `section.key=value`, and the other way round."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,15 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base
 def config_to_yaml(config: Config) -> str:
     """All settings as YAML, from which `load_config` makes an equal Config."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def changed_settings(before: Config, now: Config) -> Iterator[tuple[str, Any, Any]]:
+    """`section.key` and its two values, as in YAML, of each setting that differs."""
+    old, new = before.model_dump(mode="json"), now.model_dump(mode="json")
+    for section, values in new.items():
+        for key, value in values.items():
+            if value != old[section][key]:
+                yield f"{section}.{key}", old[section][key], value
 
 
 def config_from_yaml(text: str, source: str) -> Config:

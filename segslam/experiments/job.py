@@ -42,7 +42,7 @@ class SharedScan:
     unusable: bool = False
 
 
-def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
+def shared_scan(job: Job, variant: ScanVariant) -> SharedScan:
     """Read, rotate, label and prepare a scan, and remove some labels. Geometric labels are those of rotated points."""
     dataset, row_of_scan = open_once(job.source)
     try:

@@ -12,7 +12,7 @@ from segslam.config import Config
 from segslam.experiments import report_figures
 from segslam.experiments.report_tables import html, markdown, tables, varied
 from segslam.run.report import figures
-from segslam.run.report.page import changed_settings, document, plot_section, png_section, section, settings_tables
+from segslam.run.report.page import document, plot_section, png_section, section, settings_not_default, settings_tables
 from segslam.system.whole_files import write_whole
 
 
@@ -77,5 +77,5 @@ def _facts(report: dict[str, Any]) -> dict[str, Any]:
         "labels": report["labels"],
         "pairs": ", ".join(f"{one['name']}: {one['pairs']} of {one['of']}" for one in report["lists"]),
         "options": ", ".join(f"{name} {value}" for name, value in report["options"].items() if value is not None),
-        "settings other than the defaults": changed_settings(Config.model_validate(report["settings"])) or "none",
+        "settings other than the defaults": settings_not_default(Config.model_validate(report["settings"])) or "none",
     }

@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 from itertools import islice
 from typing import Any
 
-from segslam.experiments.job import Job, failed_row, prepare_scan, register_trial
+from segslam.experiments.job import Job, failed_row, register_trial, shared_scan
 from segslam.experiments.rows import Row
 from segslam.experiments.trials import ScanVariant, Trial
 from segslam.system.extras import how_to_install
@@ -25,7 +25,7 @@ LOST_WORKER = "worker_lost"
 
 def run_here(job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]]:
     """Yields the rows of one trial after the other."""
-    prepared = lru_cache(NUM_SCANS_KEPT)(partial(prepare_scan, job))
+    prepared = lru_cache(NUM_SCANS_KEPT)(partial(shared_scan, job))
     for trial in trials:
         yield register_trial(job, trial, prepared(trial.source), prepared(trial.target))
 
@@ -69,7 +69,7 @@ def run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]
 
     def prepared(variant: ScanVariant) -> Any:
         if variant not in scans:
-            scans[variant] = client.submit(prepare_scan, job, variant, pure=False)
+            scans[variant] = client.submit(shared_scan, job, variant, pure=False)
         return scans[variant]
 
     def submit(trial: Trial) -> Any:

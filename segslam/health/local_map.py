@@ -91,7 +91,7 @@ class LocalMap:
         if self._surface is None:
             T_map_odom = geometry.inverse(self.T_odom_map)
             clouds = [geometry.apply(T_map_odom @ T_odom_lidar, thinned) for T_odom_lidar, thinned, _ in self._scans]
-            merged = clouds[0] if len(clouds) == 1 else refinement.merge(clouds, config=self._refine)
+            merged = clouds[0] if len(clouds) == 1 else refinement.merge_clouds(clouds, config=self._refine)
             self._surface = self.make_surface(merged)
         return self._surface
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from segslam.config import MapConfig
-from segslam.map.ground_heights import ground_heights
+from segslam.map.lowest_ground import lowest_ground
 from segslam.map.tiles import Tile, distance_m
 from segslam.types import GROUND_LABELS, Label, Labels, Points, Vector
 
@@ -53,7 +53,7 @@ def free_range_m(points: Points, labels: Labels, *, low_m: float, high_m: float)
         return np.zeros(NUM_DIRECTIONS)
     is_ground = np.isin(labels, np.array(GROUND_LABELS, np.uint8))
     within = points + np.array([REACH_M, REACH_M, 0.0])
-    height_m = points[:, 2] - ground_heights(within, within[is_ground] if is_ground.any() else within, 2 * REACH_M)
+    height_m = points[:, 2] - lowest_ground(within, within[is_ground] if is_ground.any() else within, 2 * REACH_M)
     stands = (height_m >= low_m) & (height_m <= high_m) & ~is_ground
     range_m, direction = np.hypot(points[:, 0], points[:, 1]), _direction(points[:, 0], points[:, 1])
     farthest, nearest = np.zeros(NUM_DIRECTIONS), np.full(NUM_DIRECTIONS, np.inf)

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from segslam.config import MapConfig
-from segslam.map.ground_heights import ground_heights
+from segslam.map.lowest_ground import lowest_ground
 from segslam.map.part import Extent, Part
 from segslam.map.tiles import TILE_M, corner
 from segslam.types import GROUND_LABELS
@@ -65,7 +65,7 @@ class Grid:
         """(cells, cells) uint8, the southernmost row first."""
         within = part.points - corner(part.tile)
         is_ground = np.isin(part.labels, np.array(GROUND_LABELS, np.uint8))
-        height_m = within[:, 2] - ground_heights(within, within[is_ground] if is_ground.any() else within, TILE_M)
+        height_m = within[:, 2] - lowest_ground(within, within[is_ground] if is_ground.any() else within, TILE_M)
         column, row = np.clip((within[:, :2] / TILE_M * self._cells).astype(np.int64), 0, self._cells - 1).T
         low_m, high_m = self._config.obstacle_m
         cell = row * self._cells + column

@@ -40,7 +40,7 @@ class Views:
     def add(self, points: Points) -> None:
         """Add the points (n, 3) of the next keyframe, in its own frame."""
         with self._file.open("ab") as stream:
-            view(points.astype(np.float32), self._spread_m).tofile(stream)
+            nearest_returns(points.astype(np.float32), self._spread_m).tofile(stream)
 
     def __getitem__(self, number: int) -> np.ndarray:
         """(NUM_ROWS, NUM_COLUMNS) uint16, the range image of the keyframe added as number 0, 1, ..."""
@@ -58,7 +58,7 @@ def _direction(x, y, z):
 
 
 @kernel("uint16[:, :](float32[:, :], float64)")
-def view(points, spread_m):
+def nearest_returns(points, spread_m):
     """Range image in units of STEP_M; each point covers all pixels within `spread_m` of it."""
     nearest = np.full((NUM_ROWS, NUM_COLUMNS), NOTHING, np.uint16)
     for x, y, z in points:

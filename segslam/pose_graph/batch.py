@@ -110,7 +110,7 @@ def _solve(
     if robust == "none":
         factors = joined(backbone, factor_graph(problem.closures))
         return least_squares(factors, start, redundancy=problem.redundancy(weights)), weights
-    kernel = noise.kernel(robust, noise.inlier_bound(inlier_probability))
+    kernel = noise.robust_kernel(robust, noise.inlier_bound(inlier_probability))
     return search(joined(backbone, factor_graph(problem.closures, kernel=kernel)), start), weights
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from segslam.pose_graph import gnc
 from segslam.pose_graph.closure_pairs import ends_m, neighbours, num_near
 from segslam.pose_graph.edges import Edge, factor_graph, joined
-from segslam.pose_graph.motions import Drive, Found, solve
+from segslam.pose_graph.motions import Constants, MotionSolution, solve
 from segslam.types import Mask, Vector
 
 MAX_PAIRED = 5_000
@@ -40,19 +40,19 @@ class Measured:
         return np.minimum(1.0, PLACE_PENALTY / num_near(ends_m(self.closures, self.travel_m), PLACE_M))
 
 
-def solve_gnc(measured: Measured, start: gtsam.Values) -> Found:
+def solve_gnc(measured: Measured, start: gtsam.Values) -> MotionSolution:
     """Poses and inliers by graduated non-convexity; all motions are kept."""
     backbone = joined(measured.prior, factor_graph(measured.odometry))
     problem = gnc.TruncatedProblem(backbone, measured.closures, measured.inlier_bound, penalties=measured.penalties())
-    return Found(gnc.solve(problem, start), np.zeros(len(measured.odometry), dtype=bool))
+    return MotionSolution(gnc.solve(problem, start), np.zeros(len(measured.odometry), dtype=bool))
 
 
-def solve_consistent(measured: Measured, start: gtsam.Values, rejected: Mask) -> Found:
+def solve_consistent(measured: Measured, start: gtsam.Values, rejected: Mask) -> MotionSolution:
     """Poses and inliers starting from the largest pairwise-consistent set, and motions that are rejected (again)."""
     if len(measured.closures) > MAX_PAIRED:
         return solve_gnc(measured, start)
     near = neighbours(ends_m(measured.closures, measured.travel_m), PLACE_M)
-    drive = Drive(
+    drive = Constants(
         measured.prior,
         measured.closures,
         measured.penalties(),

@@ -59,7 +59,7 @@ class PoseGraph:
         self._robust = gtsam.NonlinearFactorGraph()
         """The same factors with the robust kernel."""
         self._inlier_bound = noise.inlier_bound(config.inlier_probability, error_allowance=config.error_allowance)
-        self._kernel = noise.kernel(config.robust, self._inlier_bound)
+        self._kernel = noise.robust_kernel(config.robust, self._inlier_bound)
         self._values = gtsam.Values()
         self._T_world = Rows(np.empty((0, 4, 4)))
         """The poses in `_values`, as an array."""

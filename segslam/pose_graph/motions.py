@@ -35,7 +35,7 @@ TURN_M = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drive:
+class Constants:
     """The constant data of the problem while motions are rejected."""
 
     prior: gtsam.NonlinearFactorGraph
@@ -58,7 +58,7 @@ class Drive:
         return select_consistent(self.problem(odometry), start, consistent, self.near)
 
 
-class Found(NamedTuple):
+class MotionSolution(NamedTuple):
     """A solution and the motions that it rejects (n - 1,)."""
 
     solution: Solution
@@ -77,18 +77,18 @@ def without(odometry: Sequence[Edge], rejected: Mask) -> list[Edge]:
     ]
 
 
-def solve(drive: Drive, odometry: Sequence[Edge], start: gtsam.Values, rejected: Mask) -> Found:
+def solve(drive: Constants, odometry: Sequence[Edge], start: gtsam.Values, rejected: Mask) -> MotionSolution:
     """The best solution near `start`, where motions that were rejected before are rejected again or restored."""
     none = np.zeros(len(odometry), dtype=bool)
-    found = _reject(drive, odometry, Found(drive.solve(odometry, start), none))
+    found = _reject(drive, odometry, MotionSolution(drive.solve(odometry, start), none))
     if not rejected.any():
         return found
     kept = without(odometry, rejected)
-    again = _reject(drive, kept, Found(drive.solve(kept, start), rejected))
+    again = _reject(drive, kept, MotionSolution(drive.solve(kept, start), rejected))
     return min(again, found, key=lambda each: each.cost(drive.inlier_bound))
 
 
-def _reject(drive: Drive, odometry: Sequence[Edge], best: Found) -> Found:
+def _reject(drive: Constants, odometry: Sequence[Edge], best: MotionSolution) -> MotionSolution:
     """The solution without the motions that groups of rejected closures contradict.
 
     Without such a group the solution stays as it is.
@@ -112,7 +112,7 @@ def _reject(drive: Drive, odometry: Sequence[Edge], best: Found) -> Found:
         start = values_of(_bent(poses_by_id(best.solution.search.values), jump))
         rejected = best.rejected.copy()
         rejected[jump.a] = True
-        trial = Found(drive.solve(trial_odometry, start), rejected)
+        trial = MotionSolution(drive.solve(trial_odometry, start), rejected)
         if trial.cost(drive.inlier_bound) < best.cost(drive.inlier_bound):
             best, consistent, left = trial, None, trial.solution.weights == 0.0
             T_world_a, T_world_b = poses_by_id(trial.solution.search.values)[jump.a : jump.b + 1]
@@ -126,7 +126,7 @@ def _bent(T_world: Transforms, motion: Edge) -> Transforms:
     return np.concatenate([T_world[: motion.b], T_new_old @ T_world[motion.b :]])
 
 
-def _jump(drive: Drive, odometry: Sequence[Edge], group: Mask, weights: Vector) -> Edge | None:
+def _jump(drive: Constants, odometry: Sequence[Edge], group: Mask, weights: Vector) -> Edge | None:
     """The motion that a group of closures contradicts, as they measure it; None if rejecting it costs more.
 
     All closures of the group span it. Inliers that span it contradict the group, so it is one where their penalties are

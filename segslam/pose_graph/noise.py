@@ -88,7 +88,7 @@ def inlier_bound(probability: float, *, error_allowance: float = 1.0) -> float:
     return error_allowance**2 * float(chdtri(DEGREES_OF_FREEDOM, 1.0 - probability))
 
 
-def kernel(name: str, inlier_bound: float) -> Kernel | None:
+def robust_kernel(name: str, inlier_bound: float) -> Kernel | None:
     """A robust kernel as wide as the bound of inliers; None for least squares (`none`)."""
     estimators = gtsam.noiseModel.mEstimator
     width = math.sqrt(inlier_bound)

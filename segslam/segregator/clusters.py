@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from segslam import geometry
 from segslam.config import SegregatorConfig
 from segslam.points import EMPTY, canonical_order, find_key, group_means, hash_keys, within_range
 from segslam.system.kernels import kernel
@@ -65,11 +66,11 @@ def curved_voxel_clusters(
     """
     if not len(points):
         return np.empty(0, np.int64)
-    polar = _polar(points)
+    range_m, elevation, turn = geometry.spherical(points)
     num_azimuth = max(1, round(360.0 / azimuth_deg))
-    radial = _radial_bins(polar[:, 0], start_m, step_m)
-    pitch = _nearest_bin(polar[:, 1] - min(0.0, polar[:, 1].min()), math.radians(pitch_deg))
-    azimuth = _nearest_bin(polar[:, 2], math.tau / num_azimuth) % num_azimuth
+    radial = _radial_bins(range_m, start_m, step_m)
+    pitch = _nearest_bin(elevation - min(0.0, elevation.min()), math.radians(pitch_deg))
+    azimuth = _nearest_bin(turn, math.tau / num_azimuth) % num_azimuth
     num_radial = int(radial.max()) + 2  # one more than occupied: neighbours of the outermost bin have keys of their own
     keys, voxel = np.unique((pitch * num_radial + radial) * num_azimuth + azimuth, return_inverse=True)
     return _components(keys, num_radial, num_azimuth)[voxel]
@@ -99,13 +100,6 @@ def _class_clusters(points: Points, label: Label, min_points: int, config: Segre
     area = sizes[large] * (means**2).sum(axis=1)
     order = np.lexsort((*means.T, -area))[: config.max_clusters_per_class]
     return Clusters(means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[large][order])
-
-
-def _polar(points: Points) -> Points:
-    """Range (m), pitch and azimuth (rad) of each point, a row each."""
-    x, y, z = points.T
-    level = np.hypot(x, y)
-    return np.column_stack((np.hypot(level, z), np.arctan2(z, level), np.arctan2(y, x)))
 
 
 def _nearest_bin(values: Vector, width: float) -> Indices:

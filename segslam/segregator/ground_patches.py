@@ -26,14 +26,14 @@ RESOLUTION_M = 1e-4
 """Unit of the integer sums of coordinates (m), which do not depend on the order of points."""
 
 
-class Ground(NamedTuple):
+class GroundPatches(NamedTuple):
     """Patches, a row each: centre (m) and unit normal. float32."""
 
     points: Points
     normals: Points
 
 
-def ground_patches(points: Points, labels: Labels) -> Ground:
+def ground_patches(points: Points, labels: Labels) -> GroundPatches:
     """The ground patches of a scan, in the frame of `points`, whose origin is the sensor. NaN points are ignored.
 
     Normals point towards the sensor.
@@ -49,7 +49,7 @@ def ground_patches(points: Points, labels: Labels) -> Ground:
     flat = (variances[:, 0] <= MAX_THICKNESS_M**2) & (variances[:, 1] >= MIN_BREADTH_M**2)
     centres, normals = centres[flat], axes[flat, :, 0]
     away = np.sum(normals * centres, axis=1, keepdims=True) > 0.0
-    return Ground(centres.astype(np.float32), np.where(away, -normals, normals).astype(np.float32))
+    return GroundPatches(centres.astype(np.float32), np.where(away, -normals, normals).astype(np.float32))
 
 
 @kernel("int64[:, ::1](float64[:, ::1], float64, float64, float64)")

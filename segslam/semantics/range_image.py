@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from segslam import geometry
 from segslam.semantics.network_settings import ImageSettings, NetworkSettings
 from segslam.types import Indices, Points, Vector
 
@@ -36,10 +37,9 @@ def project(points: Points, *, settings: ImageSettings) -> Projection:
     The first column is behind the sensor; columns go clockwise as seen from above. Points above or below the field of
     view are assigned to the first or last row.
     """
-    ranges_m = np.linalg.norm(points, axis=1)
+    ranges_m, elevations, azimuths = geometry.spherical(points)
     low, high = np.radians(settings.field_of_view_deg)
-    elevations = np.arcsin(np.clip(points[:, 2] / ranges_m, -1.0, 1.0))
-    turns = 0.5 - np.arctan2(points[:, 1], points[:, 0]) / math.tau
+    turns = 0.5 - azimuths / math.tau
     rows = np.clip(np.floor((high - elevations) / (high - low) * settings.height), 0, settings.height - 1)
     columns = np.clip(np.floor(turns * settings.width), 0, settings.width - 1)
     rows, columns = rows.astype(np.int64), columns.astype(np.int64)

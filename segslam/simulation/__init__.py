@@ -4,7 +4,7 @@ from segslam.simulation.drift import SweepError, sweep_errors
 from segslam.simulation.drive import drive_sweeps, simulate_drive
 from segslam.simulation.files import prepare_folder, write_drive, write_sequence
 from segslam.simulation.label_errors import LabelErrorConfig, network_like
-from segslam.simulation.levelling import level, upright
+from segslam.simulation.levelling import level_revisits, level_world
 from segslam.simulation.routes import example_loop
 from segslam.simulation.sensor import Sensor, Sweep, make_sensor, sweep
 from segslam.simulation.tracks import Drive, example_drive, in_lane, read_drive
@@ -27,7 +27,8 @@ __all__ = [
     "example_drive",
     "example_loop",
     "in_lane",
-    "level",
+    "level_revisits",
+    "level_world",
     "make_sensor",
     "network_like",
     "prepare_folder",
@@ -36,7 +37,6 @@ __all__ = [
     "simulation_config",
     "sweep",
     "sweep_errors",
-    "upright",
     "write_drive",
     "write_sequence",
 ]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segslam.simulation.mesh import Mesh, box, merge, mesh, placed, stem
+from segslam.simulation.mesh import Mesh, box, join_meshes, mesh, placed, stem
 from segslam.types import Label, Vector
 
 STOREYS_M = (0.0, 0.9, 2.2, 3.6, 4.9, 6.4, 7.7)  # heights of sills and lintels, alternating
@@ -19,7 +19,7 @@ def building(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
         for sign in (-1, 1)
     ]
     core = box(width_m - 1.0, depth_m - 1.0, levels[-1] - 0.5, levels[-1], Label.BUILDING, at=(0.0, depth_m / 2))
-    return merge([front, back, *sides, core])
+    return join_meshes([front, back, *sides, core])
 
 
 def wall(rng: np.random.Generator, width_m: float, levels: Vector, *, relief: float) -> Mesh:
@@ -77,7 +77,7 @@ def fence(rng: np.random.Generator, length_m: float) -> Mesh:
     posts = [
         box(0.1, 0.1, 0.0, height + 0.1, Label.FENCE, at=(x, 0.06)) for x in np.arange(-length_m / 2, length_m / 2, 2.5)
     ]
-    return merge([*pickets, *posts])
+    return join_meshes([*pickets, *posts])
 
 
 def lamp(rng: np.random.Generator) -> Mesh:
@@ -90,7 +90,7 @@ def sign(rng: np.random.Generator) -> Mesh:
     """A traffic sign with its post; the plate faces -x."""
     height, width, tall = rng.uniform(2.1, 2.9), rng.uniform(0.45, 0.75), rng.uniform(0.45, 0.9)
     plate = box(0.02, width, height - tall, height, Label.TRAFFIC_SIGN, at=(-0.06, 0.0))
-    return merge([stem((0.035, 0.035), (-0.2, height), Label.POLE, sides=6), plate])
+    return join_meshes([stem((0.035, 0.035), (-0.2, height), Label.POLE, sides=6), plate])
 
 
 def clutter(rng: np.random.Generator) -> Mesh:

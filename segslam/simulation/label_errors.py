@@ -3,6 +3,7 @@
 import numpy as np
 from pydantic import Field
 
+from segslam import geometry
 from segslam.config import Section
 from segslam.types import Label, Labels, Points
 
@@ -88,8 +89,8 @@ def _blurred(labels: Labels, points: Points, share: float, rng: np.random.Genera
 
 def _pixels(points: Points) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of each point in the range image."""
-    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    _, elevation, azimuth = geometry.spherical(points)
     low, high = (elevation.min(), elevation.max()) if len(points) else (0.0, 1.0)
     row = (elevation - low) / max(high - low, 1e-9) * (IMAGE[0] - 1)
-    column = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * IMAGE[1]
+    column = (azimuth / (2 * np.pi) + 0.5) * IMAGE[1]
     return np.rint(row).astype(int), column.astype(int) % IMAGE[1]

@@ -22,7 +22,7 @@ TENSION_M = 10.0  # chosen: prevents the correction from overshooting the differ
 MAX_SLOPE = 0.2  # chosen: steeper than any street of the data
 
 
-def upright(T_world_lidar: Poses) -> Poses:
+def level_world(T_world_lidar: Poses) -> Poses:
     """The drive in a frame with z along the mean up direction of the sensor. It starts at the origin; yaw is kept."""
     up = T_world_lidar[:, :3, 2].mean(axis=0)
     up /= np.linalg.norm(up)
@@ -33,7 +33,7 @@ def upright(T_world_lidar: Poses) -> Poses:
     return poses
 
 
-def level(T_world_lidar: Poses) -> Poses:
+def level_revisits(T_world_lidar: Poses) -> Poses:
     """The drive with one height for each place; x, y and yaw are unchanged. z must point up."""
     positions = T_world_lidar[:, :3, 3]
     travel = _travel_m(positions)

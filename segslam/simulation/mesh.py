@@ -41,7 +41,7 @@ def mesh(vertices: np.ndarray, triangles: np.ndarray, label: Label, *, glass: bo
     )
 
 
-def merge(parts: Sequence[Mesh]) -> Mesh:
+def join_meshes(parts: Sequence[Mesh]) -> Mesh:
     """All parts as one mesh; an empty mesh if there are no parts."""
     if not parts:
         return mesh(np.empty((0, 3)), np.empty((0, 3)), Label.UNLABELLED)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segslam.simulation.mesh import Mesh, leaves, merge, stem
+from segslam.simulation.mesh import Mesh, join_meshes, leaves, stem
 from segslam.types import Label
 
 
@@ -18,7 +18,7 @@ def tree(rng: np.random.Generator, *, scale: float | None = None) -> Mesh:
         lean=rng.normal(scale=0.03),
     )
     crown = _ball(rng, 220, hollow=0.3) * [spread, spread, rise] + [0.0, 0.0, clear + 0.7 * rise]
-    return merge([trunk, leaves(crown, 0.55, rng)])
+    return join_meshes([trunk, leaves(crown, 0.55, rng)])
 
 
 def bush(rng: np.random.Generator, width_m: float, height_m: float) -> Mesh:

@@ -8,7 +8,7 @@ import numpy as np
 import open3d as o3d
 
 from segslam import geometry
-from segslam.simulation.mesh import Mesh, box, leaves, merge, mesh, placed, stem
+from segslam.simulation.mesh import Mesh, box, join_meshes, leaves, mesh, placed, stem
 from segslam.simulation.plants import bush, tree
 from segslam.simulation.vehicles import car
 from segslam.simulation.world import Hits, cast_mesh, scene_of
@@ -34,7 +34,7 @@ class Scene:
 
 
 def _scene(parts: Sequence[Mesh], path: np.ndarray, max_shift_m: float) -> Scene:
-    whole = merge(parts)
+    whole = join_meshes(parts)
     return Scene(whole, path, max_shift_m, scene_of(whole))
 
 
@@ -222,6 +222,6 @@ def _ground(rng: np.random.Generator, size: float, step: float) -> Mesh:
         [np.column_stack([at, at + len(side), at + 1]), np.column_stack([at + 1, at + len(side), at + len(side) + 1])]
     )
     tufts = np.column_stack([rng.uniform(0.0, size, (2500, 2)), rng.uniform(0.05, 0.35, 2500)])
-    return merge(
+    return join_meshes(
         [mesh(np.column_stack([x.ravel(), y.ravel(), z.ravel()]), triangles, Label.TERRAIN), leaves(tufts, 0.3, rng)]
     )

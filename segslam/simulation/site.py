@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from segslam.simulation.mesh import Mesh, placed
-from segslam.simulation.terrain import CELL_M, Ground, middle_of_street
+from segslam.simulation.terrain import CELL_M, Terrain, middle_of_street
 from segslam.types import Label, Vector
 
 STREET_GAP_M = 7.0  # chosen: a path nearer than this to an earlier part of itself is on the same street
@@ -48,7 +48,7 @@ def frontages(path: np.ndarray) -> tuple[Frontage, Frontage]:
 class Site:
     """The ground, and the cells on which objects stand."""
 
-    def __init__(self, ground: Ground) -> None:
+    def __init__(self, ground: Terrain) -> None:
         self.ground = ground
         self._taken = np.zeros(ground.height_m.shape, dtype=bool)
 

@@ -22,7 +22,7 @@ Raster = Float[np.ndarray, "_ _"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ground:
+class Terrain:
     """Rasters with cells of CELL_M over x (rows) and y (columns), starting at `origin`."""
 
     origin: Float[np.ndarray, "2"]
@@ -56,7 +56,7 @@ def middle_of_street(path: np.ndarray) -> np.ndarray:
     return path[:, :2] + LANE_M * np.column_stack([-tangent[:, 1], tangent[:, 0]])
 
 
-def ground_of(path: np.ndarray, rng: np.random.Generator) -> Ground:
+def ground_of(path: np.ndarray, rng: np.random.Generator) -> Terrain:
     """The ground with a road through `path` (n, 3); points of the road are at most 1 m apart."""
     origin = np.floor(path[:, :2].min(axis=0) - MARGIN_M)
     span = np.ceil(path[:, :2].max(axis=0) + MARGIN_M) - origin
@@ -67,7 +67,7 @@ def ground_of(path: np.ndarray, rng: np.random.Generator) -> Ground:
     coarse += _relief(rng, street_m[::COARSE, ::COARSE])
     kerb = np.clip((street_m - ROAD_M) / CELL_M, 0.0, 1.0) * KERB_M
     labels = np.select([street_m < ROAD_M, street_m < SIDEWALK_M], [Label.ROAD, Label.SIDEWALK], Label.TERRAIN)
-    return Ground(origin, path_m, street_m, _refined(coarse) + kerb, labels.astype(np.uint8))
+    return Terrain(origin, path_m, street_m, _refined(coarse) + kerb, labels.astype(np.uint8))
 
 
 def _distance_m(at: np.ndarray, shape: tuple[int, ...]) -> Raster:
@@ -106,7 +106,7 @@ def _refined(coarse: Raster) -> Raster:
     return map_coordinates(coarse, np.stack(np.meshgrid(*along, indexing="ij")), order=1)
 
 
-def ground_mesh(ground: Ground) -> Mesh:
+def ground_mesh(ground: Terrain) -> Mesh:
     """Triangles of CELL_M near the road and of COARSE cells elsewhere, within MARGIN_M of the path.
 
     The boundary lies beyond the kerb, where fine nodes lie on the edges of coarse triangles: the mesh has no gaps.

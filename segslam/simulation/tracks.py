@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam import geometry
-from segslam.simulation.levelling import level, upright
+from segslam.simulation.levelling import level_revisits, level_world
 from segslam.simulation.routes import example_loop
 from segslam.trajectory import Poses, lidar_from_camera, read_poses
 from segslam.types import SegslamError, Transform, Vector
@@ -61,7 +61,7 @@ def read_drive(poses_file: Path, *, sequence: str) -> Drive:
     T_camera_lidar = parse_calib(calib, source=str(calib_file))
     count = len(T_world_camera)
     time_s = np.arange(count) * PERIOD_S if times_file is None else _times(times_file, count)
-    return Drive(level(upright(lidar_from_camera(T_world_camera, T_camera_lidar))), time_s, calib)
+    return Drive(level_revisits(level_world(lidar_from_camera(T_world_camera, T_camera_lidar))), time_s, calib)
 
 
 def _beside(poses_file: Path, name: str, sequence: str) -> Path | None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segslam.simulation.mesh import Mesh, box, extruded, frustum, merge
+from segslam.simulation.mesh import Mesh, box, extruded, frustum, join_meshes
 from segslam.types import Label
 
 CAR_KINDS = (  # share; ranges of length, width, height (m); ranges of hood and boot as shares of the length
@@ -28,7 +28,7 @@ def car(rng: np.random.Generator, label: Label = Label.CAR) -> Mesh:
     middle, cabin = (front + back) / 2, front - back
     roof = (cabin * rng.uniform(0.62, 0.74), width * 0.74, middle - cabin * 0.06)
     glazed = frustum((cabin, width * 0.94, middle), roof, belt, height - 0.06, label, glass=True)
-    return merge(
+    return join_meshes(
         [
             extruded(body, width, label),
             glazed,
@@ -42,7 +42,7 @@ def truck(rng: np.random.Generator) -> Mesh:
     """A lorry with cab and cargo box, 5.5-9 m long."""
     length, width, height = rng.uniform(5.5, 9.0), rng.uniform(2.1, 2.5), rng.uniform(2.7, 3.5)
     cab = rng.uniform(1.6, 2.1)
-    return merge(
+    return join_meshes(
         [
             box(cab, width * 0.95, 0.45, min(height, 2.6), Label.TRUCK, at=(length / 2 - cab / 2, 0.0)),
             box(length - cab - 0.25, width, 0.9, height, Label.TRUCK, at=(-cab / 2 - 0.12, 0.0)),
@@ -53,7 +53,7 @@ def truck(rng: np.random.Generator) -> Mesh:
 
 def _wheels(length: float, width: float, label: Label) -> Mesh:
     """Four short boxes, the visible parts of the wheels."""
-    return merge(
+    return join_meshes(
         [
             box(0.6, 0.2, 0.0, 0.3, label, at=(sx * length * 0.31, sy * (width / 2 - 0.12)))
             for sx in (-1, 1)

@@ -6,12 +6,12 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import open3d as o3d
 
-from segslam.simulation.mesh import Flags, Instances, Mesh, as_instance, merge
+from segslam.simulation.mesh import Flags, Instances, Mesh, as_instance, join_meshes
 from segslam.simulation.parking import ParkedCar, parked_cars
 from segslam.simulation.path import Route, route_of, street_of
 from segslam.simulation.site import Site, frontages
 from segslam.simulation.streets import furnish
-from segslam.simulation.terrain import Ground, ground_mesh, ground_of
+from segslam.simulation.terrain import Terrain, ground_mesh, ground_of
 from segslam.simulation.traffic import MovingCar, meshes_at, moving_cars
 from segslam.simulation.world_settings import WorldConfig
 from segslam.trajectory import Poses
@@ -37,7 +37,7 @@ class World:
     """Streets along one drive, made by `build_world`. Equal arguments make equal worlds."""
 
     def __init__(
-        self, ground: Ground, static: Mesh, route: Route, parked: list[ParkedCar], moving: list[MovingCar], day: int
+        self, ground: Terrain, static: Mesh, route: Route, parked: list[ParkedCar], moving: list[MovingCar], day: int
     ) -> None:
         self.day = day
         self.ground = ground
@@ -66,7 +66,7 @@ class World:
 
 
 def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> World:
-    """Streets along a drive with level poses (`levelling.level`), z up; `time_s` (n,) ascending.
+    """Streets along a drive with level poses (`levelling.level_revisits`), z up; `time_s` (n,) ascending.
 
     Every pose is `config.sensor_height_m` above the road, and no static object stands on the path. On another
     `config.day` the streets are the same, but parked and moving cars differ.
@@ -81,7 +81,7 @@ def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, se
     parked = _numbered_cars([car for side in sides for car in parked_cars(site, side, route, config, rng, today=today)])
     things = [thing for side in sides for thing in furnish(site, side, config, rng)]
     standing = [car.mesh for car in parked if not car.changes]
-    static = merge([ground_mesh(ground), *standing, *_numbered(things)])
+    static = join_meshes([ground_mesh(ground), *standing, *_numbered(things)])
     changing = [car for car in parked if car.changes]
     return World(ground, static, route, changing, moving_cars(route, config, today or rng), config.day)
 
@@ -116,7 +116,7 @@ def cast_mesh(scene: o3d.t.geometry.RaycastingScene, part: Mesh, rays: np.ndarra
     return Hits(range_m, part.labels[hit], part.instances[hit], cos, part.glass[hit])
 
 
-def _relabelled(hits: Hits, ground: Ground, rays: np.ndarray) -> Hits:
+def _relabelled(hits: Hits, ground: Terrain, rays: np.ndarray) -> Hits:
     """Hits of terrain with the class of the ground at each point: road, sidewalk, ..."""
     rows = np.flatnonzero((hits.labels == Label.TERRAIN) & np.isfinite(hits.range_m))
     at = rays[rows, :2] + hits.range_m[rows, None] * rays[rows, 3:5]

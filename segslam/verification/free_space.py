@@ -52,8 +52,8 @@ def observe_free_space(points: Points) -> FreeSpace:
     """The spherical image of a scan; `points` (n, 3) in the sensor's frame."""
     rays = np.ascontiguousarray(points, np.float32)
     rays = rays.compress(within_range(rays, 0.0, np.inf), axis=0)
-    elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
-    column = ((np.arctan2(rays[:, 1], rays[:, 0]) + np.pi) * (NUM_COLUMNS / math.tau)).astype(np.int64) % NUM_COLUMNS
+    _, elevation, azimuth = geometry.spherical(rays)
+    column = ((azimuth + np.pi) * (NUM_COLUMNS / math.tau)).astype(np.int64) % NUM_COLUMNS
     lowest_rad = float(elevation.min(initial=np.inf)) if len(rays) else 0.0
     row_rad = _row_height(elevation - lowest_rad, column)
     num_rows = 1 + int((float(elevation.max(initial=lowest_rad)) - lowest_rad) / row_rad)

@@ -213,11 +213,11 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[ScanVariant]:
     """Registrations without scans: which of them were prepared."""
     prepared: list[ScanVariant] = []
 
-    def prepare_scan(job: Job, variant: ScanVariant) -> SharedScan:
+    def shared_scan(job: Job, variant: ScanVariant) -> SharedScan:
         prepared.append(variant)
         return SharedScan({}, unusable=True)
 
-    monkeypatch.setattr("segslam.experiments.workers.prepare_scan", prepare_scan)
+    monkeypatch.setattr("segslam.experiments.workers.shared_scan", shared_scan)
     return prepared
 
 

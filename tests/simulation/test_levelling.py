@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.simulation.levelling import MAX_SLOPE, level, upright
+from segslam.simulation.levelling import MAX_SLOPE, level_revisits, level_world
 from segslam.simulation.tracks import read_drive
 
 
@@ -38,19 +38,21 @@ def height_gaps(poses: np.ndarray, *, radius_m: float, apart: int) -> np.ndarray
 def test_two_visits_of_one_place_get_one_height():
     drive = two_rounds(3.0)
     assert height_gaps(drive, radius_m=1.5, apart=100).min() > 2.5
-    assert height_gaps(level(drive), radius_m=1.5, apart=100).max() < 0.05  # neighbours on a slope differ a little
+    assert (
+        height_gaps(level_revisits(drive), radius_m=1.5, apart=100).max() < 0.05
+    )  # neighbours on a slope differ a little
 
 
 def test_positions_in_the_plane_and_headings_stay():
     drive = two_rounds(3.0)
-    levelled = level(drive)
+    levelled = level_revisits(drive)
     np.testing.assert_array_equal(levelled[:, :2, 3], drive[:, :2, 3])
     headings = [np.arctan2(poses[:, 1, 0], poses[:, 0, 0]) for poses in (drive, levelled)]
     np.testing.assert_allclose(*headings, atol=1e-12)
 
 
 def test_poses_pitch_with_their_new_slope():
-    levelled = level(two_rounds(3.0))
+    levelled = level_revisits(two_rounds(3.0))
     step = np.diff(levelled[:, :3, 3], axis=0)
     slope = step[:, 2] / np.linalg.norm(step, axis=1)
     # 0.3 degrees: the slope is that of stations a metre apart, the poses are 0.8 m apart
@@ -62,7 +64,7 @@ def test_poses_pitch_with_their_new_slope():
 def test_a_drive_without_revisits_keeps_its_heights():
     along = np.linspace(0.0, 300.0, 250)
     drive = driven(np.column_stack([along, 0.1 * along]), 2.0 * np.sin(along / 40.0))
-    np.testing.assert_allclose(level(drive), drive, atol=1e-9)
+    np.testing.assert_allclose(level_revisits(drive), drive, atol=1e-9)
 
 
 def test_a_standing_car_does_not_rise():
@@ -70,7 +72,7 @@ def test_a_standing_car_does_not_rise():
     climbing = np.concatenate([np.zeros(50), np.linspace(0.0, 9.0, 60), np.full(50, 9.0)])
     drive = np.tile(np.eye(4), (160, 1, 1))
     drive[:, 0, 3], drive[:, 2, 3] = along, climbing
-    levelled = level(drive)
+    levelled = level_revisits(drive)
     assert np.ptp(levelled[50:110, 2, 3]) < 1e-3
     # the last jump, of a metre's travel, is all that may remain
     assert np.abs(np.diff(levelled[:, 2, 3])).max() <= MAX_SLOPE * 1.03
@@ -79,7 +81,7 @@ def test_a_standing_car_does_not_rise():
 def test_upright_turns_the_mean_up_to_z_and_keeps_relative_poses():
     tilt = np.eye(4)
     tilt[:3, :3] = ScipyRotation.from_euler("xy", [4.0, -7.0], degrees=True).as_matrix()
-    drive = upright(tilt @ two_rounds(0.0))
+    drive = level_world(tilt @ two_rounds(0.0))
     np.testing.assert_allclose(drive[:, :3, 2].mean(axis=0), [0.0, 0.0, 1.0], atol=1e-3)
     np.testing.assert_allclose(drive[0, :3, 3], 0.0, atol=1e-12)
     before = np.linalg.inv(two_rounds(0.0)[10]) @ two_rounds(0.0)[200]
@@ -87,7 +89,7 @@ def test_upright_turns_the_mean_up_to_z_and_keeps_relative_poses():
 
 
 def test_a_single_pose_stays_where_it_is():
-    np.testing.assert_array_equal(level(np.eye(4)[None]), np.eye(4)[None])
+    np.testing.assert_array_equal(level_revisits(np.eye(4)[None]), np.eye(4)[None])
 
 
 @pytest.mark.data

@@ -5,7 +5,7 @@ import open3d as o3d
 import pytest
 
 from segslam.simulation import buildings, plants, vehicles
-from segslam.simulation.mesh import Mesh, as_instance, box, extruded, frustum, merge, placed, stem
+from segslam.simulation.mesh import Mesh, as_instance, box, extruded, frustum, placed, stem
 from segslam.types import Label
 
 

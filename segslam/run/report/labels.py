@@ -7,6 +7,7 @@ from jaxtyping import UInt8
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from segslam import geometry
 from segslam.semantics.class_colors import Colors, of_classes
 from segslam.semantics.network_settings import ImageSettings
 from segslam.semantics.range_image import EMPTY, project
@@ -47,7 +48,7 @@ def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: 
 
 def fitting_image(points: Points) -> ImageSettings:
     """An image for a scan of any sensor; excludes the lowest and highest percent of its points."""
-    elevations = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    elevations = np.degrees(geometry.spherical(points)[1])
     low, high = np.percentile(elevations, [1, 99])
     return ImageSettings(field_of_view_deg=(float(low), float(max(high, low + 1.0))), height=64, width=1024)
 

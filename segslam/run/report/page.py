@@ -11,7 +11,7 @@ from typing import Any
 from pydantic.fields import FieldInfo
 
 from segslam.calibration import vertical_angle_advice
-from segslam.config import Config, Section
+from segslam.config import Config, Section, changed_settings
 from segslam.run.finished import FIGURES, FinishedRun
 from segslam.types import Rejected
 
@@ -120,20 +120,14 @@ def _files(run: FinishedRun) -> str:
 
 def _conditions(run: FinishedRun, about: Mapping[str, str]) -> str:
     facts = {name: about[key] for key, name in CONDITIONS.items() if key in about}
-    facts["settings other than the defaults"] = changed_settings(run.config) or "none"
+    facts["settings other than the defaults"] = settings_not_default(run.config) or "none"
     rows = (f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in facts.items())
     return f"<table>{''.join(rows)}</table>"
 
 
-def changed_settings(config: Config) -> str:
+def settings_not_default(config: Config) -> str:
     """The settings that differ from the defaults, in the format of `--set`."""
-    values, usual = config.model_dump(mode="json"), Config().model_dump(mode="json")
-    return ", ".join(
-        f"{section}.{key}={value}"
-        for section, keys in values.items()
-        for key, value in keys.items()
-        if value != usual[section][key]
-    )
+    return ", ".join(f"{key}={value}" for key, _, value in changed_settings(Config(), config))
 
 
 def document(title: str, body: str) -> str:

@@ -13,7 +13,7 @@ from segslam.datasets.kitti import read_calibration
 from segslam.evaluation import trajectory_metrics
 from segslam.keyframes import KeyframeSelector
 from segslam.pose_graph.noise import odometry_information
-from segslam.simulation import level, upright
+from segslam.simulation import level_revisits, level_world
 from segslam.trajectory import lidar_from_camera, read_poses, travelled_m
 from segslam.types import Alignment, LoopClosure, Registration
 
@@ -66,7 +66,7 @@ def exact(loops: Iterable[LoopClosure], truth: np.ndarray) -> list[LoopClosure]:
 def read_drive(data: Path, sequence: str, odometry: str, rng: np.random.Generator) -> Drive:
     """`odometry`: measured (trajectories/simple_online_NN.txt), drifting, or what the graph expects or just allows."""
     T_camera_lidar = read_calibration(data / "kitti" / "sequences" / sequence / "calib.txt")
-    truth = level(upright(_lidar_poses(data / "kitti" / "poses" / f"{sequence}.txt", T_camera_lidar)))
+    truth = level_revisits(level_world(_lidar_poses(data / "kitti" / "poses" / f"{sequence}.txt", T_camera_lidar)))
     if odometry == "measured":
         measured = _lidar_poses(data / "trajectories" / f"simple_online_{sequence}.txt", T_camera_lidar)
         rows = _keyframe_rows(measured)

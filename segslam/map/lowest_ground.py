@@ -8,7 +8,7 @@ from segslam.types import Points, Vector
 GROUND_CELL_M = 2.0
 
 
-def ground_heights(points: Points, ground: Points, side_m: float) -> Vector:
+def lowest_ground(points: Points, ground: Points, side_m: float) -> Vector:
     """Height (n,) of the ground (m) below each point: the lowest point of `ground` in its cell, or in the nearest cell.
 
     All points lie within a square of `side_m`, with x and y measured from its corner.

@@ -7,7 +7,7 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.map import map_data
-from segslam.cli.run_options import DataArgument, RunOptions
+from segslam.cli.run_options import DataArgument, OutputOptions, RunOptions
 from segslam.cli.shared_options import with_options
 
 
@@ -17,6 +17,7 @@ def localise(
     data: DataArgument,
     out: Annotated[Path, typer.Option(help="New folder for the run; with --resume the folder of the run.")],
     options: RunOptions,
+    output: OutputOptions,
 ) -> None:
     """Localise new scans in the map of an earlier run; writes a run folder like `map`, in the frame of the earlier run.
 
@@ -25,4 +26,4 @@ def localise(
     friday_scans --out runs/friday
     """
     check_exists(run, "give the folder of a finished run")
-    map_data(data, out, options, in_map=run)
+    map_data(data, out, options, output, in_map=run)

@@ -18,7 +18,7 @@ from segslam.cli.export import map_summary, write_maps
 from segslam.cli.foxglove import serve_foxglove
 from segslam.cli.given_odometry import given_odometry
 from segslam.cli.in_map import pipeline
-from segslam.cli.run_options import DataArgument, DryRunOption, RunOptions
+from segslam.cli.run_options import DataArgument, DryRunOption, OutputOptions, RunOptions
 from segslam.cli.shared_options import with_options
 from segslam.cli.view import check_display, close_scene, open_scene
 from segslam.errors import SegslamError
@@ -43,6 +43,7 @@ def map_command(
         Path | None, typer.Option(help="New folder for the run; with --resume the folder of the run.  [required]")
     ] = None,
     options: RunOptions,
+    output: OutputOptions,
     dry_run: DryRunOption = False,
 ) -> None:
     """Map scans: write the corrected trajectory, the loops, a log, a report and, with ground truth, the error.
@@ -51,39 +52,45 @@ def map_command(
     """
     if out is None and not dry_run:
         raise SegslamError("--out: give a new folder for the run, as in --out runs/00 (to look first: --dry-run)")
-    map_data(data, out or Path(), options, dry_run=dry_run)
+    map_data(data, out or Path(), options, output, dry_run=dry_run)
 
 
 def map_data(
-    data: Path, folder: Path, options: RunOptions, *, dry_run: bool = False, in_map: Path | None = None
+    data: Path,
+    folder: Path,
+    options: RunOptions,
+    output: OutputOptions,
+    *,
+    dry_run: bool = False,
+    in_map: Path | None = None,
 ) -> None:
     """Map scans into a folder, or localise them in the map of the run `in_map`; `dry_run` prints what would be done."""
-    quiet = options.quiet
-    if options.view:
+    quiet = output.quiet
+    if output.view:
         check_display()
     check_exists(data, "give the folder with sequences/ or with the scans")
     recorded = log_to_resume(folder) if options.resume and not dry_run else None
     check_preset(options.preset, resumes=recorded is not None)
-    settings = options.load_config(base=recorded.config if recorded else None)
+    settings = output.load_config(base=recorded.config if recorded else None)
     announce(f"map: opening {data}" if in_map is None else f"localise: reading the map of {in_map}", quiet=quiet)
     slam_of = pipeline(in_map)
     from segslam.run.map_folder import open_scans
 
-    map_names, map_files = options.maps(folder)
+    map_names, map_files = output.maps(folder)
     scans = open_scans(options.source(data), settings)
     if settings.map.color == "intensity":
         check_intensities(scans)
     choices = ({"in_map": str(in_map.expanduser().resolve())} if in_map else {}) | options.choices()
     given = given_odometry(options.odometry, scans, settings.odometry) if options.odometry else None
     if recorded is None:
-        settings = options.load_config(base=preset_config(options.preset, scans, quiet=quiet))
+        settings = output.load_config(base=preset_config(options.preset, scans, quiet=quiet))
     if dry_run:
-        _show_dry_run(scans, settings, json=options.json, quiet=quiet)
+        _show_dry_run(scans, settings, json=output.json, quiet=quiet)
         return
     if recorded is not None:
         check_same(recorded, settings, dataset=scans.name, options=choices)
         if is_finished(recorded, scans):
-            _complete(recorded, map_files, config=settings.map, json=options.json, quiet=quiet)
+            _complete(recorded, map_files, config=settings.map, json=output.json, quiet=quiet)
             raise typer.Exit(0)
     source = {
         "data": str(data.expanduser().resolve()),
@@ -91,9 +98,9 @@ def map_data(
         "sequence": options.sequence,
         "map_files": json_text.dumps([str(name) for name in map_names]),
     }
-    scene = open_scene(None, view_every=settings.log.view_every) if options.view else None
+    scene = open_scene(None, view_every=settings.log.view_every) if output.view else None
     with ExitStack() as stack:
-        server = serve_foxglove(options.foxglove, stack, quiet=quiet)
+        server = serve_foxglove(output.foxglove, stack, quiet=quiet)
         map_scans(
             scans,
             folder,
@@ -106,7 +113,7 @@ def map_data(
             go_on=f"continue with: segslam resume {shlex.quote(str(folder))}",
             slam_of=slam_of,
             mirror=server.send if server else None,
-            json=options.json,
+            json=output.json,
             quiet=quiet,
         )
     if scene:

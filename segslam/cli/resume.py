@@ -9,7 +9,7 @@ import typer
 from segslam.cli.checks import check_exists, log_to_resume
 from segslam.cli.console import JsonOption, QuietOption, announce
 from segslam.cli.map import map_data
-from segslam.cli.run_options import RunOptions, ViewOption
+from segslam.cli.run_options import OutputOptions, RunOptions, ViewOption
 from segslam.errors import SegslamError
 
 
@@ -48,10 +48,9 @@ def resume(
         labels=chosen["labels"],
         encoding=chosen["encoding"] or None,
         odometry=Path(chosen["odometry"]) if chosen["odometry"] else None,
-        map_file=[Path(name) for name in json_text.loads(chosen["map_files"])],
-        view=view,
         resume=True,
-        json=json,
-        quiet=quiet,
     )
-    map_data(Path(chosen["data"]), run, options, in_map=Path(chosen["in_map"]) if chosen.get("in_map") else None)
+    map_files = [Path(name) for name in json_text.loads(chosen["map_files"])]
+    output = OutputOptions(map_file=map_files, view=view, json=json, quiet=quiet)
+    in_map = Path(chosen["in_map"]) if chosen.get("in_map") else None
+    map_data(Path(chosen["data"]), run, options, output, in_map=in_map)

@@ -86,8 +86,8 @@ class OutputOptions:
 
 
 @dataclass(frozen=True)
-class RunOptions(OutputOptions):
-    """All options that `map` and `localise` share."""
+class RunOptions:
+    """What is mapped, and how: of `map` and `localise`."""
 
     dataset: DatasetOption = None
     sequence: SequenceOption = "00"

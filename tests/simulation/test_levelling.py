@@ -38,9 +38,7 @@ def height_gaps(poses: np.ndarray, *, radius_m: float, apart: int) -> np.ndarray
 def test_two_visits_of_one_place_get_one_height():
     drive = two_rounds(3.0)
     assert height_gaps(drive, radius_m=1.5, apart=100).min() > 2.5
-    assert (
-        height_gaps(level_revisits(drive), radius_m=1.5, apart=100).max() < 0.05
-    )  # neighbours on a slope differ a little
+    assert height_gaps(level_revisits(drive), radius_m=1.5, apart=100).max() < 0.05  # a slope between neighbours
 
 
 def test_positions_in_the_plane_and_headings_stay():

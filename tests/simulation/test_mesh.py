@@ -5,7 +5,7 @@ import open3d as o3d
 import pytest
 
 from segslam.simulation import buildings, plants, vehicles
-from segslam.simulation.mesh import Mesh, as_instance, box, extruded, frustum, placed, stem
+from segslam.simulation.mesh import Mesh, as_instance, box, extruded, frustum, join_meshes, placed, stem
 from segslam.types import Label
 
 
@@ -54,13 +54,13 @@ def test_a_stem_has_its_radii_and_lean():
 
 def test_merging_keeps_every_part_as_it_was():
     parts = [box(1, 1, 0, 1, Label.CAR), as_instance(box(2, 2, 0, 2, Label.POLE, at=(9.0, 9.0)), 7)]
-    whole = merge(parts)
+    whole = join_meshes(parts)
     for part, start in zip(parts, (0, len(parts[0].triangles)), strict=True):
         rows = slice(start, start + len(part.triangles))
         np.testing.assert_array_equal(whole.vertices[whole.triangles[rows]], part.vertices[part.triangles])
         np.testing.assert_array_equal(whole.labels[rows], part.labels)
         np.testing.assert_array_equal(whole.instances[rows], part.instances)
-    assert len(merge([]).triangles) == 0
+    assert len(join_meshes([]).triangles) == 0
 
 
 def test_placing_turns_counter_clockwise_then_moves():

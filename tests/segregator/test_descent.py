@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 from segslam import geometry
-from segslam.segregator.descent import GATE, GROUND_SLOPE, least_cost, squared_distances
+from segslam.segregator.descent import GATE, GROUND_SLOPE, MAX_STEPS, STEP_DONE, least_cost, squared_distances
 from segslam.types import Transform
 
 NOISE, SHARE, GROUND_NOISE, GROUND_WEIGHT = 0.07, 0.35, 0.1, 0.3
@@ -126,3 +127,53 @@ def test_centroids_alone_are_enough_and_no_ground_is_no_error() -> None:
     T_found, information = solve({**s, **none}, T_TRUE)
     assert np.allclose(T_found, T_TRUE, atol=1e-9)
     assert np.all(np.linalg.eigvalsh(information) > 0)
+
+
+def plain_rows(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Jacobian of the distances of points from planes: [point x normal, normal]."""
+    return np.hstack([np.cross(points, normals), normals])
+
+
+def plain_weights(gaps: np.ndarray, points: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    variances = GROUND_NOISE**2 + GROUND_SLOPE**2 * np.sum((points - centres) ** 2, axis=1)
+    return GROUND_WEIGHT / (variances + gaps**2)
+
+
+def plain_least_cost(s: dict[str, np.ndarray], T: Transform) -> tuple[Transform, np.ndarray]:
+    """`least_cost` in NumPy: all residuals and Jacobians of a step at once."""
+    for _ in range(MAX_STEPS):
+        R = T[:3, :3]
+        T_back = geometry.inverse(T)
+        errors = geometry.apply(T_back, s["target"]) - s["source"]
+        spread = s["source_covariances"] + R.T @ s["target_covariances"] @ R
+        W = np.linalg.inv(SHARE**2 * spread + 2 * NOISE**2 * np.eye(3))
+        W /= 1.0 + np.einsum("ni,nij,nj->n", errors, W, errors)[:, None, None] / 3.0
+        J = np.tile(np.hstack([np.zeros((3, 3)), np.eye(3)]), (len(errors), 1, 1))
+        J[:, :, :3] = np.cross(s["source"][:, None], np.eye(3))
+        H = np.einsum("nur,nuv,nvc->rc", J, W, J)
+        g = np.einsum("nur,nuv,nv->r", J, W, errors)
+        centres, normals = geometry.apply(T_back, s["target_planes"]), s["target_normals"] @ R
+        points = geometry.apply(T_back, s["target_patches"])
+        forth = np.sum(normals * (centres - s["source_patches"]), axis=1)
+        back = np.sum(s["source_normals"] * (points - s["source_planes"]), axis=1)
+        rows = np.vstack([plain_rows(s["source_patches"], normals), plain_rows(points, s["source_normals"])])
+        weights = np.hstack(
+            [plain_weights(forth, s["source_patches"], centres), plain_weights(back, points, s["source_planes"])]
+        )
+        H += rows.T @ (weights[:, None] * rows)
+        g += rows.T @ (weights * np.hstack([forth, back]))
+        step = np.linalg.solve(H + 1e-9 * np.eye(6), g)
+        T = T @ geometry.transform(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
+        if np.abs(step).max() < STEP_DONE:
+            break
+    return T, H
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_pose_and_information_are_those_of_plain_numpy(seed: int) -> None:
+    s = scene(seed, centroid_noise_m=0.3)
+    T_start = T_TRUE @ geometry.exp(geometry.tangent(rotation_rad=[0.03, -0.03, 0.07], translation_m=[0.6, -0.6, 0.3]))
+    T_found, information = solve(s, T_start)
+    T_plain, H = plain_least_cost(s, T_start)
+    np.testing.assert_allclose(T_found, T_plain, atol=1e-9)
+    np.testing.assert_allclose(information, H, rtol=1e-6, atol=1e-6 * np.abs(H).max())

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from segslam.map.grid import ground_heights
 from segslam.map.histogram import Histogram
+from segslam.map.lowest_ground import lowest_ground
 from segslam.map.tiles import TILE_M, Tiles, corner, distance_m
 from segslam.map.views import CELL_RAD, NOTHING, NUM_COLUMNS, NUM_ROWS, STEP_M, Views, count_votes
 from segslam.map.voxels import VOXEL, merged
@@ -107,7 +107,7 @@ def test_views_and_votes_are_those_of_plain_loops(tmp_path: Path) -> None:
 def test_ground_is_the_lowest_in_the_cell_or_in_the_nearest_with_ground() -> None:
     ground = np.array([[1.0, 1.0, -1.0], [1.5, 0.5, -2.0], [31.0, 31.0, 5.0]])
     asked = np.array([[0.2, 0.2, 0.0], [4.0, 4.0, 0.0], [30.1, 31.9, 9.0], [25.0, 28.0, 0.0]])
-    np.testing.assert_array_equal(ground_heights(asked, ground, 32.0), [-2.0, -2.0, 5.0, 5.0])
+    np.testing.assert_array_equal(lowest_ground(asked, ground, 32.0), [-2.0, -2.0, 5.0, 5.0])
 
 
 def _sorted(points: np.ndarray) -> np.ndarray:

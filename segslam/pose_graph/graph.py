@@ -21,7 +21,7 @@ from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, pos
 from segslam.pose_graph.final import Measured, solve_consistent, solve_gnc
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
 from segslam.pose_graph.levenberg_marquardt import search
-from segslam.pose_graph.motions import Found, without
+from segslam.pose_graph.motions import MotionSolution, without
 from segslam.pose_graph.rows import Rows
 from segslam.pose_graph.steady_drift import noise_factor, steady_drift, turned
 from segslam.types import GraphEstimate, Information, LoopClosure, Mask, SegslamError, Transform, Vector
@@ -206,7 +206,7 @@ class PoseGraph:
             final = self._solve_final()
         return self._estimate(final.solution.search.error, final.solution.weights)
 
-    def _solve_final(self) -> Found:
+    def _solve_final(self) -> MotionSolution:
         measured = Measured(
             self._prior(),
             self._odometry,

@@ -20,7 +20,7 @@ from segslam.run.folder import write_metrics
 from segslam.run.report import write_report
 from segslam.run.report.figures import draw_loops
 from segslam.run.report.gallery import choose, outcome_text
-from segslam.run.report.page import changed_settings, number, page
+from segslam.run.report.page import number, page, settings_not_default
 from segslam.types import SegslamError
 
 VOID = {"meta", "img"}
@@ -173,7 +173,7 @@ def test_conditions_name_when_where_and_how_the_run_was_made(tmp_path: Path, mon
     assert conditions["command"] == "segslam map my_drive"
     assert "cores" in conditions["processor"]
     assert conditions["settings other than the defaults"] == "none"
-    assert changed_settings(load_config(None, ["map.color=height"])) == "map.color=height"
+    assert settings_not_default(load_config(None, ["map.color=height"])) == "map.color=height"
 
 
 def test_the_gallery_has_the_best_accepted_and_the_nearest_missed_loops(tmp_path: Path) -> None:

@@ -63,9 +63,9 @@ def yaw(
 
     Example: segslam bench yaw kitti --sequence 05 --step-deg 5 --out yaw05
     """
+    job = make_job(data, options)
     from segslam.experiments.variations import PAPER_PAIR, turned_trials
 
-    job = make_job(data, options)
     reference = reference_of(job)
     lists = read_lists(options, reference, default=PAPER_PAIR)
     trials = [trial for one in lists for trial in turned_trials(one, reference, step_deg=step_deg)]
@@ -89,9 +89,9 @@ def deterioration(
 
     Example: segslam bench deterioration kitti --sequence 05 --labels predictions --clouds one --out lost05
     """
+    job = make_job(data, options)
     from segslam.experiments.variations import PAPER_PAIR, unlabelled_trials
 
-    job = make_job(data, options)
     reference = reference_of(job)
     lists = read_lists(options, reference, default=PAPER_PAIR)
     reduced = partial(
@@ -142,9 +142,10 @@ def places(
 
 
 def _run_pairs(experiment: str, data: Path, options: Options) -> None:
+    # as in `yaw`, what loads scipy is imported after the first message, which is that of make_job
+    job = make_job(data, options)
     from segslam.experiments.variations import pair_trials
 
-    job = make_job(data, options)
     reference = reference_of(job)
     lists = read_lists(options, reference)
     trials = [trial for one in lists for trial in pair_trials(one, reference)]

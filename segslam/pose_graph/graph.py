@@ -228,7 +228,7 @@ class PoseGraph:
         """Correct a steady drift of the heading, if that explains a drift beyond the tolerated errors."""
         kept = [edge for edge, weight in zip(self._closures, weights, strict=True) if weight > 0.0]
         growth = np.column_stack([np.diff(self.travel_m), np.nan_to_num(np.diff(self._time_s.all()))])
-        growth[np.array(self._has_own_information) | self._rejected_motions()] = 0.0
+        growth[np.array(self._has_own_information, dtype=bool) | self._rejected_motions()] = 0.0
         raised = self._config
         self.use_odometry_noise(0.0, 0.0)
         tolerated = self._config.error_allowance

@@ -165,7 +165,7 @@ class MotionState(StrEnum):
     REPAIRED = "repaired"
     """Replaced by a registration: the motion of the odometry was off by more than the tolerance."""
     REJOINED = "rejoined"
-    """Registered with the scans before a break, which joins the trajectory again."""
+    """Registered with the scans before a break. The motion since the scan before, which is at a guess, is unknown."""
     BROKEN = "broken"
     """A break: the motion is a guess that no scan supports."""
     BEGUN = "begun"

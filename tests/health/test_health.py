@@ -137,6 +137,8 @@ def test_an_unsupported_motion_is_a_break_and_is_repaired_when_the_map_is_visibl
     assert information is not None
     assert np.sqrt(1 / information[3, 3]) >= 5.0, "metres"
     assert states[21] is MotionState.REJOINED
+    assert results[21].motion is not None
+    np.testing.assert_array_equal(results[21].motion.information, information)  # the scan before is at a guess
     assert (
         geometry.distance(
             geometry.inverse(geometry.inverse(truth.T_world_lidar[19]) @ truth.T_world_lidar[21])
@@ -145,6 +147,25 @@ def test_an_unsupported_motion_is_a_break_and_is_repaired_when_the_map_is_visibl
         )
         < 0.1
     )
+
+
+@pytest.mark.parametrize("degrees", [-25.0, 32.0])
+def test_a_sudden_turn_is_registered_from_turned_guesses(degrees: float) -> None:
+    """Both the odometry and its prediction miss the turn, and no registration without initial guess is accepted."""
+    scans, truth = round_drive()
+    turn = geometry.transform(geometry.yaw(np.radians(degrees)), np.zeros(3))
+    turned = replace(scans[SLIP_AT], points=geometry.apply(geometry.inverse(turn), scans[SLIP_AT].points))
+    none = Rejected(RejectReason.HIGH_RESIDUAL)
+    odometry = CheckedOdometry(_given(truth.T_world_lidar), CONFIG, recover=lambda source, target: none)
+    results = _registered(odometry, [*scans[:SLIP_AT], turned])
+    motion = results[-1].motion
+    assert motion is not None
+    assert motion.state is MotionState.REPAIRED
+    before, now = truth.T_world_lidar[SLIP_AT - 1 : SLIP_AT + 1]
+    T_before_found = geometry.inverse(results[-2].T_odom_lidar) @ results[-1].T_odom_lidar
+    T_true_found = geometry.inverse(now @ turn) @ before @ T_before_found
+    assert geometry.distance(T_true_found) < 0.1
+    assert np.degrees(geometry.angle(T_true_found)) < 0.3
 
 
 def test_a_keyframe_follows_a_break_and_its_motion_has_nearly_no_information() -> None:

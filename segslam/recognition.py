@@ -150,10 +150,9 @@ def _clear_winner(
 
 
 def _mismatch(scan: PreparedScan, place: PreparedScan, alignment: Alignment) -> float:
-    """Mismatch as defined by `gates.Agreement`."""
+    """Mismatch as defined by `gates.mismatch`."""
     roughness_m = max(scan.surface.roughness_m, place.surface.roughness_m)
-    ratio = alignment.rms_m / roughness_m
-    return gates.Agreement(alignment.overlap, alignment.rms_m, ratio, alignment.free_space_violation).mismatch
+    return gates.mismatch(alignment.overlap, alignment.rms_m / roughness_m)
 
 
 def _apart_m(T_world_a: Transform, T_world_b: Transform) -> float:

@@ -24,7 +24,7 @@ from segslam.verification.gates import (
 CONFIG = VerifyConfig()
 REFINE = RefineConfig()
 LIMITS = limits(SINGLE_PAIR, config=CONFIG)
-RIGHT = Agreement(overlap=0.9, rms_m=0.05, residual_ratio=0.7, free_space_violation=0.0)
+RIGHT = Agreement(overlap=0.9, rms_m=0.05, residual_ratio=0.7, free_space_violation=0.0, free_path_m=7.0)
 
 
 def _prepared(points: np.ndarray) -> Observed:
@@ -68,9 +68,9 @@ def test_ground_alone_is_no_overlap() -> None:
 def test_each_test_rejects_for_its_own_reason() -> None:
     assert rejection(RIGHT, LIMITS) is None
     cases = {
-        RejectReason.LOW_OVERLAP: Agreement(0.1, 0.05, 0.7, 0.0),
-        RejectReason.HIGH_RESIDUAL: Agreement(0.9, 0.5, 3.0, 0.0),
-        RejectReason.FREE_SPACE_VIOLATED: Agreement(0.9, 0.05, 0.7, 0.2),
+        RejectReason.LOW_OVERLAP: Agreement(0.1, 0.05, 0.7, 0.0, 7.0),
+        RejectReason.HIGH_RESIDUAL: Agreement(0.9, 0.5, 3.0, 0.0, 7.0),
+        RejectReason.FREE_SPACE_VIOLATED: Agreement(0.9, 0.05, 0.7, 0.2, 7.0),
     }
     for reason, found in cases.items():
         rejected = rejection(found, LIMITS)
@@ -112,13 +112,15 @@ def test_limits_follow_the_neighbours_of_the_run() -> None:
     assert better.max_free_space_violation == CONFIG.max_free_space_violation
 
 
-def test_scans_that_overlap_as_neighbours_do_must_fit_nearly_as_well() -> None:
+def test_in_a_narrow_place_scans_that_overlap_as_neighbours_do_must_fit_nearly_as_well() -> None:
     floor = NoiseFloor(overlap=0.8, residual_ratio=0.7, free_space_violation=0.0)
     allowed = limits(floor, config=CONFIG)
     most = allowed.max_residual_ratio, allowed.max_free_space_violation
-    assert allowed.at(0.4) == allowed.at(0.1) == pytest.approx(most), "up to half of the overlap of neighbours"
-    assert allowed.at(0.8) == allowed.at(0.95) == pytest.approx((0.85 * most[0], 0.5 * most[1]))
-    between = Agreement(overlap=0.8, rms_m=0.1, residual_ratio=0.9 * most[0], free_space_violation=0.0)
+    narrow_m, street_m = 3.0, 7.0
+    assert allowed.at(0.4, narrow_m) == allowed.at(0.1, narrow_m) == pytest.approx(most), "half of that overlap"
+    assert allowed.at(0.8, narrow_m) == allowed.at(0.95, narrow_m) == pytest.approx((0.85 * most[0], 0.5 * most[1]))
+    assert allowed.at(0.8, street_m) == pytest.approx(most), "in a street the parked cars change"
+    between = Agreement(0.8, 0.1, residual_ratio=0.9 * most[0], free_space_violation=0.0, free_path_m=narrow_m)
     rejected = rejection(between, allowed)
     assert rejected is not None
     assert rejected.reason is RejectReason.HIGH_RESIDUAL
@@ -131,9 +133,9 @@ def test_neighbours_that_share_their_points_do_not_make_the_limit_stricter_than_
 
 
 def test_an_alignment_is_certain_if_it_agrees_as_well_as_neighbours_do() -> None:
-    assert is_certain(Agreement(0.7, 0.1, SINGLE_PAIR.residual_ratio, 0.004), SINGLE_PAIR)
-    assert not is_certain(Agreement(0.7, 0.1, 1.4 * SINGLE_PAIR.residual_ratio, 0.004), SINGLE_PAIR)
-    assert not is_certain(Agreement(0.7, 0.1, SINGLE_PAIR.residual_ratio, 0.02), SINGLE_PAIR)
+    assert is_certain(Agreement(0.7, 0.1, SINGLE_PAIR.residual_ratio, 0.004, 7.0), SINGLE_PAIR)
+    assert not is_certain(Agreement(0.7, 0.1, 1.4 * SINGLE_PAIR.residual_ratio, 0.004, 7.0), SINGLE_PAIR)
+    assert not is_certain(Agreement(0.7, 0.1, SINGLE_PAIR.residual_ratio, 0.02, 7.0), SINGLE_PAIR)
 
 
 def test_a_coarse_pose_is_rejected_early_beyond_three_times_the_free_space_allowed() -> None:

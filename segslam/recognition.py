@@ -3,13 +3,14 @@
 A place is accepted only if no other place fits almost as well, because streets repeat.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from segslam import geometry
 from segslam.config import Config
-from segslam.registration import Gate, PreparedScan, Stopwatch, register_prepared
+from segslam.registration import Gate, PreparedScan, Stopwatch, may_match, register_prepared
 from segslam.retrieval import PlaceCandidate
 from segslam.system.short_repr import Record
 from segslam.types import Alignment, Rejected, RejectReason, Transform
@@ -54,10 +55,14 @@ def recognise(
     """
     watch = watch or Stopwatch()
 
-    def tried(place_id: int, also: Gate) -> Recognised | Rejected:
+    def tried(place_id: int, also: Gate, mismatch: float = math.inf) -> Recognised | Rejected:
         with watch("prepare"):
             place = places(place_id)
         both = _Both(gate(place_id), also)
+        if mismatch < math.inf and not may_match(
+            scan, place, config=config, gate=both, floor=floor, mismatch=mismatch, watch=watch
+        ):
+            return Rejected(RejectReason.LOW_OVERLAP, "fits much worse")
         found = register_prepared(scan, place, config=config, gate=both, floor=floor, watch=watch)
         if isinstance(found, Rejected):
             return found
@@ -67,8 +72,9 @@ def recognise(
     for place_id in _spread(candidates, T_world_place, max_places):
         outcome = tried(place_id, _no_gate)
         if isinstance(outcome, Recognised):
+            most = config.verify.rival_ratio * _mismatch(scan, places(place_id), outcome.alignment)
             rivals = [
-                tried(other, _Elsewhere(outcome.T_world_lidar, T_world_place(other)))
+                tried(other, _Elsewhere(outcome.T_world_lidar, T_world_place(other)), most)
                 for other in _others(outcome, candidates, T_world_place)
             ]
             others = [rival for rival in rivals if isinstance(rival, Recognised)]

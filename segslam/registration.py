@@ -32,8 +32,9 @@ from segslam.verification import gates
 from segslam.verification.free_space import FreeSpace, observe_free_space
 
 Labeller = Callable[[Points], Labels]
-SHIFTS_M = tuple(sign * float(shift_m) for shift_m in range(1, 9) for sign in (-1.0, 1.0))
-"""Chosen: shifts along the weak direction where rivals are searched; refinement finds rivals within 0.5 m."""
+MOST_SHIFT_M = 8
+"""Chosen: largest shift along the weak direction at which rivals are searched, in steps of 1 m; refinement finds rivals
+within 0.5 m."""
 SPARSE_MARGIN = 1.25
 """Chosen: a rival is refined with all points if its mismatch after refinement with few is at most so many times the
 largest that makes a pose ambiguous."""
@@ -168,6 +169,24 @@ def register_prepared(
     return rejections[0]
 
 
+def may_match(
+    source: PreparedScan,
+    target: PreparedScan,
+    *,
+    config: Config,
+    gate: Gate,
+    floor: gates.NoiseFloor,
+    mismatch: float,
+    watch: Stopwatch,
+) -> bool:
+    """Whether `register_prepared` may find a pose with about this mismatch or less; a few points decide that."""
+    trial = _Trial(source, target, config, gate, floor, gates.limits(floor, config=config.verify), watch)
+    few = refinement.sparse(source.surface, config=config.refine)
+    ends = (trial.led(coarse, few) for coarse in _coarse(trial) if isinstance(coarse, Registration))
+    most = SPARSE_MARGIN * mismatch
+    return any(led is not None and trial.mismatch(led.T_target_source) <= most for led in ends)
+
+
 class Found(NamedTuple):
     """A pose that passed all gates."""
 
@@ -210,10 +229,8 @@ class _Trial(NamedTuple):
         with self.watch("verify"):
             return self._verified(coarse, fine)
 
-    def settled(
-        self, coarse: Registration, few: refinement.Surface, known: Sequence[Found], most_mismatch: float
-    ) -> Registration | None:
-        """The pose to which a few points of the source lead; None if it is known or has a larger mismatch."""
+    def led(self, coarse: Registration, few: refinement.Surface) -> Registration | None:
+        """The pose to which a few points of the source lead; None if the pose is impossible."""
         if self.gate(coarse.T_target_source, slack_m=self.config.verify.max_coarse_fine_m):
             return None
         scans = self.source.observed, self.target.observed
@@ -224,11 +241,13 @@ class _Trial(NamedTuple):
             fine = refinement.refine(
                 few, self.target.surface, coarse.T_target_source, config=self.config.refine, must_converge=False
             )
-        if isinstance(fine, Rejected) or _is_near(fine.T_target_source, known):
-            return None
+        return None if isinstance(fine, Rejected) else replace(coarse, T_target_source=fine.T_target_source)
+
+    def mismatch(self, T_target_source: Transform) -> float:
+        """Mismatch of the scans at this pose."""
+        scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            found = gates.agreement(*scans, fine.T_target_source, config=self.config.verify)
-        return replace(coarse, T_target_source=fine.T_target_source) if found.mismatch <= most_mismatch else None
+            return gates.agreement(*scans, T_target_source, config=self.config.verify).mismatch
 
     def _verified(self, coarse: Registration, fine: Registration) -> Found | Rejected:
         config = self.config.verify
@@ -278,10 +297,9 @@ def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
     passed = [found]
     few = refinement.sparse(trial.source.surface, config=trial.config.refine)
     most = SPARSE_MARGIN * config.rival_ratio * found.agreement.mismatch
-    for coarse in _rivals(found, loose):
-        settled = None if _is_near(coarse.T_target_source, passed) else loose.settled(coarse, few, passed, most)
-        if settled is not None:
-            rival = loose.outcome(settled)
+    for led in _rivals(found, loose, few):
+        if not _is_near(led.T_target_source, passed) and loose.mismatch(led.T_target_source) <= most:
+            rival = loose.outcome(led)
             if isinstance(rival, Found) and not _is_near(rival.alignment.fine.T_target_source, passed):
                 passed.append(rival)
     best, *others = sorted(passed, key=lambda one: one.agreement.mismatch)
@@ -293,13 +311,36 @@ def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
     return far or gates.rejection(best.agreement, trial.limits) or best.alignment
 
 
-def _rivals(found: Found, trial: _Trial) -> Iterator[Registration]:
-    """Candidates for other poses that fit as well: along the weak direction, and from the floor plans."""
-    pose = found.alignment.fine
-    for shift_m in SHIFTS_M:
-        shift = geometry.transform(np.eye(3), shift_m * found.weak_direction)
-        yield replace(pose, T_target_source=pose.T_target_source @ shift)
-    yield from _plans(trial, num_poses=trial.config.verify.max_rivals)
+def _rivals(found: Found, trial: _Trial, few: refinement.Surface) -> Iterator[Registration]:
+    """Other poses that may fit as well, to which a few points lead: along the weak direction, and from floor plans."""
+
+    def lead(coarse: Registration) -> Registration | None:
+        return trial.led(coarse, few)
+
+    for sign in (-1.0, 1.0):
+        yield from _shifted(found.alignment.fine, sign * found.weak_direction, lead)
+    for coarse in _plans(trial, num_poses=trial.config.verify.max_rivals):
+        led = None if _is_near(coarse.T_target_source, [found]) else lead(coarse)
+        if led is not None:
+            yield led
+
+
+def _shifted(
+    pose: Registration, direction: Direction, lead: Callable[[Registration], Registration | None]
+) -> Iterator[Registration]:
+    """Poses to which refinement (`lead`) leads from shifts in one direction, the farthest first.
+
+    Shifts between the start and the end of a refinement are not tried: they would lead to the same pose.
+    """
+    nearest_m = math.inf
+    for shift_m in range(MOST_SHIFT_M, 0, -1):
+        if shift_m >= nearest_m:
+            continue
+        T_shifted = pose.T_target_source @ geometry.transform(np.eye(3), shift_m * direction)
+        led = lead(replace(pose, T_target_source=T_shifted))
+        if led is not None:
+            yield led
+            nearest_m = float((geometry.inverse(pose.T_target_source) @ led.T_target_source)[:3, 3] @ direction)
 
 
 def _is_near(T_target_source: Transform, others: Sequence[Found]) -> bool:

@@ -7,8 +7,17 @@ from helpers.rooms import ground_and_walls
 
 from segslam import geometry, segregator
 from segslam.config import Config
-from segslam.registration import PreparedScan, Stopwatch, prepare_scan, register, register_prepared
-from segslam.types import Alignment, Label, Rejected, RejectReason
+from segslam.registration import (
+    PreparedScan,
+    Stopwatch,
+    _shifted,
+    anywhere,
+    may_match,
+    prepare_scan,
+    register,
+    register_prepared,
+)
+from segslam.types import Alignment, Label, Registration, Rejected, RejectReason
 from segslam.verification import gates
 from segslam.verification.free_space import observe_free_space
 
@@ -102,6 +111,41 @@ def test_a_pose_that_fits_badly_has_rivals_that_the_prior_excludes(
 
     found = register_prepared(source, target, config=CONFIG, gate=gate)
     assert (found.reason if isinstance(found, Rejected) else None) is reason
+
+
+def test_shifts_that_others_led_past_are_not_tried() -> None:
+    """Refinement that leads to the next multiple of 3 m below: 6 from 8 m, 3 from 5 m, 0 from 2 m."""
+    tried: list[float] = []
+
+    def lead(coarse: Registration) -> Registration:
+        tried.append(float(coarse.T_target_source[0, 3]))
+        return replace(coarse, T_target_source=geometry.transform(np.eye(3), [tried[-1] // 3 * 3.0, 0.0, 0.0]))
+
+    pose = Registration(np.eye(4), 1, 1, 0.1, np.eye(6))
+    ends = [led.T_target_source[0, 3] for led in _shifted(pose, np.array([1.0, 0.0, 0.0]), lead)]
+    assert tried == [8.0, 5.0, 2.0]
+    assert ends == [6.0, 3.0, 0.0]
+
+
+def test_a_few_points_decide_whether_a_place_can_fit_as_well_as_another() -> None:
+    source, target, _ = _round_pair()
+    aligned = register_prepared(source, target, config=CONFIG)
+    assert isinstance(aligned, Alignment)
+    roughness_m = max(source.surface.roughness_m, target.surface.roughness_m)
+    mismatch = gates.mismatch(aligned.overlap, aligned.rms_m / roughness_m)
+    answers = [
+        may_match(
+            source,
+            target,
+            config=CONFIG,
+            gate=anywhere,
+            floor=gates.SINGLE_PAIR,
+            mismatch=factor * mismatch,
+            watch=Stopwatch(),
+        )
+        for factor in (1.0, 0.3)
+    ]
+    assert answers == [True, False]
 
 
 def test_moving_classes_are_in_neither_surface_nor_free_space() -> None:

@@ -10,7 +10,7 @@ from segslam.far_loops import FarLoops
 from segslam.keyframes import Clouds
 from segslam.pose_graph import Graph
 from segslam.proximity import ProximityDetector
-from segslam.registration import Labeller, PreparedScan, Stopwatch, register_prepared
+from segslam.registration import Labeller, PreparedScan, Stopwatch, register_near, register_prepared
 from segslam.retrieval import PlaceSignature, signature_of
 from segslam.submaps import Submaps
 from segslam.system.threads import both
@@ -67,12 +67,17 @@ class LoopCloser:
         return signature
 
     def attempt(self, keyframe_id: int, watch: Stopwatch, *, below: int | None = None) -> tuple[LoopAttempt, ...]:
-        """Propose and try loops for a keyframe; only with ids smaller than `below`, if given."""
+        """Propose and try loops for a keyframe.
+
+        With `below`, only with smaller ids, those of earlier sessions whose relative poses are known: such a loop is
+        refined from the estimate first.
+        """
         with watch("propose"):
             candidates = self._detector.candidates(
                 keyframe_id, self._graph.T_world_keyframes, self._graph.travel_m, below=below
             )
-        near = self._tried_in_turn([c for c in candidates if (c.source_id, c.target_id) not in self._tried], watch)
+        new = [c for c in candidates if (c.source_id, c.target_id) not in self._tried]
+        near = self._tried_in_turn(new, watch, is_known=below is not None)
         is_newest = below is None and keyframe_id == len(self.submaps.T_odom) - 1 and not self._is_finished
         return (*near, *self._far_loops(keyframe_id, watch)) if is_newest and not _has_closure(near) else near
 
@@ -105,8 +110,10 @@ class LoopCloser:
         self.take(attempts)
         return attempts
 
-    def _tried_in_turn(self, candidates: list[LoopCandidate], watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        attempts = tuple(self._attempt(candidate, watch) for candidate in candidates)
+    def _tried_in_turn(
+        self, candidates: list[LoopCandidate], watch: Stopwatch, *, is_known: bool
+    ) -> tuple[LoopAttempt, ...]:
+        attempts = tuple(self._attempt(candidate, watch, is_known=is_known) for candidate in candidates)
         self.take(attempts)
         return attempts
 
@@ -118,23 +125,29 @@ class LoopCloser:
                 self._graph.add_closure(attempt.outcome)
                 self._detector.note_closure(attempt.outcome)
 
-    def _attempt(self, candidate: LoopCandidate, watch: Stopwatch) -> LoopAttempt:
+    def _attempt(self, candidate: LoopCandidate, watch: Stopwatch, *, is_known: bool) -> LoopAttempt:
         own = Stopwatch()
         with own("prepare"):
             source, target = both(self._prepared, (candidate.source_id,), (candidate.target_id,))
-        outcome = register_prepared(
-            source,
-            target,
-            config=self._config,
-            gate=partial(
-                far_from_prior,
-                candidate=candidate,
-                R_world_target=self._graph.T_world_keyframes[candidate.target_id][:3, :3],
+        floor = self._floor.at(candidate.source_id)
+        outcome: Alignment | Rejected | None = None
+        if is_known:
+            prior = candidate.T_target_source_prior
+            outcome = register_near(source, target, prior, config=self._config, floor=floor, watch=own)
+        if not isinstance(outcome, Alignment):
+            outcome = register_prepared(
+                source,
+                target,
                 config=self._config,
-            ),
-            floor=self._floor.at(candidate.source_id),
-            watch=own,
-        )
+                gate=partial(
+                    far_from_prior,
+                    candidate=candidate,
+                    R_world_target=self._graph.T_world_keyframes[candidate.target_id][:3, :3],
+                    config=self._config,
+                ),
+                floor=floor,
+                watch=own,
+            )
         for stage, seconds in own.seconds.items():
             watch.add(stage, seconds)
         return LoopAttempt(candidate, _closure(candidate, outcome), own.seconds)

@@ -40,6 +40,8 @@ SPARSE_MARGIN = 1.25
 largest that makes a pose ambiguous."""
 SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
 """Chosen: poses closer to each other than this are the same."""
+KNOWN_M, KNOWN_RAD = 1.0, math.radians(3.0)
+"""Chosen: a known pose is off by less. Nearer rivals hardly exist: `SAME_POSE_M`."""
 MOST_PLANS = 24
 """Chosen: floor-plan poses looked through for those near the prior, 1 ms each."""
 
@@ -169,6 +171,34 @@ def register_prepared(
     return rejections[0]
 
 
+def register_near(
+    source: PreparedScan,
+    target: PreparedScan,
+    T_target_source: Transform,
+    *,
+    config: Config,
+    floor: gates.NoiseFloor,
+    watch: Stopwatch,
+) -> Alignment | Rejected:
+    """The refined and verified pose near one that is known to `KNOWN_M` and `KNOWN_RAD`; no other poses are tried.
+
+    It takes a tenth of the time of `register_prepared`. Rejects FAR_FROM_PRIOR if refinement moves the pose farther.
+    """
+    trial = _Trial(source, target, config, anywhere, floor, gates.limits(floor, config=config.verify), watch)
+    with watch("refine"):
+        fine = refinement.refine(source.surface, target.surface, T_target_source, config=config.refine)
+    if isinstance(fine, Rejected):
+        return fine
+    moved = geometry.inverse(T_target_source) @ fine.T_target_source
+    if geometry.distance(moved) > KNOWN_M or geometry.angle(moved) > KNOWN_RAD:
+        detail = f"moved {geometry.distance(moved):.2f} m, {math.degrees(geometry.angle(moved)):.1f} degrees"
+        return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
+    coarse = replace(fine, T_target_source=T_target_source, num_inliers=0, num_correspondences=0)
+    with watch("verify"):
+        found = trial.verified(coarse, fine)
+    return found if isinstance(found, Rejected) else found.alignment
+
+
 def may_match(
     source: PreparedScan,
     target: PreparedScan,
@@ -227,7 +257,7 @@ class _Trial(NamedTuple):
         if isinstance(fine, Rejected):
             return fine
         with self.watch("verify"):
-            return self._verified(coarse, fine)
+            return self.verified(coarse, fine)
 
     def led(self, coarse: Registration, few: refinement.Surface) -> Registration | None:
         """The pose to which a few points of the source lead; None if the pose is impossible."""
@@ -249,7 +279,8 @@ class _Trial(NamedTuple):
         with self.watch("verify"):
             return gates.agreement(*scans, T_target_source, config=self.config.verify).mismatch
 
-    def _verified(self, coarse: Registration, fine: Registration) -> Found | Rejected:
+    def verified(self, coarse: Registration, fine: Registration) -> Found | Rejected:
+        """A refined pose that passes all gates."""
         config = self.config.verify
         moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ fine.T_target_source)
         if moved_m > config.max_coarse_fine_m:

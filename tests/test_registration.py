@@ -15,6 +15,7 @@ from segslam.registration import (
     may_match,
     prepare_scan,
     register,
+    register_near,
     register_prepared,
 )
 from segslam.types import Alignment, Label, Registration, Rejected, RejectReason
@@ -125,6 +126,16 @@ def test_shifts_that_others_led_past_are_not_tried() -> None:
     ends = [led.T_target_source[0, 3] for led in _shifted(pose, np.array([1.0, 0.0, 0.0]), lead)]
     assert tried == [8.0, 5.0, 2.0]
     assert ends == [6.0, 3.0, 0.0]
+
+
+@pytest.mark.parametrize(("off_m", "is_found"), [(0.4, True), (2.5, False)])
+def test_near_a_known_pose_no_others_are_tried(off_m: float, is_found: bool) -> None:
+    source, target, T_target_source = _round_pair()
+    T_known = T_target_source @ geometry.transform(np.eye(3), [off_m, 0.0, 0.0])
+    found = register_near(source, target, T_known, config=CONFIG, floor=gates.SINGLE_PAIR, watch=Stopwatch())
+    assert isinstance(found, Alignment) == is_found
+    if isinstance(found, Alignment):
+        assert _error(T_target_source, found.fine.T_target_source)[0] < 0.05
 
 
 def test_a_few_points_decide_whether_a_place_can_fit_as_well_as_another() -> None:

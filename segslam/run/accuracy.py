@@ -9,12 +9,14 @@ from segslam.types import IndexPairs, LoopClosure, Trajectory
 
 
 def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
-    """The figures of `metrics.json` that need ground truth; figures of the odometry start with `odometry_`."""
+    """The figures of `metrics.json` that need ground truth; figures of the odometry start with `odometry_`.
+
+    A drive localised in a map has no figures of loops, because loops within it are not searched.
+    """
     corrected = trajectory_accuracy(result.trajectory, reference)
     odometry = trajectory_accuracy(result.odometry, reference)
-    return (
-        corrected | {f"odometry_{name}": value for name, value in odometry.items()} | _loop_accuracy(result, reference)
-    )
+    loops = {} if result.from_map_m is not None else _loop_accuracy(result, reference)
+    return corrected | {f"odometry_{name}": value for name, value in odometry.items()} | loops
 
 
 def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from segslam.config import Config
 from segslam.log import RunLog, read_log
-from segslam.run.folder import LOG
+from segslam.run.folder import LOG, read_localised
 from segslam.slam import SlamResult
 from segslam.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
@@ -83,11 +83,12 @@ def read_run(folder: str | Path) -> FinishedRun:
     if not folder.is_dir():
         raise SegslamError(f"{folder}: no such folder; give a folder made by `segslam map --out`")
     log = read_log(folder / LOG)
+    result = _result(log)
     return FinishedRun(
         folder=folder,
         dataset=log.run.get("dataset", ""),
         config=log.config,
-        result=_result(log),
+        result=replace(result, from_map_m=read_localised(folder, len(result.trajectory))),
         reference=log.reference(),
         T_camera_lidar=log.T_camera_lidar,
         metrics=read_metrics(folder),

@@ -79,6 +79,24 @@ def write_localised(folder: Path, trajectory: Trajectory, from_map_m: Vector, lo
             writer.writerow((scan, stamp_ns, int(is_localised), f"{distance_m:.2f}" if np.isfinite(distance_m) else ""))
 
 
+def read_localised(folder: Path, num_scans: int) -> Vector | None:
+    """(n,) travel from each scan to a keyframe with a placement, infinite where there is none (m).
+
+    None for a run without `localised.csv`. Raises SegslamError if the file is damaged.
+    """
+    file = folder / "localised.csv"
+    if not file.exists():
+        return None
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            distance_m = np.array([float(row["from_placed_keyframe_m"] or "inf") for row in csv.DictReader(stream)])
+    except (KeyError, ValueError, TypeError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); localise the data again") from error
+    if len(distance_m) != num_scans:
+        raise SegslamError(f"{file}: damaged, {len(distance_m)} rows for {num_scans} scans; localise the data again")
+    return distance_m
+
+
 def write_loops(file: Path, attempts: tuple[LoopAttempt, ...], weights: dict[tuple[int, int], float]) -> None:
     """One row per attempt; cells that do not apply are empty. `weight`: final weight in the graph, 0 to 1."""
     head = ("source", "target", "outcome", "detail", "distance_m", "correspondences", "inliers", "overlap", "rms_m")

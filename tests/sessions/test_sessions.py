@@ -141,6 +141,7 @@ def test_a_new_day_is_localised_in_the_old_map_which_is_only_read(
     assert run("localise", days.monday.folder, days.friday_scans, "--out", out, "--json", "--quiet") == 0
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["localised_percent"] == 100.0
+    assert "loop_recall" not in metrics, "loops within the drive are not searched"
     assert _contents(days.monday.folder) == before
     localised = segslam.read_run(out)
     assert localised.reference is not None
@@ -153,6 +154,10 @@ def test_a_new_day_is_localised_in_the_old_map_which_is_only_read(
     assert placed[0].is_found
     assert not placed[-1].is_found
     assert len((out / "localised.csv").read_text().splitlines()) == 1 + metrics["num_scans"]
+    assert localised.result.from_map_m is not None
+    (out / "localised.csv").write_text("scan,stamp_ns\n0,0\n")
+    with pytest.raises(segslam.SegslamError, match=r"localised\.csv: damaged"):
+        segslam.read_run(out)
 
 
 def _contents(folder: Path) -> dict[str, str]:

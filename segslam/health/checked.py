@@ -52,7 +52,8 @@ Registration of these scans converges from errors below 15 degrees."""
 BREAK_SIGMA_M, BREAK_SIGMA_RAD = 30.0, np.radians(60.0)
 """Standard deviations of an unsupported motion: the sensor may have been carried to any place nearby."""
 SUDDEN_M, SUDDEN_RAD = 0.5, np.radians(5.0)
-"""Chosen: a motion that differs by more than this from the previous one is checked, however short it is."""
+"""Chosen: a motion that differs by more than this from the previous one is checked, however short it is, and so is a
+rotation by more than this: on the real courtyard, scans 0.5 s apart, KISS-ICP misses turns."""
 CHECK_EVERY = 10
 """Chosen: at least every tenth scan is checked, because a stuck odometry reports no motion."""
 
@@ -200,6 +201,7 @@ class CheckedOdometry:
             self._num_unchecked >= CHECK_EVERY
             or gap > LONG_GAP
             or _is_sudden(T_predicted_lidar)
+            or geometry.angle(self._since_last(proposed.T_odom_lidar)) > SUDDEN_RAD
             or self._history.is_watching
         )
         T_anchor_lidar = geometry.inverse(self._anchor[0]) @ proposed.T_odom_lidar

@@ -18,7 +18,7 @@ MIN_OVERLAPS, LEAST_SHARE = 3, 0.75
 """Chosen: smallest overlap of a check, relative to the drive's median; below it the scans are metres apart and the
 correction is meaningless. On real KITTI the smallest of 178 is 0.80 of the median."""
 LEAST_OVERLAP = 0.35
-"""Chosen: smallest overlap of a registered scan while the drive has no median yet."""
+"""Chosen: smallest overlap of a check or a registered scan while the drive has no median yet."""
 
 LOST_SCANS = 30
 """Chosen: number of scans after a break that are tried against the map before it (3 s at 10 Hz)."""
@@ -73,7 +73,8 @@ class History:
 
     def note_moved(self, moved_m: float, moved_rad: float, overlap: float) -> None:
         """As `note_check`, from a correction and an overlap."""
-        lost = len(self._overlaps) >= MIN_OVERLAPS and overlap < LEAST_SHARE * median(self._overlaps)
+        is_known = len(self._overlaps) >= MIN_OVERLAPS
+        lost = overlap < (LEAST_SHARE * median(self._overlaps) if is_known else LEAST_OVERLAP)
         self._checks.append((moved_m, moved_rad))
         halves = len(self._checks) == NUM_CHECKS and any(
             median(check[k] for check in self._checks) > self._tolerance[k] / 2 for k in range(2)

@@ -13,7 +13,8 @@ from segslam import geometry
 from segslam.config import Config, load_config
 from segslam.evaluation import trajectory_metrics
 from segslam.health import CheckedOdometry, information_of
-from segslam.health.check import nudge, open_direction
+from segslam.health.check import Nudge, nudge, open_direction
+from segslam.health.history import History
 from segslam.health.local_map import LocalMap
 from segslam.odometry import GivenOdometry, KissOdometry, OdometryResult
 from segslam.refinement import LightSurface
@@ -166,6 +167,19 @@ def test_a_sudden_turn_is_registered_from_turned_guesses(degrees: float) -> None
     T_true_found = geometry.inverse(now @ turn) @ before @ T_before_found
     assert geometry.distance(T_true_found) < 0.1
     assert np.degrees(geometry.angle(T_true_found)) < 0.3
+
+
+def test_a_rotation_of_some_degrees_is_checked_however_near_the_prediction_it_is() -> None:
+    config = load_config(None, ["keyframes.distance_m=20", "keyframes.angle_deg=40"])
+    scans, truth = round_drive()  # 7 degrees from scan to scan
+    results = _registered(_checked(truth.T_world_lidar, config), scans[:5])
+    assert [result.motion.state for result in results[1:] if result.motion] == 4 * [MotionState.CONFIRMED]
+
+
+def test_a_check_with_little_overlap_confirms_nothing_even_at_the_start() -> None:
+    history = History(CONFIG.health)
+    history.note_check(Nudge(np.eye(4), overlap=0.13, moved_m=0.01, moved_rad=0.001))
+    assert history.is_watching
 
 
 def test_a_keyframe_follows_a_break_and_its_motion_has_nearly_no_information() -> None:

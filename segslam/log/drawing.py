@@ -53,6 +53,8 @@ VIEW_GRID_M = 2.0**-5
 
 MAP_KEYFRAMES = 500
 """Chosen: in longer drives, every second keyframe is in the displayed map, or every third, and so on."""
+MAP_BATCH = 50
+"""Chosen: number of keyframes after which the displayed map is downsampled again, which limits the memory."""
 MAP_RANGE_M, MAP_VOXEL_M = 40.0, 0.2
 
 Topical = tuple[str, Message]
@@ -168,15 +170,20 @@ def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, *, vie
     """
     every = 1 + len(T_world_keyframe) // MAP_KEYFRAMES
     some = slice(None, None, view_every)
-    parts = [(np.empty((0, 3)), np.empty(0, np.uint8))]
-    for keyframe_id in list(T_world_keyframe)[::every]:
-        points, labels = cloud(keyframe_id)
-        kept = within_range(points[some], 0.0, MAP_RANGE_M) & (labels[some] < Label.MOVING_CAR)
-        placed = geometry.apply(T_world_keyframe[keyframe_id], points[some][kept].astype(np.float64))
-        parts.append((placed, labels[some][kept]))
-    points, labels = (np.concatenate(column) for column in zip(*parts, strict=True))
-    rows = voxel_first(points, MAP_VOXEL_M)
-    return np.round(points[rows] / VIEW_GRID_M) * VIEW_GRID_M, labels[rows]
+    ids = list(T_world_keyframe)[::every]
+    drawn = np.empty((0, 3)), np.empty(0, np.uint8)
+    for start in range(0, len(ids), MAP_BATCH):
+        parts = [drawn]
+        for keyframe_id in ids[start : start + MAP_BATCH]:
+            points, labels = cloud(keyframe_id)
+            kept = within_range(points[some], 0.0, MAP_RANGE_M) & (labels[some] < Label.MOVING_CAR)
+            placed = geometry.apply(T_world_keyframe[keyframe_id], points[some][kept].astype(np.float64))
+            parts.append((placed, labels[some][kept]))
+        points, labels = (np.concatenate(column) for column in zip(*parts, strict=True))
+        rows = voxel_first(points, MAP_VOXEL_M)
+        drawn = points[rows], labels[rows]
+    points, labels = drawn
+    return np.round(points / VIEW_GRID_M) * VIEW_GRID_M, labels
 
 
 def map_message(points: Points, labels: Labels, *, stamp_ns: int) -> Topical:

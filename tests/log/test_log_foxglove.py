@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from segslam import geometry
-from segslam.log import LogWriter, schema
+from segslam.log import LogWriter, drawing, schema
 from segslam.log.drawing import MAP_RANGE_M, REJECTED_COLORS, weight_color
 from segslam.log.records import BULK, codec
 from segslam.semantics.class_colors import of_classes
@@ -214,3 +214,20 @@ def test_memory_at_each_step_is_what_the_process_holds(steps: list[Step], whole:
         ]
     assert len(values) == len(steps)
     assert 10 < values[-1] <= resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 + 1
+
+
+def test_the_displayed_map_does_not_depend_on_the_number_of_keyframes_in_a_batch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(1)
+    clouds = {
+        number: (rng.uniform(-3, 3, (400, 3)).astype(np.float32), rng.integers(0, 20, 400, dtype=np.uint8))
+        for number in range(7)
+    }
+    poses = {number: geometry.transform(np.eye(3), [float(number), 0.0, 0.0]) for number in clouds}
+    points, labels = drawing.map_points(poses, clouds.__getitem__, view_every=2)
+    monkeypatch.setattr(drawing, "MAP_BATCH", 3)
+    points_in_batches, labels_in_batches = drawing.map_points(poses, clouds.__getitem__, view_every=2)
+    assert 100 < len(points) < 7 * 200
+    np.testing.assert_array_equal(points_in_batches, points)
+    np.testing.assert_array_equal(labels_in_batches, labels)

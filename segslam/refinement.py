@@ -64,6 +64,10 @@ class Surface:
         rows, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
         return np.asarray(rows), np.sqrt(squared)
 
+    def normals_at(self, rows: Indices) -> Points:
+        """(k, 3) normals of points by row."""
+        return self.normals[rows]
+
     def distances_m(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """(n,) each: distances of points to the nearest point of the surface, and to the plane through it (m)."""
         rows, to_point = self.nearest(points)

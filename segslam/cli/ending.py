@@ -60,12 +60,21 @@ def finish(
     return metrics
 
 
+def _counted(number: int, thing: str) -> str:
+    return f"{number} {thing}{'s' * (number != 1)}"
+
+
+def _after_repairs(metrics: dict[str, Any]) -> str:
+    return "after repairs" if metrics.get("num_motions_repaired") else "only"
+
+
 def summary(metrics: dict[str, Any], folder: Path) -> str:
     """The summary printed at the end of a run."""
     lines = [
-        f"{metrics['num_scans']} scans in {metrics['seconds_total']:.1f} s ({metrics['scans_per_second']:.1f}/s), "
-        f"{metrics['num_keyframes']} keyframes, {metrics['num_loops_accepted']} loops of "
-        f"{metrics['num_candidates']} candidates"
+        f"{_counted(metrics['num_scans'], 'scan')} in {metrics['seconds_total']:.1f} s "
+        f"({metrics['scans_per_second']:.1f}/s), "
+        f"{_counted(metrics['num_keyframes'], 'keyframe')}, {_counted(metrics['num_loops_accepted'], 'loop')} of "
+        f"{_counted(metrics['num_candidates'], 'candidate')}"
     ]
     if skipped := metrics["num_scans_skipped"]:
         lines.append(f"{skipped} scan{'s' * (skipped != 1)} skipped (unreadable or empty); see the warning above")
@@ -82,7 +91,8 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         )
     if "ate_m" in metrics:
         lines.append(
-            f"error after alignment: {metrics['ate_m']:.3f} m, odometry only: {metrics['odometry_ate_m']:.3f} m"
+            f"error after alignment: {metrics['ate_m']:.3f} m, "
+            f"odometry {_after_repairs(metrics)}: {metrics['odometry_ate_m']:.3f} m"
             + (f"; false loops: {metrics['num_loops_false']}" if "num_loops_false" in metrics else "")
         )
     if "localised_percent" in metrics:

@@ -255,7 +255,7 @@ def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublis
     def save() -> str:
         file = run.folder / MAP_SO_FAR
         made = save_map(*run.map_so_far(), file, config=run.config.map)
-        return f"{file}: {made.num_points} points of {made.num_keyframes} keyframes"
+        return f"{file}: {made.num_points} points of {made.num_keyframes} keyframe{'s' * (made.num_keyframes != 1)}"
 
     return stack.enter_context(MappingPublisher(save))
 

@@ -3,18 +3,23 @@
 At the correct pose the steps are nearly zero. The check takes a few milliseconds, a full registration tens.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from segslam import geometry
-from segslam.refinement import LightSurface
+from segslam.refinement import LightSurface, Surface
 from segslam.types import Direction, Points, Transform
 
 NUM_POINTS = 1500
 """Chosen: the correction of KITTI's scans at 2 m changes by less than 5 mm with all points."""
 REACHES_M = (1.0, 1.0, 0.5)
-"""Search distance of each step (m)."""
+"""Search distance of each step of a check (m)."""
+POLISH_M = (0.7, 0.7, 0.5, 0.5, 0.5)
+"""Chosen: the same after GICP, to which every point has the same weight."""
+SEARCH_M = (2.0, 1.5, 1.0, 1.0, 0.7, 0.7, 0.5, 0.5, 0.5, 0.5)
+"""Chosen: the same from an initial guess."""
 RESIDUAL_SCALE_M = 0.1
 """Scale of the Cauchy weights; residuals of planar surfaces in voxels of 0.5 m are half of it."""
 NUM_NORMALS = 1000
@@ -36,17 +41,24 @@ class Nudge:
     moved_rad: float
 
 
-def nudge(points: Points, target: LightSurface, T_target_source: Transform) -> Nudge | None:
-    """Point-to-plane correction of a pose; None if too few points are near the target.
+def nudge(
+    points: Points,
+    target: LightSurface | Surface,
+    T_target_source: Transform,
+    *,
+    reaches_m: Sequence[float] = REACHES_M,
+) -> Nudge | None:
+    """Point-to-plane correction of a pose, a step for each search distance; None if too few points are near the target.
 
-    `points` (n, 3) of the source, downsampled. Chen and Medioni 1992, with Cauchy weights.
+    `points` (n, 3) of the source, downsampled. Chen and Medioni 1992, with Cauchy weights: points on a vehicle that
+    drives ahead have little weight.
     """
     if len(points) < 50 or len(target) < 50:
         return None
     chosen = points[:: max(1, len(points) // NUM_POINTS)].astype(np.float64)
     T_now = T_target_source
     overlap = 0.0
-    for reach_m in REACHES_M:
+    for reach_m in reaches_m:
         moved = geometry.apply(T_now, chosen)
         rows, apart_m = target.nearest(moved)
         near = apart_m < reach_m

@@ -31,7 +31,6 @@ from segslam.types import (
     Motion,
     MotionState,
     Points,
-    Registration,
     Rejected,
     Scan,
     Transform,
@@ -46,9 +45,10 @@ DIFFERENT_M, DIFFERENT_RAD = 0.3, np.radians(3.0)
 LEAST_SUPPORTED = 0.15
 SUPPORT_M, SUPPORT_RAD = 0.5, np.radians(3.0)
 """Chosen: a lower overlap suffices for a registration this near to an initial guess: two sources agree."""
-TURNS_DEG = 15.0, -15.0, 30.0, -30.0
-"""Chosen on real KITTI 00 with scans 3.6 m apart: initial guesses about the vertical axis, besides the predicted one.
-Registration of these scans converges from errors below 15 degrees."""
+NEARLY = 0.97
+"""Chosen: share of the best closeness with which a registration fits nearly as well."""
+TURN_M = 5.0
+"""Chosen: distance equivalent to a turn by one radian."""
 BREAK_SIGMA_M, BREAK_SIGMA_RAD = 30.0, np.radians(60.0)
 """Standard deviations of an unsupported motion: the sensor may have been carried to any place nearby."""
 SUDDEN_M, SUDDEN_RAD = 0.5, np.radians(5.0)
@@ -64,7 +64,19 @@ class _Found:
 
     T_map_lidar: Transform
     fit: Fit
-    registration: Registration
+    offsets: list[Transform]
+    """From the expected poses, which do not depend on the registration."""
+
+    @property
+    def offset_m(self) -> float:
+        """Distance from the nearest of these poses, with turns (m)."""
+        return min(geometry.distance(T) + TURN_M * geometry.angle(T) for T in self.offsets)
+
+    @property
+    def is_supported(self) -> bool:
+        """True if it is near to an expected pose, and overlaps somewhat."""
+        is_near = any(geometry.distance(T) < SUPPORT_M and geometry.angle(T) < SUPPORT_RAD for T in self.offsets)
+        return is_near and self.fit.overlap >= LEAST_SUPPORTED
 
 
 class _Seen:
@@ -188,7 +200,7 @@ class CheckedOdometry:
             self._take(proposed.T_odom_lidar, _Seen(proposed.points, self._map))
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         T_predicted_lidar = geometry.inverse(self._T_odom_last @ self._T_before_last) @ proposed.T_odom_lidar
-        if not self._has_motion and self._inner.is_from_scans and _are_different(T_predicted_lidar):
+        if not self._has_motion and self._inner.is_from_scans:
             scan = _Seen(proposed.points, self._map)
             T_odom_better = self._better_first(proposed.T_odom_lidar, scan)
             if T_odom_better is not None:
@@ -233,7 +245,7 @@ class CheckedOdometry:
         T_map_proposed = geometry.inverse(self._map.T_odom_map) @ T_odom_proposed
         if found is None or not _are_different(geometry.inverse(T_map_proposed) @ found.T_map_lidar):
             return None
-        is_better = found.fit.overlap > self._map.fit(scan.surface, T_map_proposed).overlap
+        is_better = found.fit.closeness > self._map.fit(scan.surface, T_map_proposed).closeness
         return self._map.T_odom_map @ found.T_map_lidar if is_better else None
 
     def _registered(
@@ -258,9 +270,9 @@ class CheckedOdometry:
         if found is not None and before_break is not None:
             self._map, self._lost = before_break, None
         else:
-            found = self._best(self._map, scan, guesses)
+            found = self._best(self._map, scan, guesses, guesses[:2])
             if found is None and direction is None:
-                found = self._turned(scan, T_odom_predicted)
+                found = self._best(self._map, scan, [self._around(scan, T_odom_predicted)], guesses[:2])
             found = found or self._recovered(self._map, scan)
         is_at_an_end = direction is not None or self._unseen.direction is not None
         if found is None and is_at_an_end and gap <= LONG_GAP:
@@ -308,51 +320,48 @@ class CheckedOdometry:
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         return self._break(T_odom_predicted, scan)
 
-    def _turned(self, scan: _Seen, T_odom_predicted: Transform) -> _Found | None:
-        """The pose after a turn which began or ended within this scan; None if there is none."""
-        for turn_deg in TURNS_DEG:
-            T_predicted_turned = geometry.transform(geometry.yaw(np.radians(turn_deg)), np.zeros(3))
-            found = self._best(self._map, scan, [T_odom_predicted @ T_predicted_turned], may_support=False)
-            if found is not None:
-                return found
-        return None
-
     def _best(
-        self, local: LocalMap, scan: _Seen, T_odom_guesses: list[Transform], *, may_support: bool = True
+        self, local: LocalMap, scan: _Seen, T_odom_guesses: Sequence[Transform], T_odom_expected: Sequence[Transform]
     ) -> _Found | None:
-        """The registration with the largest overlap, from distinct guesses; None if none has the usual fit.
+        """The registration that fits best, from distinct guesses; None if none has the usual fit.
 
-        A lower overlap suffices near the first two guesses, if they `may_support` it.
+        Of those that fit nearly as well, as all poses along a wall do, it is the one nearest to an expected pose. Such
+        a pose supports a worse fit too, but not in the map before a break: it continues a guess.
         """
         T_map_odom = geometry.inverse(local.T_odom_map)
-        best: _Found | None = None
+        found: list[_Found] = []
         for T_map_guess in _different([T_map_odom @ T_odom_guess for T_odom_guess in T_odom_guesses]):
-            registration = local.register(scan.surface, T_map_guess)
-            if isinstance(registration, Registration):
-                found = _Found(
-                    registration.T_target_source, local.fit(scan.surface, registration.T_target_source), registration
-                )
-                if best is None or found.fit.overlap > best.fit.overlap:
-                    best = found
-        if best is None or not (
-            self._history.is_usual(best.fit) or (may_support and _is_supported(best, T_map_odom, T_odom_guesses[:2]))
-        ):
+            for T_map_lidar in local.register(scan.surface, T_map_guess):
+                T_odom_lidar = local.T_odom_map @ T_map_lidar
+                offsets = [geometry.inverse(T_odom_other) @ T_odom_lidar for T_odom_other in T_odom_expected]
+                found.append(_Found(T_map_lidar, local.fit(scan.surface, T_map_lidar), offsets))
+        if not found:
             return None
-        return best
+        enough = NEARLY * max(each.fit.closeness for each in found)
+        best = min((each for each in found if each.fit.closeness >= enough), key=lambda each: each.offset_m)
+        is_supported = best.is_supported and local is not self._lost
+        return best if self._history.is_usual(best.fit) or is_supported else None
+
+    def _around(self, scan: _Seen, T_odom_predicted: Transform) -> Transform:
+        """The best of some poses around the last one, as an initial guess."""
+        T_map_last = geometry.inverse(self._map.T_odom_map) @ self._T_odom_last
+        T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
+        return self._map.T_odom_map @ self._map.around(scan.surface, T_map_last, T_step)
 
     def _recovered(self, local: LocalMap, scan: _Seen) -> _Found | None:
         """The pose without initial guess, verified like a loop and then registered; None if there is none."""
         alignment = self._recover(scan.points, local.cloud(self._keyframes.dense_voxels))
         if isinstance(alignment, Rejected):
             return None
-        return self._best(local, scan, [local.T_odom_map @ alignment.fine.T_target_source])
+        T_odom_recovered = local.T_odom_map @ alignment.fine.T_target_source
+        return self._best(local, scan, [T_odom_recovered], [T_odom_recovered])
 
     def _found_again(self, scan: _Seen, T_odom_guesses: list[Transform]) -> _Found | None:
         """The pose in the map before the last break, if the break was within the last `LOST_SCANS`."""
         if self._lost is None:
             return None
         self._history.scans_lost += 1
-        if found := self._best(self._lost, scan, T_odom_guesses):
+        if found := self._best(self._lost, scan, T_odom_guesses, T_odom_guesses[:2]):
             return found
         if self._history.scans_lost % RECOVER_EVERY == 0 and (found := self._recovered(self._lost, scan)):
             return found
@@ -405,14 +414,6 @@ def _exact(T_a_b: Transform) -> Transform:
     return geometry.transform(geometry.nearest_rotation(T_a_b[:3, :3]), T_a_b[:3, 3])
 
 
-def _is_supported(found: _Found, T_map_odom: Transform, T_odom_guesses: list[Transform]) -> bool:
-    """True if a guess, which does not depend on the registration, is near a registered pose with some overlap."""
-    if found.fit.overlap < LEAST_SUPPORTED:
-        return False
-    offsets = [geometry.inverse(T_map_odom @ T_odom_guess) @ found.T_map_lidar for T_odom_guess in T_odom_guesses]
-    return any(geometry.distance(o) < SUPPORT_M and geometry.angle(o) < SUPPORT_RAD for o in offsets)
-
-
 def _is_sudden(T_predicted_lidar: Transform) -> bool:
     """True if the motion differs much from the previous one."""
     return geometry.distance(T_predicted_lidar) > SUDDEN_M or bool(geometry.angle(T_predicted_lidar) > SUDDEN_RAD)
@@ -423,7 +424,7 @@ def _are_different(T_a_b: Transform) -> bool:
     return geometry.distance(T_a_b) > DIFFERENT_M or bool(geometry.angle(T_a_b) > DIFFERENT_RAD)
 
 
-def _different(guesses: list[Transform]) -> list[Transform]:
+def _different(guesses: Sequence[Transform]) -> list[Transform]:
     """The guesses without those near an earlier one."""
     kept: list[Transform] = []
     for guess in guesses:

@@ -1,16 +1,23 @@
 """The last scans of a drive in one cloud, and registration of the next scan with it."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from segslam import geometry, refinement
 from segslam.config import HealthConfig, RefineConfig
-from segslam.types import Points, Registration, Rejected, Transform
+from segslam.health.check import POLISH_M, RESIDUAL_SCALE_M, SEARCH_M, nudge
+from segslam.types import Points, Registration, Transform
 
 MIN_STANDING = 50
 """Chosen: with fewer points above the ground, all points are used."""
+TURNS_RAD = np.radians(np.arange(-45.0, 46.0, 7.5))
+TRAVELS = (0.0, 0.5, 1.0, 1.5)
+"""Chosen: turns, and shares of the last step, of the poses that `around` compares; registration reaches half as far."""
+NUM_COMPARED, COMPARED_M = 400, 0.5
+"""Chosen: points that compare them, and the distance at which a point has half its weight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +28,8 @@ class Fit:
     """Share of the scan's points on steep surfaces that lie within `inlier_m` of the map, 0 to 1."""
     rms_m: float
     """Root mean square distance of these inliers to the planes of the map; `inlier_m` without inliers."""
+    closeness: float = 0.0
+    """Mean weight of these points by their distance to the planes, 0 to 1: greater if more points fit, and better."""
 
 
 class LocalMap:
@@ -95,9 +104,29 @@ class LocalMap:
             self._surface = self.make_surface(merged)
         return self._surface
 
-    def register(self, scan: refinement.Surface, T_map_lidar: Transform) -> Registration | Rejected:
-        """The pose of a scan in the map near an initial guess, by GICP; `Rejected` as `refine` returns it."""
-        return refinement.refine(scan, self.surface(), T_map_lidar, config=self._refine, must_converge=False)
+    def register(self, scan: refinement.Surface, T_map_guess: Transform) -> list[Transform]:
+        """Poses of a scan in the map near an initial guess: by GICP, and by robust steps from the guess.
+
+        GICP reaches farther. The robust steps end at the static scene where a vehicle ahead attracts GICP.
+        """
+        found = refinement.refine(scan, self.surface(), T_map_guess, config=self._refine, must_converge=False)
+        starts: list[tuple[Transform, Sequence[float]]] = [(T_map_guess, SEARCH_M)]
+        if isinstance(found, Registration):
+            starts.append((found.T_target_source, POLISH_M))
+        nudges = [nudge(scan.points, self.surface(), T_start, reaches_m=reaches_m) for T_start, reaches_m in starts]
+        return [each.T_target_source for each in nudges if each is not None]
+
+    def around(self, scan: refinement.Surface, T_map_last: Transform, T_step: Transform) -> Transform:
+        """The best of some poses around the last one: turned to both sides, and moved by shares of the last step."""
+        points = _standing(scan)
+        points = points[:: max(1, len(points) // NUM_COMPARED)]
+        tried = [
+            T_map_last @ geometry.transform(geometry.yaw(turn), travel * T_step[:3, 3])
+            for travel in TRAVELS
+            for turn in TURNS_RAD.tolist()
+        ]
+        apart_m = [self.surface().nearest(geometry.apply(T_map_scan, points))[1] for T_map_scan in tried]
+        return tried[int(np.argmax([np.mean(1.0 / (1.0 + (each / COMPARED_M) ** 2)) for each in apart_m]))]
 
     def fit(self, scan: refinement.Surface, T_map_lidar: Transform) -> Fit:
         """Fit of the scan to the map at this pose."""
@@ -106,10 +135,18 @@ class LocalMap:
 
 def _fit(source: refinement.Surface, target: refinement.Surface, T_target_source: Transform, *, inlier_m: float) -> Fit:
     """Overlap and residual of the source's points on steep surfaces, or of all points if there are few."""
-    standing = source.standing
-    chosen = standing if len(standing) >= MIN_STANDING else source.points
+    chosen = _standing(source)
     if not len(chosen) or not len(target):
         return Fit(0.0, inlier_m)
     to_point, to_plane = target.distances_m(geometry.apply(T_target_source, chosen))
     met = to_plane[to_point < inlier_m]
-    return Fit(len(met) / len(chosen), float(np.sqrt(np.mean(met**2))) if len(met) else inlier_m)
+    if not len(met):
+        return Fit(0.0, inlier_m)
+    weights = 1.0 / (1.0 + (met / RESIDUAL_SCALE_M) ** 2)
+    return Fit(len(met) / len(chosen), float(np.sqrt(np.mean(met**2))), float(weights.sum()) / len(chosen))
+
+
+def _standing(source: refinement.Surface) -> Points:
+    """(k, 3) the points on steep surfaces, or all points if there are few."""
+    standing = source.standing
+    return standing if len(standing) >= MIN_STANDING else source.points

@@ -21,7 +21,7 @@ STAMP_TOLERANCE_NS = 10_000_000
 
 FIGURES = {
     "ate_m": "absolute trajectory error after alignment, rms (m)",
-    "odometry_ate_m": "the same error, odometry only (m)",
+    "odometry_ate_m": "the same error of the odometry, after repairs by the check (m)",
     "are_deg": "absolute rotation error after alignment, rms (degrees)",
     "height_m": "height error after alignment, rms (m)",
     "rpe_m": "error of the motion from pose to pose, rms (m)",

@@ -18,9 +18,10 @@ from segslam.health.history import History
 from segslam.health.local_map import LocalMap
 from segslam.odometry import GivenOdometry, KissOdometry, OdometryResult
 from segslam.refinement import LightSurface
+from segslam.refinement import refine as refined
 from segslam.registration import register
 from segslam.slam import Slam
-from segslam.types import Motion, MotionState, Rejected, RejectReason, Scan, Trajectory
+from segslam.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Trajectory
 
 CONFIG = load_config(None, ["proximity.min_travel_m=60"])
 SLIP_AT = 20
@@ -90,7 +91,7 @@ class _LikeKiss(GivenOdometry):
     is_from_scans = True
 
 
-@pytest.mark.parametrize("metres", [-2.5, 0.0])
+@pytest.mark.parametrize("metres", [-2.5, -STEP_M, 0.0])
 def test_a_wrong_first_motion_is_repaired_and_a_right_one_is_kept(metres: float) -> None:
     scans, truth = round_drive()
     trajectory = replace(truth, T_world_lidar=_slipped(metres=metres, at=1))
@@ -255,6 +256,31 @@ def test_a_checked_odometry_continues_after_restore(last: int) -> None:
     assert states[0] == states[1]
 
 
+def _behind_a_van(scan: Scan) -> np.ndarray:
+    """What a sensor with 40 degrees of view sees behind a van that drives as fast as its own vehicle."""
+    in_view = np.abs(np.arctan2(scan.points[:, 1], scan.points[:, 0])) < np.radians(20.0)
+    sides = np.mgrid[9:15:0.25, -1:1.1:2, -1.5:1:0.25].reshape(3, -1).T
+    back = np.mgrid[9:10, -1:1.1:0.25, -1.5:1:0.25].reshape(3, -1).T
+    return np.vstack([scan.points[in_view], sides, back]).astype(np.float32)
+
+
+def test_a_vehicle_that_drives_ahead_does_not_hold_a_registration_back() -> None:
+    scans, truth = round_drive()
+    local = LocalMap(CONFIG.health, CONFIG.refine)
+    for row in range(10):
+        points = _behind_a_van(scans[row])
+        local.add(truth.T_world_lidar[row], local.downsample(points), points)
+    surface = local.make_surface(local.downsample(_behind_a_van(scans[10])))
+    T_true = geometry.inverse(local.T_odom_map) @ truth.T_world_lidar[10]
+    found = local.register(surface, T_true)
+    best = max(found, key=lambda T_map_lidar: local.fit(surface, T_map_lidar).closeness)
+    assert geometry.distance(geometry.inverse(T_true) @ best) < 0.1
+    refine = CONFIG.refine.model_copy(update={"correspondence_m": CONFIG.health.correspondence_m})
+    by_gicp = refined(surface, local.surface(), T_true, config=refine, must_converge=False)
+    assert isinstance(by_gicp, Registration)
+    assert geometry.distance(geometry.inverse(T_true) @ by_gicp.T_target_source) > 0.3
+
+
 def test_kiss_icp_follows_a_repair() -> None:
     scans, truth = round_drive()
     odometry = KissOdometry(CONFIG.odometry)
@@ -343,7 +369,15 @@ def test_the_scan_behind_a_tunnel_continues_the_drive_without_a_break() -> None:
         MotionState.CONFIRMED,
         MotionState.REFINED,
         MotionState.REPAIRED,
+        MotionState.REJOINED,  # the round ends where the tunnel began
     }
+    truth = round_drive()[1].T_world_lidar
+    for row, result in enumerate(results[21:], start=21):
+        if result.motion is not None and result.motion.state is MotionState.REJOINED:
+            T_true_found = geometry.inverse(geometry.inverse(truth[10]) @ truth[row + 40]) @ (
+                geometry.inverse(results[10].T_odom_lidar) @ result.T_odom_lidar
+            )
+            assert geometry.distance(T_true_found) < 0.2
 
 
 def test_a_given_odometry_is_kept_in_a_smooth_tunnel() -> None:

@@ -143,7 +143,7 @@ def document(title: str, body: str) -> str:
 def _tiles(metrics: dict[str, Any]) -> str:
     tiles = [
         ("ate_m", " m", "error after alignment"),
-        ("odometry_ate_m", " m", "error, odometry only"),
+        ("odometry_ate_m", " m", "error of the odometry, after repairs"),
         ("num_loops_accepted", "", "loops accepted"),
         ("num_loops_false", "", "false loops"),
         ("scans_per_second", "", "scans per second"),
@@ -181,7 +181,7 @@ def _figures(metrics: dict[str, Any]) -> str:
         (f"{FIGURES.get(key, '')} <code>{escape(key)}</code>", metrics[key], metrics.get(ODOMETRY + key))
         for key in of_run
     ]
-    return _table(("", "run", "odometry only"), rows)
+    return _table(("", "run", "odometry, after repairs"), rows)
 
 
 def _outcomes(run: FinishedRun) -> str:

@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.fft import ifft, irfft, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter
 
 from segslam import geometry
-from segslam.types import Direction, Points, Registration, Rotation
+from segslam.system.kernels import kernel
+from segslam.types import Direction, Points, Registration, Rotation, Vector
 
 CELL_M = 0.5
 NUM_YAWS = 90
@@ -82,24 +83,29 @@ def _levelled(scan: Points, up: Direction) -> _Level:
 
 def _correlation(source: Points, target: Points) -> tuple[Float[np.ndarray, "yaws shifts shifts"], np.ndarray]:
     """Correlation of the plans for each yaw of the source and each shift in x and y, and the shifts in cells."""
-    angles = math.tau * np.arange(NUM_YAWS) / NUM_YAWS
-    cosines, sines = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    x, y = source[:, 0], source[:, 1]
-    turned = rfft2(_plans(cosines * x - sines * y, sines * x + cosines * y))
-    blurred = gaussian_filter(_plans(target[None, :, 0], target[None, :, 1])[0], BLUR_CELLS)
-    agreement = irfft2(rfft2(blurred) * np.conj(turned), (SIZE, SIZE))
+    turned = rfft2(_plans(source, math.tau * np.arange(NUM_YAWS) / NUM_YAWS))
+    blurred = gaussian_filter(_plans(target, np.zeros(1))[0], BLUR_CELLS)
     steps = np.arange(-int(MAX_SHIFT_M / CELL_M), int(MAX_SHIFT_M / CELL_M) + 1)
-    return agreement[:, steps[:, None], steps[None, :]], steps
+    agreement = ifft(rfft2(blurred) * np.conj(turned), axis=1)[:, steps]
+    return irfft(agreement, SIZE, axis=2)[:, :, steps], steps
 
 
-def _plans(x: np.ndarray, y: np.ndarray) -> Float[np.ndarray, "plans size size"]:
-    """Points in each cell, up to MAX_COUNT, for each row of coordinates."""
-    i, j = np.floor(x / CELL_M).astype(np.int64) + HALF, np.floor(y / CELL_M).astype(np.int64) + HALF
-    plan = np.broadcast_to(np.arange(len(x))[:, None], x.shape)
-    inside = (i >= 0) & (i < 2 * HALF) & (j >= 0) & (j < 2 * HALF)
-    cells = (plan * SIZE + i) * SIZE + j
-    counts = np.bincount(cells[inside], minlength=len(x) * SIZE * SIZE)
-    return np.minimum(counts, MAX_COUNT).astype(np.float32).reshape(len(x), SIZE, SIZE)
+def _plans(points: Points, yaws_rad: Vector) -> Float[np.ndarray, "plans size size"]:
+    """Points in each cell, up to MAX_COUNT, after each rotation."""
+    flat = np.ascontiguousarray(points[:, :2], dtype=np.float64)
+    return _counts(flat, np.cos(yaws_rad), np.sin(yaws_rad), CELL_M, HALF, SIZE, MAX_COUNT)
+
+
+@kernel("float32[:, :, ::1](float64[:, ::1], float64[:], float64[:], float64, int64, int64, int64)")
+def _counts(points, cosines, sines, cell_m, half, size, most):
+    counts = np.zeros((len(cosines), size, size), np.float32)
+    for k in range(len(cosines)):
+        for x, y in points:
+            i = math.floor((cosines[k] * x - sines[k] * y) / cell_m) + half
+            j = math.floor((sines[k] * x + cosines[k] * y) / cell_m) + half
+            if 0 <= i < 2 * half and 0 <= j < 2 * half and counts[k, i, j] < most:
+                counts[k, i, j] += 1.0
+    return counts
 
 
 def _peaks(volume: Float[np.ndarray, "yaws shifts shifts"], num_peaks: int) -> Iterator[tuple[int, int, int]]:

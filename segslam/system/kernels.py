@@ -23,6 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 PACKAGE = Path(__file__).resolve().parents[1]
 MODULES = (
     "segregator.descent",
+    "segregator.plan",
     "cliques.search",
     "cliques.bits",
     "segregator.fpfh",

@@ -23,7 +23,6 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 PACKAGE = Path(__file__).resolve().parents[1]
 MODULES = (
     "segregator.descent",
-    "segregator.plan",
     "cliques.search",
     "cliques.bits",
     "segregator.fpfh",
@@ -34,6 +33,7 @@ MODULES = (
     "semantics.walls",
     "semantics.votes",
     "segregator.clusters",
+    "segregator.plan",
     "segregator.correspondences",
     "segregator.feet",
     "segregator.gaussians",

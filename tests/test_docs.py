@@ -45,6 +45,20 @@ def test_the_example_that_maps_writes_a_pose_a_scan(
     assert "5 poses in" in capsys.readouterr().out
 
 
+def test_the_python_of_the_readme_skips_a_scan_that_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    velodyne = write_kitti_sequence(tmp_path / "FOLDER", num_scans=4)
+    np.full((500, 4), 900.0, dtype=np.float32).tofile(velodyne / "000002.bin")  # beyond the range
+    monkeypatch.chdir(tmp_path)
+    [block] = re.findall(r"(?s)```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"))
+    points = np.zeros((0, 3))
+    names: dict[str, Any] = {"source_points": points, "target_points": points}
+    exec(compile(block, "README.md", "exec"), names)
+    assert names["result"].trajectory.scan_index.tolist() == [0, 1, 3]
+    assert "skipped: scan 2" in capsys.readouterr().out
+
+
 def test_the_example_that_registers_finds_the_pose(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,6 @@
 """A killed run is resumed after its last complete step, and ends like an uninterrupted run."""
 
+import csv
 import errno
 import json
 import shutil
@@ -17,6 +18,9 @@ from helpers.made_logs import boundaries, largest_file
 from mcap.reader import make_reader
 
 from segslam.log import LogWriter, RunLog, read_log
+from segslam.pose_graph import read_g2o
+from segslam.run.finished import read_run
+from segslam.run.folder import POSE_COLUMNS
 from segslam.types import LoopClosure
 
 pytestmark = pytest.mark.usefixtures("blank_reports")
@@ -86,6 +90,27 @@ def _assert_as_whole(whole: Path, resumed: Path) -> None:
     with (resumed / "log.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert sum(1 for _ in reader.iter_messages()) == reader.get_summary().statistics.message_count
+
+
+def test_graph_table_and_log_have_the_same_closures(whole: Path) -> None:
+    """With their poses and final weights, in files written from different records."""
+    made = read_run(whole)
+    logged = {
+        (one.outcome.target_id, one.outcome.source_id): one.outcome.T_target_source
+        for one in made.result.attempts
+        if isinstance(one.outcome, LoopClosure)
+    }
+    graph = read_g2o(whole / "graph.g2o")
+    drawn = {(edge.a, edge.b): edge.T_a_b for edge in graph.edges if edge.b != edge.a + 1}
+    with (whole / "loops.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["outcome"] == "accepted"]
+    assert drawn.keys() == logged.keys() == {(int(row["target"]), int(row["source"])) for row in rows}
+    assert len(rows) == len(logged) > 0
+    for row in rows:
+        target_id, source_id = int(row["target"]), int(row["source"])
+        np.testing.assert_allclose(drawn[target_id, source_id], logged[target_id, source_id], atol=1e-6)
+        np.testing.assert_array_equal([float(row[name]) for name in POSE_COLUMNS], logged[target_id, source_id].ravel())
+        assert float(row["weight"]) == made.result.estimate.closure_weights[source_id, target_id]
 
 
 def _resumed_as_whole(kitti: Path, whole: Path, out: Path) -> None:

@@ -6,6 +6,7 @@ of graphs of Qiao et al., "G3Reg: Pyramid Graph-Based Global Registration Using 
 then point features.
 """
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -23,15 +24,18 @@ from segslam.segregator.correspondences import (
 )
 from segslam.segregator.gaussians import align_gaussians
 from segslam.segregator.pose_solver import PoseFit, solve_level, solve_pose
-from segslam.types import Description, Direction, Indices, Registration, Rejected, RejectReason, Transform
+from segslam.types import Description, Direction, Indices, Points, Registration, Rejected, RejectReason, Transform
 
 SAME_PLACE_M, SAME_TURN_RAD = 0.5, np.radians(2.0)
 """Chosen: closer poses are one hypothesis, because refinement leads to the same pose."""
 MIN_GROUND_PATCHES = 5
 """Chosen: smallest number of ground patches that determine the vertical."""
-LEVEL_PATCHES = 8.0
-"""Chosen: number of ground patches that tell as much as the z axis of a scan. In a corridor the normals of single
-patches scatter by 13 degrees; sensors are level to 5."""
+TILT_RAD = math.radians(5.0)
+"""Chosen: standard deviation of a sensor's tilt, if the ground says nothing."""
+PATCH_RAD = math.radians(13.0)
+"""Chosen: scatter of a ground normal before any is seen, as in a corridor whose ground is seen by 16 beams."""
+RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
+"""Median angle of directions that scatter by 1 in each of two directions."""
 
 
 def match(source: Description, target: Description, *, config: SegregatorConfig) -> Registration | Rejected:
@@ -150,18 +154,32 @@ def _rough_pose(
 
 
 def upward(description: Description) -> Direction | None:
-    """Upward unit vector from the mean normal of the ground; None if too little ground is visible."""
+    """Upward unit vector from the normals of the ground; None if too little ground is visible."""
     if len(description.ground_normals) < MIN_GROUND_PATCHES:
         return None
-    total = description.ground_normals.astype(np.float64).sum(axis=0)
-    return total / np.linalg.norm(total)
+    return _middle(description.ground_normals)
 
 
 def vertical(description: Description) -> Direction:
-    """Upward unit vector: the scan's z axis, corrected by the normals of the ground as far as ground is visible."""
-    total = description.ground_normals.astype(np.float64).sum(axis=0)
-    total[2] += LEVEL_PATCHES
+    """Upward unit vector: the scan's z axis, corrected by the normals of the ground as far as ground is visible.
+
+    Ground and z axis are weighted by their inverse variances: that of the ground follows from the scatter of its
+    normals around their middle, that of the z axis is `TILT_RAD`.
+    """
+    normals = description.ground_normals
+    if not len(normals):
+        return np.array([0.0, 0.0, 1.0])
+    middle = _middle(normals)
+    scatter = np.median(np.linalg.norm(normals - middle, axis=1)) / RAYLEIGH_MEDIAN
+    variance = (len(normals) * scatter**2 + PATCH_RAD**2) / len(normals) ** 2  # of the middle
+    total = middle / variance + np.array([0.0, 0.0, 1.0 / TILT_RAD**2])
     return total / np.linalg.norm(total)
+
+
+def _middle(normals: Points) -> Direction:
+    """Unit vector of the medians of the components: patches of slopes and walls do not move it, as they do the mean."""
+    middle = np.median(normals.astype(np.float64), axis=0)
+    return middle / np.linalg.norm(middle)
 
 
 def _is_among(T_target_source: Transform, poses: list[Transform]) -> bool:

@@ -290,27 +290,40 @@ class _Trial(NamedTuple):
         if far is not None:
             return far
         found = gates.agreement(self.source.observed, self.target.observed, fine.T_target_source, config=config)
-        rejected = gates.rejection(found, self.limits)
-        if rejected is not None:
-            return rejected
         observability, _ = refinement.observability(fine.information, config=self.config.refine)
-        weak_direction = refinement.weakest_level(fine.information)
-        unsupported = self._unsupported(fine.T_target_source, weak_direction, found.overlap)
-        if unsupported is not None:
-            return unsupported
         alignment = Alignment(
             coarse, fine, found.overlap, found.rms_m, found.free_space_violation, observability=observability
         )
-        return Found(alignment, found, weak_direction)
+        passed = Found(alignment, found, refinement.weakest_level(fine.information))
+        return self.rejection(passed) or passed
 
-    def _unsupported(self, T_target_source: Transform, direction: Direction, overlap: float) -> Rejected | None:
-        """Rejects a pose along whose weak direction nothing matches, such as one slid along a corridor."""
+    def rejection(self, pose: Found) -> Rejected | None:
+        """Rejects a pose that fits badly, or along whose weak direction nothing matches, as if slid along a corridor.
+
+        More than one surface must match there if the fine Hessian leaves a direction unobserved, if a scan sees one
+        side of the place only, or if the pose fits less well than neighbours do.
+        """
+        found = pose.agreement
+        config = self.config.verify
+        rejected = gates.rejection(found, self.limits.unreduced())
+        if rejected is not None:
+            return rejected
         scans = self.source.surface, self.target.surface
-        support = gates.weak_support(*scans, T_target_source, direction, config=self.config.verify)
-        least = self.config.verify.min_weak_support * overlap
-        if support >= least:
+        T_target_source = pose.alignment.fine.T_target_source
+        support = gates.weak_support(*scans, T_target_source, pose.weak_direction, config=config)
+        least = config.min_weak_support * found.overlap
+        if support.whole < least:
+            return Rejected(RejectReason.LOW_OVERLAP, f"{support.whole:.3f} < {least:.3f} along the weakest direction")
+        least = config.min_second_support * found.overlap
+        if support.second >= least:
             return None
-        return Rejected(RejectReason.LOW_OVERLAP, f"{support:.3f} < {least:.3f} along the weakest direction")
+        detail = f"{support.second:.3f} < {least:.3f} beside one surface along the weakest direction"
+        rejected = gates.rejection(found, self.limits)
+        if rejected is not None:
+            return Rejected(rejected.reason, f"{rejected.detail}, and {detail}")
+        is_narrow = min(self.source.free_space.view, self.target.free_space.view) < gates.NARROW_VIEW
+        is_unobserved = pose.alignment.observability < refinement.UNOBSERVED
+        return Rejected(RejectReason.LOW_OVERLAP, detail) if is_narrow or is_unobserved else None
 
 
 def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
@@ -339,7 +352,7 @@ def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
         beside = f"{others[0].agreement.mismatch:.3f} {geometry.distance(apart):.1f} m off"
         return Rejected(RejectReason.AMBIGUOUS, f"mismatch {best.agreement.mismatch:.3f}, and {beside}")
     far = trial.gate(best.alignment.fine.T_target_source, slack_m=0.0)
-    return far or gates.rejection(best.agreement, trial.limits) or best.alignment
+    return far or trial.rejection(best) or best.alignment
 
 
 def _rivals(found: Found, trial: _Trial, few: refinement.Surface) -> Iterator[Registration]:

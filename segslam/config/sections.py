@@ -489,6 +489,14 @@ class VerifyConfig(Section):
         description="smallest share of matching points, relative to the overlap, among points facing the direction in "
         "which they constrain the pose least [chosen on courtyard and simulated corridors]",
     )
+    min_second_support: float = Field(
+        0.15,
+        ge=0,
+        le=1,
+        description="the same without the surface that most of them match, for poses with an unobserved direction, "
+        "scans that see one side only, and scans that fit less well than neighbouring keyframes "
+        "[chosen on simulated corridors and tunnels]",
+    )
     max_range_m: float = Field(
         50.0,
         gt=0,

@@ -47,6 +47,11 @@ class FreeSpace:
     free_path_m: float
     """Median range over the directions with a return: the scale of the place (m); 0 without returns."""
 
+    @property
+    def view(self) -> float:
+        """Share of the azimuths with a return, 0 to 1."""
+        return float(np.isfinite(self.nearest_m).any(axis=0).mean())
+
 
 def observe_free_space(points: Points) -> FreeSpace:
     """The spherical image of a scan; `points` (n, 3) in the sensor's frame."""

@@ -9,6 +9,7 @@ surfaces, and its limit is relative to neighbouring keyframes of the run, whose 
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from segslam import geometry
 from segslam.config import VerifyConfig
 from segslam.points import within_range
 from segslam.refinement import Surface
-from segslam.types import Direction, Rejected, RejectReason, Transform
+from segslam.types import Direction, Mask, Rejected, RejectReason, Transform, Vector
 from segslam.verification.free_space import FreeSpace, violation
 
 Observed = tuple[Surface, FreeSpace]
@@ -62,11 +63,13 @@ CERTAIN_RESIDUAL, CERTAIN_VIOLATION, LEAST_VIOLATION = 1.25, 3.0, 0.005
 KITTI 00, 0.5 to 35 m apart, 95 % have less."""
 RESIDUAL_OF_NEIGHBOURS, VIOLATION_OF_NEIGHBOURS = 0.85, 0.5
 """Chosen on simulated corridors, seed 1: limits of scans in narrow places that overlap as neighbours do, relative to
-those of others."""
+those of others, unless a second surface confirms the pose."""
 NARROW_M, OPEN_M = 4.0, 6.0
 """Chosen: free paths of narrow places, where the limits above hold, and of open ones, where they do not. Simulated
 corridors have 1.7 to 4.5 m, the courtyard, NCLT, KITTI and simulated streets 4.7 to 14.4 m. In a street parked cars
 come and go: half of the correct poses on another day violate free space by more than such a limit."""
+NARROW_VIEW = 0.5
+"""Chosen: a scan with returns in less than this share of the azimuths sees one side of a place only."""
 FACING, SAME_NORMAL, MIN_FACING = 0.5, 0.8, 10
 """Chosen: a surface faces a direction within 60 degrees; two surfaces are the same within 37 degrees; fewer facing
 points than `MIN_FACING` prove nothing."""
@@ -91,6 +94,10 @@ class Limits:
             (1.0 - share * (1.0 - RESIDUAL_OF_NEIGHBOURS)) * self.max_residual_ratio,
             (1.0 - share * (1.0 - VIOLATION_OF_NEIGHBOURS)) * self.max_free_space_violation,
         )
+
+    def unreduced(self) -> "Limits":
+        """The limits at any overlap, for poses that a second surface confirms."""
+        return replace(self, overlap_of_neighbours=math.inf)
 
     def loosened(self) -> "Limits":
         """Limits for rivals, which need not fit as well as an accepted pose to make it ambiguous."""
@@ -135,32 +142,62 @@ def mismatch(overlap: float, residual_ratio: float) -> float:
     return 1.0 - overlap + overlap * min(residual_ratio / 2.0, 1.0) ** 2
 
 
+class Support(NamedTuple):
+    """Shares of the points facing a direction that match a surface of the other scan."""
+
+    whole: float
+    """Of all facing points."""
+    second: float
+    """Of those beside the surface that most of them match. A single surface, like the end of a corridor, exists at
+    many places; a second one at the same distance does not."""
+
+
 def weak_support(
     source: Surface, target: Surface, T_target_source: Transform, direction: Direction, *, config: VerifyConfig
-) -> float:
-    """Share of the points facing a direction that lie on a surface of the other scan with the same normal.
+) -> Support:
+    """Evidence for the position along a direction; the smaller shares of both directions of comparison.
 
     `direction`: unit vector in the source's frame in which the scans constrain the pose least. Only surfaces facing it
-    determine the pose there, as the recesses of doors do along a corridor, whose walls match at any shift. The smaller
-    share of both directions of comparison; 0 where too few points face the direction to decide, as in a smooth tunnel.
+    determine the pose there, as the recesses of doors do along a corridor, whose walls match at any shift. A surface
+    matches within `inlier_m` if the normals are the same, a second one if it also fits within twice the roughness.
+    Shares are 0 where too few points face the direction to decide, as in a smooth tunnel.
     """
-    ways = (
-        (source, target, T_target_source, direction),
-        (target, source, geometry.inverse(T_target_source), T_target_source[:3, :3] @ direction),
-    )
-    shares = []
-    for a, b, T_b_a, towards in ways:
-        normals = a.normals
-        facing = np.abs(normals @ towards) > FACING
-        moved = geometry.apply(T_b_a, a.points[facing])
-        near = within_range(moved, 0.0, config.max_range_m)
-        if near.sum() < MIN_FACING:
-            return 0.0
-        rows, to_point = b.nearest(moved[near])
-        turned = normals[facing][near] @ T_b_a[:3, :3].T
-        same = np.abs(np.einsum("ij,ij->i", turned, b.normals[rows])) > SAME_NORMAL
-        shares.append(float(np.mean((to_point < config.inlier_m) & same)))
-    return min(shares)
+    fit_m = 2.0 * max(source.roughness_m, target.roughness_m)
+    there = T_target_source[:3, :3] @ direction
+    forth = _support(source, target, T_target_source, direction, fit_m, config)
+    back = _support(target, source, geometry.inverse(T_target_source), there, fit_m, config)
+    return Support(min(forth.whole, back.whole), min(forth.second, back.second))
+
+
+def _support(
+    a: Surface, b: Surface, T_b_a: Transform, towards: Direction, fit_m: float, config: VerifyConfig
+) -> Support:
+    """Support of one scan by the other; `towards` in the frame of the first."""
+    normals = a.normals
+    facing = np.abs(normals @ towards) > FACING
+    moved = geometry.apply(T_b_a, a.points[facing])
+    near = within_range(moved, 0.0, config.max_range_m)
+    if near.sum() < MIN_FACING:
+        return Support(0.0, 0.0)
+    rows, to_point = b.nearest(moved[near])
+    turned = normals[facing][near] @ T_b_a[:3, :3].T
+    same = np.abs(np.einsum("ij,ij->i", turned, b.normals[rows])) > SAME_NORMAL
+    matches = (to_point < config.inlier_m) & same
+    to_plane = np.abs(np.einsum("ij,ij->i", moved[near] - b.points[rows], b.normals[rows]))
+    fits = matches & (to_plane < fit_m)
+    along_m = a.points[facing][near] @ towards
+    beside = ~_within_fullest(along_m, fits, 2.0 * config.inlier_m)
+    return Support(float(np.mean(matches)), float(np.mean(fits[beside])) if beside.any() else 0.0)
+
+
+def _within_fullest(along_m: Vector, counted: Mask, width_m: float) -> Mask:
+    """(n,) the points within the interval of this width that has most of the counted points."""
+    if not counted.any():
+        return np.zeros(len(along_m), bool)
+    starts_m = np.sort(along_m[counted])
+    sizes = np.searchsorted(starts_m, starts_m + width_m, side="right") - np.arange(len(starts_m))
+    start_m = starts_m[sizes.argmax()]
+    return (along_m >= start_m) & (along_m <= start_m + width_m)
 
 
 def is_certain(found: Agreement, floor: NoiseFloor) -> bool:

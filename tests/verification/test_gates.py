@@ -10,6 +10,7 @@ from segslam.config import RefineConfig, VerifyConfig
 from segslam.types import RejectReason
 from segslam.verification.free_space import observe_free_space
 from segslam.verification.gates import (
+    NARROW_VIEW,
     SINGLE_PAIR,
     Agreement,
     NoiseFloor,
@@ -19,6 +20,7 @@ from segslam.verification.gates import (
     is_certain,
     limits,
     rejection,
+    weak_support,
 )
 
 CONFIG = VerifyConfig()
@@ -31,6 +33,17 @@ def _prepared(points: np.ndarray) -> Observed:
     return refinement.make_surface(refinement.downsample(points, config=REFINE), config=REFINE), observe_free_space(
         points
     )
+
+
+def _room(pillar_m: float | None = None) -> Observed:
+    """Two walls and an end wall 12 m ahead; perhaps the front of a pillar at the left wall."""
+    u, v = np.meshgrid(np.arange(0.05, 1.0, 0.02), np.arange(-1.0, 1.5, 0.15))
+    x, z = 1.5 + 10.5 * u.ravel(), v.ravel()
+    parts = [np.column_stack([x, np.full_like(x, side), z]) for side in (-2.5, 2.5)]
+    parts.append(np.column_stack([np.full_like(x, 12.0), 5.0 * u.ravel() - 2.5, z]))
+    if pillar_m is not None:
+        parts.append(np.column_stack([np.full_like(x, pillar_m), 2.5 - 2.0 * u.ravel(), z]))
+    return _prepared(np.concatenate(parts))
 
 
 def test_swapping_the_scans_changes_nothing() -> None:
@@ -125,6 +138,25 @@ def test_in_a_narrow_place_scans_that_overlap_as_neighbours_do_must_fit_nearly_a
     assert rejected is not None
     assert rejected.reason is RejectReason.HIGH_RESIDUAL
     assert rejection(replace(between, overlap=0.4), allowed) is None
+    assert rejection(between, allowed.unreduced()) is None
+
+
+def test_a_wall_that_every_corridor_ends_with_is_no_second_surface() -> None:
+    """Two corridors that end alike, one with a pillar before the end, and the other with none."""
+    ends, pillar = _room(), _room(pillar_m=5.0)
+    along = np.array([1.0, 0.0, 0.0])
+    same = weak_support(pillar[0], pillar[0], np.eye(4), along, config=CONFIG)
+    assert min(same) > 0.9
+    other = weak_support(pillar[0], ends[0], np.eye(4), along, config=CONFIG)
+    assert other.whole > CONFIG.min_weak_support
+    assert other.second < 0.05
+
+
+def test_a_scan_that_looks_one_way_has_a_narrow_view() -> None:
+    assert _room()[1].view < NARROW_VIEW
+    azimuth = np.radians(np.arange(0.0, 360.0, 0.5))
+    around = np.column_stack([8.0 * np.cos(azimuth), 8.0 * np.sin(azimuth), np.zeros(len(azimuth))])
+    assert observe_free_space(around).view == 1.0
 
 
 def test_neighbours_that_share_their_points_do_not_make_the_limit_stricter_than_other_scans_can_reach() -> None:

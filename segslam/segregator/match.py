@@ -31,7 +31,7 @@ SAME_PLACE_M, SAME_TURN_RAD = 0.5, np.radians(2.0)
 MIN_GROUND_PATCHES = 5
 """Chosen: smallest number of ground patches that determine the vertical."""
 TILT_RAD = math.radians(5.0)
-"""Chosen: standard deviation of a sensor's tilt, if the ground says nothing."""
+"""Chosen: standard deviation of a sensor's tilt, without visible ground."""
 PATCH_RAD = math.radians(13.0)
 """Chosen: scatter of a ground normal before any is seen, as in a corridor whose ground is seen by 16 beams."""
 RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))

@@ -142,7 +142,7 @@ def test_in_a_narrow_place_scans_that_overlap_as_neighbours_do_must_fit_nearly_a
 
 
 def test_a_wall_that_every_corridor_ends_with_is_no_second_surface() -> None:
-    """Two corridors that end alike, one with a pillar before the end, and the other with none."""
+    """Two corridors with the same end; in one of them stands a pillar."""
     ends, pillar = _room(), _room(pillar_m=5.0)
     along = np.array([1.0, 0.0, 0.0])
     same = weak_support(pillar[0], pillar[0], np.eye(4), along, config=CONFIG)

@@ -261,12 +261,13 @@ class _Trial(NamedTuple):
 
     def led(self, coarse: Registration, few: refinement.Surface) -> Registration | None:
         """The pose to which a few points of the source lead; None if the pose is impossible."""
-        if self.gate(coarse.T_target_source, slack_m=self.config.verify.max_coarse_fine_m):
+        if self.gate(coarse.T_target_source, slack_m=self.config.verify.max_coarse_fine_m) is not None:
             return None
         scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            if gates.early_rejection(*scans, coarse.T_target_source, self.limits, config=self.config.verify):
-                return None
+            hopeless = gates.early_rejection(*scans, coarse.T_target_source, self.limits, config=self.config.verify)
+        if hopeless is not None:
+            return None
         with self.watch("refine"):
             fine = refinement.refine(
                 few, self.target.surface, coarse.T_target_source, config=self.config.refine, must_converge=False
@@ -295,7 +296,8 @@ class _Trial(NamedTuple):
             coarse, fine, found.overlap, found.rms_m, found.free_space_violation, observability=observability
         )
         passed = Found(alignment, found, refinement.weakest_level(fine.information))
-        return self.rejection(passed) or passed
+        rejected = self.rejection(passed)
+        return passed if rejected is None else rejected
 
     def rejection(self, pose: Found) -> Rejected | None:
         """Rejects a pose that fits badly, or along whose weak direction nothing matches, as if slid along a corridor.
@@ -351,8 +353,10 @@ def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
         apart = geometry.inverse(best.alignment.fine.T_target_source) @ others[0].alignment.fine.T_target_source
         beside = f"{others[0].agreement.mismatch:.3f} {geometry.distance(apart):.1f} m off"
         return Rejected(RejectReason.AMBIGUOUS, f"mismatch {best.agreement.mismatch:.3f}, and {beside}")
-    far = trial.gate(best.alignment.fine.T_target_source, slack_m=0.0)
-    return far or trial.rejection(best) or best.alignment
+    rejected = trial.gate(best.alignment.fine.T_target_source, slack_m=0.0)
+    if rejected is None:
+        rejected = trial.rejection(best)
+    return best.alignment if rejected is None else rejected
 
 
 def _rivals(found: Found, trial: _Trial, few: refinement.Surface) -> Iterator[Registration]:

@@ -26,6 +26,8 @@ from segslam.tracker import Tracked, Tracker
 from segslam.types import BadScan, Scan, SegslamError
 
 READY = b"ready"
+END_S = 5.0
+"""Chosen: time for a source to end; the process does not wait longer for a middleware that hangs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,6 +135,7 @@ def _serve(pipe: Connection, source: Source, config: Config, idle_s: float | Non
     sender.start()
     waiting, stopped = Waiting(), Event()
     why, failed = "", False
+    feeder: _Feeder | None = None
     try:
         with OdometryApart(config.odometry) as odometry:
             _warm_up(config, odometry)
@@ -144,13 +147,16 @@ def _serve(pipe: Connection, source: Source, config: Config, idle_s: float | Non
                 is_idle = _place_all(Tracker(config, odometry=odometry), source, waiting, to_send, idle_s)
             finally:
                 stopped.set()
-                feeder.join()
+                feeder.join(timeout=END_S)
             why = f"no scan for {idle_s:g} s" if is_idle else feeder.why
             failed = feeder.failed
+            if feeder.is_alive():
+                why, failed = f"the source did not end within {END_S:g} s", False
     except SegslamError as error:
         why, failed = str(error), True
     finally:
-        source.close()
+        if feeder is None or not feeder.is_alive():
+            source.close()
     rhythm = waiting.rhythm
     to_send.put(
         Ended(

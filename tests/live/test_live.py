@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.commands import run
 from helpers.drives import drifting_slam, round_drive
+from helpers.hanging_source import HangingSource
 from helpers.live_command import LiveCommand, record, write_scan
 from helpers.terminal import in_terminal
 
@@ -17,7 +18,7 @@ from segslam import geometry
 from segslam.cli.live_status import too_slow
 from segslam.config import Config, OdometryConfig
 from segslam.evaluation import trajectory_metrics
-from segslam.live import FolderSource
+from segslam.live import FolderSource, Front
 from segslam.live.folder import stamp_of_name
 from segslam.live.rhythm import Rhythm
 from segslam.live.waiting import Waiting
@@ -325,3 +326,12 @@ def test_a_faster_odometry_is_recommended_where_many_scans_were_dropped() -> Non
     advice = too_slow({"num_scans_dropped": 30, "num_scans_arrived": 100}, 0.4)
     assert advice.startswith("30 of 100 scans were dropped")
     assert "--set odometry.voxel_size_m=0.6 " in advice
+
+
+def test_a_source_that_hangs_does_not_keep_a_run_from_ending() -> None:
+    with Front(HangingSource(), Config(), tell=lambda text: None) as front:
+        front.wait_until_ready()
+        front.stop()
+        assert list(front) == []
+    assert not front.ended.failed
+    assert "did not end" in front.ended.why

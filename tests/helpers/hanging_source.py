@@ -21,7 +21,7 @@ class HangingSource:
         return ""
 
     def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
-        """Nobody listens."""
+        """There is no subscriber."""
 
     def close(self) -> None:
         """Would hang, too."""

@@ -271,8 +271,10 @@ class CheckedOdometry:
             self._map, self._lost = before_break, None
         else:
             found = self._best(self._map, scan, guesses, guesses[:2])
-            if found is None and direction is None:
-                found = self._best(self._map, scan, [self._around(scan, T_odom_predicted)], guesses[:2])
+            is_usual = found is not None and self._history.is_usual(found.fit)
+            if not is_usual and direction is None:
+                around = self._around(scan, T_odom_predicted)
+                found = self._best(self._map, scan, [*guesses, around], guesses[:2])
             found = found or self._recovered(self._map, scan)
         is_at_an_end = direction is not None or self._unseen.direction is not None
         if found is None and is_at_an_end and gap <= LONG_GAP:

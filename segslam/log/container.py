@@ -1,5 +1,6 @@
 """Reading of MCAP files, complete, truncated (process killed, disk full) or damaged (power failure)."""
 
+import os
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
@@ -141,6 +142,8 @@ def _records(stream: IO[bytes], start: int = 0) -> Iterator[tuple[int, int, byte
             raise CutError(offset)
         opcode, length = _RECORD_HEAD.unpack(head)
         if opcode not in set(Opcode):  # after a power failure, pages that were not written read as zeros
+            raise CutError(offset)
+        if length > os.fstat(stream.fileno()).st_size:  # a damaged length may not even fit in memory
             raise CutError(offset)
         body = stream.read(length)
         if len(body) < length:

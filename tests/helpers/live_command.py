@@ -14,6 +14,11 @@ import numpy as np
 from segslam.types import Scan
 
 
+def _with_ctrl_c() -> None:
+    """A shell starts what runs in the background with Ctrl-C ignored, which a command inherits."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 class LiveCommand:
     """The command; a context manager that leaves no process behind."""
 
@@ -21,7 +26,12 @@ class LiveCommand:
         words = [sys.executable, "-m", "segslam", "live", *map(str, arguments), "--json"]
         self.output = ""
         self._process = subprocess.Popen(
-            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment
+            words,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | environment,
+            preexec_fn=_with_ctrl_c,
         )
 
     def __enter__(self) -> "LiveCommand":

@@ -179,3 +179,14 @@ def test_a_step_that_contradicts_its_schema_is_refused(tmp_path: Path) -> None:
     log = read_log(_foreign(tmp_path / "broken.mcap", metadata, step_schema))
     with pytest.raises(SegslamError, match="not written by segslam"):
         list(log.steps())
+
+
+def test_a_record_with_an_impossible_length_ends_the_log(whole: Path, tmp_path: Path, steps: list[Step]) -> None:
+    data = bytearray(whole.read_bytes())
+    offset = 8  # after the magic bytes
+    while offset < len(data) // 2:  # to a record in the middle: opcode, length, body
+        offset += 9 + int.from_bytes(data[offset + 1 : offset + 9], "little")
+    data[offset + 1 : offset + 9] = b"\xff" * 8
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    assert 0 < len(list(read_log(damaged).steps())) < len(steps)

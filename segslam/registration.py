@@ -182,7 +182,7 @@ def register_near(
 ) -> Alignment | Rejected:
     """The refined and verified pose near one that is known to `KNOWN_M` and `KNOWN_RAD`; no other poses are tried.
 
-    It takes a tenth of the time of `register_prepared`. Rejects FAR_FROM_PRIOR if refinement moves the pose farther.
+    Rejects FAR_FROM_PRIOR if refinement moves the pose farther.
     """
     trial = _Trial(source, target, config, anywhere, floor, gates.limits(floor, config=config.verify), watch)
     with watch("refine"):

@@ -2,9 +2,9 @@
 
 As long as the odometry is sound, one scan every `keyframes.distance_m` is compared with the previous one by
 `check.nudge`, in a few milliseconds. If the scans contradict a motion, the scan is registered with the last scans
-(`LocalMap`): first from several initial guesses, then without any. Each following scan is registered as well, until the
-odometry agrees with `watch_scans` registrations in a row. A motion that no registration supports is a break: a guess
-with nearly no information.
+(`LocalMap`): first from several initial guesses, then from the best of many poses around the last one, then without
+any. Each following scan is registered as well, until the odometry agrees with `watch_scans` registrations in a row. A
+motion that no registration supports is a break: a guess with nearly no information.
 """
 
 from collections.abc import Callable, Sequence
@@ -270,11 +270,7 @@ class CheckedOdometry:
         if found is not None and before_break is not None:
             self._map, self._lost = before_break, None
         else:
-            found = self._best(self._map, scan, guesses, guesses[:2])
-            is_usual = found is not None and self._history.is_usual(found.fit)
-            if not is_usual and direction is None:
-                around = self._around(scan, T_odom_predicted)
-                found = self._best(self._map, scan, [*guesses, around], guesses[:2])
+            found = self._near(scan, guesses, T_odom_predicted if direction is None else None)
             found = found or self._recovered(self._map, scan)
         is_at_an_end = direction is not None or self._unseen.direction is not None
         if found is None and is_at_an_end and gap <= LONG_GAP:
@@ -322,21 +318,37 @@ class CheckedOdometry:
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         return self._break(T_odom_predicted, scan)
 
-    def _best(
+    def _near(self, scan: _Seen, T_odom_guesses: list[Transform], T_odom_predicted: Transform | None) -> _Found | None:
+        """The best registration from the guesses and, if none of them leads to the usual fit, from `_around` as well.
+
+        The first two guesses are expected poses. Without `T_odom_predicted` no other poses are searched.
+        """
+        guesses, expected = _different(T_odom_guesses), T_odom_guesses[:2]
+        found = self._registrations(self._map, scan, guesses, expected)
+        best = self._best(self._map, found)
+        if T_odom_predicted is None or (best is not None and self._history.is_usual(best.fit)):
+            return best
+        more = _different([*guesses, self._around(scan, T_odom_predicted)])[len(guesses) :]
+        return self._best(self._map, found + self._registrations(self._map, scan, more, expected))
+
+    def _registrations(
         self, local: LocalMap, scan: _Seen, T_odom_guesses: Sequence[Transform], T_odom_expected: Sequence[Transform]
-    ) -> _Found | None:
-        """The registration that fits best, from distinct guesses; None if none has the usual fit.
+    ) -> list[_Found]:
+        """All registrations from some initial guesses."""
+        found = []
+        for T_odom_guess in T_odom_guesses:
+            for T_map_lidar in local.register(scan.surface, geometry.inverse(local.T_odom_map) @ T_odom_guess):
+                T_odom_lidar = local.T_odom_map @ T_map_lidar
+                offsets = [geometry.inverse(T_odom_other) @ T_odom_lidar for T_odom_other in T_odom_expected]
+                found.append(_Found(T_map_lidar, local.fit(scan.surface, T_map_lidar), offsets))
+        return found
+
+    def _best(self, local: LocalMap, found: list[_Found]) -> _Found | None:
+        """The registration that fits best; None if none has the usual fit.
 
         Of those that fit nearly as well, as all poses along a wall do, it is the one nearest to an expected pose. Such
         a pose supports a worse fit too, but not in the map before a break: it continues a guess.
         """
-        T_map_odom = geometry.inverse(local.T_odom_map)
-        found: list[_Found] = []
-        for T_map_guess in _different([T_map_odom @ T_odom_guess for T_odom_guess in T_odom_guesses]):
-            for T_map_lidar in local.register(scan.surface, T_map_guess):
-                T_odom_lidar = local.T_odom_map @ T_map_lidar
-                offsets = [geometry.inverse(T_odom_other) @ T_odom_lidar for T_odom_other in T_odom_expected]
-                found.append(_Found(T_map_lidar, local.fit(scan.surface, T_map_lidar), offsets))
         if not found:
             return None
         enough = NEARLY * max(each.fit.closeness for each in found)
@@ -356,14 +368,15 @@ class CheckedOdometry:
         if isinstance(alignment, Rejected):
             return None
         T_odom_recovered = local.T_odom_map @ alignment.fine.T_target_source
-        return self._best(local, scan, [T_odom_recovered], [T_odom_recovered])
+        return self._best(local, self._registrations(local, scan, [T_odom_recovered], [T_odom_recovered]))
 
     def _found_again(self, scan: _Seen, T_odom_guesses: list[Transform]) -> _Found | None:
         """The pose in the map before the last break, if the break was within the last `LOST_SCANS`."""
         if self._lost is None:
             return None
         self._history.scans_lost += 1
-        if found := self._best(self._lost, scan, T_odom_guesses, T_odom_guesses[:2]):
+        tried = self._registrations(self._lost, scan, _different(T_odom_guesses), T_odom_guesses[:2])
+        if found := self._best(self._lost, tried):
             return found
         if self._history.scans_lost % RECOVER_EVERY == 0 and (found := self._recovered(self._lost, scan)):
             return found

@@ -152,7 +152,7 @@ def test_an_unsupported_motion_is_a_break_and_is_repaired_when_the_map_is_visibl
 
 
 @pytest.mark.parametrize("degrees", [-25.0, 32.0])
-def test_a_sudden_turn_is_registered_from_turned_guesses(degrees: float) -> None:
+def test_a_sudden_turn_is_found_by_the_search_around_the_last_pose(degrees: float) -> None:
     """Both the odometry and its prediction miss the turn, and no registration without initial guess is accepted."""
     scans, truth = round_drive()
     turn = geometry.transform(geometry.yaw(np.radians(degrees)), np.zeros(3))

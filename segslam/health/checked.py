@@ -8,8 +8,6 @@ motion that no registration supports is a break: a guess with nearly no informat
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -17,38 +15,26 @@ from segslam import geometry
 from segslam.config import Config
 from segslam.health.check import nudge, open_direction
 from segslam.health.history import LONG_GAP, LOST_SCANS, History, Intervals
-from segslam.health.local_map import Fit, LocalMap
+from segslam.health.local_map import LocalMap
 from segslam.health.restored import rows_in_maps
+from segslam.health.search import LEAST_SUPPORTED, Found, PoseSearch, Recover, SeenScan, are_different
 from segslam.health.unseen import Unseen, moved_along
 from segslam.odometry import Odometry, OdometryResult, deskew_scan
-from segslam.refinement import LightSurface, Surface
+from segslam.refinement import LightSurface
 from segslam.trajectory import Poses
 from segslam.types import (
-    Alignment,
     Direction,
     Indices,
     Information,
     Motion,
     MotionState,
     Points,
-    Rejected,
     Scan,
     Transform,
 )
 
-Recover = Callable[[Points, Points], Alignment | Rejected]
-"""Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
 RECOVER_EVERY = 5
 """Chosen: number of scans tried after a break; every fifth is registered without initial guess, 0.2 s each."""
-DIFFERENT_M, DIFFERENT_RAD = 0.3, np.radians(3.0)
-"""Chosen: initial guesses nearer to each other than this lead to the same pose."""
-LEAST_SUPPORTED = 0.15
-SUPPORT_M, SUPPORT_RAD = 0.5, np.radians(3.0)
-"""Chosen: a lower overlap suffices for a registration this near to an initial guess: two sources agree."""
-NEARLY = 0.97
-"""Chosen: share of the best closeness with which a registration fits nearly as well."""
-TURN_M = 5.0
-"""Chosen: distance equivalent to a turn by one radian."""
 BREAK_SIGMA_M, BREAK_SIGMA_RAD = 30.0, np.radians(60.0)
 """Standard deviations of an unsupported motion: the sensor may have been carried to any place nearby."""
 SUDDEN_M, SUDDEN_RAD = 0.5, np.radians(5.0)
@@ -56,46 +42,6 @@ SUDDEN_M, SUDDEN_RAD = 0.5, np.radians(5.0)
 rotation by more than this: on the real courtyard, scans 0.5 s apart, KISS-ICP misses turns."""
 CHECK_EVERY = 10
 """Chosen: at least every tenth scan is checked, because a stuck odometry reports no motion."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Found:
-    """Pose of a scan in a local map, and the quality of its fit."""
-
-    T_map_lidar: Transform
-    fit: Fit
-    offsets: list[Transform]
-    """From the expected poses, which do not depend on the registration."""
-
-    @property
-    def offset_m(self) -> float:
-        """Distance from the nearest of these poses, with turns (m)."""
-        return min(geometry.distance(T) + TURN_M * geometry.angle(T) for T in self.offsets)
-
-    @property
-    def is_supported(self) -> bool:
-        """True if it is near to an expected pose, and overlaps somewhat."""
-        is_near = any(geometry.distance(T) < SUPPORT_M and geometry.angle(T) < SUPPORT_RAD for T in self.offsets)
-        return is_near and self.fit.overlap >= LEAST_SUPPORTED
-
-
-class _Seen:
-    """A scan: all its points, its downsampled points, and their surface, which is computed on use."""
-
-    def __init__(self, points: Points, local: LocalMap) -> None:
-        self._local = local
-        self.points = points
-        self.thinned = local.downsample(points)
-
-    @cached_property
-    def light(self) -> LightSurface:
-        """For the quick check."""
-        return LightSurface(self.thinned)
-
-    @cached_property
-    def surface(self) -> Surface:
-        """For a registration."""
-        return self._local.make_surface(self.thinned)
 
 
 class CheckedOdometry:
@@ -108,11 +54,11 @@ class CheckedOdometry:
         self._keyframes = config.keyframes
         self._odometry = config.odometry
         self._min_points = config.refine.min_points
-        self._recover = recover
         self._map = LocalMap(config.health, config.refine)
         self._lost: LocalMap | None = None
         """The map before a break, as long as scans are tried against it."""
         self._history = History(config.health)
+        self._search = PoseSearch(self._history, recover, dense_voxels=config.keyframes.dense_voxels)
         self._anchor: tuple[Transform, LightSurface] | None = None
         """Pose and surface of the last checked scan."""
         self._T_odom_last = np.eye(4)
@@ -197,11 +143,11 @@ class CheckedOdometry:
 
     def _checked(self, proposed: OdometryResult, gap: float) -> tuple[Transform, Motion]:
         if self._anchor is None:
-            self._take(proposed.T_odom_lidar, _Seen(proposed.points, self._map))
+            self._take(proposed.T_odom_lidar, SeenScan(proposed.points, self._map))
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         T_predicted_lidar = geometry.inverse(self._T_odom_last @ self._T_before_last) @ proposed.T_odom_lidar
         if not self._has_motion and self._inner.is_from_scans:
-            scan = _Seen(proposed.points, self._map)
+            scan = SeenScan(proposed.points, self._map)
             T_odom_better = self._better_first(proposed.T_odom_lidar, scan)
             if T_odom_better is not None:
                 self._has_motion = True
@@ -221,7 +167,7 @@ class CheckedOdometry:
         if not (is_suspect or is_far or geometry.angle(T_anchor_lidar) >= np.radians(self._keyframes.angle_deg)):
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
-        scan = _Seen(proposed.points, self._map)
+        scan = SeenScan(proposed.points, self._map)
         if min(len(scan.thinned), len(self._anchor[1])) < self._min_points:  # too sparse for a check
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         direction = open_direction(scan.light)
@@ -237,13 +183,13 @@ class CheckedOdometry:
                 return proposed.T_odom_lidar, Motion(MotionState.CONFIRMED, found.moved_m, moved_deg, found.overlap)
         return self._registered(proposed.T_odom_lidar, scan, direction, gap)
 
-    def _better_first(self, T_odom_proposed: Transform, scan: _Seen) -> Transform | None:
+    def _better_first(self, T_odom_proposed: Transform, scan: SeenScan) -> Transform | None:
         """Another pose of the second scan, found with no guess, which fits the first better; None if there is none."""
         if len(scan.thinned) < self._min_points or len(self._map) == 0:
             return None
-        found = self._recovered(self._map, scan)
+        found = self._search.without_guess(self._map, scan)
         T_map_proposed = geometry.inverse(self._map.T_odom_map) @ T_odom_proposed
-        if found is None or not _are_different(geometry.inverse(T_map_proposed) @ found.T_map_lidar):
+        if found is None or not are_different(geometry.inverse(T_map_proposed) @ found.T_map_lidar):
             return None
         is_better = found.fit.closeness > self._map.fit(scan.surface, T_map_proposed).closeness
         return self._map.T_odom_map @ found.T_map_lidar if is_better else None
@@ -251,7 +197,7 @@ class CheckedOdometry:
     def _registered(
         self,
         T_odom_proposed: Transform,
-        scan: _Seen,
+        scan: SeenScan,
         direction: Direction | None,
         gap: float,
         *,
@@ -270,8 +216,9 @@ class CheckedOdometry:
         if found is not None and before_break is not None:
             self._map, self._lost = before_break, None
         else:
-            found = self._near(scan, guesses, T_odom_predicted if direction is None else None)
-            found = found or self._recovered(self._map, scan)
+            around = None if direction is not None else (self._T_odom_last, T_odom_predicted)
+            found = self._search.near(self._map, scan, guesses, around=around)
+            found = found or self._search.without_guess(self._map, scan)
         is_at_an_end = direction is not None or self._unseen.direction is not None
         if found is None and is_at_an_end and gap <= LONG_GAP:
             T_odom_guess = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
@@ -306,7 +253,7 @@ class CheckedOdometry:
         return T_odom_lidar, Motion(state, moved_m, moved_deg, fit.overlap, fit.rms_m, information=information)
 
     def _unsupported(
-        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: _Seen
+        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan
     ) -> tuple[Transform, Motion]:
         """A motion that no registration supports: that of the odometry, if steady and with some overlap; else a break.
 
@@ -318,74 +265,22 @@ class CheckedOdometry:
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         return self._break(T_odom_predicted, scan)
 
-    def _near(self, scan: _Seen, T_odom_guesses: list[Transform], T_odom_predicted: Transform | None) -> _Found | None:
-        """The best registration from the guesses and, if none of them leads to the usual fit, from `_around` as well.
-
-        The first two guesses are expected poses. Without `T_odom_predicted` no other poses are searched.
-        """
-        guesses, expected = _different(T_odom_guesses), T_odom_guesses[:2]
-        found = self._registrations(self._map, scan, guesses, expected)
-        best = self._best(self._map, found)
-        if T_odom_predicted is None or (best is not None and self._history.is_usual(best.fit)):
-            return best
-        more = _different([*guesses, self._around(scan, T_odom_predicted)])[len(guesses) :]
-        return self._best(self._map, found + self._registrations(self._map, scan, more, expected))
-
-    def _registrations(
-        self, local: LocalMap, scan: _Seen, T_odom_guesses: Sequence[Transform], T_odom_expected: Sequence[Transform]
-    ) -> list[_Found]:
-        """All registrations from some initial guesses."""
-        found = []
-        for T_odom_guess in T_odom_guesses:
-            for T_map_lidar in local.register(scan.surface, geometry.inverse(local.T_odom_map) @ T_odom_guess):
-                T_odom_lidar = local.T_odom_map @ T_map_lidar
-                offsets = [geometry.inverse(T_odom_other) @ T_odom_lidar for T_odom_other in T_odom_expected]
-                found.append(_Found(T_map_lidar, local.fit(scan.surface, T_map_lidar), offsets))
-        return found
-
-    def _best(self, local: LocalMap, found: list[_Found]) -> _Found | None:
-        """The registration that fits best; None if none has the usual fit.
-
-        Of those that fit nearly as well, as all poses along a wall do, it is the one nearest to an expected pose. Such
-        a pose supports a worse fit too, but not in the map before a break: it continues a guess.
-        """
-        if not found:
-            return None
-        enough = NEARLY * max(each.fit.closeness for each in found)
-        best = min((each for each in found if each.fit.closeness >= enough), key=lambda each: each.offset_m)
-        is_supported = best.is_supported and local is not self._lost
-        return best if self._history.is_usual(best.fit) or is_supported else None
-
-    def _around(self, scan: _Seen, T_odom_predicted: Transform) -> Transform:
-        """The best of some poses around the last one, as an initial guess."""
-        T_map_last = geometry.inverse(self._map.T_odom_map) @ self._T_odom_last
-        T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
-        return self._map.T_odom_map @ self._map.around(scan.surface, T_map_last, T_step)
-
-    def _recovered(self, local: LocalMap, scan: _Seen) -> _Found | None:
-        """The pose without initial guess, verified like a loop and then registered; None if there is none."""
-        alignment = self._recover(scan.points, local.cloud(self._keyframes.dense_voxels))
-        if isinstance(alignment, Rejected):
-            return None
-        T_odom_recovered = local.T_odom_map @ alignment.fine.T_target_source
-        return self._best(local, self._registrations(local, scan, [T_odom_recovered], [T_odom_recovered]))
-
-    def _found_again(self, scan: _Seen, T_odom_guesses: list[Transform]) -> _Found | None:
+    def _found_again(self, scan: SeenScan, T_odom_guesses: list[Transform]) -> Found | None:
         """The pose in the map before the last break, if the break was within the last `LOST_SCANS`."""
         if self._lost is None:
             return None
         self._history.scans_lost += 1
-        tried = self._registrations(self._lost, scan, _different(T_odom_guesses), T_odom_guesses[:2])
-        if found := self._best(self._lost, tried):
+        if found := self._search.near(self._lost, scan, T_odom_guesses, leads_here=False):
             return found
-        if self._history.scans_lost % RECOVER_EVERY == 0 and (found := self._recovered(self._lost, scan)):
+        is_due = self._history.scans_lost % RECOVER_EVERY == 0
+        if is_due and (found := self._search.without_guess(self._lost, scan, leads_here=False)):
             return found
         if self._history.scans_lost >= LOST_SCANS:
             self._lost = None
         return None
 
     def _at_an_end(
-        self, T_odom_predicted: Transform, scan: _Seen, direction: Direction | None
+        self, T_odom_predicted: Transform, scan: SeenScan, direction: Direction | None
     ) -> tuple[Transform, Motion]:
         """The predicted pose where a tunnel begins or ends between two scans, which have nothing in common."""
         overlap = self._map.fit(scan.surface, geometry.inverse(self._map.T_odom_map) @ T_odom_predicted).overlap
@@ -396,13 +291,13 @@ class CheckedOdometry:
     def _way_m(self, T_odom_lidar: Transform) -> float:
         return geometry.distance(geometry.inverse(self._T_odom_last) @ T_odom_lidar)
 
-    def _break(self, T_odom_lidar: Transform, scan: _Seen) -> tuple[Transform, Motion]:
+    def _break(self, T_odom_lidar: Transform, scan: SeenScan) -> tuple[Transform, Motion]:
         """A guess that nothing supports."""
         self._restart(T_odom_lidar, scan, np.eye(4))
         self._unseen.note_seen(np.eye(4))
         return T_odom_lidar, Motion(MotionState.BROKEN, information=_unknown())
 
-    def _restart(self, T_odom_lidar: Transform, scan: _Seen, T_before_lidar: Transform) -> None:
+    def _restart(self, T_odom_lidar: Transform, scan: SeenScan, T_before_lidar: Transform) -> None:
         """Start a new local map at a guess; the old one is kept for some time."""
         if self._lost is None:
             self._lost, self._map = self._map, self._map.empty_copy()
@@ -413,7 +308,7 @@ class CheckedOdometry:
         self._take(T_odom_lidar, scan)
         self._inner.follow(self._map.scans, T_odom_lidar, T_before_lidar)
 
-    def _take(self, T_odom_lidar: Transform, scan: _Seen) -> None:
+    def _take(self, T_odom_lidar: Transform, scan: SeenScan) -> None:
         """Make the scan the reference of the next check, and add it to the local map."""
         self._anchor = T_odom_lidar, scan.light
         self._map.add(T_odom_lidar, scan.thinned, scan.points)
@@ -432,20 +327,6 @@ def _exact(T_a_b: Transform) -> Transform:
 def _is_sudden(T_predicted_lidar: Transform) -> bool:
     """True if the motion differs much from the previous one."""
     return geometry.distance(T_predicted_lidar) > SUDDEN_M or bool(geometry.angle(T_predicted_lidar) > SUDDEN_RAD)
-
-
-def _are_different(T_a_b: Transform) -> bool:
-    """Whether two poses are so far from each other that a registration may lead to different results."""
-    return geometry.distance(T_a_b) > DIFFERENT_M or bool(geometry.angle(T_a_b) > DIFFERENT_RAD)
-
-
-def _different(guesses: Sequence[Transform]) -> list[Transform]:
-    """The guesses without those near an earlier one."""
-    kept: list[Transform] = []
-    for guess in guesses:
-        if all(_are_different(geometry.inverse(other) @ guess) for other in kept):
-            kept.append(guess)
-    return kept
 
 
 def _is_predicted(motion: Motion) -> bool:

@@ -22,8 +22,8 @@ from segslam.slam import Slam
 from segslam.types import Scan, Trajectory
 from tools.benchmarks import common
 
-BEAM_GAP_DEG = 0.04
-"""Least gap between the points of two beams of the simulated sensor."""
+NEXT_BEAM_DEG = 180.0
+"""A step back of the azimuth by more than this begins the next beam."""
 
 
 @dataclass(frozen=True)
@@ -107,13 +107,11 @@ def _in_tube(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def with_beams(drive: Drive, every: int) -> Drive:
-    """One beam of so many is kept; gaps between the elevations of the points divide the beams."""
+    """One beam of so many is kept. The simulator writes beam after beam, each in the order of its azimuths."""
 
     def thinned(scan: Scan) -> Scan:
-        elevation = np.degrees(np.arctan2(scan.points[:, 2], np.linalg.norm(scan.points[:, :2], axis=1)))
-        order = np.argsort(elevation)
-        beam = np.empty(len(order), dtype=int)
-        beam[order] = np.cumsum(np.diff(elevation[order], prepend=elevation[order[0]]) > BEAM_GAP_DEG)
+        azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0])) % 360.0
+        beam = np.cumsum(np.diff(azimuth, prepend=azimuth[:1]) < -NEXT_BEAM_DEG)
         return _kept(scan, beam % every == 0)
 
     return Drive(lambda: (thinned(scan) for scan in drive.scans()), drive.T_world_lidar)

@@ -91,8 +91,8 @@ class _AlignerApart:
     def _ended(self) -> SegslamError:
         self._process.join(timeout=1.0)
         return SegslamError(
-            f"the odometry process has ended (exit code {self._process.exitcode}; -9 is often a lack of memory); "
-            "continue with `segslam map --resume`"
+            f"the odometry process has ended (exit code {self._process.exitcode}; -9 is often a lack of memory, 1 a "
+            'script without `if __name__ == "__main__":`); continue with `segslam map --resume`'
         )
 
 

@@ -1,4 +1,5 @@
 import json
+import multiprocessing
 from pathlib import Path
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from helpers.commands import run
 from helpers.drives import round_drive, write_kitti_sequence
 
+from segslam.errors import SegslamError
 from segslam.log import read_log
 from segslam.trajectory import read_poses, write_kitti
 
@@ -53,6 +55,18 @@ def test_a_run_folder_is_never_overwritten(kitti: Path, tmp_path: Path, capsys: 
     assert run("map", kitti, "--out", tmp_path) == 2
     assert "not empty" in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_run_that_cannot_start_leaves_no_process(
+    kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        assert multiprocessing.active_children(), "the odometry has started"
+        raise SegslamError("no room")
+
+    monkeypatch.setattr("segslam.run.run.Run", refuse)
+    assert run("map", kitti, "--out", tmp_path / "run") == 2
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.parametrize(

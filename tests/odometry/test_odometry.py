@@ -1,4 +1,6 @@
 import multiprocessing
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,6 +110,17 @@ def test_a_process_that_was_killed_is_reported_with_the_remedy() -> None:
     process.join()
     with pytest.raises(SegslamError, match=r"exit code -9.*--resume"):
         odometry.register(scan)
+
+
+def test_a_script_that_runs_again_when_imported_ends_with_the_remedy(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import numpy as np\nfrom segslam.config import OdometryConfig\nfrom segslam.odometry import OdometryApart\n"
+        "from segslam.types import Scan\nOdometryApart(OdometryConfig()).register(Scan(np.full((9, 3), 9.0), 0, 0))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert 'a script without `if __name__ == "__main__":`' in done.stderr
 
 
 def test_points_out_of_range_leave_with_their_labels() -> None:

@@ -236,6 +236,8 @@ class _Trial(NamedTuple):
     floor: gates.NoiseFloor
     limits: gates.Limits
     watch: Stopwatch
+    is_rival: bool = False
+    """Whether the poses are compared with one that was found."""
 
     def outcome(self, coarse: Registration) -> Found | Rejected:
         """One hypothesis, refined and verified."""
@@ -302,8 +304,9 @@ class _Trial(NamedTuple):
     def rejection(self, pose: Found) -> Rejected | None:
         """Rejects a pose that fits badly, or along whose weak direction nothing matches, as if slid along a corridor.
 
-        More than one surface must match there if the fine Hessian leaves a direction unobserved, if a scan sees one
-        side of the place only, or if the pose fits less well than neighbours do.
+        More than one surface must match there if the fine Hessian hardly constrains a direction, if it constrains one
+        badly and the pose fits less well than neighbours do, if a scan sees one side of the place only, or if the
+        stricter limits of narrow places are exceeded. Rivals need not be proven as well as that.
         """
         found = pose.agreement
         config = self.config.verify
@@ -316,16 +319,23 @@ class _Trial(NamedTuple):
         least = config.min_weak_support * found.overlap
         if support.whole < least:
             return Rejected(RejectReason.LOW_OVERLAP, f"{support.whole:.3f} < {least:.3f} along the weakest direction")
+        is_doubtful = not self.is_rival and not gates.is_certain(found, self.floor)
+        is_narrow = min(self.source.free_space.view, self.target.free_space.view) < gates.NARROW_VIEW
         least = config.min_second_support * found.overlap
-        if support.second >= least:
-            return None
+        if is_doubtful:
+            least *= gates.DOUBTFUL_NARROW if is_narrow else gates.DOUBTFUL
+        has_second = support.second >= least
+        rejected = None
+        if not has_second or (is_doubtful and not gates.is_free(found, self.floor)):
+            rejected = gates.rejection(found, self.limits)
+        if has_second:
+            return rejected
         detail = f"{support.second:.3f} < {least:.3f} beside one surface along the weakest direction"
-        rejected = gates.rejection(found, self.limits)
         if rejected is not None:
             return Rejected(rejected.reason, f"{rejected.detail}, and {detail}")
-        is_narrow = min(self.source.free_space.view, self.target.free_space.view) < gates.NARROW_VIEW
-        is_unobserved = pose.alignment.observability < refinement.UNOBSERVED
-        return Rejected(RejectReason.LOW_OVERLAP, detail) if is_narrow or is_unobserved else None
+        needed = refinement.UNOBSERVED if self.is_rival else gates.WEAKLY_OBSERVED
+        is_open = pose.alignment.observability < (config.well_observed if is_doubtful else needed)
+        return Rejected(RejectReason.LOW_OVERLAP, detail) if is_narrow or is_open else None
 
 
 def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
@@ -339,7 +349,7 @@ def _unless_ambiguous(found: Found, trial: _Trial) -> Alignment | Rejected:
     certain = gates.is_certain(found.agreement, trial.floor)
     if certain and found.alignment.observability >= config.well_observed:
         return found.alignment
-    loose = trial._replace(limits=trial.limits.loosened(), gate=trial.gate if certain else anywhere)
+    loose = trial._replace(limits=trial.limits.loosened(), gate=trial.gate if certain else anywhere, is_rival=True)
     passed = [found]
     few = refinement.sparse(trial.source.surface, config=trial.config.refine)
     most = SPARSE_MARGIN * config.rival_ratio * found.agreement.mismatch

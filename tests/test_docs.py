@@ -20,6 +20,7 @@ from typer.main import get_command
 import segslam
 from segslam import cli
 from segslam.cli import commands
+from segslam.config import Config
 from segslam.trajectory import read_poses
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -170,3 +171,24 @@ def test_the_commands_and_options_that_a_page_names_exist(page: str) -> None:
 def test_the_files_that_a_page_links_to_exist(page: str) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text()):
         assert target.startswith("http") or ((ROOT / page).parent / target).exists(), f"{page}: {target}"
+
+
+def _defaults(section: str) -> list[tuple[str, float]]:
+    """Name and default of each number of a section of the settings."""
+    values = getattr(Config(), section).model_dump()
+    return [
+        (name, number)
+        for name, value in values.items()
+        for number in (value if isinstance(value, tuple) else (value,))
+        if isinstance(number, int | float) and not isinstance(number, bool)
+    ]
+
+
+@pytest.mark.parametrize("section", ["proximity", "verify", "refine", "graph", "health"])
+def test_the_page_of_thresholds_gives_each_setting_with_its_default(section: str) -> None:
+    page = (ROOT / "docs" / "decisions.md").read_text(encoding="utf-8")
+    rows = [line for line in page.splitlines() if line.startswith("| ")]
+    for name, number in _defaults(section):
+        named = " ".join(row for row in rows if re.search(rf"[`.]{name}`", row))
+        shown = {f"{number:g}", f"{100 * number:g} %"}
+        assert any(re.search(rf"(?<![\d.]){re.escape(text)}(?![\d.]*\d)", named) for text in shown), (name, number)

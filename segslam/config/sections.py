@@ -494,7 +494,8 @@ class VerifyConfig(Section):
         ge=0,
         le=1,
         description="the same without the surface that most of them match, for poses with an unobserved direction, "
-        "scans that see one side only, and scans that fit less well than neighbouring keyframes "
+        "scans that see one side only, and poses in narrow or badly observed places that fit less well than "
+        "neighbouring keyframes; these need 1.3 times as much, with scans that see one side only twice as much "
         "[chosen on simulated corridors and tunnels]",
     )
     max_range_m: float = Field(
@@ -530,7 +531,8 @@ class VerifyConfig(Section):
         ge=0,
         le=1,
         description="a pose is compared with rivals if the ratio of the smallest to the largest variance of its "
-        "translation is below this [chosen on KITTI 00]",
+        "translation is below this; if it also fits less well than neighbouring keyframes, more than one surface must "
+        "confirm it (`min_second_support`) [chosen on KITTI 00]",
     )
     max_rivals: int = Field(
         6,

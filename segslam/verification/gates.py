@@ -70,6 +70,13 @@ corridors have 1.7 to 4.5 m, the courtyard, NCLT, KITTI and simulated streets 4.
 come and go: half of the correct poses on another day violate free space by more than such a limit."""
 NARROW_VIEW = 0.5
 """Chosen: a scan with returns in less than this share of the azimuths sees one side of a place only."""
+DOUBTFUL, DOUBTFUL_NARROW = 1.3, 2.0
+"""Chosen on simulated corridors and tunnels, even seeds: factors of the least second support for a pose that fits less
+well than neighbours do, and for such a pose of a scan with a narrow view."""
+WEAKLY_OBSERVED = 0.02
+"""Chosen on simulated tunnels, even seeds: a ratio of variances below which more than one surface must match along the
+weak direction. Of the wrong poses that fit as well as neighbours do it is 0.011 to 0.013; corridors have 0.023 or more.
+"""
 FACING, SAME_NORMAL, MIN_FACING = 0.5, 0.8, 10
 """Chosen: a surface faces a direction within 60 degrees; two surfaces are the same within 37 degrees; fewer facing
 points than `MIN_FACING` prove nothing."""
@@ -202,10 +209,12 @@ def _within_fullest(along_m: Vector, counted: Mask, width_m: float) -> Mask:
 
 def is_certain(found: Agreement, floor: NoiseFloor) -> bool:
     """Whether a pose fits as well as neighbours do, so that no other pose can fit better."""
-    most = CERTAIN_VIOLATION * floor.free_space_violation
-    return found.residual_ratio <= CERTAIN_RESIDUAL * floor.residual_ratio and found.free_space_violation <= max(
-        most, LEAST_VIOLATION
-    )
+    return found.residual_ratio <= CERTAIN_RESIDUAL * floor.residual_ratio and is_free(found, floor)
+
+
+def is_free(found: Agreement, floor: NoiseFloor) -> bool:
+    """Whether a pose violates free space as little as neighbours do."""
+    return found.free_space_violation <= max(CERTAIN_VIOLATION * floor.free_space_violation, LEAST_VIOLATION)
 
 
 def early_rejection(

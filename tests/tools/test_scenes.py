@@ -12,7 +12,7 @@ from segslam.registration import PreparedScan, prepare_scan, register_prepared, 
 from segslam.simulation.scene_sensors import SENSORS, scan_points
 from segslam.simulation.scenes import SCENES, corridor
 from segslam.types import Alignment, Registration, Rejected
-from segslam.verification.gates import weak_support
+from segslam.verification.gates import NoiseFloor, weak_support
 from tools.benchmarks import scenes
 
 CONFIG = Config()
@@ -62,6 +62,37 @@ def test_a_pose_turned_round_in_a_corridor_is_not_accepted(monkeypatch: pytest.M
     for shift_m in (5.0, 5.5, 4.5):
         found = _from(geometry.transform(geometry.yaw(math.pi), [shift_m, 0.0, 0.0]), monkeypatch)
         assert not _is_wrong(found), (shift_m, found)
+
+
+@pytest.mark.parametrize(
+    ("scene", "sensor", "source", "target", "shift_m", "turn_deg"),
+    [
+        ("tunnel", "non-repeating", (2, 24, 1), (2, 94, 3), (-4.61, 0.05, 0.16), 0.0),
+        ("tunnel", "non-repeating", (4, 108, 1), (4, 63, 3), (-1.26, -0.03, 0.07), 0.0),
+        ("tunnel", "32", (6, 44, 0), (6, 104, 3), (1.72, -0.11, 0.04), 180.0),
+        ("tunnel", "70 wide", (104, 133, 0), (4, 76, 2), (0.17, 0.26, 0.03), -4.9),
+        ("corridor", "64", (2, 10, 1), (2, 83, 3), (-1.34, 0.16, -0.08), -170.9),
+    ],
+)
+def test_two_places_of_which_a_part_has_the_same_shape_are_not_taken_for_one(
+    scene: str,
+    sensor: str,
+    source: tuple[int, int, int],
+    target: tuple[int, int, int],
+    shift_m: tuple[float, float, float],
+    turn_deg: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Scans by seed of the scene, row of its path and visit. The walls match anywhere, and here one niche does too."""
+    coarse = Registration(geometry.transform(geometry.yaw(math.radians(turn_deg)), shift_m), 9, 9, 0.1, np.eye(6))
+    monkeypatch.setattr(registration, "_coarse", lambda _: iter([coarse]))
+    one, other = (
+        scenes.Place(SCENES[scene](seed), sensor, 0.03, seed, CONFIG).prepared(row, visit)
+        for seed, row, visit in (source, target)
+    )
+    floor = NoiseFloor(overlap=0.87, residual_ratio=0.71, free_space_violation=0.006 if sensor == "32" else 0.0)
+    found = register_prepared(one, other, config=CONFIG, floor=floor)
+    assert isinstance(found, Rejected), found
 
 
 def _is_wrong(found: Alignment | Rejected) -> bool:

@@ -13,7 +13,7 @@ from segslam.proximity import ProximityDetector
 from segslam.registration import Labeller, PreparedScan, Stopwatch, register_near, register_prepared
 from segslam.retrieval import PlaceSignature, signature_of
 from segslam.submaps import Submaps
-from segslam.system.threads import both
+from segslam.system.threads import at_once
 from segslam.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.verification.noise_floor import NeighbourNoise
 from segslam.verification.prior import far_from_prior
@@ -128,7 +128,9 @@ class LoopCloser:
     def _attempt(self, candidate: LoopCandidate, watch: Stopwatch, *, is_known: bool) -> LoopAttempt:
         own = Stopwatch()
         with own("prepare"):
-            source, target = both(self._prepared, (candidate.source_id,), (candidate.target_id,))
+            source, target = at_once(
+                lambda: self._prepared(candidate.source_id), lambda: self._prepared(candidate.target_id)
+            )
         floor = self._floor.at(candidate.source_id)
         outcome: Alignment | Rejected | None = None
         if is_known:

@@ -6,6 +6,7 @@ A place is accepted only if no other place fits almost as well, because streets 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 from segslam import geometry
@@ -13,6 +14,7 @@ from segslam.config import Config
 from segslam.registration import Gate, PreparedScan, Stopwatch, may_match, register_prepared
 from segslam.retrieval import PlaceCandidate
 from segslam.system.short_repr import Record
+from segslam.system.threads import at_once
 from segslam.types import Alignment, Rejected, RejectReason, Transform
 from segslam.verification import gates
 
@@ -73,17 +75,20 @@ def recognise(
         outcome = tried(place_id, _no_gate)
         if isinstance(outcome, Recognised):
             most = config.verify.rival_ratio * _mismatch(scan, places(place_id), outcome.alignment)
-            rivals = [
-                tried(other, _Elsewhere(outcome.T_world_lidar, T_world_place(other)), most)
-                for other in _others(outcome, candidates, T_world_place)
-            ]
-            others = [rival for rival in rivals if isinstance(rival, Recognised)]
-            return _clear_winner(scan, [outcome, *others], places, config)
+            others = _others(outcome, candidates, T_world_place)
+            elsewhere = [(other, _Elsewhere(outcome.T_world_lidar, T_world_place(other)), most) for other in others]
+            halves = at_once(partial(_found, tried, elsewhere[0::2]), partial(_found, tried, elsewhere[1::2]))
+            return _clear_winner(scan, [outcome, *halves[0], *halves[1]], places, config)
         if rejection is None:
             rejection = outcome
     if rejection is None:
         return Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, "no place to compare with")
     return rejection
+
+
+def _found(tried: Callable[..., Recognised | Rejected], places: Sequence[tuple[object, ...]]) -> list[Recognised]:
+    outcomes = [tried(*place) for place in places]
+    return [outcome for outcome in outcomes if isinstance(outcome, Recognised)]
 
 
 class _Both(NamedTuple):

@@ -27,6 +27,8 @@ SETTLED_M, SETTLED_RAD = 0.02, math.radians(0.1)
 """Chosen: one in ten sparse scans oscillates by less between two sets of pairs."""
 SPARSE_VOXELS, LEAST_SPARSE = 3.0, 500
 """Chosen: edge of the voxels of a sparse surface, in `voxel_m`, and the points that it has at least."""
+NUM_APPROACH = 5
+"""Chosen: iterations after which a pose that leads to no good fit can be recognised (`registration.HOPELESS`)."""
 UNOBSERVED = 0.01
 """Chosen: a ratio of variances below this means unobserved; a smooth tunnel has 0.001, from GICP's tangents."""
 
@@ -194,8 +196,19 @@ def refine(
     )
 
 
+def approach(source: Surface, target: Surface, T_target_source: Transform, *, config: RefineConfig) -> Transform:
+    """The pose after the first `NUM_APPROACH` iterations of `refine`; both surfaces have points."""
+    begun = _aligned(source, target, T_target_source, config.correspondence_m[0], config, NUM_APPROACH)
+    return begun.T_target_source
+
+
 def _aligned(
-    source: Surface, target: Surface, T_target_source: Transform, within_m: float, config: RefineConfig
+    source: Surface,
+    target: Surface,
+    T_target_source: Transform,
+    within_m: float,
+    config: RefineConfig,
+    max_iterations: int | None = None,
 ) -> Any:
     return small_gicp.align(
         target.cloud,
@@ -203,7 +216,7 @@ def _aligned(
         target.tree,
         T_target_source,
         max_correspondence_distance=within_m,
-        max_iterations=config.max_iterations,
+        max_iterations=max_iterations or config.max_iterations,
         num_threads=1,
     )
 

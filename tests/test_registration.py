@@ -5,12 +5,16 @@ import pytest
 from helpers.drives import round_drive
 from helpers.rooms import ground_and_walls
 
-from segslam import geometry, segregator
+from segslam import geometry, refinement, segregator
 from segslam.config import Config
 from segslam.registration import (
+    Found,
     PreparedScan,
     Stopwatch,
+    _coarse,
+    _few,
     _shifted,
+    _Trial,
     anywhere,
     may_match,
     prepare_scan,
@@ -157,6 +161,30 @@ def test_a_few_points_decide_whether_a_place_can_fit_as_well_as_another() -> Non
         for factor in (1.0, 0.3)
     ]
     assert answers == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("factor", "is_found", "num_refined", "leads"),
+    [(1.0, False, 1, True), (0.3, False, 0, False), (1.0, True, 0, True), (0.3, True, 0, True)],
+    ids=["fits", "fits badly", "found already", "found already, fits badly"],
+)
+def test_the_first_iterations_decide_whether_a_pose_is_refined(
+    factor: float, is_found: bool, num_refined: int, leads: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pose from which refinement starts is beside the one to which it leads."""
+    source, target, _ = _round_pair()
+    allowed = gates.limits(gates.SINGLE_PAIR, config=CONFIG.verify)
+    trial = _Trial(source, target, CONFIG, anywhere, gates.SINGLE_PAIR, allowed, Stopwatch())
+    (coarse, *_) = (one for one in _coarse(trial) if isinstance(one, Registration))
+    found = trial.outcome(coarse)
+    assert isinstance(found, Found)
+    few = _few(source, config=CONFIG, most=factor * found.agreement.mismatch, found=(found,) if is_found else ())
+    beside = found.alignment.fine.T_target_source @ geometry.transform(np.eye(3), [0.6, 0.0, 0.0])
+    refined = []
+    refine = refinement.refine
+    monkeypatch.setattr(refinement, "refine", lambda *given, **named: refined.append(1) or refine(*given, **named))
+    led = trial.led(replace(coarse, T_target_source=beside), few)
+    assert (led is not None, len(refined)) == (leads, num_refined)
 
 
 def test_moving_classes_are_in_neither_surface_nor_free_space() -> None:

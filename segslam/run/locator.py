@@ -20,7 +20,8 @@ from segslam.run.finished import read_run
 from segslam.run.folder import log_of
 from segslam.submaps import Submaps
 from segslam.system.short_repr import Record
-from segslam.types import Alignment, Keyframe, Labels, Rejected, RejectReason, Transform, as_points
+from segslam.system.threads import at_once
+from segslam.types import Alignment, Keyframe, Labels, Points, Rejected, RejectReason, Transform, as_points
 from segslam.verification import gates
 from segslam.verification.noise_floor import NeighbourNoise
 
@@ -115,15 +116,24 @@ class Locator:
         kept, kept_labels, _ = downsample_keyframe(
             near, labels, config=config.keyframes, whole_classes=tuple(config.segregator.cluster_min_points)
         )
-        scan = prepare_scan(kept, kept_labels, config=config)
-        own = signature_of(kept, kept_labels, config=config.geometric)
-        found = self._recognised(scan, self.places.shortlist(own), max_places=NUM_FIRST)
+        scan, (own, candidates) = at_once(
+            lambda: prepare_scan(kept, kept_labels, config=config), lambda: self._candidates(kept, kept_labels)
+        )
+        found = self._recognised(scan, candidates, max_places=NUM_FIRST)
         if isinstance(found, Rejected) and found.reason != RejectReason.AMBIGUOUS:
             around = signatures_around(kept, kept_labels, config=config.geometric)
             found = self._recognised(scan, self.places.shortlist_around((own, *around)), max_places=MAX_PLACES)
         if isinstance(found, Rejected):
             return found
         return Located(found.T_world_lidar, found.place_id, found.alignment, perf_counter() - started)
+
+    def _candidates(self, points: Points, labels: Labels) -> tuple[PlaceSignature, tuple[PlaceCandidate, ...]]:
+        """Signature of a scan, and the most similar places; the first of them is prepared."""
+        own = signature_of(points, labels, config=self.config.geometric)
+        candidates = self.places.shortlist(own)
+        if candidates:
+            self.prepared(candidates[0].place_id)
+        return own, candidates
 
     def _recognised(
         self, scan: PreparedScan, candidates: tuple[PlaceCandidate, ...], *, max_places: int

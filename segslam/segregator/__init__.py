@@ -2,6 +2,6 @@
 
 from segslam.segregator.describe import describe
 from segslam.segregator.match import hypotheses, match, vertical
-from segslam.segregator.plan import plan_hypotheses
+from segslam.segregator.plan import FloorPlan, plan_hypotheses
 
-__all__ = ["describe", "hypotheses", "match", "plan_hypotheses", "vertical"]
+__all__ = ["FloorPlan", "describe", "hypotheses", "match", "plan_hypotheses", "vertical"]

@@ -7,16 +7,16 @@ paper. If two scans share only walls, as in a courtyard, there are no clusters t
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Complex, Float
 from scipy.fft import ifft, irfft, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter
 
 from segslam import geometry
 from segslam.system.kernels import kernel
-from segslam.types import Direction, Points, Registration, Rotation, Vector
+from segslam.types import Direction, Points, Registration, Vector
 
 CELL_M = 0.5
 NUM_YAWS = 90
@@ -41,53 +41,53 @@ HALF = int(REACH_M / CELL_M)
 SIZE = next_fast_len(2 * HALF + int(MAX_SHIFT_M / CELL_M), real=True)  # wide enough that nothing wraps onto the other
 
 
-class _Level(NamedTuple):
-    """Points in a level frame with the scan's origin."""
+class FloorPlan:
+    """Points of a scan on upright surfaces, levelled, and their spectra at all yaws, which are computed once."""
 
-    points: Points
-    R_level_scan: Rotation
+    def __init__(self, points: Points, up: Direction) -> None:
+        """`points`: evenly downsampled, in the scan's frame; `up`: upward unit vector in this frame."""
+        self.R_level_scan = geometry.level(up)
+        level = points @ self.R_level_scan.T
+        self.num_points = len(points)
+        self.points = level[np.abs(level[:, :2]).max(axis=1, initial=0.0) < REACH_M]
+        """The points within reach in a level frame with the scan's origin."""
+
+    @cached_property
+    def turned(self) -> Complex[np.ndarray, "yaws size half"]:
+        """Spectrum of the plan at each yaw."""
+        return np.conj(rfft2(_plans(self.points, math.tau * np.arange(NUM_YAWS) / NUM_YAWS)))
 
 
-def plan_hypotheses(
-    source: Points, target: Points, source_up: Direction, target_up: Direction, *, num_poses: int
-) -> Iterator[Registration]:
+def plan_hypotheses(source: FloorPlan, target: FloorPlan, *, num_poses: int) -> Iterator[Registration]:
     """Coarse poses of the source in the target, sorted by agreement; errors up to one cell and half a yaw step.
 
-    Points: evenly downsampled points on upright surfaces, each in its own scan's frame; `up`: upward unit vectors in
-    these frames. Inliers are the points of the source that fall into occupied cells of the target.
+    Inliers are the points of the source that fall into occupied cells of the target.
     """
-    scans = _levelled(source, source_up), _levelled(target, target_up)
-    if min(len(scan.points) for scan in scans) == 0:
+    if min(len(source.points), len(target.points)) == 0:
         return
-    volume, steps = _correlation(scans[0].points, scans[1].points)
+    volume, steps = _correlation(source, target)
+    filled = _filled(target.points)
     for yaw_index, i, j in _peaks(volume, num_poses):
         R_yaw = geometry.yaw(math.tau * yaw_index / NUM_YAWS)
         T_flat = geometry.transform(R_yaw, CELL_M * np.array([steps[i], steps[j], 0.0]))
-        rise_m, num_filled = _rise(geometry.apply(T_flat, scans[0].points), scans[1].points)
+        rise_m, num_filled = _rise(geometry.apply(T_flat, source.points), filled)
         shift = T_flat[:3, 3] + [0.0, 0.0, rise_m]
-        R_scan_level = scans[1].R_level_scan.T
+        R_scan_level = target.R_level_scan.T
         yield Registration(
-            T_target_source=geometry.transform(R_scan_level @ R_yaw @ scans[0].R_level_scan, R_scan_level @ shift),
-            num_correspondences=len(source),
+            T_target_source=geometry.transform(R_scan_level @ R_yaw @ source.R_level_scan, R_scan_level @ shift),
+            num_correspondences=source.num_points,
             num_inliers=num_filled,
             rms_m=CELL_M,
             information=INFORMATION,
         )
 
 
-def _levelled(scan: Points, up: Direction) -> _Level:
-    R_level_scan = geometry.level(up)
-    points = scan @ R_level_scan.T
-    return _Level(points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < REACH_M], R_level_scan)
-
-
-def _correlation(source: Points, target: Points) -> tuple[Float[np.ndarray, "yaws shifts shifts"], np.ndarray]:
+def _correlation(source: FloorPlan, target: FloorPlan) -> tuple[Float[np.ndarray, "yaws shifts shifts"], np.ndarray]:
     """Correlation of the plans for each yaw of the source and each shift in x and y, and the shifts in cells."""
-    turned = rfft2(_plans(source, math.tau * np.arange(NUM_YAWS) / NUM_YAWS))
-    blurred = gaussian_filter(_plans(target, np.zeros(1))[0], BLUR_CELLS)
+    blurred = gaussian_filter(_plans(target.points, np.zeros(1))[0], BLUR_CELLS)
     steps = np.arange(-int(MAX_SHIFT_M / CELL_M), int(MAX_SHIFT_M / CELL_M) + 1)
-    agreement = ifft(rfft2(blurred) * np.conj(turned), axis=1)[:, steps]
-    return irfft(agreement, SIZE, axis=2)[:, :, steps], steps
+    agreement = ifft(rfft2(blurred) * source.turned, axis=1, overwrite_x=True)[:, steps]
+    return np.ascontiguousarray(irfft(agreement, SIZE, axis=2)[:, :, steps]), steps
 
 
 def _plans(points: Points, yaws_rad: Vector) -> Float[np.ndarray, "plans size size"]:
@@ -110,22 +110,41 @@ def _counts(points, cosines, sines, cell_m, half, size, most):
 
 def _peaks(volume: Float[np.ndarray, "yaws shifts shifts"], num_peaks: int) -> Iterator[tuple[int, int, int]]:
     """The maxima of the volume, in descending order; it is changed: the surroundings of each maximum are cleared."""
+    flat = volume.reshape(NUM_YAWS, -1)
+    places = flat.argmax(axis=1)
+    largest = flat.max(axis=1)
     for _ in range(num_peaks):
-        yaw_index, i, j = (int(place) for place in np.unravel_index(volume.argmax(), volume.shape))
+        yaw_index = int(largest.argmax())
+        i, j = (int(place) for place in np.unravel_index(places[yaw_index], volume.shape[1:]))
         yield yaw_index, i, j
         around = (np.arange(yaw_index - SAME_YAWS, yaw_index + SAME_YAWS + 1)) % NUM_YAWS
         volume[around, max(i - SAME_CELLS, 0) : i + SAME_CELLS + 1, max(j - SAME_CELLS, 0) : j + SAME_CELLS + 1] = -1.0
+        places[around] = flat[around].argmax(axis=1)
+        largest[around] = flat[around, places[around]]
 
 
-def _rise(source: Points, target: Points) -> tuple[float, int]:
+def _rise(source: Points, filled: Bool[np.ndarray, "size size slices"]) -> tuple[float, int]:
     """Height offset (m) at which most source points fall into occupied cells of the target, and their number."""
+    rows, columns, slices = _slots(source)
+    num_filled = _count_filled(rows, columns, slices, filled, MAX_RISE_SLICES)
+    return SLICE_M * float(num_filled.argmax() - MAX_RISE_SLICES), int(num_filled.max())
+
+
+@kernel("int64[:](int64[:], int64[:], int64[:], boolean[:, :, ::1], int64)")
+def _count_filled(rows, columns, slices, filled, most_rise):
+    """Number of slots that are filled, for each rise from -most_rise to most_rise slices."""
+    num_filled = np.zeros(2 * most_rise + 1, np.int64)
+    for at in range(len(rows)):
+        for k in range(2 * most_rise + 1):
+            height = min(max(slices[at] + k - most_rise, 0), filled.shape[2] - 1)
+            num_filled[k] += filled[rows[at], columns[at], height]
+    return num_filled
+
+
+def _filled(points: Points) -> Bool[np.ndarray, "size size slices"]:
     filled = np.zeros((SIZE, SIZE, NUM_SLICES), bool)
-    filled[*_slots(target)] = True
-    i, j, k = _slots(source)
-    rises = np.arange(-MAX_RISE_SLICES, MAX_RISE_SLICES + 1)
-    moved = np.clip(k[:, None] + rises, 0, NUM_SLICES - 1)
-    num_filled = filled[i[:, None], j[:, None], moved].sum(axis=0)
-    return SLICE_M * float(rises[num_filled.argmax()]), int(num_filled.max())
+    filled[*_slots(points)] = True
+    return filled
 
 
 def _slots(points: Points) -> tuple[np.ndarray, ...]:

@@ -3,17 +3,19 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TypeVar
 
+First = TypeVar("First")
+Second = TypeVar("Second")
 Item = TypeVar("Item")
 Done = TypeVar("Done")
 
 
-def both(work: Callable[..., Done], first: tuple[Any, ...], second: tuple[Any, ...]) -> tuple[Done, Done]:
-    """The results of `work` for two sets of arguments, computed at the same time."""
+def at_once(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """The results of two functions that run at the same time, the second in another thread."""
     with ThreadPoolExecutor(1) as thread:
-        other = thread.submit(work, *second)
-        return work(*first), other.result()
+        other = thread.submit(second)
+        return first(), other.result()
 
 
 def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, max_waiting: int) -> Iterator[Done]:

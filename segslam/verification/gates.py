@@ -17,7 +17,7 @@ from segslam import geometry
 from segslam.config import VerifyConfig
 from segslam.points import within_range
 from segslam.refinement import Surface
-from segslam.types import Direction, Mask, Rejected, RejectReason, Transform, Vector
+from segslam.types import Direction, Mask, Points, Rejected, RejectReason, Transform, Vector
 from segslam.verification.free_space import FreeSpace, violation
 
 Observed = tuple[Surface, FreeSpace]
@@ -132,7 +132,7 @@ def limits(floor: NoiseFloor, *, config: VerifyConfig) -> Limits:
 def agreement(source: Observed, target: Observed, T_target_source: Transform, *, config: VerifyConfig) -> Agreement:
     """Agreement of two scans at this pose of the source in the target."""
     ways = [
-        (*_surface_agreement(a[0], b[0], T_b_a, config), violation(a[0].points, b[1], T_b_a, config=config))
+        (*_surface_agreement(a[0].standing, b[0], T_b_a, config), violation(a[0].points, b[1], T_b_a, config=config))
         for a, b, T_b_a in (
             (source, target, T_target_source),
             (target, source, geometry.inverse(T_target_source)),
@@ -147,6 +147,14 @@ def agreement(source: Observed, target: Observed, T_target_source: Transform, *,
 def mismatch(overlap: float, residual_ratio: float) -> float:
     """Mean squared residual of the standing points in units of twice the roughness, truncated at 1 (no match)."""
     return 1.0 - overlap + overlap * min(residual_ratio / 2.0, 1.0) ** 2
+
+
+def mismatch_of_some(
+    standing: Points, target: Surface, T_target_source: Transform, *, roughness_m: float, config: VerifyConfig
+) -> float:
+    """Mismatch of some standing points of the source. With all of them and both directions it is hardly smaller."""
+    overlap, rms_m = _surface_agreement(standing, target, T_target_source, config)
+    return mismatch(overlap, rms_m / roughness_m)
 
 
 class Support(NamedTuple):
@@ -246,9 +254,9 @@ def rejection(found: Agreement, allowed: Limits) -> Rejected | None:
     return None
 
 
-def _surface_agreement(a: Surface, b: Surface, T_b_a: Transform, config: VerifyConfig) -> tuple[float, float]:
+def _surface_agreement(standing: Points, b: Surface, T_b_a: Transform, config: VerifyConfig) -> tuple[float, float]:
     """Overlap and residual of a's standing points within reach of b's sensor; no overlap where none is."""
-    moved = geometry.apply(T_b_a, a.standing)
+    moved = geometry.apply(T_b_a, standing)
     moved = moved[within_range(moved, 0.0, config.max_range_m)]
     if not len(moved):
         return 0.0, math.inf

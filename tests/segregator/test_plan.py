@@ -8,7 +8,7 @@ import pytest
 from segslam import geometry
 from segslam.config import load_config
 from segslam.registration import register
-from segslam.segregator.plan import CELL_M, NUM_YAWS, plan_hypotheses
+from segslam.segregator.plan import CELL_M, NUM_YAWS, FloorPlan, plan_hypotheses
 from segslam.types import Alignment, Label, Points, Registration, Transform
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -43,7 +43,7 @@ def _error(found: Registration, T_target_source: Transform) -> tuple[float, floa
 def test_a_court_is_found_again_from_elsewhere_at_any_yaw(yaw_deg: int) -> None:
     T_target_source = geometry.transform(geometry.yaw(math.radians(yaw_deg)), np.array([7.0, 9.0, 1.2]))
     source = geometry.apply(geometry.inverse(T_target_source), _court())
-    (found,) = plan_hypotheses(source, _court(), UP, UP, num_poses=1)
+    (found,) = plan_hypotheses(FloorPlan(source, UP), FloorPlan(_court(), UP), num_poses=1)
     apart_m, apart_rad = _error(found, T_target_source)
     reach_m = np.linalg.norm(source, axis=1).max()
     assert apart_rad <= HALF_STEP_RAD + 1e-9
@@ -60,14 +60,15 @@ def test_sensors_that_lean_are_righted_by_their_up() -> None:
     T_leaning = leaning[1] @ T_target_source @ geometry.inverse(leaning[0])
     source = geometry.apply(leaning[0] @ geometry.inverse(T_target_source), _court())
     target = geometry.apply(leaning[1], _court())
-    (found,) = plan_hypotheses(source, target, leaning[0][:3, :3] @ UP, leaning[1][:3, :3] @ UP, num_poses=1)
+    plans = [FloorPlan(points, T[:3, :3] @ UP) for points, T in zip((source, target), leaning, strict=True)]
+    (found,) = plan_hypotheses(*plans, num_poses=1)
     apart_m, apart_rad = _error(found, T_leaning)
     assert apart_m < 2.0
     assert apart_rad < math.radians(5.0)
 
 
 def test_hypotheses_differ_and_the_best_comes_first() -> None:
-    found = list(plan_hypotheses(_court(), _court(), UP, UP, num_poses=5))
+    found = list(plan_hypotheses(FloorPlan(_court(), UP), FloorPlan(_court(), UP), num_poses=5))
     assert len(found) == 5
     assert _error(found[0], np.eye(4)) == pytest.approx((0.0, 0.0), abs=1e-6)
     for k, one in enumerate(found):
@@ -79,14 +80,15 @@ def test_hypotheses_differ_and_the_best_comes_first() -> None:
 def test_order_of_points_changes_nothing() -> None:
     court = _court()
     shuffled = np.random.default_rng(1).permutation(court)
-    first, again = (next(plan_hypotheses(points, court, UP, UP, num_poses=1)) for points in (court, shuffled))
+    target = FloorPlan(court, UP)
+    first, again = (next(plan_hypotheses(FloorPlan(points, UP), target, num_poses=1)) for points in (court, shuffled))
     np.testing.assert_array_equal(first.T_target_source, again.T_target_source)
 
 
 def test_nothing_upright_gives_no_pose() -> None:
-    assert list(plan_hypotheses(np.empty((0, 3)), _court(), UP, UP, num_poses=3)) == []
+    assert list(plan_hypotheses(FloorPlan(np.empty((0, 3)), UP), FloorPlan(_court(), UP), num_poses=3)) == []
     far = _court() + np.array([200.0, 0.0, 0.0])
-    assert list(plan_hypotheses(_court(), far, UP, UP, num_poses=3)) == []
+    assert list(plan_hypotheses(FloorPlan(_court(), UP), FloorPlan(far, UP), num_poses=3)) == []
 
 
 @pytest.mark.parametrize(("num_plans", "aligned"), [(2, True), (0, False)])

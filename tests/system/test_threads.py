@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from segslam.system.threads import both, in_other_thread
+from segslam.system.threads import at_once, in_other_thread
 
 
 @pytest.mark.parametrize("max_waiting", [1, 8])
@@ -98,16 +98,14 @@ def test_an_early_end_stops_the_work() -> None:
 def test_both_are_done_at_the_same_time_and_given_in_their_order() -> None:
     meeting = threading.Barrier(2, timeout=5.0)
 
-    def work(first: int, second: int) -> int:
+    def meet(result: str) -> str:
         meeting.wait()
-        return first - second
+        return result
 
-    assert both(work, (5, 1), (2, 7)) == (4, -5)
+    assert at_once(lambda: meet("first"), lambda: meet("second")) == ("first", "second")
 
 
-@pytest.mark.parametrize("zero", [0, 1])
-def test_what_raises_in_either_raises(zero: int) -> None:
-    arguments = [(1, 1), (1, 1)]
-    arguments[zero] = (1, 0)
+@pytest.mark.parametrize("divisors", [(0, 1), (1, 0)])
+def test_what_raises_in_either_raises(divisors: tuple[int, int]) -> None:
     with pytest.raises(ZeroDivisionError):
-        both(lambda a, b: a / b, *arguments)
+        at_once(lambda: 1 / divisors[0], lambda: 1 / divisors[1])

@@ -1,19 +1,17 @@
 """Loop closing by place recognition, independent of drift: keyframes similar to an older place, wherever it is.
 
-A single registration of this kind may be wrong, because streets repeat, and would then ruin the map. A loop is closed
-only if several keyframes, along some metres of travel, are registered with one place, and their poses are consistent
-with the odometry between them.
+A loop is closed only if several keyframes confirm it (`Confirmation`).
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from segslam import geometry
 from segslam.config import Config
+from segslam.confirmation import Confirmation
 from segslam.pose_graph import Graph
 from segslam.proximity import BREAK_TRAVEL_M, search_radius_m
 from segslam.recognition import recognise
@@ -31,12 +29,6 @@ from segslam.verification import gates
 
 MIN_SCORE = 0.6
 """Chosen on the real places of KITTI 05: 97 % of the revisits are more similar, 99 % of other best places less."""
-NUM_AGREEING, AGREEING_M = 3, 5.0
-"""Chosen: number of keyframes that must be consistent, and travel between the first and the last."""
-WAITING_M = 40.0
-"""Chosen: travel after which an unconfirmed registration is dropped."""
-SAME_M, SAME_SHARE, SAME_RAD = 0.5, 0.05, math.radians(2.0)
-"""Chosen: largest difference of motions between consistent registrations; constant (m), and per metre between them."""
 MOST_DRIFT, LEAST_REACH_M = 0.25, 15.0
 """Chosen: largest error of the odometry, as a share of the travel, and constant."""
 NUM_LISTED = 5
@@ -47,14 +39,6 @@ NEAR_M = 10.0
 """Chosen: places nearer to the predicted position than this are candidates of proximity only."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Waiting:
-    """A registration that is not yet confirmed by others."""
-
-    closure: LoopClosure
-    candidate: LoopCandidate
-
-
 class FarLoops:
     """Registers keyframes with similar places, and closes the loops that several keyframes confirm."""
 
@@ -63,14 +47,14 @@ class FarLoops:
         config: Config,
         graph: Graph,
         prepared: Callable[[int], PreparedScan],
-        T_odom_keyframe: Callable[[int], Transform],
         floor: Callable[[int], gates.NoiseFloor],
+        confirmation: Confirmation,
     ) -> None:
         self._config, self._graph = config, graph
-        self._prepared, self._T_odom, self._floor = prepared, T_odom_keyframe, floor
+        self._prepared, self._floor = prepared, floor
+        self._confirmation = confirmation
         self._places = Places()
         self._signatures: dict[int, PlaceSignature] = {}
-        self._waiting: list[Waiting] = []
         self._rejected_m = -math.inf
         """Travel at the last rejection."""
 
@@ -81,8 +65,6 @@ class FarLoops:
 
     def attempt(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
         """Try the place most similar to that of the newest keyframe; closures follow once enough others confirm it."""
-        at_m = self._graph.travel_m[keyframe_id]
-        self._waiting = [one for one in self._waiting if at_m - self._travel_m(one) <= WAITING_M]
         with watch("propose"):
             candidate = self._candidate(keyframe_id)
         if candidate is None:
@@ -105,12 +87,12 @@ class FarLoops:
             return (LoopAttempt(candidate, found, own.seconds),)
         fine = found.alignment.fine
         closure = LoopClosure(keyframe_id, candidate.target_id, fine.T_target_source, fine.information, found.alignment)
-        return self._confirmed(Waiting(closure, candidate), own.seconds)
+        return self._confirmation.attempts(candidate, closure, own.seconds)
 
     def _candidate(self, keyframe_id: int) -> LoopCandidate | None:
         """The most similar older place that lies within the largest drift and is not a candidate of proximity."""
         travel_m = self._graph.travel_m
-        if not self._waiting and travel_m[keyframe_id] - self._rejected_m < RETRY_M:
+        if not self._confirmation.is_waiting(keyframe_id) and travel_m[keyframe_id] - self._rejected_m < RETRY_M:
             return None
         num_old = int(
             np.searchsorted(travel_m, travel_m[keyframe_id] - self._config.proximity.min_travel_m, side="right")
@@ -140,33 +122,6 @@ class FarLoops:
     def _expected_m(self, candidate: LoopCandidate) -> float:
         """Largest distance from the prior that proximity accepts."""
         return float(search_radius_m(np.array([candidate.chain_m]), config=self._config.proximity)[0])
-
-    def _confirmed(self, newest: Waiting, seconds: dict[str, float]) -> tuple[LoopAttempt, ...]:
-        """Attempts that result from a registration: closures if enough others confirm it; otherwise it waits."""
-        at_m = self._travel_m(newest)
-        agreeing = [one for one in self._waiting if self._agree(one, newest)]
-        if len(agreeing) + 1 < NUM_AGREEING or at_m - self._travel_m(agreeing[0]) < AGREEING_M:
-            self._waiting.append(newest)
-            shown = f"{len(agreeing)} of {NUM_AGREEING - 1} earlier keyframes confirm it"
-            return (LoopAttempt(newest.candidate, Rejected(RejectReason.UNCONFIRMED, shown), seconds),)
-        self._waiting = []
-        return (
-            *(LoopAttempt(one.candidate, one.closure, {}) for one in agreeing),
-            LoopAttempt(newest.candidate, newest.closure, seconds),
-        )
-
-    def _agree(self, earlier: Waiting, later: Waiting) -> bool:
-        """True if the motion between two keyframes is the same by their registrations and by odometry."""
-        T_world = self._graph.T_world_keyframes
-        a, b = earlier.closure, later.closure
-        T_a_b = geometry.inverse(T_world[a.target_id] @ a.T_target_source) @ T_world[b.target_id] @ b.T_target_source
-        T_odom = geometry.inverse(self._T_odom(a.source_id)) @ self._T_odom(b.source_id)
-        apart = geometry.inverse(T_odom) @ T_a_b
-        within_m = SAME_M + SAME_SHARE * (self._travel_m(later) - self._travel_m(earlier))
-        return geometry.distance(apart) <= within_m and geometry.angle(apart) <= SAME_RAD
-
-    def _travel_m(self, one: Waiting) -> float:
-        return float(self._graph.travel_m[one.closure.source_id])
 
 
 def _not_far(

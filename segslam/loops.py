@@ -6,10 +6,11 @@ from functools import lru_cache, partial
 from time import monotonic
 
 from segslam.config import Config
+from segslam.confirmation import Confirmation
 from segslam.far_loops import FarLoops
 from segslam.keyframes import Clouds
 from segslam.pose_graph import Graph
-from segslam.proximity import ProximityDetector
+from segslam.proximity import BREAK_TRAVEL_M, ProximityDetector
 from segslam.registration import Labeller, PreparedScan, Stopwatch, register_near, register_prepared
 from segslam.retrieval import PlaceSignature, signature_of
 from segslam.submaps import Submaps
@@ -43,7 +44,8 @@ class LoopCloser:
             self.submaps.lag,
             config=config,
         )
-        self._far = FarLoops(config, graph, self._prepared, lambda number: self.submaps.T_odom[number], self._floor.at)
+        self._confirmation = Confirmation(graph, lambda number: self.submaps.T_odom[number])
+        self._far = FarLoops(config, graph, self._prepared, self._floor.at, self._confirmation)
         self._tried: set[tuple[int, int]] = set()
         self._is_finished = False
 
@@ -113,7 +115,9 @@ class LoopCloser:
     def _tried_in_turn(
         self, candidates: list[LoopCandidate], watch: Stopwatch, *, is_known: bool
     ) -> tuple[LoopAttempt, ...]:
-        attempts = tuple(self._attempt(candidate, watch, is_known=is_known) for candidate in candidates)
+        attempts = tuple(
+            attempt for candidate in candidates for attempt in self._attempts(candidate, watch, is_known=is_known)
+        )
         self.take(attempts)
         return attempts
 
@@ -125,7 +129,7 @@ class LoopCloser:
                 self._graph.add_closure(attempt.outcome)
                 self._detector.note_closure(attempt.outcome)
 
-    def _attempt(self, candidate: LoopCandidate, watch: Stopwatch, *, is_known: bool) -> LoopAttempt:
+    def _attempts(self, candidate: LoopCandidate, watch: Stopwatch, *, is_known: bool) -> tuple[LoopAttempt, ...]:
         own = Stopwatch()
         with own("prepare"):
             source, target = at_once(
@@ -152,7 +156,10 @@ class LoopCloser:
             )
         for stage, seconds in own.seconds.items():
             watch.add(stage, seconds)
-        return LoopAttempt(candidate, _closure(candidate, outcome), own.seconds)
+        closure = _closure(candidate, outcome)
+        if candidate.chain_m >= BREAK_TRAVEL_M and not is_known and isinstance(closure, LoopClosure):
+            return self._confirmation.attempts(candidate, closure, own.seconds)
+        return (LoopAttempt(candidate, closure, own.seconds),)
 
 
 def _has_closure(attempts: tuple[LoopAttempt, ...]) -> bool:

@@ -11,7 +11,7 @@ from segslam.config import OdometryConfig, load_config
 from segslam.odometry import GivenOdometry, OdometryResult
 from segslam.slam import Slam
 from segslam.slam_result import SlamResult
-from segslam.types import LoopClosure, Motion, MotionState, RejectReason, Scan, Trajectory
+from segslam.types import LoopClosure, Motion, MotionState, Rejected, RejectReason, Scan, Trajectory
 
 FAR_DEG = 1.0
 """20 m off after a round of 113 m."""
@@ -77,23 +77,48 @@ class Carried(GivenOdometry):
         return replace(found, motion=Motion(MotionState.BROKEN, information=1e-3 * np.eye(6)))
 
 
-def test_a_sensor_that_was_carried_to_an_older_place_is_found_there() -> None:
+BEFORE, AFTER = 30, 55
+"""The sensor is carried from one scan to the other, which is in the second round, near scan 4 of the first."""
+
+
+@cache
+def carried() -> SlamResult:
+    """The drive of a sensor that is carried."""
     scans, truth = round_drive()
-    before, after = 30, 55  # in the second round, near scan 4 of the first
+    before, after = BEFORE, AFTER
     kept = [*range(before), *range(after, len(scans))]
     odometry = drifting(truth)
     T_odom = odometry.T_world_lidar.copy()
     T_odom[after:] = T_odom[before - 1] @ geometry.inverse(T_odom[after]) @ T_odom[after:]
     config = load_config(None, ["health.check=false"])
-    carried = Carried(replace(odometry, T_world_lidar=T_odom), config.odometry, first_after=after)
-    slam = Slam(config, odometry=carried)
+    given = Carried(replace(odometry, T_world_lidar=T_odom), config.odometry, first_after=after)
+    slam = Slam(config, odometry=given)
     for number in kept:
         slam.process(scans[number])
-    result = slam.finish()
-    assert [motion.is_break for motion in result.motions].index(True) == before
+    return slam.finish()
+
+
+def test_a_sensor_that_was_carried_to_an_older_place_is_found_there() -> None:
+    result, truth = carried(), round_drive()[1]
+    assert [motion.is_break for motion in result.motions].index(True) == BEFORE
     assert len(result.closures()) >= 3
-    off_m = np.linalg.norm(result.trajectory.T_world_lidar[before:, :3, 3] - _from_first(truth)[after:], axis=1)
+    off_m = np.linalg.norm(result.trajectory.T_world_lidar[BEFORE:, :3, 3] - _from_first(truth)[AFTER:], axis=1)
     assert off_m.max() < 1.0
+
+
+def test_a_loop_across_a_break_waits_for_two_others() -> None:
+    result = carried()
+    across = [
+        attempt.outcome
+        for attempt in result.attempts
+        if result.keyframe_rows[attempt.candidate.source_id]
+        >= BEFORE
+        > result.keyframe_rows[attempt.candidate.target_id]
+    ]
+    first_closure = next(k for k, outcome in enumerate(across) if isinstance(outcome, LoopClosure))
+    waited = [outcome.reason for outcome in across[:first_closure] if isinstance(outcome, Rejected)]
+    assert waited.count(RejectReason.UNCONFIRMED) >= 2
+    assert all(isinstance(outcome, LoopClosure) for outcome in across[first_closure : first_closure + 3])
 
 
 def _from_first(truth: Trajectory) -> np.ndarray:

@@ -17,7 +17,7 @@ from segslam.health.check import nudge, open_direction
 from segslam.health.history import LONG_GAP, LOST_SCANS, History, Intervals
 from segslam.health.local_map import LocalMap
 from segslam.health.restored import rows_in_maps
-from segslam.health.search import LEAST_SUPPORTED, Found, PoseSearch, Recover, SeenScan, are_different
+from segslam.health.search import Found, PoseSearch, Recover, SeenScan, are_different
 from segslam.health.unseen import Unseen, moved_along
 from segslam.odometry import Odometry, OdometryResult, deskew_scan
 from segslam.refinement import LightSurface
@@ -40,6 +40,8 @@ BREAK_SIGMA_M, BREAK_SIGMA_RAD = 30.0, np.radians(60.0)
 SUDDEN_M, SUDDEN_RAD = 0.5, np.radians(5.0)
 """Chosen: a motion that differs by more than this from the previous one is checked, however short it is, and so is a
 rotation by more than this: on the real courtyard, scans 0.5 s apart, KISS-ICP misses turns."""
+TURN_S = 2.0
+"""Chosen: a turn that lasts no longer while scans are missing is another guess, and that of a break."""
 CHECK_EVERY = 10
 """Chosen: at least every tenth scan is checked, because a stuck odometry reports no motion."""
 
@@ -66,7 +68,7 @@ class CheckedOdometry:
         """Motion between the last two scans, per interval of the sensor."""
         self._unseen = Unseen()
         self._intervals = 1.0
-        """Intervals from the last scan to this one, if scans between them are known to be lost."""
+        """Intervals from the last scan to this one, more than 1 if scans between them are missing."""
         self._pace = Intervals()
         self._num_unchecked = 0
         """Number of scans since the last checked one."""
@@ -75,11 +77,11 @@ class CheckedOdometry:
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
         """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry."""
-        self._intervals = gap
         proposed = self._inner.register(scan, gap=gap)
         if not self._config.check:
             return proposed
-        T_odom_lidar, motion = self._checked(proposed, self._pace.note(scan.stamp_ns))
+        self._intervals = max(gap, self._pace.note(scan.stamp_ns))
+        T_odom_lidar, motion = self._checked(proposed)
         self._T_before_last = self._since_last(T_odom_lidar)
         self._T_odom_last = T_odom_lidar
         return OdometryResult(T_odom_lidar, proposed.points, proposed.labels, proposed.intensities, motion)
@@ -96,7 +98,7 @@ class CheckedOdometry:
             self._inner.restore(T_odom_lidar, scan_of)
             return
         for stamp_ns in stamps_ns:
-            self._pace.note(int(stamp_ns))
+            self._intervals = self._pace.note(int(stamp_ns))
         rows = rows_in_maps(
             T_odom_lidar, motions, history=self._history, empty=self._map.empty_copy, map_scans=self._config.map_scans
         )
@@ -118,7 +120,9 @@ class CheckedOdometry:
         self._T_odom_last = T_odom_lidar[-1]
         self._has_motion = len(T_odom_lidar) > 1
         if self._has_motion:
-            self._T_before_last = geometry.inverse(T_odom_lidar[-2]) @ T_odom_lidar[-1]
+            self._T_before_last = geometry.scaled(
+                geometry.inverse(T_odom_lidar[-2]) @ T_odom_lidar[-1], 1 / self._intervals
+            )
             self._restore_unseen(T_odom_lidar, motions, scan_of)
 
     def _restore_unseen(self, T_odom_lidar: Poses, motions: Sequence[Motion], scan_of: Callable[[int], Scan]) -> None:
@@ -141,7 +145,7 @@ class CheckedOdometry:
         """The motion per interval of the sensor."""
         return geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / self._intervals)
 
-    def _checked(self, proposed: OdometryResult, gap: float) -> tuple[Transform, Motion]:
+    def _checked(self, proposed: OdometryResult) -> tuple[Transform, Motion]:
         if self._anchor is None:
             self._take(proposed.T_odom_lidar, SeenScan(proposed.points, self._map))
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
@@ -152,12 +156,12 @@ class CheckedOdometry:
             if T_odom_better is not None:
                 self._has_motion = True
                 self._history.watch()
-                return self._registered(proposed.T_odom_lidar, scan, None, gap, also=[T_odom_better])
+                return self._registered(proposed.T_odom_lidar, scan, None, also=[T_odom_better])
         self._has_motion = True
         self._num_unchecked += 1
         is_suspect = (
             self._num_unchecked >= CHECK_EVERY
-            or gap > LONG_GAP
+            or self._intervals > LONG_GAP
             or _is_sudden(T_predicted_lidar)
             or geometry.angle(self._since_last(proposed.T_odom_lidar)) > SUDDEN_RAD
             or self._history.is_watching
@@ -181,7 +185,7 @@ class CheckedOdometry:
                 self._unseen.note_seen(self._since_last(proposed.T_odom_lidar))
                 moved_deg = float(np.degrees(found.moved_rad))
                 return proposed.T_odom_lidar, Motion(MotionState.CONFIRMED, found.moved_m, moved_deg, found.overlap)
-        return self._registered(proposed.T_odom_lidar, scan, direction, gap)
+        return self._registered(proposed.T_odom_lidar, scan, direction)
 
     def _better_first(self, T_odom_proposed: Transform, scan: SeenScan) -> Transform | None:
         """Another pose of the second scan, found with no guess, which fits the first better; None if there is none."""
@@ -199,7 +203,6 @@ class CheckedOdometry:
         T_odom_proposed: Transform,
         scan: SeenScan,
         direction: Direction | None,
-        gap: float,
         *,
         also: Sequence[Transform] = (),
     ) -> tuple[Transform, Motion]:
@@ -209,24 +212,26 @@ class CheckedOdometry:
         `also`: further initial guesses.
         """
         T_before_last = self._T_before_last if direction is None else self._unseen.T_steady
-        T_odom_predicted = _exact(self._T_odom_last @ geometry.scaled(T_before_last, gap))
-        guesses = [T_odom_proposed, T_odom_predicted, self._T_odom_last, *also]
+        T_odom_predicted = _exact(self._T_odom_last @ geometry.scaled(T_before_last, self._intervals))
+        T_odom_ahead = _exact(self._T_odom_last @ _straightened(T_before_last, self._intervals, self._pace.usual_s))
+        guesses = [T_odom_proposed, T_odom_predicted, self._T_odom_last, T_odom_ahead, *also]
         before_break = self._lost
         found = self._found_again(scan, guesses) if direction is None else None
         if found is not None and before_break is not None:
             self._map, self._lost = before_break, None
         else:
             around = None if direction is not None else (self._T_odom_last, T_odom_predicted)
-            found = self._search.near(self._map, scan, guesses, around=around)
+            supporting = self._supporting(T_odom_proposed, T_odom_predicted)
+            found = self._search.near(self._map, scan, guesses, around=around, T_odom_supporting=[*supporting, *also])
             found = found or self._search.without_guess(self._map, scan)
         is_at_an_end = direction is not None or self._unseen.direction is not None
-        if found is None and is_at_an_end and gap <= LONG_GAP:
+        if found is None and is_at_an_end and self._intervals <= LONG_GAP:
             T_odom_guess = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
             return self._at_an_end(T_odom_guess, scan, direction)
         if found is None and direction is not None:
-            return self._break(T_odom_predicted, scan)
+            return self._break(T_odom_ahead, scan)
         if found is None:
-            return self._unsupported(T_odom_proposed, T_odom_predicted, scan)
+            return self._unsupported(T_odom_proposed, T_odom_ahead, scan)
         T_odom_lidar = _exact(self._map.T_odom_map @ found.T_map_lidar)
         if direction is not None:
             T_odom_along = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
@@ -252,6 +257,16 @@ class CheckedOdometry:
         moved_deg = float(np.degrees(moved_rad))
         return T_odom_lidar, Motion(state, moved_m, moved_deg, fit.overlap, fit.rms_m, information=information)
 
+    def _supporting(self, T_odom_proposed: Transform, T_odom_predicted: Transform) -> list[Transform]:
+        """Poses that support a registration: the prediction, unless scans are missing; an odometry of other sensors.
+
+        A proposal made from the same scans, which may be wrong in the same way, supports it at the start only.
+        """
+        if self._intervals > LONG_GAP:
+            return [] if self._inner.is_from_scans else [T_odom_proposed]
+        is_known = self._inner.is_from_scans and self._history.is_usual_known
+        return [T_odom_predicted] if is_known else [T_odom_predicted, T_odom_proposed]
+
     def _unsupported(
         self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan
     ) -> tuple[Transform, Motion]:
@@ -261,7 +276,8 @@ class CheckedOdometry:
         """
         found = self._map.fit(scan.surface, geometry.inverse(self._map.T_odom_map) @ T_odom_proposed)
         off = geometry.inverse(T_odom_predicted) @ T_odom_proposed
-        if found.overlap >= LEAST_SUPPORTED and not _is_sudden(off):
+        is_steady = self._intervals <= LONG_GAP and not _is_sudden(off)
+        if is_steady and self._history.is_plausible(found):
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         return self._break(T_odom_predicted, scan)
 
@@ -270,10 +286,10 @@ class CheckedOdometry:
         if self._lost is None:
             return None
         self._history.scans_lost += 1
-        if found := self._search.near(self._lost, scan, T_odom_guesses, leads_here=False):
+        if found := self._search.near(self._lost, scan, T_odom_guesses):
             return found
         is_due = self._history.scans_lost % RECOVER_EVERY == 0
-        if is_due and (found := self._search.without_guess(self._lost, scan, leads_here=False)):
+        if is_due and (found := self._search.without_guess(self._lost, scan, must_be_usual=True)):
             return found
         if self._history.scans_lost >= LOST_SCANS:
             self._lost = None
@@ -317,6 +333,13 @@ class CheckedOdometry:
 def _unknown() -> Information:
     """The information of a motion that no scan supports."""
     return np.diag(geometry.tangent(rotation_rad=BREAK_SIGMA_RAD, translation_m=BREAK_SIGMA_M) ** -2.0)
+
+
+def _straightened(T_step: Transform, gap: float, usual_s: float) -> Transform:
+    """The motion over `gap` intervals of `usual_s` seconds, from that of one, if a turn ends after `TURN_S`."""
+    turning = min(gap, max(TURN_S / usual_s, 1.0)) if usual_s > 0.0 else gap
+    straight = geometry.transform(np.eye(3), (gap - turning) * T_step[:3, 3])
+    return geometry.scaled(T_step, turning) @ straight
 
 
 def _exact(T_a_b: Transform) -> Transform:

@@ -16,9 +16,8 @@ Recover = Callable[[Points, Points], Alignment | Rejected]
 """Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
 DIFFERENT_M, DIFFERENT_RAD = 0.3, np.radians(3.0)
 """Chosen: initial guesses nearer to each other than this lead to the same pose."""
-LEAST_SUPPORTED = 0.15
 SUPPORT_M, SUPPORT_RAD = 0.5, np.radians(3.0)
-"""Chosen: a lower overlap suffices for a registration this near to an expected pose: two sources agree."""
+"""Chosen: a registration this near to a pose from another source is supported by it, and a lower overlap suffices."""
 NEARLY = 0.97
 """Chosen: share of the best closeness with which a registration fits nearly as well."""
 TURN_M = 5.0
@@ -31,19 +30,17 @@ class Found:
 
     T_map_lidar: Transform
     fit: Fit
-    offsets: list[Transform]
-    """From the expected poses, which do not depend on the registration."""
+    T_odom_lidar: Transform
 
-    @property
-    def offset_m(self) -> float:
-        """Distance from the nearest of these poses, with turns (m)."""
-        return min(geometry.distance(T) + TURN_M * geometry.angle(T) for T in self.offsets)
+    def offset_m(self, T_odom_expected: Sequence[Transform]) -> float:
+        """Distance from the nearest of some poses, with turns (m)."""
+        offsets = [geometry.inverse(T_odom_other) @ self.T_odom_lidar for T_odom_other in T_odom_expected]
+        return min(geometry.distance(T) + TURN_M * geometry.angle(T) for T in offsets)
 
-    @property
-    def is_supported(self) -> bool:
-        """True if it is near to an expected pose, and overlaps somewhat."""
-        is_near = any(geometry.distance(T) < SUPPORT_M and geometry.angle(T) < SUPPORT_RAD for T in self.offsets)
-        return is_near and self.fit.overlap >= LEAST_SUPPORTED
+    def is_near(self, T_odom_supporting: Sequence[Transform]) -> bool:
+        """True if it is near to one of some poses."""
+        offsets = [geometry.inverse(T_odom_other) @ self.T_odom_lidar for T_odom_other in T_odom_supporting]
+        return any(geometry.distance(T) < SUPPORT_M and geometry.angle(T) < SUPPORT_RAD for T in offsets)
 
 
 class SeenScan:
@@ -66,11 +63,7 @@ class SeenScan:
 
 
 class PoseSearch:
-    """Registers scans with a local map and chooses the best result, or none.
-
-    `leads_here`: whether the known motion leads from the map to the scan, so that an expected pose supports a result.
-    After a break it continues a guess.
-    """
+    """Registers scans with a local map and chooses the best result, or none."""
 
     def __init__(self, history: History, recover: Recover, *, dense_voxels: int) -> None:
         """`recover` receives the newest scans of a map, as many as have `dense_voxels` voxels."""
@@ -82,19 +75,20 @@ class PoseSearch:
         self,
         local: LocalMap,
         scan: SeenScan,
-        T_odom_guesses: list[Transform],
+        T_odom_guesses: Sequence[Transform],
         *,
         around: tuple[Transform, Transform] | None = None,
-        leads_here: bool = True,
+        T_odom_supporting: Sequence[Transform] = (),
     ) -> Found | None:
         """The best registration from the guesses, the first two of which are expected poses; None if none is good.
 
         `around`: the last pose and the predicted one. If no guess leads to the usual fit, poses around the last one are
-        compared, and the best is registered too.
+        compared, and the best is registered too. `T_odom_supporting`: poses known from other sources than this scan;
+        near to one of them a lower overlap suffices.
         """
         guesses, expected = _different(T_odom_guesses), T_odom_guesses[:2]
-        found = _registrations(local, scan, guesses, expected)
-        best = self._best(found, leads_here=leads_here)
+        found = _registrations(local, scan, guesses)
+        best = self._best(found, expected, T_odom_supporting)
         if around is None or (best is not None and self._history.is_usual(best.fit)):
             return best
         T_odom_last, T_odom_predicted = around
@@ -102,18 +96,22 @@ class PoseSearch:
         T_step = geometry.inverse(T_odom_last) @ T_odom_predicted
         T_odom_around = local.T_odom_map @ local.around(scan.surface, T_map_last, T_step)
         more = _different([*guesses, T_odom_around])[len(guesses) :]
-        return self._best(found + _registrations(local, scan, more, expected), leads_here=leads_here)
+        return self._best(found + _registrations(local, scan, more), expected, T_odom_supporting)
 
-    def without_guess(self, local: LocalMap, scan: SeenScan, *, leads_here: bool = True) -> Found | None:
-        """The pose without initial guess, verified like a loop and then registered; None if there is none."""
+    def without_guess(self, local: LocalMap, scan: SeenScan, *, must_be_usual: bool = False) -> Found | None:
+        """The pose without initial guess, verified like a loop and then registered; None if there is none.
+
+        If the registration ends near the verified pose, a lower overlap suffices, unless it `must_be_usual`.
+        """
         alignment = self._recover(scan.points, local.cloud(self._dense_voxels))
         if isinstance(alignment, Rejected):
             return None
-        T_odom_recovered = local.T_odom_map @ alignment.fine.T_target_source
-        found = _registrations(local, scan, [T_odom_recovered], [T_odom_recovered])
-        return self._best(found, leads_here=leads_here)
+        verified = [local.T_odom_map @ alignment.fine.T_target_source]
+        return self._best(_registrations(local, scan, verified), verified, () if must_be_usual else verified)
 
-    def _best(self, found: list[Found], *, leads_here: bool) -> Found | None:
+    def _best(
+        self, found: list[Found], T_odom_expected: Sequence[Transform], T_odom_supporting: Sequence[Transform]
+    ) -> Found | None:
         """The registration that fits best; None if it does not fit as usual and is not supported.
 
         Of those that fit nearly as well, as all poses along a wall do, it is the one nearest to an expected pose.
@@ -121,21 +119,19 @@ class PoseSearch:
         if not found:
             return None
         enough = NEARLY * max(each.fit.closeness for each in found)
-        best = min((each for each in found if each.fit.closeness >= enough), key=lambda each: each.offset_m)
-        return best if self._history.is_usual(best.fit) or (leads_here and best.is_supported) else None
+        good = [each for each in found if each.fit.closeness >= enough]
+        best = min(good, key=lambda each: each.offset_m(T_odom_expected))
+        is_supported = best.is_near(T_odom_supporting) and self._history.is_plausible(best.fit)
+        return best if self._history.is_usual(best.fit) or is_supported else None
 
 
-def _registrations(
-    local: LocalMap, scan: SeenScan, T_odom_guesses: Sequence[Transform], T_odom_expected: Sequence[Transform]
-) -> list[Found]:
+def _registrations(local: LocalMap, scan: SeenScan, T_odom_guesses: Sequence[Transform]) -> list[Found]:
     """All registrations from some initial guesses."""
-    found = []
-    for T_odom_guess in T_odom_guesses:
-        for T_map_lidar in local.register(scan.surface, geometry.inverse(local.T_odom_map) @ T_odom_guess):
-            T_odom_lidar = local.T_odom_map @ T_map_lidar
-            offsets = [geometry.inverse(T_odom_other) @ T_odom_lidar for T_odom_other in T_odom_expected]
-            found.append(Found(T_map_lidar, local.fit(scan.surface, T_map_lidar), offsets))
-    return found
+    return [
+        Found(T_map_lidar, local.fit(scan.surface, T_map_lidar), local.T_odom_map @ T_map_lidar)
+        for T_odom_guess in T_odom_guesses
+        for T_map_lidar in local.register(scan.surface, geometry.inverse(local.T_odom_map) @ T_odom_guess)
+    ]
 
 
 def are_different(T_a_b: Transform) -> bool:

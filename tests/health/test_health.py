@@ -7,14 +7,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.drives import STEP_M, drifting, round_drive
+from helpers.drives import STEP_M, drifting, round_drive, round_sweeps
 
 from segslam import geometry
 from segslam.config import Config, load_config
 from segslam.evaluation import trajectory_metrics
 from segslam.health import CheckedOdometry, information_of
 from segslam.health.check import Nudge, nudge, open_direction
-from segslam.health.history import History
+from segslam.health.history import History, Intervals
 from segslam.health.local_map import LocalMap
 from segslam.odometry import GivenOdometry, KissOdometry, OdometryResult
 from segslam.refinement import LightSurface
@@ -127,6 +127,29 @@ def _elsewhere(scan: Scan) -> Scan:
     rng = np.random.default_rng(scan.index)
     points = rng.uniform([-40, -40, -2], [40, 40, 6], size=(20_000, 3))
     return replace(scan, points=points.astype(np.float32), labels=np.zeros(20_000, np.uint8))
+
+
+@pytest.mark.parametrize("interval_s", [0.3, 6.0])
+def test_a_scan_from_another_town_is_a_break_though_the_odometry_is_steady(interval_s: float) -> None:
+    scans, _ = round_drive()
+    odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    before = _registered(odometry, scans[:20])
+    sweeps = round_sweeps(seed=13, only=range(20, 22))
+    since_ns = scans[19].stamp_ns + int(interval_s * 1e9)
+    others = [one.scan(index=20 + k, stamp_ns=since_ns + k * 300_000_000) for k, one in enumerate(sweeps)]
+    results = _registered(odometry, others)
+    states = [result.motion.state for result in results if result.motion]
+    assert states[0] is MotionState.BROKEN
+    assert states[1] is MotionState.REFINED
+    T_break = geometry.inverse(before[-1].T_odom_lidar) @ results[0].T_odom_lidar
+    assert np.degrees(geometry.angle(T_break)) < 60.0, "the turn, 7 degrees a scan, ends in the gap of 20 scans"
+
+
+def test_a_long_pause_before_the_second_scan_does_not_set_the_usual_interval() -> None:
+    intervals = Intervals()
+    stamps_s = [0.0, 6.0, 6.1, 6.2, 6.3, 6.4, 7.4, 7.5]
+    gaps = [intervals.note(int(stamp_s * 1e9)) for stamp_s in stamps_s]
+    np.testing.assert_allclose(gaps, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 10.0, 1.0], rtol=1e-6)
 
 
 def test_an_unsupported_motion_is_a_break_and_is_repaired_when_the_map_is_visible_again() -> None:

@@ -1,0 +1,80 @@
+"""Loops without a useful prior wait until others confirm them.
+
+A single registration may be wrong, because places repeat. Where the odometry predicts the pose, the prior and the other
+closures exclude such errors; after much drift, and across a break of the odometry, nothing does, and one wrong loop
+ruins the map. Such a loop is closed only if several keyframes, along some metres of travel, are registered, and their
+poses are consistent with the odometry between them.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from segslam import geometry
+from segslam.pose_graph import Graph
+from segslam.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
+
+NUM_AGREEING, AGREEING_M = 3, 5.0
+"""Chosen: number of keyframes that must be consistent, and travel between the first and the last."""
+WAITING_M = 40.0
+"""Chosen: travel after which an unconfirmed registration is dropped."""
+SAME_M, SAME_SHARE, SAME_RAD = 0.5, 0.05, math.radians(2.0)
+"""Chosen: largest difference of motions between consistent registrations; constant (m), and per metre between them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Waiting:
+    """A registration that is not yet confirmed by others."""
+
+    closure: LoopClosure
+    candidate: LoopCandidate
+
+
+class Confirmation:
+    """The registrations that wait."""
+
+    def __init__(self, graph: Graph, T_odom_keyframe: Callable[[int], Transform]) -> None:
+        """`T_odom_keyframe`: pose of a keyframe by odometry."""
+        self._graph, self._T_odom = graph, T_odom_keyframe
+        self._waiting: list[Waiting] = []
+
+    def is_waiting(self, keyframe_id: int) -> bool:
+        """Whether a registration waits that this keyframe may confirm."""
+        at_m = self._graph.travel_m[keyframe_id]
+        self._waiting = [one for one in self._waiting if at_m - self._travel_m(one) <= WAITING_M]
+        return bool(self._waiting)
+
+    def attempts(
+        self, candidate: LoopCandidate, closure: LoopClosure, seconds: dict[str, float]
+    ) -> tuple[LoopAttempt, ...]:
+        """Attempts that result from a registration: closures if enough others confirm it; otherwise it waits."""
+        newest = Waiting(closure, candidate)
+        agreeing = (
+            [one for one in self._waiting if self._agree(one, newest)] if self.is_waiting(closure.source_id) else []
+        )
+        sources = {one.closure.source_id for one in agreeing} - {closure.source_id}
+        if (
+            len(sources) + 1 < NUM_AGREEING
+            or self._travel_m(newest) - min(self._travel_m(one) for one in agreeing) < AGREEING_M
+        ):
+            self._waiting.append(newest)
+            shown = f"{len(sources)} of {NUM_AGREEING - 1} earlier keyframes confirm it"
+            return (LoopAttempt(candidate, Rejected(RejectReason.UNCONFIRMED, shown), seconds),)
+        self._waiting = []
+        return (
+            *(LoopAttempt(one.candidate, one.closure, {}) for one in agreeing),
+            LoopAttempt(candidate, closure, seconds),
+        )
+
+    def _agree(self, earlier: Waiting, later: Waiting) -> bool:
+        """True if the motion between two keyframes is the same by their registrations and by odometry."""
+        T_world = self._graph.T_world_keyframes
+        a, b = earlier.closure, later.closure
+        T_a_b = geometry.inverse(T_world[a.target_id] @ a.T_target_source) @ T_world[b.target_id] @ b.T_target_source
+        T_odom = geometry.inverse(self._T_odom(a.source_id)) @ self._T_odom(b.source_id)
+        apart = geometry.inverse(T_odom) @ T_a_b
+        within_m = SAME_M + SAME_SHARE * (self._travel_m(later) - self._travel_m(earlier))
+        return geometry.distance(apart) <= within_m and geometry.angle(apart) <= SAME_RAD
+
+    def _travel_m(self, one: Waiting) -> float:
+        return float(self._graph.travel_m[one.closure.source_id])

@@ -8,13 +8,8 @@ from helpers.rooms import ground_and_walls
 from segslam import geometry, refinement, segregator
 from segslam.config import Config
 from segslam.registration import (
-    Found,
     PreparedScan,
     Stopwatch,
-    _coarse,
-    _few,
-    _shifted,
-    _Trial,
     anywhere,
     may_match,
     prepare_scan,
@@ -22,6 +17,8 @@ from segslam.registration import (
     register_near,
     register_prepared,
 )
+from segslam.registration.rivals import _shifted, few_points, sparsely_refined
+from segslam.registration.trial import Found, Trial, coarse_poses
 from segslam.types import Alignment, Label, Registration, Rejected, RejectReason
 from segslam.verification import gates
 from segslam.verification.free_space import observe_free_space
@@ -174,16 +171,16 @@ def test_the_first_iterations_decide_whether_a_pose_is_refined(
     """The pose from which refinement starts is beside the one to which it leads."""
     source, target, _ = _round_pair()
     allowed = gates.limits(gates.SINGLE_PAIR, config=CONFIG.verify)
-    trial = _Trial(source, target, CONFIG, anywhere, gates.SINGLE_PAIR, allowed, Stopwatch())
-    (coarse, *_) = (one for one in _coarse(trial) if isinstance(one, Registration))
+    trial = Trial(source, target, CONFIG, anywhere, gates.SINGLE_PAIR, allowed, Stopwatch())
+    (coarse, *_) = (one for one in coarse_poses(trial) if isinstance(one, Registration))
     found = trial.outcome(coarse)
     assert isinstance(found, Found)
-    few = _few(source, config=CONFIG, most=factor * found.agreement.mismatch, found=(found,) if is_found else ())
+    few = few_points(source, config=CONFIG, most=factor * found.agreement.mismatch, found=(found,) if is_found else ())
     beside = found.alignment.fine.T_target_source @ geometry.transform(np.eye(3), [0.6, 0.0, 0.0])
     refined = []
     refine = refinement.refine
     monkeypatch.setattr(refinement, "refine", lambda *given, **named: refined.append(1) or refine(*given, **named))
-    led = trial.led(replace(coarse, T_target_source=beside), few)
+    led = sparsely_refined(trial, replace(coarse, T_target_source=beside), few)
     assert (led is not None, len(refined)) == (leads, num_refined)
 
 

@@ -1,0 +1,53 @@
+"""A scan prepared for registration: described, downsampled with normals, and its free space."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from segslam import refinement, segregator
+from segslam.config import Config
+from segslam.semantics import geometric_labels
+from segslam.types import Description, Label, Labels, Points
+from segslam.verification import gates
+from segslam.verification.free_space import FreeSpace, observe_free_space
+
+Labeller = Callable[[Points], Labels]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedScan:
+    """A scan prepared for registration; computed once per scan."""
+
+    description: Description
+    surface: refinement.Surface
+    free_space: FreeSpace
+
+    @property
+    def observed(self) -> gates.Observed:
+        """Input of the gates: surface and free space."""
+        return self.surface, self.free_space
+
+
+def shape_labels(points: Points, *, config: Config) -> Labels:
+    """Labels computed from geometry alone."""
+    return geometric_labels(points, config=config.geometric)
+
+
+def prepare_scan(
+    points: Points, labels: Labels, *, config: Config, seen_from_here: Points | None = None
+) -> PreparedScan:
+    """Description, surface and free space of a scan; `points` in the scan's own frame.
+
+    If `points` are gathered from several scans, `seen_from_here` are the points measured from this pose: free space is
+    computed from these only. Points of moving classes are used for neither surface nor free space.
+    """
+    surface, seen = prepare_observed(points, labels, config=config, seen_from_here=seen_from_here)
+    return PreparedScan(segregator.describe(points, labels, config=config.segregator), surface, seen)
+
+
+def prepare_observed(
+    points: Points, labels: Labels, *, config: Config, seen_from_here: Points | None = None
+) -> gates.Observed:
+    """Surface and free space as in `prepare_scan`: sufficient to refine and verify a pose that is nearly known."""
+    still = points.compress(labels < Label.MOVING_CAR, axis=0)
+    surface = refinement.make_surface(refinement.downsample(still, config=config.refine), config=config.refine)
+    return surface, observe_free_space(still if seen_from_here is None else seen_from_here)

@@ -1,0 +1,153 @@
+"""Rivals: other poses that fit the two scans almost as well, which make a pose ambiguous."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from segslam import geometry, refinement
+from segslam.config import Config
+from segslam.registration.prepared import PreparedScan
+from segslam.registration.trial import Found, Trial, anywhere, plans_near
+from segslam.system.threads import at_once
+from segslam.types import Alignment, Direction, Points, Registration, Rejected, RejectReason, Transform
+from segslam.verification import gates
+
+MOST_SHIFT_M = 8
+"""Chosen: largest shift along the weak direction at which rivals are searched, in steps of 1 m; refinement finds rivals
+within 0.5 m."""
+SPARSE_MARGIN = 1.25
+"""Chosen: a rival is refined with all points if its mismatch after refinement with few is at most so many times the
+largest that makes a pose ambiguous."""
+NUM_SAMPLED = 800
+"""Chosen: number of standing points that show how well a pose fits, to 0.02."""
+HOPELESS = 1.2
+"""Chosen: a pose is dropped if, after the first iterations, its mismatch is more than so many times the largest of the
+poses that are searched. Of 46 rivals in streets, corridors, tunnels, garages and forests none had more than 1.05; nine
+of ten other poses had more."""
+SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
+"""Chosen: poses closer to each other than this are the same."""
+
+
+class FewPoints(NamedTuple):
+    """A few points of the source, which lead to poses and show in 1 ms how well they fit."""
+
+    surface: refinement.Surface
+    standing: Points
+    most: float
+    """Largest mismatch of the poses that are searched."""
+    found: tuple[Found, ...]
+    """Poses that are not searched again."""
+
+
+def few_points(source: PreparedScan, *, config: Config, most: float, found: tuple[Found, ...] = ()) -> FewPoints:
+    """Some points of the source, for poses with at most this mismatch."""
+    standing = source.surface.standing
+    sampled = standing[:: max(len(standing) // NUM_SAMPLED, 1)]
+    return FewPoints(refinement.sparse(source.surface, config=config.refine), sampled, most, found)
+
+
+def unless_ambiguous(found: Found, trial: Trial) -> Alignment | Rejected:
+    """The best of a pose and its rivals; AMBIGUOUS if a different pose fits almost as well.
+
+    Rivals are searched if the scans constrain the pose badly in some direction, as along a tunnel, or fit less well
+    than neighbouring keyframes do. In the second case poses that the prior excludes are rivals too: a pose that fits
+    no better than wrong ones is not proven by being near the prior.
+    """
+    config = trial.config.verify
+    certain = gates.is_certain(found.agreement, trial.floor)
+    if certain and found.alignment.observability >= config.well_observed:
+        return found.alignment
+    loose = trial._replace(limits=trial.limits.loosened(), gate=trial.gate if certain else anywhere, is_rival=True)
+    passed = [found]
+    most = SPARSE_MARGIN * config.rival_ratio * found.agreement.mismatch
+    few = few_points(trial.source, config=trial.config, most=most, found=(found,))
+    for led in _rivals(found, loose, few):
+        if not _is_near(led.T_target_source, passed) and loose.mismatch(led.T_target_source) <= most:
+            rival = loose.outcome(led)
+            if isinstance(rival, Found) and not _is_near(rival.alignment.fine.T_target_source, passed):
+                passed.append(rival)
+    best, *others = sorted(passed, key=lambda one: one.agreement.mismatch)
+    if others and others[0].agreement.mismatch < config.rival_ratio * best.agreement.mismatch:
+        apart = geometry.inverse(best.alignment.fine.T_target_source) @ others[0].alignment.fine.T_target_source
+        beside = f"{others[0].agreement.mismatch:.3f} {geometry.distance(apart):.1f} m off"
+        return Rejected(RejectReason.AMBIGUOUS, f"mismatch {best.agreement.mismatch:.3f}, and {beside}")
+    rejected = trial.gate(best.alignment.fine.T_target_source, slack_m=0.0)
+    if rejected is None:
+        rejected = trial.rejection(best)
+    return best.alignment if rejected is None else rejected
+
+
+def _rivals(found: Found, trial: Trial, few: FewPoints) -> list[Registration]:
+    """Other poses that may fit as well, to which a few points lead: along the weak direction, and from floor plans."""
+
+    def lead(coarse: Registration) -> Registration | None:
+        return sparsely_refined(trial, coarse, few)
+
+    def along() -> list[Registration]:
+        ways = (sign * found.weak_direction for sign in (-1.0, 1.0))
+        return [led for way in ways for led in _shifted(found.alignment.fine, way, lead)]
+
+    def from_plans() -> list[Registration]:
+        plans = plans_near(trial, num_poses=trial.config.verify.max_rivals)
+        leds = [lead(coarse) for coarse in plans if not _is_near(coarse.T_target_source, [found])]
+        return [led for led in leds if led is not None]
+
+    shifted, planned = at_once(along, from_plans)
+    return shifted + planned
+
+
+def sparsely_refined(trial: Trial, coarse: Registration, few: FewPoints) -> Registration | None:
+    """The pose to which a few points of the source lead; None if it is impossible or fits badly.
+
+    The first iterations show both whether the pose fits badly and whether it is one of those found.
+    """
+    if trial.gate(coarse.T_target_source, slack_m=trial.config.verify.max_coarse_fine_m) is not None:
+        return None
+    scans = trial.source.observed, trial.target.observed
+    with trial.watch("verify"):
+        hopeless = gates.early_rejection(*scans, coarse.T_target_source, trial.limits, config=trial.config.verify)
+    if hopeless is not None or min(map(len, (few.surface, trial.target.surface))) < trial.config.refine.min_points:
+        return None
+    surfaces = few.surface, trial.target.surface
+    with trial.watch("refine"):
+        T_begun = refinement.approach(*surfaces, coarse.T_target_source, config=trial.config.refine)
+        if _is_near(T_begun, few.found):
+            return replace(coarse, T_target_source=T_begun)
+        if _mismatch_of(trial, few, T_begun) > HOPELESS * few.most:
+            return None
+        fine = refinement.refine(*surfaces, T_begun, config=trial.config.refine, must_converge=False)
+    return None if isinstance(fine, Rejected) else replace(coarse, T_target_source=fine.T_target_source)
+
+
+def _mismatch_of(trial: Trial, few: FewPoints, T_target_source: Transform) -> float:
+    roughness_m = max(trial.source.surface.roughness_m, trial.target.surface.roughness_m)
+    return gates.mismatch_of_some(
+        few.standing, trial.target.surface, T_target_source, roughness_m=roughness_m, config=trial.config.verify
+    )
+
+
+def _shifted(
+    pose: Registration, direction: Direction, lead: Callable[[Registration], Registration | None]
+) -> Iterator[Registration]:
+    """Poses to which refinement (`lead`) leads from shifts in one direction, the farthest first.
+
+    Shifts between the start and the end of a refinement are not tried: they would lead to the same pose.
+    """
+    nearest_m = math.inf
+    for shift_m in range(MOST_SHIFT_M, 0, -1):
+        if shift_m >= nearest_m:
+            continue
+        T_shifted = pose.T_target_source @ geometry.transform(np.eye(3), shift_m * direction)
+        led = lead(replace(pose, T_target_source=T_shifted))
+        if led is not None:
+            yield led
+            nearest_m = float((geometry.inverse(pose.T_target_source) @ led.T_target_source)[:3, 3] @ direction)
+
+
+def _is_near(T_target_source: Transform, others: Sequence[Found]) -> bool:
+    """True if a pose is so close to one of the others that refinement would lead to it."""
+    apart = [geometry.inverse(other.alignment.fine.T_target_source) @ T_target_source for other in others]
+    return any(geometry.distance(T) < SAME_POSE_M and geometry.angle(T) < SAME_POSE_RAD for T in apart)

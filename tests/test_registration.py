@@ -1,3 +1,4 @@
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -35,6 +36,14 @@ def _round_pair() -> tuple[PreparedScan, PreparedScan, np.ndarray]:
     scans, truth = round_drive()
     source, target = (prepare_scan(scans[i].points, scans[i].labels, config=CONFIG) for i in (3, 0))
     return source, target, geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[3]
+
+
+def test_a_stopwatch_can_be_sent_to_another_process() -> None:
+    watch = Stopwatch()
+    watch.add("refine", 0.5)
+    sent = pickle.loads(pickle.dumps(watch))
+    sent.add("refine", 0.25)
+    assert (watch.seconds, sent.seconds) == ({"refine": 0.5}, {"refine": 0.75})
 
 
 @pytest.mark.parametrize("turn_deg", [0, 90, 180])

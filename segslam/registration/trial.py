@@ -35,12 +35,15 @@ def anywhere(T_target_source: Transform, *, slack_m: float) -> Rejected | None:
     return None
 
 
+_ADDING = Lock()
+"""Held while a stopwatch is changed. All share it: a stopwatch itself can be sent to another process."""
+
+
 class Stopwatch:
     """Seconds spent in each stage, summed over all calls and threads."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self._lock = Lock()
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -53,7 +56,7 @@ class Stopwatch:
 
     def add(self, stage: str, seconds: float) -> None:
         """Add a time measured elsewhere (s)."""
-        with self._lock:
+        with _ADDING:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
 

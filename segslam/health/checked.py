@@ -276,7 +276,7 @@ class CheckedOdometry:
         """
         found = self._map.fit(scan.surface, geometry.inverse(self._map.T_odom_map) @ T_odom_proposed)
         off = geometry.inverse(T_odom_predicted) @ T_odom_proposed
-        is_steady = self._intervals <= LONG_GAP and not _is_sudden(off)
+        is_steady = not _is_sudden(off) and (self._intervals <= LONG_GAP or not self._inner.is_from_scans)
         if is_steady and self._history.is_plausible(found):
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         return self._break(T_odom_predicted, scan)

@@ -31,8 +31,9 @@ def within_range(points: Points, min_m: float, max_m: float) -> np.ndarray:
 def squared_ranges(points: Points) -> np.ndarray:
     """(n,) squared distances from the origin (m^2); not finite if a coordinate is not."""
     with np.errstate(over="ignore"):
-        x, y, z = (points * points).T  # column by column: sums along rows of three take five times as long
-    return x + y + z
+        x, y, z = points.T  # column by column: sums along rows of three take five times as long
+        squared: np.ndarray = x * x + y * y + z * z
+    return squared
 
 
 def is_finite(points: Points) -> np.ndarray:

@@ -20,7 +20,7 @@ from segslam.types import BadScan, Indices, Scan, SegslamError, Trajectory, Tran
 
 VERTICAL_ANGLE_DEG = 0.205
 """Angle by which the points of KITTI's scans are too low; value of KISS-ICP (Vizzo et al., RA-L 2023)."""
-EVERY = 11  # prime: the sampled rows start equally often at each of 3 or 5 columns
+EVERY = (101, 11)  # primes: the sampled rows start equally often at each of 3 or 5 columns
 FEWEST_COMPARED = 300
 ALIKE = 0.15
 """Chosen: largest difference of quantiles, as a share of their range, between 300 samples of one distribution."""
@@ -136,9 +136,12 @@ def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
 
 def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
     """True if the file has 3 or 5 values per point: each value then occurs in every column in turn."""
-    some = returns[::EVERY]
-    some = some[np.isfinite(some).all(axis=1)]
-    if len(some) < FEWEST_COMPARED:
+    for every in EVERY:
+        some = returns[::every]
+        some = some[np.isfinite(some).all(axis=1)]
+        if len(some) >= FEWEST_COMPARED:
+            break
+    else:
         return False
     shares = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
     levels = np.sort(some, axis=0)[(shares * len(some)).astype(int)]

@@ -156,7 +156,8 @@ def raise_beams(points: Points, angle_deg: float) -> Points:
         return points
     cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     x, y, z = np.ascontiguousarray(points.T)
-    horizontal = np.maximum(np.sqrt(x * x + y * y), np.finfo(x.dtype).tiny)  # a point straight above has no azimuth to keep
+    horizontal = np.sqrt(x * x + y * y)
+    np.maximum(horizontal, np.finfo(x.dtype).tiny, out=horizontal)  # a point straight above has no azimuth to keep
     stretch = cosine - sine * z / horizontal
     return np.stack([x * stretch, y * stretch, sine * horizontal + cosine * z], axis=1)
 

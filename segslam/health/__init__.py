@@ -1,6 +1,7 @@
 """Health of the odometry: motions are checked against the scans, and repaired if the scans contradict them."""
 
-from segslam.health.checked import CheckedOdometry, information_of
+from segslam.health.checked import CheckedOdometry
 from segslam.health.search import Recover
+from segslam.health.unseen import information_of
 
 __all__ = ["CheckedOdometry", "Recover", "information_of"]

@@ -14,18 +14,18 @@ import numpy as np
 from segslam import geometry
 from segslam.config import Config
 from segslam.health.check import nudge, open_direction
-from segslam.health.history import LONG_GAP, LOST_SCANS, History, Intervals
+from segslam.health.history import LONG_GAP, History, Intervals
 from segslam.health.local_map import LocalMap
+from segslam.health.maps import MapsAroundBreak
 from segslam.health.restored import rows_in_maps
 from segslam.health.search import Found, PoseSearch, Recover, SeenScan, are_different
-from segslam.health.unseen import Unseen, moved_along
+from segslam.health.unseen import Unseen, is_predicted, moved_along, unknown_information
 from segslam.odometry import Odometry, OdometryResult, deskew_scan
 from segslam.refinement import LightSurface
 from segslam.trajectory import Poses
 from segslam.types import (
     Direction,
     Indices,
-    Information,
     Motion,
     MotionState,
     Points,
@@ -33,15 +33,11 @@ from segslam.types import (
     Transform,
 )
 
-RECOVER_EVERY = 5
-"""Chosen: number of scans tried after a break; every fifth is registered without initial guess, 0.2 s each."""
-BREAK_SIGMA_M, BREAK_SIGMA_RAD = 30.0, np.radians(60.0)
-"""Standard deviations of an unsupported motion: the sensor may have been carried to any place nearby."""
 SUDDEN_M, SUDDEN_RAD = 0.5, np.radians(5.0)
 """Chosen: a motion that differs by more than this from the previous one is checked, however short it is, and so is a
 rotation by more than this: on the real courtyard, scans 0.5 s apart, KISS-ICP misses turns."""
 TURN_S = 2.0
-"""Chosen: a turn that lasts no longer while scans are missing is another guess, and that of a break."""
+"""Chosen: where scans are missing, another initial guess assumes that a turn ends after this time; so does a break."""
 CHECK_EVERY = 10
 """Chosen: at least every tenth scan is checked, because a stuck odometry reports no motion."""
 
@@ -56,13 +52,9 @@ class CheckedOdometry:
         self._keyframes = config.keyframes
         self._odometry = config.odometry
         self._min_points = config.refine.min_points
-        self._map = LocalMap(config.health, config.refine)
-        self._lost: LocalMap | None = None
-        """The map before a break, as long as scans are tried against it."""
         self._history = History(config.health)
         self._search = PoseSearch(self._history, recover, dense_voxels=config.keyframes.dense_voxels)
-        self._anchor: tuple[Transform, LightSurface] | None = None
-        """Pose and surface of the last checked scan."""
+        self._maps = MapsAroundBreak(LocalMap(config.health, config.refine), self._history, self._search)
         self._T_odom_last = np.eye(4)
         self._T_before_last = np.eye(4)
         """Motion between the last two scans, per interval of the sensor."""
@@ -99,12 +91,11 @@ class CheckedOdometry:
             return
         for stamp_ns in stamps_ns:
             self._intervals = self._pace.note(int(stamp_ns))
-        rows = rows_in_maps(
-            T_odom_lidar, motions, history=self._history, empty=self._map.empty_copy, map_scans=self._config.map_scans
-        )
+        empty = self._maps.local.empty_copy
+        rows = rows_in_maps(T_odom_lidar, motions, history=self._history, empty=empty, map_scans=self._config.map_scans)
 
         def fill(rows: list[int]) -> LocalMap:
-            local = self._map.empty_copy()
+            local = empty()
             for row in rows:
                 points = self._points(T_odom_lidar, row, scan_of)
                 local.add(T_odom_lidar[row], local.downsample(points), points)
@@ -112,11 +103,11 @@ class CheckedOdometry:
 
         since = None if rows.followed is None else (rows.followed[0], fill(rows.followed[1]).scans)
         self._inner.restore(T_odom_lidar, scan_of, since=since)
-        self._map, self._lost = fill(rows.now), None if rows.lost is None else fill(rows.lost)
+        self._maps.local = fill(rows.now)
+        self._maps.before_break = None if rows.lost is None else fill(rows.lost)
         checked = max(row for row, motion in enumerate(motions) if row == 0 or motion.state != MotionState.UNCHECKED)
         self._num_unchecked = len(motions) - 1 - checked
-        thinned = self._map.downsample(self._points(T_odom_lidar, checked, scan_of))
-        self._anchor = T_odom_lidar[checked], LightSurface(thinned)
+        self._maps.reference = T_odom_lidar[checked], self._light(T_odom_lidar, checked, scan_of)
         self._T_odom_last = T_odom_lidar[-1]
         self._has_motion = len(T_odom_lidar) > 1
         if self._has_motion:
@@ -127,13 +118,11 @@ class CheckedOdometry:
 
     def _restore_unseen(self, T_odom_lidar: Poses, motions: Sequence[Motion], scan_of: Callable[[int], Scan]) -> None:
         """The way that was predicted in the tunnel where the last scans were taken, if they were."""
-        seen = max((row for row, motion in enumerate(motions) if not _is_predicted(motion)), default=0)
+        seen = max((row for row, motion in enumerate(motions) if not is_predicted(motion)), default=0)
         T_motion = geometry.inverse(T_odom_lidar[max(seen - 1, 0)]) @ T_odom_lidar[seen]
         way_m = float(np.linalg.norm(np.diff(T_odom_lidar[seen:, :3, 3], axis=0), axis=1).sum())
         last = len(motions) - 1
-        direction = None
-        if seen < last:
-            direction = open_direction(LightSurface(self._map.downsample(self._points(T_odom_lidar, last, scan_of))))
+        direction = open_direction(self._light(T_odom_lidar, last, scan_of)) if seen < last else None
         self._unseen.restore(T_motion, way_m if direction is not None else 0.0, direction)
 
     def _points(self, T_odom_lidar: Poses, row: int, scan_of: Callable[[int], Scan]) -> Points:
@@ -141,17 +130,21 @@ class CheckedOdometry:
         T_last_lidar = np.eye(4) if row < 2 else np.linalg.inv(T_odom_lidar[row - 2]) @ T_odom_lidar[row - 1]
         return deskew_scan(scan_of(row), T_last_lidar, self._odometry)[0].astype(np.float32)
 
+    def _light(self, T_odom_lidar: Poses, row: int, scan_of: Callable[[int], Scan]) -> LightSurface:
+        """The surface of an earlier scan, for the quick check."""
+        return LightSurface(self._maps.local.downsample(self._points(T_odom_lidar, row, scan_of)))
+
     def _since_last(self, T_odom_lidar: Transform) -> Transform:
         """The motion per interval of the sensor."""
         return geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / self._intervals)
 
     def _checked(self, proposed: OdometryResult) -> tuple[Transform, Motion]:
-        if self._anchor is None:
-            self._take(proposed.T_odom_lidar, SeenScan(proposed.points, self._map))
+        """The pose of a scan and the result of its check, if one is due."""
+        scan = SeenScan(proposed.points, self._maps.local)
+        if self._maps.reference is None:
+            self._maps.add(proposed.T_odom_lidar, scan)
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
-        T_predicted_lidar = geometry.inverse(self._T_odom_last @ self._T_before_last) @ proposed.T_odom_lidar
         if not self._has_motion and self._inner.is_from_scans:
-            scan = SeenScan(proposed.points, self._map)
             T_odom_better = self._better_first(proposed.T_odom_lidar, scan)
             if T_odom_better is not None:
                 self._has_motion = True
@@ -159,44 +152,50 @@ class CheckedOdometry:
                 return self._registered(proposed.T_odom_lidar, scan, None, also=[T_odom_better])
         self._has_motion = True
         self._num_unchecked += 1
-        is_suspect = (
-            self._num_unchecked >= CHECK_EVERY
-            or self._intervals > LONG_GAP
-            or _is_sudden(T_predicted_lidar)
-            or geometry.angle(self._since_last(proposed.T_odom_lidar)) > SUDDEN_RAD
-            or self._history.is_watching
-        )
-        T_anchor_lidar = geometry.inverse(self._anchor[0]) @ proposed.T_odom_lidar
-        is_far = geometry.distance(T_anchor_lidar) >= self._keyframes.distance_m
-        if not (is_suspect or is_far or geometry.angle(T_anchor_lidar) >= np.radians(self._keyframes.angle_deg)):
+        T_odom_reference, reference = self._maps.reference
+        T_reference_lidar = geometry.inverse(T_odom_reference) @ proposed.T_odom_lidar
+        if not self._is_due(proposed.T_odom_lidar, T_reference_lidar):
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
-        scan = SeenScan(proposed.points, self._map)
-        if min(len(scan.thinned), len(self._anchor[1])) < self._min_points:  # too sparse for a check
+        if min(len(scan.thinned), len(reference)) < self._min_points:  # too sparse for a check
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         direction = open_direction(scan.light)
         if direction is not None:
             self._history.watch()
         if not self._history.is_watching:
-            found = nudge(scan.thinned, self._anchor[1], T_anchor_lidar)
+            found = nudge(scan.thinned, reference, T_reference_lidar)
             self._history.note_check(found)
             if found is not None and not self._history.is_watching:
-                self._take(proposed.T_odom_lidar, scan)
+                self._maps.add(proposed.T_odom_lidar, scan)
                 self._unseen.note_seen(self._since_last(proposed.T_odom_lidar))
                 moved_deg = float(np.degrees(found.moved_rad))
                 return proposed.T_odom_lidar, Motion(MotionState.CONFIRMED, found.moved_m, moved_deg, found.overlap)
         return self._registered(proposed.T_odom_lidar, scan, direction)
 
+    def _is_due(self, T_odom_proposed: Transform, T_reference_lidar: Transform) -> bool:
+        """True if a motion is checked: it is suspect, or as long as a keyframe's since the last checked scan."""
+        T_predicted_lidar = geometry.inverse(self._T_odom_last @ self._T_before_last) @ T_odom_proposed
+        return bool(
+            self._num_unchecked >= CHECK_EVERY
+            or self._intervals > LONG_GAP
+            or _is_sudden(T_predicted_lidar)
+            or geometry.angle(self._since_last(T_odom_proposed)) > SUDDEN_RAD
+            or self._history.is_watching
+            or geometry.distance(T_reference_lidar) >= self._keyframes.distance_m
+            or geometry.angle(T_reference_lidar) >= np.radians(self._keyframes.angle_deg)
+        )
+
     def _better_first(self, T_odom_proposed: Transform, scan: SeenScan) -> Transform | None:
         """Another pose of the second scan, found with no guess, which fits the first better; None if there is none."""
-        if len(scan.thinned) < self._min_points or len(self._map) == 0:
+        if len(scan.thinned) < self._min_points or len(self._maps.local) == 0:
             return None
-        found = self._search.without_guess(self._map, scan)
-        T_map_proposed = geometry.inverse(self._map.T_odom_map) @ T_odom_proposed
+        local = self._maps.local
+        found = self._search.without_guess(local, scan)
+        T_map_proposed = geometry.inverse(local.T_odom_map) @ T_odom_proposed
         if found is None or not are_different(geometry.inverse(T_map_proposed) @ found.T_map_lidar):
             return None
-        is_better = found.fit.closeness > self._map.fit(scan.surface, T_map_proposed).closeness
-        return self._map.T_odom_map @ found.T_map_lidar if is_better else None
+        is_better = found.fit.closeness > local.fit(scan.surface, T_map_proposed).closeness
+        return local.T_odom_map @ found.T_map_lidar if is_better else None
 
     def _registered(
         self,
@@ -215,46 +214,59 @@ class CheckedOdometry:
         T_odom_predicted = _exact(self._T_odom_last @ geometry.scaled(T_before_last, self._intervals))
         T_odom_ahead = _exact(self._T_odom_last @ _straightened(T_before_last, self._intervals, self._pace.usual_s))
         guesses = [T_odom_proposed, T_odom_predicted, self._T_odom_last, T_odom_ahead, *also]
-        before_break = self._lost
-        found = self._found_again(scan, guesses) if direction is None else None
-        if found is not None and before_break is not None:
-            self._map, self._lost = before_break, None
-        else:
-            around = None if direction is not None else (self._T_odom_last, T_odom_predicted)
-            supporting = self._supporting(T_odom_proposed, T_odom_predicted)
-            found = self._search.near(self._map, scan, guesses, around=around, T_odom_supporting=[*supporting, *also])
-            found = found or self._search.without_guess(self._map, scan)
-        is_at_an_end = direction is not None or self._unseen.direction is not None
-        if found is None and is_at_an_end and self._intervals <= LONG_GAP:
-            T_odom_guess = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
-            return self._at_an_end(T_odom_guess, scan, direction)
-        if found is None and direction is not None:
-            return self._break(T_odom_ahead, scan)
+        found = self._maps.rejoin(scan, guesses) if direction is None else None
+        is_rejoined = found is not None
         if found is None:
-            return self._unsupported(T_odom_proposed, T_odom_ahead, scan)
-        T_odom_lidar = _exact(self._map.T_odom_map @ found.T_map_lidar)
+            around = None if direction is not None else (self._T_odom_last, T_odom_predicted)
+            supporting = [*self._supporting(T_odom_proposed, T_odom_predicted), *also]
+            local = self._maps.local
+            found = self._search.near(local, scan, guesses, around=around, T_odom_supporting=supporting)
+            found = found or self._search.without_guess(local, scan)
+        T_odom_along = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
+        if found is not None:
+            return self._accepted(found, T_odom_proposed, T_odom_along, scan, direction, is_rejoined=is_rejoined)
+        if (direction is not None or self._unseen.direction is not None) and self._intervals <= LONG_GAP:
+            return self._at_an_end(T_odom_along, scan, direction)
         if direction is not None:
-            T_odom_along = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
+            return self._break(T_odom_ahead, scan)
+        return self._unsupported(T_odom_proposed, T_odom_ahead, scan)
+
+    def _accepted(
+        self,
+        found: Found,
+        T_odom_proposed: Transform,
+        T_odom_along: Transform,
+        scan: SeenScan,
+        direction: Direction | None,
+        *,
+        is_rejoined: bool,
+    ) -> tuple[Transform, Motion]:
+        """The pose and the motion after a successful registration; the inner odometry continues from there.
+
+        Along a `direction` that the scan does not constrain, the position is that of `T_odom_along`. `is_rejoined`:
+        the scan was registered with the map before a break.
+        """
+        T_odom_lidar = _exact(self._maps.local.T_odom_map @ found.T_map_lidar)
+        if direction is not None:
             T_odom_lidar = moved_along(direction, T_odom_lidar, T_odom_along)
         off = geometry.inverse(T_odom_proposed) @ T_odom_lidar
         moved_m, moved_rad = geometry.distance(off), geometry.angle(off)
         state = self._history.note_registration(moved_m, moved_rad, found.fit)
-        if before_break is not None and self._map is before_break:
+        if is_rejoined:
             state = MotionState.REJOINED
         elif state is MotionState.REFINED and not self._inner.is_from_scans:
             state, T_odom_lidar = MotionState.CONFIRMED, T_odom_proposed  # the odometry uses more than these scans
-        information = _unknown() if state is MotionState.REJOINED else None  # the scans before are at a guess
+        information = unknown_information() if is_rejoined else None  # the scans before are at a guess
         if direction is None:
             self._unseen.note_seen(self._since_last(T_odom_lidar))
         elif state is not MotionState.CONFIRMED:
             state = MotionState.BROKEN
             information = self._unseen.note_predicted(self._way_m(T_odom_lidar), direction, is_registered=True)
-        self._take(T_odom_lidar, scan)
+        self._maps.add(T_odom_lidar, scan)
         if state is not MotionState.CONFIRMED:
             T_before_lidar = _exact(self._since_last(T_odom_lidar))
-            self._inner.follow(self._map.scans, T_odom_lidar, T_before_lidar)
-        fit = found.fit
-        moved_deg = float(np.degrees(moved_rad))
+            self._inner.follow(self._maps.local.scans, T_odom_lidar, T_before_lidar)
+        fit, moved_deg = found.fit, float(np.degrees(moved_rad))
         return T_odom_lidar, Motion(state, moved_m, moved_deg, fit.overlap, fit.rms_m, information=information)
 
     def _supporting(self, T_odom_proposed: Transform, T_odom_predicted: Transform) -> list[Transform]:
@@ -274,32 +286,21 @@ class CheckedOdometry:
 
         Sparse scans cannot always be registered; this alone is no evidence against the odometry.
         """
-        found = self._map.fit(scan.surface, geometry.inverse(self._map.T_odom_map) @ T_odom_proposed)
+        local = self._maps.local
+        found = local.fit(scan.surface, geometry.inverse(local.T_odom_map) @ T_odom_proposed)
         off = geometry.inverse(T_odom_predicted) @ T_odom_proposed
         is_steady = not _is_sudden(off) and (self._intervals <= LONG_GAP or not self._inner.is_from_scans)
         if is_steady and self._history.is_plausible(found):
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         return self._break(T_odom_predicted, scan)
 
-    def _found_again(self, scan: SeenScan, T_odom_guesses: list[Transform]) -> Found | None:
-        """The pose in the map before the last break, if the break was within the last `LOST_SCANS`."""
-        if self._lost is None:
-            return None
-        self._history.scans_lost += 1
-        if found := self._search.near(self._lost, scan, T_odom_guesses):
-            return found
-        is_due = self._history.scans_lost % RECOVER_EVERY == 0
-        if is_due and (found := self._search.without_guess(self._lost, scan, must_be_usual=True)):
-            return found
-        if self._history.scans_lost >= LOST_SCANS:
-            self._lost = None
-        return None
-
     def _at_an_end(
         self, T_odom_predicted: Transform, scan: SeenScan, direction: Direction | None
     ) -> tuple[Transform, Motion]:
         """The predicted pose where a tunnel begins or ends between two scans, which have nothing in common."""
-        overlap = self._map.fit(scan.surface, geometry.inverse(self._map.T_odom_map) @ T_odom_predicted).overlap
+        overlap = self._maps.local.fit(
+            scan.surface, geometry.inverse(self._maps.local.T_odom_map) @ T_odom_predicted
+        ).overlap
         information = self._unseen.note_predicted(self._way_m(T_odom_predicted), direction, is_registered=False)
         self._restart(T_odom_predicted, scan, self._unseen.T_steady)
         return T_odom_predicted, Motion(MotionState.BROKEN, overlap=overlap, information=information)
@@ -311,28 +312,13 @@ class CheckedOdometry:
         """A guess that nothing supports."""
         self._restart(T_odom_lidar, scan, np.eye(4))
         self._unseen.note_seen(np.eye(4))
-        return T_odom_lidar, Motion(MotionState.BROKEN, information=_unknown())
+        return T_odom_lidar, Motion(MotionState.BROKEN, information=unknown_information())
 
     def _restart(self, T_odom_lidar: Transform, scan: SeenScan, T_before_lidar: Transform) -> None:
-        """Start a new local map at a guess; the old one is kept for some time."""
-        if self._lost is None:
-            self._lost, self._map = self._map, self._map.empty_copy()
-            self._history.scans_lost = 0
-        else:
-            self._map.clear()
+        """Start a new local map at a guess; the inner odometry continues from there with this motion per interval."""
+        self._maps.restart(T_odom_lidar, scan)
         self._history.watch()
-        self._take(T_odom_lidar, scan)
-        self._inner.follow(self._map.scans, T_odom_lidar, T_before_lidar)
-
-    def _take(self, T_odom_lidar: Transform, scan: SeenScan) -> None:
-        """Make the scan the reference of the next check, and add it to the local map."""
-        self._anchor = T_odom_lidar, scan.light
-        self._map.add(T_odom_lidar, scan.thinned, scan.points)
-
-
-def _unknown() -> Information:
-    """The information of a motion that no scan supports."""
-    return np.diag(geometry.tangent(rotation_rad=BREAK_SIGMA_RAD, translation_m=BREAK_SIGMA_M) ** -2.0)
+        self._inner.follow(self._maps.local.scans, T_odom_lidar, T_before_lidar)
 
 
 def _straightened(T_step: Transform, gap: float, usual_s: float) -> Transform:
@@ -350,17 +336,3 @@ def _exact(T_a_b: Transform) -> Transform:
 def _is_sudden(T_predicted_lidar: Transform) -> bool:
     """True if the motion differs much from the previous one."""
     return geometry.distance(T_predicted_lidar) > SUDDEN_M or bool(geometry.angle(T_predicted_lidar) > SUDDEN_RAD)
-
-
-def _is_predicted(motion: Motion) -> bool:
-    """Whether a motion was predicted in a tunnel."""
-    return motion.state is MotionState.BROKEN and motion.information is not None and not motion.is_break
-
-
-def information_of(motions: Sequence[Motion]) -> Information | None:
-    """The information of motions in a row, from those that have their own; None where none has.
-
-    Their covariances are added: the motions between two keyframes are too short for their lever arms to matter.
-    """
-    own = [motion.information for motion in motions if motion.information is not None]
-    return np.linalg.inv(sum(np.linalg.inv(information) for information in own)) if own else None

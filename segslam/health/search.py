@@ -21,7 +21,7 @@ SUPPORT_M, SUPPORT_RAD = 0.5, np.radians(3.0)
 NEARLY = 0.97
 """Chosen: share of the best closeness with which a registration fits nearly as well."""
 TURN_M = 5.0
-"""Chosen: distance equivalent to a turn by one radian."""
+"""Chosen: distance equivalent to a rotation by one radian (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Found:
     T_odom_lidar: Transform
 
     def offset_m(self, T_odom_expected: Sequence[Transform]) -> float:
-        """Distance from the nearest of some poses, with turns (m)."""
+        """Distance from the nearest of some poses (m); a rotation counts `TURN_M` per radian."""
         offsets = [geometry.inverse(T_odom_other) @ self.T_odom_lidar for T_odom_other in T_odom_expected]
         return min(geometry.distance(T) + TURN_M * geometry.angle(T) for T in offsets)
 
@@ -44,21 +44,26 @@ class Found:
 
 
 class SeenScan:
-    """A scan: all its points, its downsampled points, and their surface, which is computed on use."""
+    """A scan: all its points, its downsampled points, and their surfaces, each computed on first use."""
 
     def __init__(self, points: Points, local: LocalMap) -> None:
+        """`points` (n, 3) in the scan's frame; they are downsampled as those of the map `local`."""
         self._local = local
         self.points = points
-        self.thinned = local.downsample(points)
+
+    @cached_property
+    def thinned(self) -> Points:
+        """(m, 3) the downsampled points."""
+        return self._local.downsample(self.points)
 
     @cached_property
     def light(self) -> LightSurface:
-        """For the quick check."""
+        """The surface for the quick check."""
         return LightSurface(self.thinned)
 
     @cached_property
     def surface(self) -> Surface:
-        """For a registration."""
+        """The surface for a registration."""
         return self._local.make_surface(self.thinned)
 
 

@@ -1,15 +1,20 @@
-"""Motions that the scans do not constrain in one direction, as in a tunnel: predicted from the last confirmed one.
+"""Motions that the scans do not constrain: in one direction, as in a tunnel, or, at a break, in none.
 
-The speed at the entrance of a tunnel is known, and how it changes inside is not. So the error of the position is
-proportional to the way through the tunnel, and its standard deviation too: the variances of the motions, which the
-pose graph adds up, grow from one to the next. Closures that span the tunnel then correct its end most, as a steady
-braking or acceleration would.
+In a tunnel the motion is predicted from the last confirmed one. The speed at the entrance is known, and how it changes
+inside is not. So the error of the position is proportional to the way through the tunnel, and its standard deviation
+too: the variances of the motions, which the pose graph adds up, grow from one to the next. Closures that span the
+tunnel then correct its end most, as a steady braking or acceleration would.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from segslam import geometry
-from segslam.types import Direction, Information, Transform
+from segslam.types import Direction, Information, Motion, MotionState, Transform
+
+BREAK_SIGMA_M, BREAK_SIGMA_RAD = 30.0, np.radians(60.0)
+"""Standard deviations of an unsupported motion: the sensor may have been carried to any place nearby."""
 
 UNSEEN_SHARE = 0.7
 """Chosen: standard deviation of the predicted distance in the direction that is not constrained, as a share of it."""
@@ -32,13 +37,13 @@ class Unseen:
         self._way_m = 0.0
 
     def note_seen(self, T_motion: Transform) -> None:
-        """The scans showed a motion of one interval."""
+        """Note a motion that the scans showed, per interval of the sensor."""
         self.T_steady, self.direction, self._way_m = T_motion, None, 0.0
 
     def note_predicted(self, way_m: float, direction: Direction | None, *, is_registered: bool) -> Information:
-        """The information of a motion of this length (m) that was predicted along `direction`, or that of the last.
+        """Information of a motion of `way_m` predicted along `direction`; if None, along that of the scan before.
 
-        `is_registered`: whether the scans showed the other directions.
+        `is_registered`: True if the scans showed the other directions.
         """
         along = self.direction if direction is None else direction
         assert along is not None, "a motion is predicted in a tunnel, or at its end"
@@ -59,3 +64,22 @@ def moved_along(direction: Direction, T_odom_lidar: Transform, T_odom_along: Tra
     """A pose, with its position along a direction in its own frame replaced by that of another pose."""
     apart = (geometry.inverse(T_odom_lidar) @ T_odom_along)[:3, 3]
     return T_odom_lidar @ geometry.transform(np.eye(3), direction * (direction @ apart))
+
+
+def unknown_information() -> Information:
+    """The information of a motion that no scan supports."""
+    return np.diag(geometry.tangent(rotation_rad=BREAK_SIGMA_RAD, translation_m=BREAK_SIGMA_M) ** -2.0)
+
+
+def is_predicted(motion: Motion) -> bool:
+    """True if a motion was predicted in a tunnel."""
+    return motion.state is MotionState.BROKEN and motion.information is not None and not motion.is_break
+
+
+def information_of(motions: Sequence[Motion]) -> Information | None:
+    """Information of successive motions together; None if none has an information of its own.
+
+    Their covariances are added: the motions between two keyframes are too short for their lever arms to matter.
+    """
+    own = [motion.information for motion in motions if motion.information is not None]
+    return np.linalg.inv(sum(np.linalg.inv(information) for information in own)) if own else None

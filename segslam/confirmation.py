@@ -14,7 +14,7 @@ from segslam import geometry
 from segslam.pose_graph import Graph
 from segslam.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
 
-NUM_AGREEING, AGREEING_M = 3, 5.0
+MIN_CONSISTENT, MIN_SPREAD_M = 3, 5.0
 """Chosen: number of keyframes that must be consistent, and travel between the first and the last."""
 WAITING_M = 40.0
 """Chosen: travel after which an unconfirmed registration is dropped."""
@@ -31,7 +31,7 @@ class Waiting:
 
 
 class Confirmation:
-    """The registrations that wait."""
+    """The registrations that are not yet confirmed, and their confirmation by later ones."""
 
     def __init__(self, graph: Graph, T_odom_keyframe: Callable[[int], Transform]) -> None:
         """`T_odom_keyframe`: pose of a keyframe by odometry."""
@@ -39,7 +39,7 @@ class Confirmation:
         self._waiting: list[Waiting] = []
 
     def is_waiting(self, keyframe_id: int) -> bool:
-        """Whether a registration waits that this keyframe may confirm."""
+        """True if this keyframe may confirm an earlier registration."""
         at_m = self._graph.travel_m[keyframe_id]
         self._waiting = [one for one in self._waiting if at_m - self._travel_m(one) <= WAITING_M]
         return bool(self._waiting)
@@ -47,26 +47,28 @@ class Confirmation:
     def attempts(
         self, candidate: LoopCandidate, closure: LoopClosure, seconds: dict[str, float]
     ) -> tuple[LoopAttempt, ...]:
-        """Attempts that result from a registration: closures if enough others confirm it; otherwise it waits."""
+        """The closures of a registration and of all that confirm it; one UNCONFIRMED attempt if these are too few."""
         newest = Waiting(closure, candidate)
-        agreeing = (
-            [one for one in self._waiting if self._agree(one, newest)] if self.is_waiting(closure.source_id) else []
+        consistent = (
+            [one for one in self._waiting if self._are_consistent(one, newest)]
+            if self.is_waiting(closure.source_id)
+            else []
         )
-        sources = {one.closure.source_id for one in agreeing} - {closure.source_id}
+        sources = {one.closure.source_id for one in consistent} - {closure.source_id}
         if (
-            len(sources) + 1 < NUM_AGREEING
-            or self._travel_m(newest) - min(self._travel_m(one) for one in agreeing) < AGREEING_M
+            len(sources) + 1 < MIN_CONSISTENT
+            or self._travel_m(newest) - min(self._travel_m(one) for one in consistent) < MIN_SPREAD_M
         ):
             self._waiting.append(newest)
-            shown = f"{len(sources)} of {NUM_AGREEING - 1} earlier keyframes confirm it"
+            shown = f"{len(sources)} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
             return (LoopAttempt(candidate, Rejected(RejectReason.UNCONFIRMED, shown), seconds),)
         self._waiting = []
         return (
-            *(LoopAttempt(one.candidate, one.closure, {}) for one in agreeing),
+            *(LoopAttempt(one.candidate, one.closure, {}) for one in consistent),
             LoopAttempt(candidate, closure, seconds),
         )
 
-    def _agree(self, earlier: Waiting, later: Waiting) -> bool:
+    def _are_consistent(self, earlier: Waiting, later: Waiting) -> bool:
         """True if the motion between two keyframes is the same by their registrations and by odometry."""
         T_world = self._graph.T_world_keyframes
         a, b = earlier.closure, later.closure

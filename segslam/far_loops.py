@@ -36,7 +36,7 @@ NUM_LISTED = 5
 RETRY_M = 4.0
 """Chosen: travel after a rejection until the next attempt, unless a registration waits for confirmation."""
 NEAR_M = 10.0
-"""Chosen: places nearer to the predicted position than this are candidates of proximity only."""
+"""Chosen: places nearer to the predicted position than this are left to the search by distance (`proximity`)."""
 
 
 class FarLoops:
@@ -85,12 +85,11 @@ class FarLoops:
         if isinstance(found, Rejected):
             self._rejected_m = float(self._graph.travel_m[keyframe_id])
             return (LoopAttempt(candidate, found, own.seconds),)
-        fine = found.alignment.fine
-        closure = LoopClosure(keyframe_id, candidate.target_id, fine.T_target_source, fine.information, found.alignment)
+        closure = LoopClosure.of(keyframe_id, candidate.target_id, found.alignment)
         return self._confirmation.attempts(candidate, closure, own.seconds)
 
     def _candidate(self, keyframe_id: int) -> LoopCandidate | None:
-        """The most similar older place that lies within the largest drift and is not a candidate of proximity."""
+        """The most similar older place within the largest drift; None if only the search by distance may try it."""
         travel_m = self._graph.travel_m
         if not self._confirmation.is_waiting(keyframe_id) and travel_m[keyframe_id] - self._rejected_m < RETRY_M:
             return None
@@ -120,14 +119,14 @@ class FarLoops:
         )
 
     def _expected_m(self, candidate: LoopCandidate) -> float:
-        """Largest distance from the prior that proximity accepts."""
+        """Largest distance from the prior that the search by distance accepts (m)."""
         return float(search_radius_m(np.array([candidate.chain_m]), config=self._config.proximity)[0])
 
 
 def _not_far(
     T_target_source: Transform, *, candidate: LoopCandidate, expected_m: float, slack_m: float
 ) -> Rejected | None:
-    """Rejects poses beyond the largest drift, and poses near the prior, which are candidates of proximity."""
+    """Rejects poses beyond the largest drift, and poses near the prior, which the search by distance tries."""
     off_m = float(np.linalg.norm(T_target_source[:3, 3] - candidate.T_target_source_prior[:3, 3]))
     if off_m > candidate.search_radius_m + slack_m:
         return Rejected(RejectReason.FAR_FROM_PRIOR, f"distance {off_m:.1f} m > {candidate.search_radius_m:.1f} m")

@@ -124,6 +124,11 @@ def nearest_rotation(matrix: Rotation) -> Rotation:
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
+def nearest_transform(matrix: np.ndarray) -> Transform:
+    """The rigid transform nearest to a (3, 4) or (4, 4) matrix; undoes rounding in files and in long products."""
+    return transform(nearest_rotation(matrix[:3, :3]), matrix[:3, 3])
+
+
 def _left_jacobian(phi: np.ndarray) -> Rotation:
     theta = float(np.linalg.norm(phi))
     cross = _cross(phi)

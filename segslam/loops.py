@@ -156,18 +156,13 @@ class LoopCloser:
             )
         for stage, seconds in own.seconds.items():
             watch.add(stage, seconds)
-        closure = _closure(candidate, outcome)
-        if candidate.chain_m >= BREAK_TRAVEL_M and not is_known and isinstance(closure, LoopClosure):
+        if isinstance(outcome, Rejected):
+            return (LoopAttempt(candidate, outcome, own.seconds),)
+        closure = LoopClosure.of(candidate.source_id, candidate.target_id, outcome)
+        if candidate.chain_m >= BREAK_TRAVEL_M and not is_known:
             return self._confirmation.attempts(candidate, closure, own.seconds)
         return (LoopAttempt(candidate, closure, own.seconds),)
 
 
 def _has_closure(attempts: tuple[LoopAttempt, ...]) -> bool:
     return any(isinstance(attempt.outcome, LoopClosure) for attempt in attempts)
-
-
-def _closure(candidate: LoopCandidate, outcome: Alignment | Rejected) -> LoopClosure | Rejected:
-    if isinstance(outcome, Rejected):
-        return outcome
-    fine = outcome.fine
-    return LoopClosure(candidate.source_id, candidate.target_id, fine.T_target_source, fine.information, outcome)

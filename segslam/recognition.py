@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from segslam import geometry
 from segslam.config import Config
-from segslam.registration import Gate, PreparedScan, Stopwatch, may_match, register_prepared
+from segslam.registration import Gate, PreparedScan, Stopwatch, anywhere, may_match, register_prepared
 from segslam.retrieval import PlaceCandidate
 from segslam.system.short_repr import Record
 from segslam.system.threads import at_once
@@ -46,7 +46,7 @@ def recognise(
     *,
     config: Config,
     floor: gates.NoiseFloor = gates.SINGLE_PAIR,
-    gate: Callable[[int], Gate] = lambda place_id: _no_gate,
+    gate: Callable[[int], Gate] = lambda place_id: anywhere,
     max_places: int = MAX_PLACES,
     watch: Stopwatch | None = None,
 ) -> Recognised | Rejected:
@@ -72,7 +72,7 @@ def recognise(
 
     rejection: Rejected | None = None
     for place_id in _spread(candidates, T_world_place, max_places):
-        outcome = tried(place_id, _no_gate)
+        outcome = tried(place_id, anywhere)
         if isinstance(outcome, Recognised):
             most = config.verify.rival_ratio * _mismatch(scan, places(place_id), outcome.alignment)
             others = _others(outcome, candidates, T_world_place)
@@ -114,14 +114,10 @@ class _Elsewhere(NamedTuple):
         return None
 
 
-def _no_gate(T_target_source: Transform, *, slack_m: float) -> None:
-    return None
-
-
 def _spread(
     candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform], most: int
 ) -> Iterator[int]:
-    """Candidates that are apart from all previous ones."""
+    """At most `most` candidates, each `SPREAD_M` from all previous ones."""
     taken: list[Transform] = []
     for candidate in candidates:
         T_world = T_world_place(candidate.place_id)
@@ -135,7 +131,7 @@ def _spread(
 def _others(
     found: Recognised, candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform]
 ) -> list[int]:
-    """The most similar places away from the found one, each apart from the others."""
+    """At most `MAX_RIVALS` most similar places, `ELSEWHERE_M` from the found one and from each other."""
     taken: list[int] = []
     for candidate in candidates:
         T_world = T_world_place(candidate.place_id)

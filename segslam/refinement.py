@@ -1,7 +1,7 @@
 """Coarse-to-fine GICP from a coarse pose; the search distance decreases from stage to stage.
 
-No other module imports small_gicp. Its tangents, like ours, are [rotation; translation] with the perturbation on the
-right.
+Besides the benchmarks in `experiments`, no other module imports small_gicp. Its tangents, like ours, are [rotation;
+translation] with the perturbation on the right.
 """
 
 import math

@@ -317,6 +317,11 @@ class LoopClosure(Record):
     information: Information
     alignment: Alignment
 
+    @classmethod
+    def of(cls, source_id: int, target_id: int, alignment: Alignment) -> "LoopClosure":
+        """The loop between two keyframes with the pose and information of their alignment."""
+        return cls(source_id, target_id, alignment.fine.T_target_source, alignment.fine.information, alignment)
+
     @property
     def ok(self) -> bool:
         """True; False for `Rejected`."""

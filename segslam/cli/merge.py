@@ -54,7 +54,7 @@ def merge(
     sessions = read_sessions(runs)
     compile_kernels(quiet=quiet)
     settings_now = load_config(config, settings or (), base=sessions[0].run.config)
-    merged = plan(sessions, config=settings_now, same_reference=same_reference, shown=partial(_shown, quiet=quiet))
+    merged = plan(sessions, config=settings_now, same_reference=same_reference, progress=partial(_shown, quiet=quiet))
     say(merged.summary(), quiet=quiet)
     folder = new_folder(out)
     when_stopped(f"the log in {folder} is kept, without results")

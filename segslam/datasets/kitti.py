@@ -171,7 +171,7 @@ def _rigid(texts: list[str], place: str) -> Transform:
         raise SegslamError(f"{place}: expected 12 numbers, a 3x4 matrix by rows ({error})") from error
     if not np.isfinite(matrix).all():
         raise SegslamError(f"{place}: all numbers must be finite")
-    return geometry.transform(geometry.nearest_rotation(matrix[:, :3]), matrix[:, 3])
+    return geometry.nearest_transform(matrix)
 
 
 def _is_sequence(folder: Path) -> bool:

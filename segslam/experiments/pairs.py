@@ -113,8 +113,7 @@ def _from_json(file: Path, text: str) -> PairList:
 
 
 def _rigid(rows: object) -> Transform:
-    matrix = np.array(rows, dtype=float).reshape(4, 4)
-    return geometry.transform(geometry.nearest_rotation(matrix[:3, :3]), matrix[:3, 3])
+    return geometry.nearest_transform(np.array(rows, dtype=float).reshape(4, 4))
 
 
 def _checked(file: Path, pairs: PairList) -> PairList:

@@ -2,6 +2,6 @@
 
 from segslam.health.checked import CheckedOdometry
 from segslam.health.search import Recover
-from segslam.health.unseen import information_of
+from segslam.health.unconstrained import information_of
 
 __all__ = ["CheckedOdometry", "Recover", "information_of"]

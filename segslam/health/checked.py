@@ -18,8 +18,8 @@ from segslam.health.history import LONG_GAP, History, Intervals
 from segslam.health.local_map import LocalMap
 from segslam.health.maps import MapsAroundBreak
 from segslam.health.restored import rows_in_maps
-from segslam.health.search import Found, PoseSearch, Recover, SeenScan, are_different
-from segslam.health.unseen import Unseen, is_predicted, moved_along, unknown_information
+from segslam.health.search import FoundPose, PoseSearch, Recover, SeenScan, are_different
+from segslam.health.unconstrained import Unconstrained, is_predicted, moved_along, unknown_information
 from segslam.odometry import Odometry, OdometryResult, deskew_scan
 from segslam.refinement import LightSurface
 from segslam.trajectory import Poses
@@ -58,7 +58,7 @@ class CheckedOdometry:
         self._T_odom_last = np.eye(4)
         self._T_before_last = np.eye(4)
         """Motion between the last two scans, per interval of the sensor."""
-        self._unseen = Unseen()
+        self._unconstrained = Unconstrained()
         self._intervals = 1.0
         """Intervals from the last scan to this one, more than 1 if scans between them are missing."""
         self._pace = Intervals()
@@ -114,16 +114,18 @@ class CheckedOdometry:
             self._T_before_last = geometry.scaled(
                 geometry.inverse(T_odom_lidar[-2]) @ T_odom_lidar[-1], 1 / self._intervals
             )
-            self._restore_unseen(T_odom_lidar, motions, scan_of)
+            self._restore_unconstrained(T_odom_lidar, motions, scan_of)
 
-    def _restore_unseen(self, T_odom_lidar: Poses, motions: Sequence[Motion], scan_of: Callable[[int], Scan]) -> None:
-        """The way that was predicted in the tunnel where the last scans were taken, if they were."""
+    def _restore_unconstrained(
+        self, T_odom_lidar: Poses, motions: Sequence[Motion], scan_of: Callable[[int], Scan]
+    ) -> None:
+        """Restore the distance predicted since the last constrained motion, if the drive is in a tunnel."""
         seen = max((row for row, motion in enumerate(motions) if not is_predicted(motion)), default=0)
         T_motion = geometry.inverse(T_odom_lidar[max(seen - 1, 0)]) @ T_odom_lidar[seen]
-        way_m = float(np.linalg.norm(np.diff(T_odom_lidar[seen:, :3, 3], axis=0), axis=1).sum())
+        distance_m = float(np.linalg.norm(np.diff(T_odom_lidar[seen:, :3, 3], axis=0), axis=1).sum())
         last = len(motions) - 1
         direction = open_direction(self._light(T_odom_lidar, last, scan_of)) if seen < last else None
-        self._unseen.restore(T_motion, way_m if direction is not None else 0.0, direction)
+        self._unconstrained.restore(T_motion, distance_m if direction is not None else 0.0, direction)
 
     def _points(self, T_odom_lidar: Poses, row: int, scan_of: Callable[[int], Scan]) -> Points:
         """The cropped points of an earlier scan, motion-compensated as before."""
@@ -167,7 +169,7 @@ class CheckedOdometry:
             self._history.note_check(found)
             if found is not None and not self._history.is_watching:
                 self._maps.add(proposed.T_odom_lidar, scan)
-                self._unseen.note_seen(self._since_last(proposed.T_odom_lidar))
+                self._unconstrained.note_observed(self._since_last(proposed.T_odom_lidar))
                 moved_deg = float(np.degrees(found.moved_rad))
                 return proposed.T_odom_lidar, Motion(MotionState.CONFIRMED, found.moved_m, moved_deg, found.overlap)
         return self._registered(proposed.T_odom_lidar, scan, direction)
@@ -210,9 +212,13 @@ class CheckedOdometry:
         In a `direction` that the scan does not constrain, its position is predicted from the last confirmed motion.
         `also`: further initial guesses.
         """
-        T_before_last = self._T_before_last if direction is None else self._unseen.T_steady
-        T_odom_predicted = _exact(self._T_odom_last @ geometry.scaled(T_before_last, self._intervals))
-        T_odom_ahead = _exact(self._T_odom_last @ _straightened(T_before_last, self._intervals, self._pace.usual_s))
+        T_before_last = self._T_before_last if direction is None else self._unconstrained.T_steady
+        T_odom_predicted = geometry.nearest_transform(
+            self._T_odom_last @ geometry.scaled(T_before_last, self._intervals)
+        )
+        T_odom_ahead = geometry.nearest_transform(
+            self._T_odom_last @ _straightened(T_before_last, self._intervals, self._pace.usual_s)
+        )
         guesses = [T_odom_proposed, T_odom_predicted, self._T_odom_last, T_odom_ahead, *also]
         found = self._maps.rejoin(scan, guesses) if direction is None else None
         is_rejoined = found is not None
@@ -225,15 +231,15 @@ class CheckedOdometry:
         T_odom_along = T_odom_predicted if self._inner.is_from_scans else T_odom_proposed
         if found is not None:
             return self._accepted(found, T_odom_proposed, T_odom_along, scan, direction, is_rejoined=is_rejoined)
-        if (direction is not None or self._unseen.direction is not None) and self._intervals <= LONG_GAP:
-            return self._at_an_end(T_odom_along, scan, direction)
+        if (direction is not None or self._unconstrained.direction is not None) and self._intervals <= LONG_GAP:
+            return self._at_tunnel_end(T_odom_along, scan, direction)
         if direction is not None:
             return self._break(T_odom_ahead, scan)
         return self._unsupported(T_odom_proposed, T_odom_ahead, scan)
 
     def _accepted(
         self,
-        found: Found,
+        found: FoundPose,
         T_odom_proposed: Transform,
         T_odom_along: Transform,
         scan: SeenScan,
@@ -246,7 +252,7 @@ class CheckedOdometry:
         Along a `direction` that the scan does not constrain, the position is that of `T_odom_along`. `is_rejoined`:
         the scan was registered with the map before a break.
         """
-        T_odom_lidar = _exact(self._maps.local.T_odom_map @ found.T_map_lidar)
+        T_odom_lidar = geometry.nearest_transform(self._maps.local.T_odom_map @ found.T_map_lidar)
         if direction is not None:
             T_odom_lidar = moved_along(direction, T_odom_lidar, T_odom_along)
         off = geometry.inverse(T_odom_proposed) @ T_odom_lidar
@@ -258,13 +264,15 @@ class CheckedOdometry:
             state, T_odom_lidar = MotionState.CONFIRMED, T_odom_proposed  # the odometry uses more than these scans
         information = unknown_information() if is_rejoined else None  # the scans before are at a guess
         if direction is None:
-            self._unseen.note_seen(self._since_last(T_odom_lidar))
+            self._unconstrained.note_observed(self._since_last(T_odom_lidar))
         elif state is not MotionState.CONFIRMED:
             state = MotionState.BROKEN
-            information = self._unseen.note_predicted(self._way_m(T_odom_lidar), direction, is_registered=True)
+            information = self._unconstrained.note_predicted(
+                self._distance_m(T_odom_lidar), direction, is_registered=True
+            )
         self._maps.add(T_odom_lidar, scan)
         if state is not MotionState.CONFIRMED:
-            T_before_lidar = _exact(self._since_last(T_odom_lidar))
+            T_before_lidar = geometry.nearest_transform(self._since_last(T_odom_lidar))
             self._inner.follow(self._maps.local.scans, T_odom_lidar, T_before_lidar)
         fit, moved_deg = found.fit, float(np.degrees(moved_rad))
         return T_odom_lidar, Motion(state, moved_m, moved_deg, fit.overlap, fit.rms_m, information=information)
@@ -294,24 +302,26 @@ class CheckedOdometry:
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         return self._break(T_odom_predicted, scan)
 
-    def _at_an_end(
+    def _at_tunnel_end(
         self, T_odom_predicted: Transform, scan: SeenScan, direction: Direction | None
     ) -> tuple[Transform, Motion]:
         """The predicted pose where a tunnel begins or ends between two scans, which have nothing in common."""
         overlap = self._maps.local.fit(
             scan.surface, geometry.inverse(self._maps.local.T_odom_map) @ T_odom_predicted
         ).overlap
-        information = self._unseen.note_predicted(self._way_m(T_odom_predicted), direction, is_registered=False)
-        self._restart(T_odom_predicted, scan, self._unseen.T_steady)
+        information = self._unconstrained.note_predicted(
+            self._distance_m(T_odom_predicted), direction, is_registered=False
+        )
+        self._restart(T_odom_predicted, scan, self._unconstrained.T_steady)
         return T_odom_predicted, Motion(MotionState.BROKEN, overlap=overlap, information=information)
 
-    def _way_m(self, T_odom_lidar: Transform) -> float:
+    def _distance_m(self, T_odom_lidar: Transform) -> float:
         return geometry.distance(geometry.inverse(self._T_odom_last) @ T_odom_lidar)
 
     def _break(self, T_odom_lidar: Transform, scan: SeenScan) -> tuple[Transform, Motion]:
         """A guess that nothing supports."""
         self._restart(T_odom_lidar, scan, np.eye(4))
-        self._unseen.note_seen(np.eye(4))
+        self._unconstrained.note_observed(np.eye(4))
         return T_odom_lidar, Motion(MotionState.BROKEN, information=unknown_information())
 
     def _restart(self, T_odom_lidar: Transform, scan: SeenScan, T_before_lidar: Transform) -> None:
@@ -326,11 +336,6 @@ def _straightened(T_step: Transform, gap: float, usual_s: float) -> Transform:
     turning = min(gap, max(TURN_S / usual_s, 1.0)) if usual_s > 0.0 else gap
     straight = geometry.transform(np.eye(3), (gap - turning) * T_step[:3, 3])
     return geometry.scaled(T_step, turning) @ straight
-
-
-def _exact(T_a_b: Transform) -> Transform:
-    """The pose without the rounding errors that long products accumulate in a rotation: KISS-ICP rejects 1e-11."""
-    return geometry.transform(geometry.nearest_rotation(T_a_b[:3, :3]), T_a_b[:3, 3])
 
 
 def _is_sudden(T_predicted_lidar: Transform) -> bool:

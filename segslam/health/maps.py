@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from segslam.health.history import LOST_SCANS, History
 from segslam.health.local_map import LocalMap
-from segslam.health.search import Found, PoseSearch, SeenScan
+from segslam.health.search import FoundPose, PoseSearch, SeenScan
 from segslam.refinement import LightSurface
 from segslam.types import Transform
 
@@ -38,7 +38,7 @@ class MapsAroundBreak:
             self.local.clear()
         self.add(T_odom_lidar, scan)
 
-    def rejoin(self, scan: SeenScan, T_odom_guesses: Sequence[Transform]) -> Found | None:
+    def rejoin(self, scan: SeenScan, T_odom_guesses: Sequence[Transform]) -> FoundPose | None:
         """The pose of a scan in the map before the break, which is the local map from then on; None if not found.
 
         After `LOST_SCANS` scans the map before the break is discarded.

@@ -25,7 +25,7 @@ TURN_M = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundPose:
     """Pose of a scan in a local map, and the quality of its fit."""
 
     T_map_lidar: Transform
@@ -84,7 +84,7 @@ class PoseSearch:
         *,
         around: tuple[Transform, Transform] | None = None,
         T_odom_supporting: Sequence[Transform] = (),
-    ) -> Found | None:
+    ) -> FoundPose | None:
         """The best registration from the guesses, the first two of which are expected poses; None if none is good.
 
         `around`: the last pose and the predicted one. If no guess leads to the usual fit, poses around the last one are
@@ -103,7 +103,7 @@ class PoseSearch:
         more = _different([*guesses, T_odom_around])[len(guesses) :]
         return self._best(found + _registrations(local, scan, more), expected, T_odom_supporting)
 
-    def without_guess(self, local: LocalMap, scan: SeenScan, *, must_be_usual: bool = False) -> Found | None:
+    def without_guess(self, local: LocalMap, scan: SeenScan, *, must_be_usual: bool = False) -> FoundPose | None:
         """The pose without initial guess, verified like a loop and then registered; None if there is none.
 
         If the registration ends near the verified pose, a lower overlap suffices, unless it `must_be_usual`.
@@ -115,8 +115,8 @@ class PoseSearch:
         return self._best(_registrations(local, scan, verified), verified, () if must_be_usual else verified)
 
     def _best(
-        self, found: list[Found], T_odom_expected: Sequence[Transform], T_odom_supporting: Sequence[Transform]
-    ) -> Found | None:
+        self, found: list[FoundPose], T_odom_expected: Sequence[Transform], T_odom_supporting: Sequence[Transform]
+    ) -> FoundPose | None:
         """The registration that fits best; None if it does not fit as usual and is not supported.
 
         Of those that fit nearly as well, as all poses along a wall do, it is the one nearest to an expected pose.
@@ -130,10 +130,10 @@ class PoseSearch:
         return best if self._history.is_usual(best.fit) or is_supported else None
 
 
-def _registrations(local: LocalMap, scan: SeenScan, T_odom_guesses: Sequence[Transform]) -> list[Found]:
+def _registrations(local: LocalMap, scan: SeenScan, T_odom_guesses: Sequence[Transform]) -> list[FoundPose]:
     """All registrations from some initial guesses."""
     return [
-        Found(T_map_lidar, local.fit(scan.surface, T_map_lidar), local.T_odom_map @ T_map_lidar)
+        FoundPose(T_map_lidar, local.fit(scan.surface, T_map_lidar), local.T_odom_map @ T_map_lidar)
         for T_odom_guess in T_odom_guesses
         for T_map_lidar in local.register(scan.surface, geometry.inverse(local.T_odom_map) @ T_odom_guess)
     ]

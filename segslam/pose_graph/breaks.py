@@ -17,12 +17,12 @@ BREAK_M, BREAK_DEG = 1.0, 5.0
 
 
 def segments(odometry: Sequence[Edge]) -> Indices:
-    """(n,) the segment of each keyframe, counted from 0; a break parts two segments."""
+    """(n,) the segment of each keyframe, counted from 0; a break separates two segments."""
     return np.cumsum([False, *(is_break(edge) for edge in odometry)])
 
 
 def is_break(edge: Edge) -> bool:
-    """Whether the standard deviation of a motion is that of a break, in any direction."""
+    """True if the standard deviation of a motion is above that of a break in any direction."""
     weakest = (np.linalg.eigvalsh(edge.information[half, half])[0] for half in (slice(0, 3), slice(3, 6)))
     rotation, translation = weakest
     return bool(rotation < np.radians(BREAK_DEG) ** -2.0 or translation < BREAK_M**-2.0)
@@ -54,7 +54,7 @@ def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Transf
 
 
 def _join(T_world: Transforms, segment: Indices, edge: Edge, placed: set[int]) -> None:
-    """Moves the segment at one end of an edge, unless it fits, and notes it as placed."""
+    """Move the segment at one end of an edge to fit the edge, if it does not yet, and mark it as placed."""
     if segment[edge.a] in placed:
         end, T_world_end = edge.b, T_world[edge.a] @ edge.T_a_b
     else:

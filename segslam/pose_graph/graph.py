@@ -116,11 +116,12 @@ class PoseGraph:
                 f"keyframe ids count from 0 without gaps: expected {self.num_keyframes}, got {keyframe_id}"
             )
         if keyframe_id == 0:
-            first = gtsam.Pose3(_exact(T_odom_keyframe))
+            first = gtsam.Pose3(geometry.nearest_transform(T_odom_keyframe))
             self._backbone.add(gtsam.PriorFactorPose3(0, first, noise.first_pose()))
             pose = first
         else:
-            T_last_new = _exact(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
+            # Rounding in a long chain would stop the solver far from the optimum.
+            T_last_new = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
             way_m = travel_m - self.travel_m[-1]
             edge = Edge(
                 keyframe_id - 1,
@@ -250,7 +251,9 @@ class PoseGraph:
         for keyframe_id in (closure.target_id, closure.source_id):
             self.T_world_keyframe(keyframe_id)
         information = noise.closure_information(closure.information, self._config)
-        return Edge(closure.target_id, closure.source_id, _exact(closure.T_target_source), information)
+        return Edge(
+            closure.target_id, closure.source_id, geometry.nearest_transform(closure.T_target_source), information
+        )
 
     def _rejected_motions(self) -> Mask:
         """(n - 1,) True for motions that the last final optimisation rejected."""
@@ -301,8 +304,3 @@ class PoseGraph:
             dict(zip(pairs, map(float, weights), strict=True)),
             {(int(row), int(row) + 1): 0.0 for row in np.flatnonzero(self._rejected)},
         )
-
-
-def _exact(T_a_b: Transform) -> Transform:
-    """The pose with an exact rotation: rounding in a long chain would stop the solver far from the optimum."""
-    return geometry.transform(geometry.nearest_rotation(T_a_b[:3, :3]), T_a_b[:3, 3])

@@ -1,9 +1,9 @@
 """Motions of odometry that closures contradict: rejected like closures, at a higher cost.
 
 If odometry jumps between two keyframes, all closures across the jump measure the same drift, and they do not fit the
-rest of the drive unless that motion is rejected. So a group of rejected closures that are consistent with each other is
-taken for a jump at one motion that all of them span, and the drive is optimised without that motion. The result stands
-if its truncated cost, in which the motion has a penalty, is lower.
+rest of the drive unless that motion is rejected. A group of rejected closures that are consistent with each other is
+therefore explained by a jump at one motion that all of them span, and the drive is optimised without that motion. The
+result is used if its truncated cost, in which the motion has a penalty, is lower.
 
 One place is never enough: its closures may all have the same error, as in a repeated street, and their penalties sum up
 to less than that of a motion.
@@ -129,8 +129,8 @@ def _bent(T_world: Transforms, motion: Edge) -> Transforms:
 def _jump(drive: Constants, odometry: Sequence[Edge], group: Mask, weights: Vector) -> Edge | None:
     """The motion that a group of closures contradicts, as they measure it; None if rejecting it costs more.
 
-    All closures of the group span it. Inliers that span it contradict the group, so it is one where their penalties are
-    least, and of those the one that becomes most like its neighbours.
+    Only motions that all closures of the group span are possible. Inliers that span a motion contradict the group, so
+    it is one where their penalties are least; of these, the one that the change makes most like its neighbours.
     """
     spans = np.sort(np.array([(edge.a, edge.b) for edge in drive.closures]), axis=1)
     first, end = spans[group, 0].max(), spans[group, 1].min()
@@ -156,7 +156,7 @@ def _jump(drive: Constants, odometry: Sequence[Edge], group: Mask, weights: Vect
 
 
 def _drift(closure: Edge, T_world: Transforms) -> Transform:
-    """The motion, in the world, of all that comes after the jump."""
+    """The transform, in the world frame, by which the jump moved all later poses."""
     T_drift = T_world[closure.a] @ closure.T_a_b @ geometry.inverse(T_world[closure.b])
     return T_drift if closure.a < closure.b else geometry.inverse(T_drift)
 

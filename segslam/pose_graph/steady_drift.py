@@ -1,4 +1,4 @@
-"""A steady drift of the heading: the odometry turns too far by so much for each metre and for each second.
+"""A steady drift of the heading: a rotation error at a constant rate per metre of travel and per second.
 
 If closures measure a drift far beyond the noise of the odometry, then noise is a poor model of it. Noise spreads the
 correction by its own growth, with turns counted more than straights, so a steady drift is corrected in wrong places.
@@ -62,7 +62,7 @@ class SteadyDrift(NamedTuple):
     """A steady drift of the heading, and what is left of the drift without it."""
 
     rates: Vector
-    """(2,) rad that motions lack per metre and per second."""
+    """(2,) heading missing in the motions: rad per metre and rad per second."""
     noise_factor: float
     """Factor by which the usual noise is too small for the corrected motions, at least 1."""
     values: gtsam.Values
@@ -80,8 +80,8 @@ def steady_drift(
 ) -> SteadyDrift | None:
     """The steady drift of an odometry with its usual noise; None if it explains little of what `closures` measure.
 
-    It is searched if the drift needs more than `tolerated` times that noise. A row of `growth` has the travel (m) and
-    the time (s) of a motion, zeros for a motion without drift. `values`: poses that satisfy the closures.
+    None also if `tolerated` times that noise is enough for the drift. A row of `growth` has the travel (m) and the time
+    (s) of a motion, zeros for a motion without drift. `values`: poses that satisfy the closures.
     """
     if not closures:
         return None
@@ -106,7 +106,7 @@ def steady_drift(
 
 
 def turned(odometry: Sequence[Edge], growth: Growth, rates: Vector) -> list[Edge]:
-    """Odometry with the heading that it lacks."""
+    """Odometry corrected by a steady drift of the heading; `rates` as in `SteadyDrift`."""
     return [
         replace(edge, T_a_b=edge.T_a_b @ geometry.transform(geometry.yaw(float(angle)), np.zeros(3)))
         for edge, angle in zip(odometry, growth @ rates, strict=True)
@@ -130,7 +130,7 @@ def _rates(
     growth: Growth,
     values: gtsam.Values,
 ) -> Vector:
-    """(k,) rad of heading that motions lack per unit of each column of `growth`, linearised at `values`."""
+    """(k,) heading (rad) missing in the motions per unit of each column of `growth`, linearised at `values`."""
     graph = joined(factor_graph(odometry), prior, factor_graph(closures))
     rows, columns, entries = graph.linearize(values).sparseJacobian_()
     size = 6 * graph.size(), 6 * values.size() + 1

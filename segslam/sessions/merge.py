@@ -15,16 +15,16 @@ from segslam.run.finished import FinishedRun, read_run
 from segslam.run.folder import new_folder, write_metrics
 from segslam.run.locator import Locator
 from segslam.run.run import Run
-from segslam.sessions.meeting import Meeting, Shown, attempt, meeting, not_shown
 from segslam.sessions.recorded import Session, Shift, next_shift, read_sessions, shifted_steps
+from segslam.sessions.session_pose import Progress, SessionPose, attempt, find_session, no_progress
 from segslam.slam import Slam, SlamResult
 from segslam.types import REJECTED_WEIGHT, LoopAttempt, SegslamError, Step, Trajectory
 
 OPTIMIZE_EVERY = 25
 """Chosen: number of keyframes of a later session between two optimisations; odometry drifts little over 50 m."""
-LOOK_EVERY_M = 12.0
+SEARCH_EVERY_M = 12.0
 """Chosen: travel between two keyframes of a later session for which loops with earlier sessions are searched."""
-Taken = tuple[Step, int, bool]
+StepToTake = tuple[Step, int, bool]
 """A step, and the arguments `below` and `optimize` of `Slam.take`."""
 
 
@@ -33,7 +33,7 @@ class Merged:
     """Sessions with known relative poses, in the order in which they are merged."""
 
     sessions: tuple[Session, ...]
-    meetings: tuple[Meeting | None, ...]
+    session_poses: tuple[SessionPose | None, ...]
     """None for the first session."""
     shifts: tuple[Shift, ...]
     reference: Trajectory | None
@@ -53,7 +53,7 @@ class Merged:
         """One line per session: the run in which it was found."""
         lines = [
             f"{session.name}: found in {self.sessions[found.earlier].name} by {len(found.found)} of its keyframes"
-            for session, found in zip(self.sessions, self.meetings, strict=True)
+            for session, found in zip(self.sessions, self.session_poses, strict=True)
             if found is not None
         ]
         return "\n".join(lines)
@@ -72,21 +72,21 @@ class Merged:
         ]
         return {"sessions": json.dumps(rows)}
 
-    def steps(self) -> Iterator[Taken]:
+    def steps(self) -> Iterator[StepToTake]:
         """The steps of all sessions; loops with earlier sessions are searched for the later ones."""
-        for session, shift, found in zip(self.sessions, self.shifts, self.meetings, strict=True):
+        for session, shift, found in zip(self.sessions, self.shifts, self.session_poses, strict=True):
             last_id = len(session.travel_m) - 1
-            looked_m = -np.inf
+            searched_m = -np.inf
             for step in shifted_steps(session, shift, self._found(shift, found)):
                 below, optimize = 0, False
                 if step.keyframe is not None:
                     number = step.keyframe.id - shift.keyframe_id
                     optimize = number == last_id or (found is not None and number % OPTIMIZE_EVERY == 0)
-                    if step.keyframe.travel_m - looked_m >= LOOK_EVERY_M:
-                        below, looked_m = shift.keyframe_id, step.keyframe.travel_m
+                    if step.keyframe.travel_m - searched_m >= SEARCH_EVERY_M:
+                        below, searched_m = shift.keyframe_id, step.keyframe.travel_m
                 yield step, below, optimize
 
-    def _found(self, shift: Shift, found: Meeting | None) -> dict[int, tuple[LoopAttempt, ...]]:
+    def _found(self, shift: Shift, found: SessionPose | None) -> dict[int, tuple[LoopAttempt, ...]]:
         if found is None:
             return {}
         target_shift = self.shifts[found.earlier].keyframe_id
@@ -108,7 +108,7 @@ class Merged:
 
 
 def plan(
-    sessions: Sequence[Session], *, config: Config, same_reference: bool = False, shown: Shown = not_shown
+    sessions: Sequence[Session], *, config: Config, same_reference: bool = False, progress: Progress = no_progress
 ) -> Merged:
     """Determine how sessions are merged. Writes nothing.
 
@@ -116,23 +116,23 @@ def plan(
     naming the run, if one was not found in any other.
     """
     taken: list[Session] = [sessions[0]]
-    meetings: list[Meeting | None] = [None]
+    session_poses: list[SessionPose | None] = [None]
     locators: list[Locator] = []
     waiting, why = list(sessions[1:]), dict[tuple[str, int], str]()
     while waiting:
         locators += [Locator.from_run(session.run.folder) for session in taken[len(locators) :]]
         found = None
         for session in waiting:
-            found = _first_meeting(session, taken, locators, why, config=config, shown=shown)
+            found = _find_in_any(session, taken, locators, why, config=config, progress=progress)
             if found is not None:
                 break
         if found is None:
-            raise SegslamError(_do_not_meet(waiting[0], taken, why))
+            raise SegslamError(_not_found(waiting[0], taken, why))
         taken.append(session)
-        meetings.append(found)
+        session_poses.append(found)
         waiting.remove(session)
-    shifts = _shifts(taken, meetings)
-    return Merged(tuple(taken), tuple(meetings), shifts, _reference(taken, shifts, same_reference))
+    shifts = _shifts(taken, session_poses)
+    return Merged(tuple(taken), tuple(session_poses), shifts, _reference(taken, shifts, same_reference))
 
 
 def merge(
@@ -178,35 +178,35 @@ def run_of(merged: Merged, folder: Path, config: Config) -> Run:
     )
 
 
-def _first_meeting(
+def _find_in_any(
     session: Session,
     taken: Sequence[Session],
     locators: Sequence[Locator],
     why: dict[tuple[str, int], str],
     *,
     config: Config,
-    shown: Shown,
-) -> Meeting | None:
+    progress: Progress,
+) -> SessionPose | None:
     """The pose of a session in the first session in which it is found. Reasons of failures are added to `why`."""
     for number, (earlier, locator) in enumerate(zip(taken, locators, strict=True)):
         if (session.name, number) not in why:
-            found = meeting(session, earlier, number, locator, config=config, shown=shown)
-            if isinstance(found, Meeting):
+            found = find_session(session, earlier, number, locator, config=config, progress=progress)
+            if isinstance(found, SessionPose):
                 return found
             why[session.name, number] = found
     return None
 
 
-def _do_not_meet(session: Session, taken: Sequence[Session], why: dict[tuple[str, int], str]) -> str:
+def _not_found(session: Session, taken: Sequence[Session], why: dict[tuple[str, int], str]) -> str:
     tried = "; ".join(f"in {one.name}: {why[session.name, number]}" for number, one in enumerate(taken))
     return f"{session.name}: not found in any other run ({tried}); merge runs that share places"
 
 
-def _shifts(sessions: Sequence[Session], meetings: Sequence[Meeting | None]) -> tuple[Shift, ...]:
+def _shifts(sessions: Sequence[Session], session_poses: Sequence[SessionPose | None]) -> tuple[Shift, ...]:
     """Offsets of the numbers of each session, and the transform of its odometry to the pose found."""
     shifts = [Shift()]
     T_first_world = [np.eye(4)]
-    for before, session, found in zip(sessions[:-1], sessions[1:], meetings[1:], strict=True):
+    for before, session, found in zip(sessions[:-1], sessions[1:], session_poses[1:], strict=True):
         T_before_world = T_first_world[-1]
         if found is not None:
             T_first_world.append(T_first_world[found.earlier] @ found.T_earlier_world)

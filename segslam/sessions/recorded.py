@@ -32,7 +32,7 @@ from segslam.types import (
 
 GAP_NS = 1_000_000_000
 """Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
-UNTIED = Motion(MotionState.BEGUN, information=1e-12 * np.eye(6))
+FIRST_MOTION = Motion(MotionState.BEGUN, information=1e-12 * np.eye(6))
 """The motion to the first scan of a session, which is unknown."""
 
 
@@ -135,7 +135,7 @@ def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopA
                 travel_m=keyframe.travel_m + shift.travel_m,
             )
         if number == 0 and shift.keyframe_id:
-            motion = UNTIED
+            motion = FIRST_MOTION
         yield Step(
             step.scan_index + shift.scan_index,
             step.stamp_ns + shift.stamp_ns,

@@ -79,7 +79,7 @@ def parse_calib(text: str, *, source: str) -> Transform:
             rows = _numbers(values)
             if rows.shape == (12,) and np.isfinite(rows).all():
                 rows = rows.reshape(3, 4)
-                return geometry.transform(geometry.nearest_rotation(rows[:, :3]), rows[:, 3])
+                return geometry.nearest_transform(rows)
     raise SegslamError(f"{source}: no line `Tr:` with 12 numbers; take calib.txt from the KITTI odometry data")
 
 

@@ -15,7 +15,7 @@ import segslam
 from segslam.evaluation import align_positions
 from segslam.log import read_log
 from segslam.run.finished import FinishedRun
-from segslam.sessions import meeting
+from segslam.sessions import session_pose
 from segslam.types import LoopClosure, MotionState, Trajectory
 
 
@@ -42,7 +42,7 @@ def days(tmp_path_factory: pytest.TempPathFactory) -> Days:
 def merged(days: Days, tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
     out = tmp_path_factory.mktemp("merged") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(meeting, "NUM_ENOUGH", 5)  # so few places take less time
+        patch.setattr(session_pose, "NUM_ENOUGH", 5)  # so few places take less time
         return segslam.merge([days.monday.folder, days.friday.folder], out, same_reference=True)
 
 

@@ -16,7 +16,7 @@ from segslam.config import Config
 from segslam.pose_graph import PoseGraph
 from segslam.proximity import BREAK_TRAVEL_M
 from segslam.run.locator import Locator
-from segslam.sessions.recorded import UNTIED, Session, submaps
+from segslam.sessions.recorded import FIRST_MOTION, Session, submaps
 from segslam.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 
 NUM_QUERIES = 60
@@ -25,21 +25,22 @@ NUM_ENOUGH = 12
 """Chosen: the search ends when this many are found; further loops are found by proximity."""
 MIN_FOUND = 3
 """Chosen: smallest number of consistent locations that relate two sessions."""
-GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 MIN_SPREAD_M = 10.0
-"""Chosen: smallest travel between them; nearer ones show a single place, which may be wrong."""
+"""Chosen: smallest travel between the first and the last of them; a single place may be a wrong one."""
+GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+"""Golden ratio less 1: steps of it, modulo 1, are spread evenly at any number."""
 
-Shown = Callable[[Iterable[Any], int, str], Iterator[Any]]
-"""Shows progress: takes the items, their number, and a title."""
+Progress = Callable[[Iterable[Any], int, str], Iterator[Any]]
+"""Passes items on and shows progress: takes the items, their number, and a title."""
 
 
-def not_shown(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
-    """Progress that is not shown."""
+def no_progress(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
+    """Progress that is not progress."""
     return iter(items)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Meeting:
+class SessionPose:
     """Pose of a session in an earlier one."""
 
     earlier: int
@@ -50,15 +51,15 @@ class Meeting:
     """Keyframe of the session, keyframe of the earlier one, and their alignment, for each consistent location."""
 
 
-def meeting(
+def find_session(
     session: Session,
     earlier: Session,
     number: int,
     locator: Locator,
     *,
     config: Config,
-    shown: Shown = not_shown,
-) -> Meeting | str:
+    progress: Progress = no_progress,
+) -> SessionPose | str:
     """The pose of a session in the earlier session of this `number`, or the reason as text if it is unknown.
 
     Sparse keyframes are searched together with their neighbours.
@@ -67,7 +68,7 @@ def meeting(
     found: list[tuple[int, int, Alignment]] = []
     queries = _spread(len(session.travel_m))
     num_tried = 0
-    for keyframe_id in shown(queries, len(queries), "locate"):
+    for keyframe_id in progress(queries, len(queries), "locate"):
         num_tried += 1
         place = locator.locate(*submap(keyframe_id))
         if not isinstance(place, Rejected):
@@ -89,7 +90,7 @@ def meeting(
             graph.add_closure(one)
     graph.optimize()
     T_earlier_first = graph.T_world_keyframes[first_id]
-    return Meeting(number, T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))
+    return SessionPose(number, T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))
 
 
 def _spread(num_keyframes: int) -> list[int]:
@@ -101,12 +102,11 @@ def _spread(num_keyframes: int) -> list[int]:
 def closure(found: tuple[int, int, Alignment], first_id: int, target_shift: int = 0) -> LoopClosure:
     """A located keyframe as a loop of a graph in which the ids of the session start at `first_id`."""
     own, target, alignment = found
-    fine = alignment.fine
-    return LoopClosure(own + first_id, target + target_shift, fine.T_target_source, fine.information, alignment)
+    return LoopClosure.of(own + first_id, target + target_shift, alignment)
 
 
 def attempt(found: tuple[int, int, Alignment], first_id: int, target_shift: int) -> LoopAttempt:
-    """The same as an attempt, whose prior is the found pose."""
+    """The same loop as an attempt, whose prior is the found pose."""
     made = closure(found, first_id, target_shift)
     T_target_source = made.T_target_source
     distance_m = geometry.distance(T_target_source)
@@ -122,7 +122,7 @@ def _both(earlier: Session, session: Session, config: Config) -> tuple[PoseGraph
     for number, one in enumerate((earlier, session)):
         shift_m = number * (float(earlier.travel_m[-1]) + BREAK_TRAVEL_M)
         for row, (T_world, travel_m) in enumerate(zip(one.T_world_keyframe, one.travel_m, strict=True)):
-            information = UNTIED.information if number and row == 0 else one.informations[row]
+            information = FIRST_MOTION.information if number and row == 0 else one.informations[row]
             add(T_world, float(travel_m) + shift_m, information)
     return graph, first_id
 

@@ -44,7 +44,7 @@ def test_a_file_holds_differences_and_set_wins_over_it(tmp_path: Path) -> None:
     assert config.refine == Config().refine
 
 
-@pytest.mark.parametrize("file", sorted((Path(__file__).parents[1] / "configs").glob("*.yaml")), ids=lambda f: f.name)
+@pytest.mark.parametrize("file", sorted((Path(__file__).parents[2] / "configs").glob("*.yaml")), ids=lambda f: f.name)
 def test_shipped_configurations_load(file: Path) -> None:
     assert load_config(file) != Config(), "a configuration that changes nothing"
 

@@ -15,7 +15,7 @@ from segslam.types import Alignment, Labels, Registration, Rejected, RejectReaso
 from segslam.verification import gates
 
 KNOWN_M, KNOWN_RAD = 1.0, math.radians(3.0)
-"""Chosen: a known pose is off by less. Nearer rivals hardly exist: `SAME_POSE_M`."""
+"""Chosen: largest error of a known pose. A rival this near is mostly the same pose (`rivals.SAME_POSE_M`)."""
 
 
 def register(
@@ -109,7 +109,7 @@ def may_match(
     mismatch: float,
     watch: Stopwatch,
 ) -> bool:
-    """Whether `register_prepared` may find a pose with about this mismatch or less; a few points decide that."""
+    """True if `register_prepared` may find a pose with about this mismatch or less, by registering a few points."""
     trial = Trial(source, target, config, gate, floor, gates.limits(floor, config=config.verify), watch)
     most = SPARSE_MARGIN * mismatch
     few = few_points(source, config=config, most=most)

@@ -32,7 +32,7 @@ SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
 
 
 class FewPoints(NamedTuple):
-    """A few points of the source, which lead to poses and show in 1 ms how well they fit."""
+    """A few points of the source, to refine a pose quickly, and to measure in 1 ms how well it fits."""
 
     surface: refinement.Surface
     standing: Points
@@ -81,7 +81,7 @@ def unless_ambiguous(found: Found, trial: Trial) -> Alignment | Rejected:
 
 
 def _rivals(found: Found, trial: Trial, few: FewPoints) -> list[Registration]:
-    """Other poses that may fit as well, to which a few points lead: along the weak direction, and from floor plans."""
+    """Other poses that may fit as well, refined with a few points: shifts along the weak direction, and floor plans."""
 
     def lead(coarse: Registration) -> Registration | None:
         return sparsely_refined(trial, coarse, few)
@@ -100,9 +100,9 @@ def _rivals(found: Found, trial: Trial, few: FewPoints) -> list[Registration]:
 
 
 def sparsely_refined(trial: Trial, coarse: Registration, few: FewPoints) -> Registration | None:
-    """The pose to which a few points of the source lead; None if it is impossible or fits badly.
+    """A pose refined with a few points of the source; None if it is impossible or fits badly.
 
-    The first iterations show both whether the pose fits badly and whether it is one of those found.
+    The first iterations show whether the pose fits badly, and whether it is one of those found.
     """
     if trial.gate(coarse.T_target_source, slack_m=trial.config.verify.max_coarse_fine_m) is not None:
         return None
@@ -132,7 +132,7 @@ def _mismatch_of(trial: Trial, few: FewPoints, T_target_source: Transform) -> fl
 def _shifted(
     pose: Registration, direction: Direction, lead: Callable[[Registration], Registration | None]
 ) -> Iterator[Registration]:
-    """Poses to which refinement (`lead`) leads from shifts in one direction, the farthest first.
+    """Poses refined (by `lead`) from shifts in one direction, the farthest first.
 
     Shifts between the start and the end of a refinement are not tried: they would lead to the same pose.
     """

@@ -80,10 +80,10 @@ class Trial(NamedTuple):
     limits: gates.Limits
     watch: Stopwatch
     is_rival: bool = False
-    """Whether the poses are compared with one that was found."""
+    """True if the poses are rivals of one that was found; their limits are looser."""
 
     def outcome(self, coarse: Registration) -> Found | Rejected:
-        """One hypothesis, refined and verified."""
+        """A hypothesis, refined and verified; `Rejected` by the first gate that it fails."""
         config = self.config.verify
         if coarse.num_inliers < config.min_inliers:
             return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {config.min_inliers}")
@@ -111,7 +111,7 @@ class Trial(NamedTuple):
             return gates.agreement(*scans, T_target_source, config=self.config.verify).mismatch
 
     def verified(self, coarse: Registration, fine: Registration) -> Found | Rejected:
-        """A refined pose that passes all gates."""
+        """A refined pose as `Found` if it passes all gates, else the rejection."""
         config = self.config.verify
         moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ fine.T_target_source)
         if moved_m > config.max_coarse_fine_m:
@@ -130,11 +130,11 @@ class Trial(NamedTuple):
         return passed if rejected is None else rejected
 
     def rejection(self, pose: Found) -> Rejected | None:
-        """Rejects a pose that fits badly, or along whose weak direction nothing matches, as if slid along a corridor.
+        """Rejects a pose that fits badly, or that no surface confirms along its weak direction, as in a corridor.
 
         More than one surface must match there if the fine Hessian hardly constrains a direction, if it constrains one
         badly and the pose fits less well than neighbours do, if a scan sees one side of the place only, or if the
-        stricter limits of narrow places are exceeded. Rivals need not be proven as well as that.
+        stricter limits of narrow places are exceeded. Rivals need less evidence.
         """
         found = pose.agreement
         config = self.config.verify

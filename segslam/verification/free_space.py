@@ -124,7 +124,8 @@ def _nearest_returns(points, lowest_rad, row_rad, num_rows):
 
 @kernel("UniTuple(int64, 2)(float32[:, :], float32[:, :], float64, float64, float64[:])")
 def _count_violations(points, nearest, lowest_rad, row_rad, margins):
-    """Of the points whose direction has a return, those that stand before it by `margins` (m, and per metre); all."""
+    """Number of points in front of the returns in their direction by `margins` (m, and per metre), and number of points
+    in directions with a return."""
     num_violations = num_seen = 0
     for x, y, z in points:
         row, column = _cell(x, y, z, lowest_rad, row_rad)

@@ -163,8 +163,8 @@ class Support(NamedTuple):
     whole: float
     """Of all facing points."""
     second: float
-    """Of those beside the surface that most of them match. A single surface, like the end of a corridor, exists at
-    many places; a second one at the same distance does not."""
+    """Of the points outside the surface that most of them match. A single surface, such as the end of a corridor,
+    exists at many places; two surfaces at the same distance from each other are rare."""
 
 
 def weak_support(
@@ -216,12 +216,12 @@ def _within_fullest(along_m: Vector, counted: Mask, width_m: float) -> Mask:
 
 
 def is_certain(found: Agreement, floor: NoiseFloor) -> bool:
-    """Whether a pose fits as well as neighbours do, so that no other pose can fit better."""
+    """True if a pose fits as well as neighbours do, so that no other pose can fit better."""
     return found.residual_ratio <= CERTAIN_RESIDUAL * floor.residual_ratio and is_free(found, floor)
 
 
 def is_free(found: Agreement, floor: NoiseFloor) -> bool:
-    """Whether a pose violates free space as little as neighbours do."""
+    """True if a pose violates free space as little as neighbours do."""
     return found.free_space_violation <= max(CERTAIN_VIOLATION * floor.free_space_violation, LEAST_VIOLATION)
 
 

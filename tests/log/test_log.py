@@ -20,16 +20,6 @@ from segslam.log.records import codec
 from segslam.types import Keyframe, LoopCandidate, SegslamError, Step
 
 
-@pytest.fixture(scope="module")
-def steps() -> list[Step]:
-    return list(made_steps(60))
-
-
-@pytest.fixture(scope="module")
-def whole(steps: list[Step], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_log(tmp_path_factory.mktemp("log") / "log.mcap", steps)
-
-
 def test_steps_read_again_are_those_written(steps: list[Step], whole: Path) -> None:
     read = list(read_log(whole).steps())
     assert len(read) == len(steps)

@@ -7,22 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.made_logs import CONFIG, assert_same, boundaries, largest_file, made_steps, write_log
+from helpers.made_logs import CONFIG, assert_same, boundaries, largest_file, write_log
 from mcap.writer import Writer
 
 from segslam.log import LogWriter, read_log, schema
 from segslam.log.output import Output
 from segslam.types import SegslamError, Step, WorkFailed
-
-
-@pytest.fixture(scope="module")
-def steps() -> list[Step]:
-    return list(made_steps(60))
-
-
-@pytest.fixture(scope="module")
-def whole(steps: list[Step], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_log(tmp_path_factory.mktemp("log") / "log.mcap", steps)
 
 
 def test_a_cut_log_gives_every_complete_step_wherever_it_is_cut(

@@ -23,16 +23,6 @@ from segslam.semantics.class_colors import of_classes
 from segslam.types import Rejected, RejectReason, Step
 
 
-@pytest.fixture(scope="module")
-def steps() -> list[Step]:
-    return list(made_steps(60))
-
-
-@pytest.fixture(scope="module")
-def whole(steps: list[Step], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_log(tmp_path_factory.mktemp("log") / "log.mcap", steps)
-
-
 def test_own_messages_agree_with_the_json_schemas_in_the_file(steps: list[Step], tmp_path: Path) -> None:
     estimate, trajectory = made_result(steps)
     with LogWriter(tmp_path / "log.mcap", config=CONFIG, reference=trajectory) as log:

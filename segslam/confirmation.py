@@ -23,7 +23,7 @@ SAME_M, SAME_SHARE, SAME_RAD = 0.5, 0.05, math.radians(2.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Waiting:
+class Unconfirmed:
     """A registration that is not yet confirmed by others."""
 
     closure: LoopClosure
@@ -36,7 +36,7 @@ class Confirmation:
     def __init__(self, graph: Graph, T_odom_keyframe: Callable[[int], Transform]) -> None:
         """`T_odom_keyframe`: pose of a keyframe by odometry."""
         self._graph, self._T_odom = graph, T_odom_keyframe
-        self._waiting: list[Waiting] = []
+        self._waiting: list[Unconfirmed] = []
 
     def is_waiting(self, keyframe_id: int) -> bool:
         """True if this keyframe may confirm an earlier registration."""
@@ -48,7 +48,7 @@ class Confirmation:
         self, candidate: LoopCandidate, closure: LoopClosure, seconds: dict[str, float]
     ) -> tuple[LoopAttempt, ...]:
         """The closures of a registration and of all that confirm it; one UNCONFIRMED attempt if these are too few."""
-        newest = Waiting(closure, candidate)
+        newest = Unconfirmed(closure, candidate)
         consistent = (
             [one for one in self._waiting if self._are_consistent(one, newest)]
             if self.is_waiting(closure.source_id)
@@ -68,7 +68,7 @@ class Confirmation:
             LoopAttempt(candidate, closure, seconds),
         )
 
-    def _are_consistent(self, earlier: Waiting, later: Waiting) -> bool:
+    def _are_consistent(self, earlier: Unconfirmed, later: Unconfirmed) -> bool:
         """True if the motion between two keyframes is the same by their registrations and by odometry."""
         T_world = self._graph.T_world_keyframes
         a, b = earlier.closure, later.closure
@@ -78,5 +78,5 @@ class Confirmation:
         within_m = SAME_M + SAME_SHARE * (self._travel_m(later) - self._travel_m(earlier))
         return geometry.distance(apart) <= within_m and geometry.angle(apart) <= SAME_RAD
 
-    def _travel_m(self, one: Waiting) -> float:
+    def _travel_m(self, one: Unconfirmed) -> float:
         return float(self._graph.travel_m[one.closure.source_id])

@@ -17,7 +17,7 @@ from scipy.ndimage import map_coordinates
 
 from segslam.config import GeometricLabelsConfig
 from segslam.points import hash_keys, voxel_first
-from segslam.semantics.ground_surface import heights_above_ground, turned, upright
+from segslam.semantics.ground_surface import heights_above_ground, rotated, upright
 from segslam.system.short_repr import Record
 from segslam.types import Label, Labels, Points, SegslamError
 
@@ -90,7 +90,7 @@ def _standing(points: Points, labels: Labels, config: GeometricLabelsConfig, *, 
     thinned = still[voxel_first(still, CELL_M / 2)].astype(np.float64)
     if not len(thinned):
         return thinned
-    level = turned(thinned, upright(thinned))
+    level = rotated(thinned, upright(thinned))
     edge_m = reach_m + 2 * config.ground_cell_m
     near = level.compress((np.abs(level[:, 0]) <= edge_m) & (np.abs(level[:, 1]) <= edge_m), axis=0)
     heights = heights_above_ground(

@@ -8,7 +8,7 @@ import numpy as np
 from segslam.config import GeometricLabelsConfig
 from segslam.points import within_range
 from segslam.semantics.cells import grid_cells
-from segslam.semantics.ground_surface import heights_above_ground, turned, upright
+from segslam.semantics.ground_surface import heights_above_ground, rotated, upright
 from segslam.semantics.solids import Pieces, pieces
 from segslam.semantics.uprights import NUM_SLICES, on_thin_uprights
 from segslam.semantics.walls import on_walls
@@ -30,7 +30,7 @@ def geometric_labels(points: Points, *, config: GeometricLabelsConfig) -> Labels
     usable = within_range(points, 0.0, config.max_range_m)
     if usable.any():
         near = points[usable].astype(np.float64)
-        labels[usable] = _labels_of_level(turned(near, upright(near)), config)
+        labels[usable] = _labels_of_level(rotated(near, upright(near)), config)
     return labels
 
 

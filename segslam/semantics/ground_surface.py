@@ -42,7 +42,7 @@ def upright(points: Points) -> Rotation:
     return geometry.level(normal) if normal[2] > np.cos(np.radians(MAX_TILT_DEG)) else np.eye(3)
 
 
-def turned(points: Points, R_a_b: Rotation) -> Points:
+def rotated(points: Points, R_a_b: Rotation) -> Points:
     """Points of frame b in frame a, float64. Unlike with a matrix product, equal rows give exactly equal results."""
     return np.column_stack([_along(points, row) for row in R_a_b])
 

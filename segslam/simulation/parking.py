@@ -9,7 +9,7 @@ import numpy as np
 from segslam.simulation import vehicles
 from segslam.simulation.mesh import Mesh
 from segslam.simulation.path import Route, time_between_visits
-from segslam.simulation.site import Frontage, Site, Spot, moved
+from segslam.simulation.site import Frontage, Site, Spot, displaced
 from segslam.simulation.world_settings import WorldConfig
 from segslam.types import Label
 
@@ -96,7 +96,7 @@ def _court_spots(
             site.pave(middle, width, COURT_DEPTH_M, Label.PARKING)
             for along in np.arange(-width / 2 + 1.5, width / 2 - 1.4, COURT_SLOT_M):
                 if rng.uniform() < 0.5:
-                    yield moved(middle, along_m=float(along), out_m=rng.normal(scale=0.3)), True
+                    yield displaced(middle, along_m=float(along), out_m=rng.normal(scale=0.3)), True
 
 
 def _stays(route: Route, spot: Spot, config: WorldConfig, rng: np.random.Generator) -> list[tuple[float, float]]:

@@ -92,7 +92,7 @@ def _samples(size_m: float) -> Vector:
     return np.linspace(-size_m / 2, size_m / 2, int(size_m / CELL_M * 1.3) + 2)
 
 
-def moved(spot: Spot, *, along_m: float = 0.0, out_m: float = 0.0) -> Spot:
+def displaced(spot: Spot, *, along_m: float = 0.0, out_m: float = 0.0) -> Spot:
     """A spot displaced along the street and away from it."""
     c, s = np.cos(spot.heading_rad), np.sin(spot.heading_rad)
     return Spot(spot.x + c * along_m - s * out_m, spot.y + s * along_m + c * out_m, spot.heading_rad)

@@ -7,7 +7,7 @@ import numpy as np
 
 from segslam.simulation import buildings, plants
 from segslam.simulation.mesh import Mesh
-from segslam.simulation.site import Frontage, Site, moved
+from segslam.simulation.site import Frontage, Site, displaced
 from segslam.simulation.world_settings import WorldConfig
 from segslam.types import Label
 
@@ -90,9 +90,9 @@ def _house(lot: Lot, rng: np.random.Generator) -> Iterator[Mesh]:
     """A building with a paved path to its door; some adjoin the next building."""
     depth, wide = rng.uniform(8.0, 12.0), lot.width_m - max(0.0, rng.uniform(-1.5, 3.0))
     spot = lot.site.outward(lot.frontage, lot.middle, rng.uniform(*HOUSE_M))
-    if lot.site.claim(moved(spot, out_m=depth / 2 + 0.5), wide, depth, clearance_m=6.5):
+    if lot.site.claim(displaced(spot, out_m=depth / 2 + 0.5), wide, depth, clearance_m=6.5):
         yield lot.site.stand(buildings.building(rng, wide, depth), spot)
-        way = moved(spot, along_m=rng.uniform(-0.3, 0.3) * wide, out_m=-3.0)
+        way = displaced(spot, along_m=rng.uniform(-0.3, 0.3) * wide, out_m=-3.0)
         lot.site.pave(way, 3.0, 6.0, Label.SIDEWALK)
 
 

@@ -49,7 +49,7 @@ def simulated_part(options: argparse.Namespace, config: Config) -> Tables:
     found = simulated(places(options), config, sample=options.sample, num_negatives=options.negatives, rng=rng)
     return {
         "Simulated pairs at real poses": found.success,
-        "Gates: simulated scans over 100 m apart, and true pairs turned down": found.gates,
+        "Gates: simulated scans over 100 m apart, and true pairs rejected": found.gates,
         "Squared errors by the information claimed": found.information,
     }
 

@@ -22,7 +22,7 @@ LEAST_OVERLAP = 0.35
 
 LOST_SCANS = 30
 """Chosen: number of scans after a break that are tried against the map before it (3 s at 10 Hz)."""
-LEAST_SUPPORTED, SUPPORTED_SHARE = 0.15, 0.5
+LEAST_SUPPORTED, SUPPORTED_SHARE = 0.15, 0.4
 """Chosen: smallest overlap where another source supports a pose; absolute, and relative to the drive's median. Between
 two simulated towns it is 0.16 at a proposal of KISS-ICP, with a median of 0.96."""
 NUM_INTERVALS = 21
@@ -115,16 +115,18 @@ class History:
         """True if a registered scan fits the map as well as is usual for this drive."""
         if not self.is_usual_known:
             return fit.overlap >= LEAST_OVERLAP
-        usual_overlap = median(other.overlap for other in self._fits)
-        usual_rms_m = median(other.rms_m for other in self._fits)
-        return (
-            fit.overlap >= self._config.min_overlap * usual_overlap and fit.rms_m <= self._config.max_rms * usual_rms_m
-        )
+        if fit.rms_m > self._config.max_rms * median(other.rms_m for other in self._fits):
+            return False
+        return fit.overlap >= (LEAST_OVERLAP if fit.is_map_new else self._config.min_overlap * self._usual_overlap())
 
     def is_plausible(self, fit: Fit) -> bool:
         """True if a scan overlaps the map enough for a pose that another source supports."""
-        usual = median(other.overlap for other in self._fits) if self.is_usual_known else 0.0
-        return fit.overlap >= max(LEAST_SUPPORTED, SUPPORTED_SHARE * usual)
+        if fit.is_map_new or not self.is_usual_known:
+            return fit.overlap >= LEAST_SUPPORTED
+        return fit.overlap >= max(LEAST_SUPPORTED, SUPPORTED_SHARE * self._usual_overlap())
+
+    def _usual_overlap(self) -> float:
+        return median(other.overlap for other in self._fits)
 
     def _is_off(self, moved_m: float, moved_rad: float) -> bool:
         return bool(moved_m > self._tolerance[0] or moved_rad > self._tolerance[1])

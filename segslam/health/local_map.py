@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,8 @@ class Fit:
     """Root mean square distance of these inliers to the planes of the map; `inlier_m` without inliers."""
     closeness: float = 0.0
     """Mean weight of these points by their distance to the planes, 0 to 1: greater if more points fit, and better."""
+    is_map_new: bool = False
+    """Whether the map has few scans, as after a break: sparse scans then overlap it much less than usual."""
 
 
 class LocalMap:
@@ -130,7 +132,8 @@ class LocalMap:
 
     def fit(self, scan: refinement.Surface, T_map_lidar: Transform) -> Fit:
         """Fit of the scan to the map at this pose."""
-        return _fit(scan, self.surface(), T_map_lidar, inlier_m=self._config.inlier_m)
+        fit = _fit(scan, self.surface(), T_map_lidar, inlier_m=self._config.inlier_m)
+        return replace(fit, is_map_new=len(self) < self._config.map_scans / 2)
 
 
 def _fit(source: refinement.Surface, target: refinement.Surface, T_target_source: Transform, *, inlier_m: float) -> Fit:

@@ -15,7 +15,7 @@ from segslam.evaluation import trajectory_metrics
 from segslam.health import CheckedOdometry, information_of
 from segslam.health.check import Nudge, nudge, open_direction
 from segslam.health.history import History, Intervals
-from segslam.health.local_map import LocalMap
+from segslam.health.local_map import Fit, LocalMap
 from segslam.odometry import GivenOdometry, KissOdometry, OdometryResult
 from segslam.refinement import LightSurface
 from segslam.refinement import refine as refined
@@ -172,6 +172,26 @@ def test_an_unsupported_motion_is_a_break_and_is_repaired_when_the_map_is_visibl
         )
         < 0.1
     )
+
+
+def test_sparse_scans_after_a_break_are_compared_with_what_one_scan_shows_and_not_with_the_usual_overlap() -> None:
+    history = History(CONFIG.health)
+    for _ in range(10):
+        history.note_registration(0.0, 0.0, Fit(0.9, 0.1))
+    low, supported, poor = Fit(0.4, 0.15), Fit(0.2, 0.15), Fit(0.4, 0.25)
+    assert not history.is_usual(low)
+    assert not history.is_plausible(supported)
+    assert history.is_usual(replace(low, is_map_new=True))
+    assert history.is_plausible(replace(supported, is_map_new=True))
+    assert not history.is_usual(replace(poor, is_map_new=True))
+
+    scans, truth = round_drive()
+    local = LocalMap(CONFIG.health, CONFIG.refine)
+    is_new = []
+    for scan, T_odom_lidar in zip(scans[:10], truth.T_world_lidar, strict=False):
+        local.add(T_odom_lidar, local.downsample(scan.points), scan.points)
+        is_new.append(local.fit(local.make_surface(local.downsample(scan.points)), np.eye(4)).is_map_new)
+    assert is_new == [True] * 4 + [False] * 6
 
 
 @pytest.mark.parametrize("degrees", [-25.0, 32.0])

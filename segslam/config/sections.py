@@ -127,7 +127,8 @@ class HealthConfig(Section):
     watch_scans: int = Field(
         20,
         ge=1,
-        description="after a repair, scans are registered until this many in a row confirm the odometry [chosen]",
+        description="after a repair, scans are registered until this many in a row confirm the odometry, after the "
+        "n-th repair n times as many [chosen on NCLT]",
     )
     map_scans: int = Field(10, ge=1, description="number of scans in the local map of the check [chosen]")
     map_spacing_m: float = Field(

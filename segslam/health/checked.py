@@ -3,8 +3,9 @@
 As long as the odometry is sound, one scan every `keyframes.distance_m` is compared with the previous one by
 `check.nudge`, in a few milliseconds. If the scans contradict a motion, the scan is registered with the last scans
 (`LocalMap`): first from several initial guesses, then from the best of many poses around the last one, then without
-any. Each following scan is registered as well, until the odometry agrees with `watch_scans` registrations in a row. A
-motion that no registration supports is a break: a guess with nearly no information.
+any. Each following scan is registered as well, until the odometry agrees with `watch_scans` registrations in a row,
+after the n-th repair with n times as many. A motion that no registration supports is a break: a guess with nearly no
+information.
 """
 
 from collections.abc import Callable, Sequence

@@ -64,6 +64,7 @@ class History:
         self._overlaps: deque[float] = deque(maxlen=NUM_FITS)
         self._fits: deque[Fit] = deque(maxlen=NUM_FITS)
         self._num_to_watch = 0
+        self._num_repaired = 0
         self.scans_lost = 0
         """Number of scans since the last break."""
 
@@ -93,14 +94,15 @@ class History:
             self._overlaps.append(overlap)
 
     def watch(self) -> None:
-        """Register the next scans, and discard the checks so far."""
+        """Register the next scans, the more of them the more motions were repaired, and discard the checks so far."""
         self._checks.clear()
-        self._num_to_watch = self._config.watch_scans
+        self._num_to_watch = self._config.watch_scans * max(self._num_repaired, 1)
 
     def note_registration(self, moved_m: float, moved_rad: float, fit: Fit) -> MotionState:
         """State of a registered motion, from the error of the odometry."""
         self._fits.append(fit)
         if self._is_off(moved_m, moved_rad):
+            self._num_repaired += 1
             self.watch()
             return MotionState.REPAIRED
         self._num_to_watch = max(self._num_to_watch - 1, 0)

@@ -174,6 +174,24 @@ def test_an_unsupported_motion_is_a_break_and_is_repaired_when_the_map_is_visibl
     )
 
 
+def test_an_odometry_that_fails_again_is_watched_for_longer() -> None:
+    history, fits = History(CONFIG.health), Fit(0.9, 0.1)
+
+    def watched() -> int:
+        """Number of registrations that confirm the odometry until it is no longer watched."""
+        count = 0
+        while history.is_watching:
+            history.note_registration(0.0, 0.0, fits)
+            count += 1
+        return count
+
+    lengths = []
+    for _ in range(3):
+        assert history.note_registration(1.0, 0.0, fits) is MotionState.REPAIRED
+        lengths.append(watched())
+    assert lengths == [CONFIG.health.watch_scans * n for n in (1, 2, 3)]
+
+
 def test_sparse_scans_after_a_break_are_compared_with_what_one_scan_shows_and_not_with_the_usual_overlap() -> None:
     history = History(CONFIG.health)
     for _ in range(10):

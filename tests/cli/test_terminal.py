@@ -88,13 +88,13 @@ def test_a_bar_passes_all_items_on(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 def test_the_first_command_on_a_machine_shows_that_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    status, shown = in_terminal("simulate", str(tmp_path / "s"), "--frames", "2", "--sensor", "vlp16")
+    status, shown = in_terminal("-m", "segslam", "simulate", str(tmp_path / "s"), "--frames", "2", "--sensor", "vlp16")
     assert status == 0, shown
-    status, shown = in_terminal("map", str(tmp_path / "s"), "--out", str(tmp_path / "r"))
+    status, shown = in_terminal("-m", "segslam", "map", str(tmp_path / "s"), "--out", str(tmp_path / "r"))
     assert status == 0, shown
     total = kernels.num_kernels()
     assert f"{total}/{total}" in shown
     assert shown.index("compiling, once") < shown.index("2/2")
-    status, shown = in_terminal("map", str(tmp_path / "s"), "--out", str(tmp_path / "again"))
+    status, shown = in_terminal("-m", "segslam", "map", str(tmp_path / "s"), "--out", str(tmp_path / "again"))
     assert status == 0
     assert "compiling" not in shown

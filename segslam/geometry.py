@@ -162,7 +162,8 @@ def raise_beams(points: Points, angle_deg: float) -> Points:
     cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     x, y, z = np.ascontiguousarray(points.T)
     horizontal = np.sqrt(x * x + y * y)
-    np.maximum(horizontal, np.finfo(x.dtype).tiny, out=horizontal)  # a point straight above has no azimuth to keep
+    # A point straight above has no azimuth to keep; squares below `tiny` lose their digits.
+    np.maximum(horizontal, np.sqrt(np.finfo(x.dtype).tiny), out=horizontal)
     stretch = cosine - sine * z / horizontal
     return np.stack([x * stretch, y * stretch, sine * horizontal + cosine * z], axis=1)
 

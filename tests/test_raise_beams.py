@@ -36,3 +36,9 @@ def test_lowering_undoes_raising() -> None:
 def test_raising_is_the_derivative() -> None:
     moved = raise_beams(POINTS, float(np.degrees(1e-6)))
     np.testing.assert_allclose((moved - POINTS) / 1e-6, raising(POINTS), rtol=1e-4, atol=1e-3)
+
+
+def test_a_point_nearly_straight_above_keeps_its_range() -> None:
+    """The squares of its horizontal coordinates are below the smallest single-precision number."""
+    above = np.array([[1e-25, 0.0, 10.0]], np.float32)
+    np.testing.assert_allclose(np.linalg.norm(raise_beams(above, 0.205).astype(float)), 10.0, rtol=1e-4)

@@ -18,7 +18,8 @@ MIN_OVERLAPS, LEAST_SHARE = 3, 0.75
 """Chosen: smallest overlap of a check, relative to the drive's median; below it the scans are metres apart and the
 correction is meaningless. On real KITTI the smallest of 178 is 0.80 of the median."""
 LEAST_OVERLAP = 0.35
-"""Chosen: smallest overlap of a check or a registered scan while the drive has no median yet."""
+"""Chosen: smallest overlap of a check or a registered scan while the drive has no median yet, and of a scan registered
+with a map of few scans."""
 
 LOST_SCANS = 30
 """Chosen: number of scans after a break that are tried against the map before it (3 s at 10 Hz)."""
@@ -65,6 +66,7 @@ class History:
         self._fits: deque[Fit] = deque(maxlen=NUM_FITS)
         self._num_to_watch = 0
         self._num_repaired = 0
+        """Number of registrations so far that corrected the odometry."""
         self.scans_lost = 0
         """Number of scans since the last break."""
 

@@ -35,7 +35,7 @@ Progress = Callable[[Iterable[Any], int, str], Iterator[Any]]
 
 
 def no_progress(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
-    """Progress that is not progress."""
+    """Passes the items on and shows nothing."""
     return iter(items)
 
 

@@ -54,7 +54,8 @@ def unless_ambiguous(found: Found, trial: Trial) -> Alignment | Rejected:
 
     Rivals are searched if the scans constrain the pose badly in some direction, as along a tunnel, or fit less well
     than neighbouring keyframes do. In the second case poses that the prior excludes are rivals too: a pose that fits
-    no better than wrong ones is not proven by being near the prior.
+    no better than wrong ones is not proven by being near the prior. A pose that violates free space is dropped if one
+    that fits about as well does not.
     """
     config = trial.config.verify
     certain = gates.is_certain(found.agreement, trial.floor)
@@ -69,8 +70,8 @@ def unless_ambiguous(found: Found, trial: Trial) -> Alignment | Rejected:
             rival = loose.outcome(led)
             if isinstance(rival, Found) and not _is_near(rival.alignment.fine.T_target_source, passed):
                 passed.append(rival)
-    best, *others = sorted(passed, key=lambda one: one.agreement.mismatch)
-    if others and others[0].agreement.mismatch < config.rival_ratio * best.agreement.mismatch:
+    best, *others = _almost_as_good(passed, trial)
+    if others:
         apart = geometry.inverse(best.alignment.fine.T_target_source) @ others[0].alignment.fine.T_target_source
         beside = f"{others[0].agreement.mismatch:.3f} {geometry.distance(apart):.1f} m off"
         return Rejected(RejectReason.AMBIGUOUS, f"mismatch {best.agreement.mismatch:.3f}, and {beside}")
@@ -78,6 +79,15 @@ def unless_ambiguous(found: Found, trial: Trial) -> Alignment | Rejected:
     if rejected is None:
         rejected = trial.rejection(best)
     return best.alignment if rejected is None else rejected
+
+
+def _almost_as_good(passed: Sequence[Found], trial: Trial) -> list[Found]:
+    """The poses that fit best or almost as well, best first, without those that another of them contradicts."""
+    ranked = sorted(passed, key=lambda one: one.agreement.mismatch)
+    most = trial.config.verify.rival_ratio * ranked[0].agreement.mismatch
+    close = [one for one in ranked if one is ranked[0] or one.agreement.mismatch < most]
+    agreed = [one.agreement for one in close]
+    return [one for one in close if not any(gates.contradicts(other, one.agreement, trial.floor) for other in agreed)]
 
 
 def _rivals(found: Found, trial: Trial, few: FewPoints) -> list[Registration]:

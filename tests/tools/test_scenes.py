@@ -95,6 +95,15 @@ def test_two_places_of_which_a_part_has_the_same_shape_are_not_taken_for_one(
     assert isinstance(found, Rejected), found
 
 
+def test_among_equal_cars_free_places_decide_which_pose_is_right() -> None:
+    """Of a wrong pose between cars of two rows, the cars fit almost as well, but some stand where places were free."""
+    lot = scenes.Place(SCENES["parking lot"](0), "32", 0.03, 0, CONFIG)
+    T_target_source = geometry.inverse(lot.pose(126, 2)) @ lot.pose(113, 0)
+    found = register_prepared(lot.prepared(113, 0), lot.prepared(126, 2), config=CONFIG)
+    assert isinstance(found, Alignment), found
+    assert geometry.distance(geometry.inverse(T_target_source) @ found.fine.T_target_source) < 0.1
+
+
 def _is_wrong(found: Alignment | Rejected) -> bool:
     """Accepted, and not where the source stands."""
     if isinstance(found, Rejected):

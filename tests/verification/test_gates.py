@@ -16,6 +16,7 @@ from segslam.verification.gates import (
     NoiseFloor,
     Observed,
     agreement,
+    contradicts,
     early_rejection,
     is_certain,
     limits,
@@ -168,6 +169,25 @@ def test_an_alignment_is_certain_if_it_agrees_as_well_as_neighbours_do() -> None
     assert is_certain(Agreement(0.7, 0.1, SINGLE_PAIR.residual_ratio, 0.004, 7.0), SINGLE_PAIR)
     assert not is_certain(Agreement(0.7, 0.1, 1.4 * SINGLE_PAIR.residual_ratio, 0.004, 7.0), SINGLE_PAIR)
     assert not is_certain(Agreement(0.7, 0.1, SINGLE_PAIR.residual_ratio, 0.02, 7.0), SINGLE_PAIR)
+
+
+@pytest.mark.parametrize(
+    ("best", "other", "floor", "is_contradicted"),
+    [
+        (0.001, 0.030, 0.002, True),
+        (0.001, 0.012, 0.002, False),  # not much more
+        (0.020, 0.090, 0.002, False),  # violates free space itself, as where cars have come and gone
+        (0.020, 0.030, 0.010, False),  # the neighbours of the run violate it as much
+        (0.020, 0.100, 0.010, True),
+    ],
+)
+def test_a_pose_contradicts_others_only_if_it_violates_free_space_as_little_as_neighbours_do(
+    best: float, other: float, floor: float, is_contradicted: bool
+) -> None:
+    neighbours = NoiseFloor(overlap=0.93, residual_ratio=0.78, free_space_violation=floor)
+    poses = [Agreement(0.5, 0.1, 0.9, violation, 7.0) for violation in (best, other)]
+    assert contradicts(*poses, neighbours) is is_contradicted
+    assert not contradicts(*poses[::-1], neighbours)
 
 
 def test_a_coarse_pose_is_rejected_early_beyond_three_times_the_free_space_allowed() -> None:

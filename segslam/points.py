@@ -54,7 +54,7 @@ def voxel_first(points: Points, voxel_m: float) -> Indices:
     Raises ValueError if voxel_m <= 0, or if the points span more voxels than int64 keys can number.
     """
     rows = np.flatnonzero(is_finite(points))
-    keys, _ = _cell_keys(points.take(rows, axis=0), voxel_m)
+    keys, _ = cell_keys(points.take(rows, axis=0), voxel_m)
     return rows[hash_keys(keys)[1] == np.arange(len(keys))]
 
 
@@ -79,7 +79,7 @@ def group_means(rows: np.ndarray, group: Indices, num_groups: int) -> np.ndarray
 
 def radius_neighbours(points: Points, radius_m: float) -> Neighbours:
     """All neighbours within a radius, the limit included. The points are finite. Raises as `voxel_first` does."""
-    keys, strides = _cell_keys(points, radius_m)
+    keys, strides = cell_keys(points, radius_m)
     order = np.argsort(keys, kind="stable")
     return Neighbours(*_neighbours(points.astype(np.float64)[order], keys[order], *strides, order, radius_m**2))
 
@@ -99,7 +99,7 @@ def normals(points: Points, covariances: Covariances) -> Points:
     return np.where(away[:, None], -directions, directions)
 
 
-def _cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]:
+def cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]:
     """A number for each point's cell floor(p / cell_m), and its increments to the next cell in x and in y (in z: 1).
 
     The numbers ascend with x, then y, then z. A margin around the points ensures that all neighbouring cells have

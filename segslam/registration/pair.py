@@ -7,9 +7,19 @@ from numpy.typing import ArrayLike
 
 from segslam import geometry, refinement
 from segslam.config import Config
+from segslam.registration.hypotheses import coarse_poses
 from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
-from segslam.registration.rivals import SPARSE_MARGIN, few_points, sparsely_refined, unless_ambiguous
-from segslam.registration.trial import Found, Gate, Stopwatch, Trial, anywhere, coarse_poses
+from segslam.registration.rivals import SPARSE_MARGIN, Searched, sparsely_refined, unless_ambiguous
+from segslam.registration.trial import (
+    EQUAL_M,
+    EQUAL_RAD,
+    Found,
+    Gate,
+    Stopwatch,
+    Trial,
+    anywhere,
+    is_near,
+)
 from segslam.system.threads import at_once
 from segslam.types import Alignment, Labels, Registration, Rejected, RejectReason, Transform, as_points
 from segslam.verification import gates
@@ -62,13 +72,32 @@ def register_prepared(
     """
     allowed = gates.limits(floor, config=config.verify)
     trial = Trial(source, target, config, gate, floor, allowed, watch or Stopwatch())
-    rejections = []
+    rejections: list[Rejected] = []
+    refused: list[tuple[Transform, Rejected]] = []
     for coarse in coarse_poses(trial):
-        outcome = coarse if isinstance(coarse, Rejected) else trial.outcome(coarse)
+        outcome = coarse if isinstance(coarse, Rejected) else _outcome(trial, coarse, refused)
         if isinstance(outcome, Found):
             return unless_ambiguous(outcome, trial)
         rejections.append(outcome)
     return rejections[0]
+
+
+def _outcome(trial: Trial, coarse: Registration, refused: list[tuple[Transform, Rejected]]) -> Found | Rejected:
+    """A hypothesis, refined with few points, then with all, and verified; `Rejected` by the first gate that it fails.
+
+    `refused`: poses to which few points led and all points were rejected. This one is added; one that equals
+    another gets the same rejection.
+    """
+    begun = trial.begin(coarse)
+    if isinstance(begun, Rejected):
+        return begun
+    for T_other, rejected in refused:
+        if is_near(begun, [T_other], within_m=EQUAL_M, within_rad=EQUAL_RAD):
+            return rejected
+    outcome = trial.refined(coarse, begun)
+    if isinstance(outcome, Rejected) and outcome.reason != RejectReason.REFINEMENT_DIVERGED:
+        refused.append((begun, outcome))
+    return outcome
 
 
 def register_near(
@@ -112,6 +141,9 @@ def may_match(
     """True if `register_prepared` may find a pose with about this mismatch or less, by registering a few points."""
     trial = Trial(source, target, config, gate, floor, gates.limits(floor, config=config.verify), watch)
     most = SPARSE_MARGIN * mismatch
-    few = few_points(source, config=config, most=most)
-    ends = (sparsely_refined(trial, coarse, few) for coarse in coarse_poses(trial) if isinstance(coarse, Registration))
+    ends = (
+        sparsely_refined(trial, coarse, Searched(most))
+        for coarse in coarse_poses(trial)
+        if isinstance(coarse, Registration)
+    )
     return any(led is not None and trial.mismatch(led.T_target_source) <= most for led in ends)

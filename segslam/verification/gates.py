@@ -19,6 +19,7 @@ from segslam.points import within_range
 from segslam.refinement import Surface
 from segslam.types import Direction, Mask, Points, Rejected, RejectReason, Transform, Vector
 from segslam.verification.free_space import FreeSpace, violation
+from segslam.verification.patches import PATCH_M, common_residual_m
 
 Observed = tuple[Surface, FreeSpace]
 
@@ -37,6 +38,8 @@ class Agreement:
     """Share of the points that violate the free space of the other scan, of those in directions with a return."""
     free_path_m: float
     """Median range of the returns: how narrow the place is; the smaller one of the two scans (m)."""
+    common_residual_m: float = 0.0
+    """Part of the residual that the points of a patch have in common (`patches.common_residual_m`)."""
 
     @property
     def mismatch(self) -> float:
@@ -72,11 +75,16 @@ NARROW_M, OPEN_M = 4.0, 6.0
 """Chosen: free paths of narrow places, where the limits above hold, and of open ones, where they do not. Simulated
 corridors have 1.7 to 4.5 m, the courtyard, NCLT, KITTI and simulated streets 4.7 to 14.4 m. In a street parked cars
 come and go: half of the correct poses on another day violate free space by more than such a limit."""
+COMMON_RESIDUAL_M = 0.07
+"""Chosen on simulated corridors, seed 2: largest common residual in narrow places. In wider ones the limit grows with
+the free path, as the effect of errors of the angles does."""
 NARROW_VIEW = 0.5
 """Chosen: a scan with returns in less than this share of the azimuths sees one side of a place only."""
 DOUBTFUL, DOUBTFUL_NARROW = 1.3, 2.0
 """Chosen on simulated corridors and tunnels, even seeds: factors of the least second support for a pose that fits less
 well than neighbours do, and for such a pose of a scan with a narrow view."""
+COARSE_VIOLATION = 3.0
+"""Chosen: a coarse pose may violate free space this much more than a refined one."""
 WEAKLY_OBSERVED = 0.02
 """Chosen on simulated tunnels, even seeds: a ratio of variances below which more than one surface must match along the
 weak direction. Of the wrong poses that fit as well as neighbours do it is 0.011 to 0.013; corridors have 0.023 or more.
@@ -93,6 +101,8 @@ class Limits:
     min_overlap: float
     max_residual_ratio: float
     max_free_space_violation: float
+    max_common_residual_m: float
+    """In narrow places; in proportion to the free path in wider ones."""
     overlap_of_neighbours: float
     """In narrow places, scans that overlap as much as neighbours do see the same things from nearly the same place, and
     must fit nearly as well: up to half of this overlap the limits hold as they are, from there they fall linearly."""
@@ -106,6 +116,11 @@ class Limits:
             (1.0 - share * (1.0 - VIOLATION_OF_NEIGHBOURS)) * self.max_free_space_violation,
         )
 
+    @property
+    def most_mismatch(self) -> float:
+        """Mismatch of a pose at the limits of overlap and residual; no pose that passes has more."""
+        return mismatch(self.min_overlap, self.max_residual_ratio)
+
     def unreduced(self) -> "Limits":
         """The limits at any overlap, for poses that a second surface confirms."""
         return replace(self, overlap_of_neighbours=math.inf)
@@ -117,6 +132,7 @@ class Limits:
             min_overlap=0.75 * self.min_overlap,
             max_residual_ratio=1.3 * self.max_residual_ratio,
             max_free_space_violation=1.5 * self.max_free_space_violation,
+            max_common_residual_m=1.3 * self.max_common_residual_m,
         )
 
 
@@ -126,6 +142,7 @@ def limits(floor: NoiseFloor, *, config: VerifyConfig) -> Limits:
     return Limits(
         min_overlap=config.min_overlap * min(floor.overlap / SINGLE_PAIR.overlap, 1.0),
         max_residual_ratio=config.max_residual_ratio * max(floor.residual_ratio, LEAST_RESIDUAL_RATIO),
+        max_common_residual_m=COMMON_RESIDUAL_M,
         overlap_of_neighbours=floor.overlap,
         max_free_space_violation=max(
             config.max_free_space_violation, config.max_violation_ratio * floor.free_space_violation
@@ -142,10 +159,11 @@ def agreement(source: Observed, target: Observed, T_target_source: Transform, *,
             (target, source, geometry.inverse(T_target_source)),
         )
     ]
-    overlaps, residuals, violations = zip(*ways, strict=True)
+    overlaps, residuals, common, violations = zip(*ways, strict=True)
     roughness_m = max(source[0].roughness_m, target[0].roughness_m)
     free_path_m = min(source[1].free_path_m, target[1].free_path_m)
-    return Agreement(min(overlaps), max(residuals), max(residuals) / roughness_m, max(violations), free_path_m)
+    ratio = max(residuals) / roughness_m
+    return Agreement(min(overlaps), max(residuals), ratio, max(violations), free_path_m, max(common))
 
 
 def mismatch(overlap: float, residual_ratio: float) -> float:
@@ -157,7 +175,7 @@ def mismatch_of_some(
     standing: Points, target: Surface, T_target_source: Transform, *, roughness_m: float, config: VerifyConfig
 ) -> float:
     """Mismatch of some standing points of the source. With all of them and both directions it is hardly smaller."""
-    overlap, rms_m = _surface_agreement(standing, target, T_target_source, config)
+    overlap, rms_m, _ = _surface_agreement(standing, target, T_target_source, config)
     return mismatch(overlap, rms_m / roughness_m)
 
 
@@ -244,15 +262,21 @@ def _free(floor: NoiseFloor) -> float:
 
 
 def early_rejection(
-    source: Observed, target: Observed, T_target_source: Transform, allowed: Limits, *, config: VerifyConfig
+    source: Observed,
+    target: Observed,
+    T_target_source: Transform,
+    allowed: Limits,
+    *,
+    config: VerifyConfig,
+    factor: float = COARSE_VIOLATION,
 ) -> Rejected | None:
-    """Rejects a coarse pose that violates free space three times as much as allowed; refinement rarely corrects that.
+    """Rejects a pose that violates free space `factor` times as much as allowed; refinement rarely corrects that.
 
     Takes 1 ms.
     """
     forth = violation(source[0].points, target[1], T_target_source, config=config, is_coarse=True)
     back = violation(target[0].points, source[1], geometry.inverse(T_target_source), config=config, is_coarse=True)
-    most = 3 * allowed.max_free_space_violation
+    most = factor * allowed.max_free_space_violation
     if max(forth, back) > most:
         return Rejected(RejectReason.FREE_SPACE_VIOLATED, f"{max(forth, back):.4f} > {most:.4f} before refinement")
     return None
@@ -266,18 +290,30 @@ def rejection(found: Agreement, allowed: Limits) -> Rejected | None:
     if found.residual_ratio > max_residual_ratio:
         detail = f"{found.rms_m:.3f} m, {found.residual_ratio:.2f} > {max_residual_ratio:.2f} times the roughness"
         return Rejected(RejectReason.HIGH_RESIDUAL, detail)
+    most_m = allowed.max_common_residual_m * max(found.free_path_m / NARROW_M, 1.0)
+    if found.common_residual_m > most_m:
+        detail = f"{found.common_residual_m:.3f} m > {most_m:.3f} m in common over patches of {PATCH_M} m"
+        return Rejected(RejectReason.HIGH_RESIDUAL, detail)
     if found.free_space_violation > max_violation:
         detail = f"{found.free_space_violation:.4f} > {max_violation:.4f}"
         return Rejected(RejectReason.FREE_SPACE_VIOLATED, detail)
     return None
 
 
-def _surface_agreement(standing: Points, b: Surface, T_b_a: Transform, config: VerifyConfig) -> tuple[float, float]:
-    """Overlap and residual of a's standing points within reach of b's sensor; no overlap where none is."""
+def _surface_agreement(
+    standing: Points, b: Surface, T_b_a: Transform, config: VerifyConfig
+) -> tuple[float, float, float]:
+    """Overlap, residual and common residual of a's standing points within reach of b; no overlap where none is."""
     moved = geometry.apply(T_b_a, standing)
     moved = moved[within_range(moved, 0.0, config.max_range_m)]
     if not len(moved):
-        return 0.0, math.inf
-    to_point, to_plane = b.distances_m(moved)
-    met = to_plane[to_point < config.inlier_m]
-    return len(met) / len(moved), float(np.sqrt(np.mean(met**2))) if len(met) else math.inf
+        return 0.0, math.inf, 0.0
+    rows, to_point_m = b.nearest(moved)
+    is_met = to_point_m < config.inlier_m
+    if not is_met.any():
+        return 0.0, math.inf, 0.0
+    met, rows = moved[is_met], rows[is_met]
+    normals = b.normals[rows]
+    to_plane_m = np.einsum("ij,ij->i", met - b.points[rows], normals)
+    common_m = common_residual_m(met, normals, to_plane_m)
+    return len(met) / len(moved), float(np.sqrt(np.mean(to_plane_m**2))), common_m

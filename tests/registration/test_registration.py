@@ -18,8 +18,9 @@ from segslam.registration import (
     register_near,
     register_prepared,
 )
-from segslam.registration.rivals import _shifted, few_points, sparsely_refined
-from segslam.registration.trial import Found, Trial, coarse_poses
+from segslam.registration.hypotheses import coarse_poses
+from segslam.registration.rivals import Searched, _shifted, sparsely_refined
+from segslam.registration.trial import Found, Trial
 from segslam.types import Alignment, Label, Registration, Rejected, RejectReason
 from segslam.verification import gates
 from segslam.verification.free_space import observe_free_space
@@ -182,14 +183,14 @@ def test_the_first_iterations_decide_whether_a_pose_is_refined(
     allowed = gates.limits(gates.SINGLE_PAIR, config=CONFIG.verify)
     trial = Trial(source, target, CONFIG, anywhere, gates.SINGLE_PAIR, allowed, Stopwatch())
     (coarse, *_) = (one for one in coarse_poses(trial) if isinstance(one, Registration))
-    found = trial.outcome(coarse)
+    found = trial.refined(coarse, coarse.T_target_source)
     assert isinstance(found, Found)
-    few = few_points(source, config=CONFIG, most=factor * found.agreement.mismatch, found=(found,) if is_found else ())
+    searched = Searched(factor * found.agreement.mismatch, (found,) if is_found else ())
     beside = found.alignment.fine.T_target_source @ geometry.transform(np.eye(3), [0.6, 0.0, 0.0])
     refined = []
     refine = refinement.refine
     monkeypatch.setattr(refinement, "refine", lambda *given, **named: refined.append(1) or refine(*given, **named))
-    led = sparsely_refined(trial, replace(coarse, T_target_source=beside), few)
+    led = sparsely_refined(trial, replace(coarse, T_target_source=beside), searched)
     assert (led is not None, len(refined)) == (leads, num_refined)
 
 

@@ -104,6 +104,26 @@ def test_among_equal_cars_free_places_decide_which_pose_is_right() -> None:
     assert geometry.distance(geometry.inverse(T_target_source) @ found.fine.T_target_source) < 0.1
 
 
+@pytest.mark.parametrize(("source", "target"), [((71, 0), (15, 2)), ((22, 0), (76, 2))])
+def test_noise_does_not_hide_that_the_doors_are_elsewhere(source: tuple[int, int], target: tuple[int, int]) -> None:
+    """Two places of a corridor, seen with 10 cm of noise; poses of which the doors lay in walls were accepted."""
+    place = scenes.Place(SCENES["corridor"](2), "64", 0.1, 2, CONFIG)
+    floor = NoiseFloor(overlap=0.89, residual_ratio=0.79, free_space_violation=0.0054)
+    found = register_prepared(place.prepared(*source), place.prepared(*target), config=CONFIG, floor=floor)
+    if isinstance(found, Alignment):
+        T_true = geometry.inverse(place.pose(*target)) @ place.pose(*source)
+        assert geometry.distance(geometry.inverse(T_true) @ found.fine.T_target_source) < 0.5, found
+
+
+@pytest.mark.parametrize("noise_m", [0.03, 0.1])
+def test_one_side_of_a_place_is_not_enough_where_free_space_is_violated(noise_m: float) -> None:
+    """The ends of a corridor, seen by 70 degrees of view: two walls and a door match, another door does not."""
+    place = scenes.Place(SCENES["corridor"](2), "70 wide", noise_m, 2, CONFIG)
+    floor = NoiseFloor(overlap=0.77, residual_ratio=0.82, free_space_violation=0.0004)
+    found = register_prepared(place.prepared(15, 1), place.prepared(86, 2), config=CONFIG, floor=floor)
+    assert isinstance(found, Rejected), found
+
+
 def _is_wrong(found: Alignment | Rejected) -> bool:
     """Accepted, and not where the source stands."""
     if isinstance(found, Rejected):

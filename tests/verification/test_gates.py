@@ -92,6 +92,18 @@ def test_each_test_rejects_for_its_own_reason() -> None:
         assert rejected.reason is reason
 
 
+def test_in_a_narrow_place_surfaces_must_not_be_displaced() -> None:
+    """However rough they are; in an open place the errors of the angles displace them, too."""
+    displaced = replace(RIGHT, common_residual_m=0.09, free_path_m=3.0)
+    rejected = rejection(displaced, LIMITS)
+    assert rejected is not None
+    assert rejected.reason is RejectReason.HIGH_RESIDUAL
+    assert rejected.detail == "0.090 m > 0.070 m in common over patches of 1.5 m"
+    assert rejection(replace(displaced, common_residual_m=0.05), LIMITS) is None
+    assert rejection(replace(displaced, free_path_m=8.0), LIMITS) is None
+    assert rejection(displaced, LIMITS.loosened()) is None, "a rival needs less evidence"
+
+
 def test_a_residual_is_measured_by_the_roughness_of_the_rougher_scan() -> None:
     rng = np.random.default_rng(3)
     rough, smooth = (

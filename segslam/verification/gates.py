@@ -78,6 +78,10 @@ come and go: half of the correct poses on another day violate free space by more
 COMMON_RESIDUAL_M = 0.07
 """Chosen on simulated corridors, seed 2: largest common residual in narrow places. In wider ones the limit grows with
 the free path, as the effect of errors of the angles does."""
+FREE_RESIDUAL, NO_VIOLATION = 1.2, 0.001
+"""Chosen on simulated scenes, seed 0: factor of the largest residual in open places if free space is violated no more
+than between neighbours, or by this share. None of 651 wrong poses with such residuals violated it so little, and all of
+8 correct ones."""
 NARROW_VIEW = 0.5
 """Chosen: a scan with returns in less than this share of the azimuths sees one side of a place only."""
 DOUBTFUL, DOUBTFUL_NARROW = 1.3, 2.0
@@ -103,6 +107,8 @@ class Limits:
     max_free_space_violation: float
     max_common_residual_m: float
     """In narrow places; in proportion to the free path in wider ones."""
+    violation_of_neighbours: float
+    """In open places the residual of a pose that violates free space as little may be `FREE_RESIDUAL` times larger."""
     overlap_of_neighbours: float
     """In narrow places, scans that overlap as much as neighbours do see the same things from nearly the same place, and
     must fit nearly as well: up to half of this overlap the limits hold as they are, from there they fall linearly."""
@@ -143,6 +149,7 @@ def limits(floor: NoiseFloor, *, config: VerifyConfig) -> Limits:
         min_overlap=config.min_overlap * min(floor.overlap / SINGLE_PAIR.overlap, 1.0),
         max_residual_ratio=config.max_residual_ratio * max(floor.residual_ratio, LEAST_RESIDUAL_RATIO),
         max_common_residual_m=COMMON_RESIDUAL_M,
+        violation_of_neighbours=max(floor.free_space_violation, NO_VIOLATION),
         overlap_of_neighbours=floor.overlap,
         max_free_space_violation=max(
             config.max_free_space_violation, config.max_violation_ratio * floor.free_space_violation
@@ -287,6 +294,8 @@ def rejection(found: Agreement, allowed: Limits) -> Rejected | None:
     if found.overlap < allowed.min_overlap:
         return Rejected(RejectReason.LOW_OVERLAP, f"{found.overlap:.3f} < {allowed.min_overlap:.3f}")
     max_residual_ratio, max_violation = allowed.at(found.overlap, found.free_path_m)
+    if found.free_path_m >= OPEN_M and found.free_space_violation <= allowed.violation_of_neighbours:
+        max_residual_ratio *= FREE_RESIDUAL
     if found.residual_ratio > max_residual_ratio:
         detail = f"{found.rms_m:.3f} m, {found.residual_ratio:.2f} > {max_residual_ratio:.2f} times the roughness"
         return Rejected(RejectReason.HIGH_RESIDUAL, detail)

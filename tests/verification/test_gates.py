@@ -92,6 +92,20 @@ def test_each_test_rejects_for_its_own_reason() -> None:
         assert rejected.reason is reason
 
 
+def test_in_an_open_place_a_pose_that_is_free_may_have_a_larger_residual() -> None:
+    """Bushes and cars seen from two sides have residuals at the correct pose, too."""
+    rough = replace(RIGHT, residual_ratio=1.15 * LIMITS.max_residual_ratio, free_space_violation=0.001)
+    assert rejection(rough, LIMITS) is None
+    for worse in (
+        replace(rough, free_space_violation=0.004),
+        replace(rough, free_path_m=5.0),
+        replace(rough, residual_ratio=1.25 * LIMITS.max_residual_ratio),
+    ):
+        rejected = rejection(worse, LIMITS)
+        assert rejected is not None
+        assert rejected.reason is RejectReason.HIGH_RESIDUAL
+
+
 def test_in_a_narrow_place_surfaces_must_not_be_displaced() -> None:
     """However rough they are; in an open place the errors of the angles displace them, too."""
     displaced = replace(RIGHT, common_residual_m=0.09, free_path_m=3.0)

@@ -206,8 +206,7 @@ class Trial(NamedTuple):
 
         More than one surface must match there if the fine Hessian hardly constrains a direction, if it constrains one
         badly and the pose fits less well than neighbours do, if a scan sees one side of the place only, or if the
-        stricter limits of narrow places are exceeded. One side is not enough if the pose violates free space more than
-        neighbours do. Rivals need less evidence.
+        stricter limits of narrow places are exceeded. Rivals need less evidence.
         """
         found = pose.agreement
         config = self.config.verify
@@ -222,9 +221,10 @@ class Trial(NamedTuple):
             return Rejected(RejectReason.LOW_OVERLAP, f"{support.whole:.3f} < {least:.3f} along the weakest direction")
         is_doubtful = not self.is_rival and not gates.is_certain(found, self.floor)
         is_narrow = min(self.source.free_space.view, self.target.free_space.view) < gates.NARROW_VIEW
-        if is_narrow and is_doubtful and not gates.is_free(found, self.floor):
-            detail = f"{found.free_space_violation:.4f}, more than neighbours, and only one side of the place is seen"
-            return Rejected(RejectReason.FREE_SPACE_VIOLATED, detail)
+        if not self.is_rival:
+            rejected = self.violation_with_little_evidence(pose, is_narrow=is_narrow)
+            if rejected is not None:
+                return rejected
         least = config.min_second_support * found.overlap
         if is_doubtful:
             least *= gates.DOUBTFUL_NARROW if is_narrow else gates.DOUBTFUL
@@ -240,6 +240,22 @@ class Trial(NamedTuple):
         needed = refinement.UNOBSERVED if self.is_rival else gates.WEAKLY_OBSERVED
         is_open = pose.alignment.observability < (config.well_observed if is_doubtful else needed)
         return Rejected(RejectReason.LOW_OVERLAP, detail) if is_narrow or is_open else None
+
+    def violation_with_little_evidence(self, pose: Found, *, is_narrow: bool) -> Rejected | None:
+        """Rejects a pose that violates free space and has little else to prove it.
+
+        If a scan sees one side of the place only (`is_narrow`), it may violate free space as little as neighbours do;
+        if a direction is badly observed, by half of the limit.
+        """
+        found = pose.agreement
+        if is_narrow and not gates.is_free(found, self.floor):
+            detail = f"{found.free_space_violation:.4f}, more than neighbours, and only one side of the place is seen"
+            return Rejected(RejectReason.FREE_SPACE_VIOLATED, detail)
+        most = gates.VIOLATION_BADLY_OBSERVED * self.limits.max_free_space_violation
+        if pose.alignment.observability < gates.BADLY_OBSERVED and found.free_space_violation > most:
+            detail = f"{found.free_space_violation:.4f} > {most:.4f} where a direction is badly observed"
+            return Rejected(RejectReason.FREE_SPACE_VIOLATED, detail)
+        return None
 
 
 def is_near(T_target_source: Transform, others: Sequence[Transform], *, within_m: float, within_rad: float) -> bool:

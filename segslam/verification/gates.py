@@ -89,6 +89,9 @@ DOUBTFUL, DOUBTFUL_NARROW = 1.3, 2.0
 well than neighbours do, and for such a pose of a scan with a narrow view."""
 COARSE_VIOLATION = 3.0
 """Chosen: a coarse pose may violate free space this much more than a refined one."""
+BADLY_OBSERVED, VIOLATION_BADLY_OBSERVED = 0.05, 0.5
+"""Chosen on simulated garages, seed 2: below this ratio of variances a pose may violate free space by this share of the
+limit."""
 WEAKLY_OBSERVED = 0.02
 """Chosen on simulated tunnels, even seeds: a ratio of variances below which more than one surface must match along the
 weak direction. Of the wrong poses that fit as well as neighbours do it is 0.011 to 0.013; corridors have 0.023 or more.

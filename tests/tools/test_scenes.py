@@ -124,6 +124,14 @@ def test_one_side_of_a_place_is_not_enough_where_free_space_is_violated(noise_m:
     assert isinstance(found, Rejected), found
 
 
+def test_where_a_direction_is_badly_observed_little_free_space_may_be_violated() -> None:
+    """Two places between equal cars: a third of the points match, and others lie where the view was free."""
+    lot = scenes.Place(SCENES["parking lot"](5), "90 high", 0.03, 5, CONFIG)
+    floor = NoiseFloor(overlap=0.93, residual_ratio=0.78, free_space_violation=0.002)
+    found = register_prepared(lot.prepared(72, 1), lot.prepared(195, 2), config=CONFIG, floor=floor)
+    assert isinstance(found, Rejected), found
+
+
 def _is_wrong(found: Alignment | Rejected) -> bool:
     """Accepted, and not where the source stands."""
     if isinstance(found, Rejected):

@@ -128,7 +128,7 @@ class Limits:
     @property
     def most_mismatch(self) -> float:
         """Mismatch of a pose at the limits of overlap and residual; no pose that passes has more."""
-        return mismatch(self.min_overlap, self.max_residual_ratio)
+        return mismatch(self.min_overlap, FREE_RESIDUAL * self.max_residual_ratio)
 
     def unreduced(self) -> "Limits":
         """The limits at any overlap, for poses that a second surface confirms."""

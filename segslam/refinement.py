@@ -64,7 +64,7 @@ class Surface:
     def nearest(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """(n,) each: row of the nearest point of the surface, and the distance to it (m)."""
         rows, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
-        return np.asarray(rows), np.sqrt(squared)
+        return np.asarray(rows, dtype=np.int64), np.sqrt(squared)
 
     def normals_at(self, rows: Indices) -> Points:
         """(k, 3) normals of points by row."""

@@ -2,7 +2,8 @@
 
 from segslam.registration.pair import may_match, register, register_near, register_prepared
 from segslam.registration.prepared import Labeller, PreparedScan, prepare_observed, prepare_scan, shape_labels
-from segslam.registration.trial import Gate, Stopwatch, anywhere
+from segslam.registration.stopwatch import Stopwatch
+from segslam.registration.trial import Gate, anywhere
 
 __all__ = [
     "Gate",

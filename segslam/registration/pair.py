@@ -10,12 +10,12 @@ from segslam.config import Config
 from segslam.registration.hypotheses import coarse_poses
 from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
 from segslam.registration.rivals import SPARSE_MARGIN, Searched, sparsely_refined, unless_ambiguous
+from segslam.registration.stopwatch import Stopwatch
 from segslam.registration.trial import (
     EQUAL_M,
     EQUAL_RAD,
     Found,
     Gate,
-    Stopwatch,
     Trial,
     anywhere,
     is_near,

@@ -1,16 +1,14 @@
 """One pose between two scans: refined with few points, then with all, and verified by all gates."""
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import lru_cache
-from threading import Lock
-from time import perf_counter
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from segslam import geometry, refinement
 from segslam.config import Config, RefineConfig
 from segslam.registration.prepared import PreparedScan
+from segslam.registration.stopwatch import Stopwatch
 from segslam.types import Alignment, Direction, Points, Registration, Rejected, RejectReason, Transform
 from segslam.verification import gates
 
@@ -43,31 +41,6 @@ class Gate(Protocol):
 def anywhere(T_target_source: Transform, *, slack_m: float) -> Rejected | None:
     """The gate of scans without prior knowledge."""
     return None
-
-
-_ADDING = Lock()
-"""Held while a stopwatch is changed. All share it: a stopwatch itself can be sent to another process."""
-
-
-class Stopwatch:
-    """Seconds spent in each stage, summed over all calls and threads."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Context manager that adds the time within it to this stage."""
-        started = perf_counter()
-        try:
-            yield
-        finally:
-            self.add(stage, perf_counter() - started)
-
-    def add(self, stage: str, seconds: float) -> None:
-        """Add a time measured elsewhere (s)."""
-        with _ADDING:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
 
 class FewPoints(NamedTuple):
@@ -113,7 +86,7 @@ class Trial(NamedTuple):
 
         Takes a fifth of the time of a refinement with all points, which most wrong hypotheses do not need.
         """
-        rejected = self.early_rejection(coarse)
+        rejected = self.rejection_of_coarse(coarse)
         if rejected is not None:
             return rejected
         few, target = few_points(self.source, self.config.refine), self.target.surface
@@ -150,7 +123,7 @@ class Trial(NamedTuple):
         with self.watch("verify"):
             return gates.early_rejection(*scans, T_target_source, self.limits, config=self.config.verify, factor=factor)
 
-    def early_rejection(self, coarse: Registration) -> Rejected | None:
+    def rejection_of_coarse(self, coarse: Registration) -> Rejected | None:
         """Rejects a hypothesis that cannot be refined to a possible pose."""
         config = self.config.verify
         if coarse.num_inliers < config.min_inliers:

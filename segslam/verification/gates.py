@@ -185,8 +185,8 @@ def mismatch_of_some(
     standing: Points, target: Surface, T_target_source: Transform, *, roughness_m: float, config: VerifyConfig
 ) -> float:
     """Mismatch of some standing points of the source. With all of them and both directions it is hardly smaller."""
-    overlap, rms_m, _ = _surface_agreement(standing, target, T_target_source, config)
-    return mismatch(overlap, rms_m / roughness_m)
+    overlap, _, _, to_plane_m = _paired(standing, target, T_target_source, config)
+    return mismatch(overlap, _rms_m(to_plane_m) / roughness_m)
 
 
 class Support(NamedTuple):
@@ -315,17 +315,28 @@ def rejection(found: Agreement, allowed: Limits) -> Rejected | None:
 def _surface_agreement(
     standing: Points, b: Surface, T_b_a: Transform, config: VerifyConfig
 ) -> tuple[float, float, float]:
-    """Overlap, residual and common residual of a's standing points within reach of b; no overlap where none is."""
+    """Overlap, residual and common residual of a's standing points."""
+    overlap, points, normals, to_plane_m = _paired(standing, b, T_b_a, config)
+    return overlap, _rms_m(to_plane_m), common_residual_m(points, normals, to_plane_m)
+
+
+def _paired(
+    standing: Points, b: Surface, T_b_a: Transform, config: VerifyConfig
+) -> tuple[float, Points, Points, Vector]:
+    """Overlap of a's standing points within reach of b's sensor (0 where none is), and the points near b's surface.
+
+    Of these the positions in b's frame, the normals of the surface, and the signed distances along them (m).
+    """
     moved = geometry.apply(T_b_a, standing)
     moved = moved[within_range(moved, 0.0, config.max_range_m)]
-    if not len(moved):
-        return 0.0, math.inf, 0.0
     rows, to_point_m = b.nearest(moved)
-    is_met = to_point_m < config.inlier_m
-    if not is_met.any():
-        return 0.0, math.inf, 0.0
-    met, rows = moved[is_met], rows[is_met]
+    is_near = to_point_m < config.inlier_m
+    points, rows = moved[is_near], rows[is_near]
     normals = b.normals[rows]
-    to_plane_m = np.einsum("ij,ij->i", met - b.points[rows], normals)
-    common_m = common_residual_m(met, normals, to_plane_m)
-    return len(met) / len(moved), float(np.sqrt(np.mean(to_plane_m**2))), common_m
+    to_plane_m = np.einsum("ij,ij->i", points - b.points[rows], normals)
+    return len(points) / max(len(moved), 1), points, normals, to_plane_m
+
+
+def _rms_m(distances_m: Vector) -> float:
+    """Root mean square; infinite for no distances."""
+    return float(np.sqrt(np.mean(distances_m**2))) if len(distances_m) else math.inf

@@ -1,7 +1,7 @@
 """Residuals that the points of a patch have in common.
 
-Noise differs from point to point and vanishes in the mean of a patch. At a wrong pose whole surfaces are displaced: the
-recess of one door lies where the wall is, however noisy the sensor.
+Noise differs from point to point and vanishes in the mean of a patch. At a wrong pose whole surfaces are displaced,
+however noisy the sensor: the recess of a door coincides with a wall.
 """
 
 import numpy as np

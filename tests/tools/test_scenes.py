@@ -110,9 +110,7 @@ def test_noise_does_not_hide_that_the_doors_are_elsewhere(source: tuple[int, int
     place = scenes.Place(SCENES["corridor"](2), "64", 0.1, 2, CONFIG)
     floor = NoiseFloor(overlap=0.89, residual_ratio=0.79, free_space_violation=0.0054)
     found = register_prepared(place.prepared(*source), place.prepared(*target), config=CONFIG, floor=floor)
-    if isinstance(found, Alignment):
-        T_true = geometry.inverse(place.pose(*target)) @ place.pose(*source)
-        assert geometry.distance(geometry.inverse(T_true) @ found.fine.T_target_source) < 0.5, found
+    assert isinstance(found, Rejected), found
 
 
 @pytest.mark.parametrize("noise_m", [0.03, 0.1])
@@ -153,13 +151,11 @@ def test_no_wrong_pose_is_accepted_and_correct_ones_are_kept(scene: str, sensor:
 @pytest.mark.parametrize("sensor", SENSORS)
 @pytest.mark.parametrize("scene", SCENES)
 def test_every_scene_and_sensor_holds(scene: str, sensor: str, noise_m: float) -> None:
-    """Two garages have the same pillars and walls; only their cars differ, as on two days in one garage."""
-    kept = 0.5 if sensor == "70 wide" else 0.85
-    _check(scene, sensor, noise_m, count=20, kept=kept, most_false=2 if scene == "garage" else 0)
+    _check(scene, sensor, noise_m, count=20, kept=0.85)
 
 
-def _check(scene: str, sensor: str, noise_m: float, *, count: int, kept: float, most_false: int = 0) -> None:
+def _check(scene: str, sensor: str, noise_m: float, *, count: int, kept: float) -> None:
     row = scenes.bench(scene, sensor, noise_m, count=count, seed=2, config=CONFIG)
-    assert int(str(row["false_accepted"])) <= most_false, row
+    assert row["false_accepted"] == 0, row
     assert row["accepted_wrong"] == 0, row
     assert row["kept"] >= kept * row["overlapping"], row

@@ -32,7 +32,7 @@ def test_the_signs_of_the_normals_do_not_matter() -> None:
 
 
 def test_two_sides_of_a_corner_are_two_patches() -> None:
-    """A scan turned against a corner lies before one wall and behind the other."""
+    """A scan rotated relative to a corner is in front of one wall and behind the other."""
     side = np.column_stack([WALL[:, 1] - 1.0, np.full(len(WALL), 6.0), WALL[:, 2]])
     points, normals = np.vstack([WALL, side]), np.vstack([TOWARDS, np.tile([0.0, -1.0, 0.0], (len(side), 1))])
     residuals_m = np.concatenate([np.full(len(WALL), 0.2), np.full(len(side), -0.2)])

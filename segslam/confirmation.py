@@ -41,7 +41,7 @@ class Confirmation:
     def is_waiting(self, keyframe_id: int) -> bool:
         """True if this keyframe may confirm an earlier registration."""
         at_m = self._graph.travel_m[keyframe_id]
-        self._waiting = [one for one in self._waiting if at_m - self._travel_m(one) <= WAITING_M]
+        self._waiting = [one for one in self._waiting if abs(at_m - self._travel_m(one)) <= WAITING_M]
         return bool(self._waiting)
 
     def attempts(
@@ -57,7 +57,7 @@ class Confirmation:
         sources = {one.closure.source_id for one in consistent} - {closure.source_id}
         if (
             len(sources) + 1 < MIN_CONSISTENT
-            or self._travel_m(newest) - min(self._travel_m(one) for one in consistent) < MIN_SPREAD_M
+            or max(abs(self._travel_m(newest) - self._travel_m(one)) for one in consistent) < MIN_SPREAD_M
         ):
             self._waiting.append(newest)
             shown = f"{len(sources)} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
@@ -75,7 +75,7 @@ class Confirmation:
         T_a_b = geometry.inverse(T_world[a.target_id] @ a.T_target_source) @ T_world[b.target_id] @ b.T_target_source
         T_odom = geometry.inverse(self._T_odom(a.source_id)) @ self._T_odom(b.source_id)
         apart = geometry.inverse(T_odom) @ T_a_b
-        within_m = SAME_M + SAME_SHARE * (self._travel_m(later) - self._travel_m(earlier))
+        within_m = SAME_M + SAME_SHARE * abs(self._travel_m(later) - self._travel_m(earlier))
         return geometry.distance(apart) <= within_m and geometry.angle(apart) <= SAME_RAD
 
     def _travel_m(self, one: Unconfirmed) -> float:

@@ -17,6 +17,12 @@ class BadScan(SegslamError):
     """A scan that cannot be used; other scans are not affected. Report it, skip it, count it."""
 
 
+def brief(text: str, num_characters: int = 80) -> str:
+    """The text on one line, cut to a length that a person reads."""
+    text = " ".join(text[: 4 * num_characters].split())
+    return text if len(text) <= num_characters else f"{text[:num_characters]}..."
+
+
 def reason(error: OSError) -> str:
     """Short reason of an error; NumPy's errors have no `strerror`, and give item counts if the disk is full."""
     if error.strerror is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):

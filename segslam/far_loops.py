@@ -61,12 +61,12 @@ class FarLoops:
     def add(self, keyframe_id: int, signature: PlaceSignature) -> None:
         """Add the newest keyframe."""
         self._places.add(keyframe_id, signature)
-        self._signatures = {keyframe_id: signature}
+        self._signatures[keyframe_id] = signature
 
     def attempt(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        """Try the place most similar to that of the newest keyframe; closures follow once enough others confirm it."""
+        """Try the place most similar to that of a keyframe, once; closures follow once enough others confirm it."""
         with watch("propose"):
-            candidate = self._candidate(keyframe_id)
+            candidate = self._candidate(keyframe_id, self._signatures[keyframe_id])
         if candidate is None:
             return ()
         own = Stopwatch()
@@ -88,15 +88,14 @@ class FarLoops:
         closure = LoopClosure.of(keyframe_id, candidate.target_id, found.alignment)
         return self._confirmation.attempts(candidate, closure, own.seconds)
 
-    def _candidate(self, keyframe_id: int) -> LoopCandidate | None:
+    def _candidate(self, keyframe_id: int, signature: PlaceSignature) -> LoopCandidate | None:
         """The most similar older place within the largest drift; None if only the search by distance may try it."""
         travel_m = self._graph.travel_m
-        if not self._confirmation.is_waiting(keyframe_id) and travel_m[keyframe_id] - self._rejected_m < RETRY_M:
+        if not self._confirmation.is_waiting(keyframe_id) and abs(travel_m[keyframe_id] - self._rejected_m) < RETRY_M:
             return None
         num_old = int(
             np.searchsorted(travel_m, travel_m[keyframe_id] - self._config.proximity.min_travel_m, side="right")
         )
-        signature = self._signatures[keyframe_id]
         listed = self._places.shortlist(signature, most=NUM_LISTED, below_id=min(num_old, keyframe_id))
         candidates = [self._candidate_at(keyframe_id, one.place_id) for one in listed if one.score >= MIN_SCORE]
         return next(

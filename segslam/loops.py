@@ -47,7 +47,8 @@ class LoopCloser:
         self._confirmation = Confirmation(graph, lambda number: self.submaps.T_odom[number])
         self._far = FarLoops(config, graph, self._prepared, self._floor.at, self._confirmation)
         self._tried: set[tuple[int, int]] = set()
-        self._is_finished = False
+        self._unsearched: set[int] = set()
+        """Keyframes for which no loop was searched when they were added, because the machine was too slow."""
 
     def add(
         self, T_odom_keyframe: Transform, *, labelled_by_shape: bool, recorded: bytes | None = None
@@ -57,6 +58,7 @@ class LoopCloser:
         `recorded`: this signature, if it is known from a log.
         """
         newest_id = len(self.submaps.T_odom)
+        self._unsearched.add(newest_id)
         self.submaps.add(T_odom_keyframe, labelled_by_shape=labelled_by_shape)
         if not self._config.retrieval.enabled:
             return None
@@ -80,8 +82,9 @@ class LoopCloser:
             )
         new = [c for c in candidates if (c.source_id, c.target_id) not in self._tried]
         near = self._tried_in_turn(new, watch, is_known=below is not None)
-        is_newest = below is None and keyframe_id == len(self.submaps.T_odom) - 1 and not self._is_finished
-        return (*near, *self._far_loops(keyframe_id, watch)) if is_newest and not _has_closure(near) else near
+        is_first_time = below is None and keyframe_id in self._unsearched
+        self._unsearched.discard(keyframe_id)
+        return (*near, *self._far_loops(keyframe_id, watch)) if is_first_time and not _has_closure(near) else near
 
     def note_estimate(self, weights: dict[tuple[int, int], float]) -> None:
         """Note the result of an optimisation: closures with weight shorten the chains between keyframes."""
@@ -92,7 +95,6 @@ class LoopCloser:
 
         No further keyframe is started after `end_s`, by time.monotonic.
         """
-        self._is_finished = True
         most = max(LEAST_AGAIN, int(MOST_AGAIN * len(self._tried)))
         for keyframe_id in range(len(self.submaps.T_odom)):
             for attempt in self.attempt(keyframe_id, watch):
@@ -109,7 +111,7 @@ class LoopCloser:
         closures = [attempt.outcome for attempt in attempts if isinstance(attempt.outcome, LoopClosure)]
         if closures:
             self._graph.weigh_odometry_by(closures[-1])
-        self.take(attempts)
+        self._take(attempts)
         return attempts
 
     def _tried_in_turn(
@@ -118,11 +120,15 @@ class LoopCloser:
         attempts = tuple(
             attempt for candidate in candidates for attempt in self._attempts(candidate, watch, is_known=is_known)
         )
-        self.take(attempts)
+        self._take(attempts)
         return attempts
 
     def take(self, attempts: tuple[LoopAttempt, ...]) -> None:
-        """Add loops tried in an earlier run to the graph; they are not tried again."""
+        """Add the loops of the newest keyframe that were tried in an earlier run; they are not tried again."""
+        self._unsearched.discard(len(self.submaps.T_odom) - 1)
+        self._take(attempts)
+
+    def _take(self, attempts: tuple[LoopAttempt, ...]) -> None:
         for attempt in attempts:
             self._tried.add((attempt.candidate.source_id, attempt.candidate.target_id))
             if isinstance(attempt.outcome, LoopClosure):

@@ -7,7 +7,7 @@ import numpy as np
 
 from segslam.config import Config, load_config
 from segslam.datasets import Dataset
-from segslam.points import voxel_first
+from segslam.points import voxel_first, within_range
 from segslam.types import BadScan
 
 Preset = Literal["driving", "campus", "indoor"]
@@ -30,6 +30,8 @@ LARGEST_M = MappingProxyType[Preset, float]({"indoor": 12.0, "campus": 17.0})
 """Chosen: largest `extent_m` of such an environment. Measured: office 7 m, courtyard 10 m, NCLT 14 m, KITTI 00 20 m,
 and 23 to 30 m along the simulated 06."""
 VOXEL_M = 0.5
+FARTHEST_M = Config().odometry.max_range_m
+"""Points beyond the sensor's range, which is that of the odometry by default, are no surfaces."""
 NUM_SCANS = 9
 """Chosen: number of scans examined, spread over the recording; about 20 ms each."""
 SEQUENTIAL_SCANS = 80
@@ -58,6 +60,7 @@ def extent_m(scans: Dataset) -> float | None:
     for row in np.unique(np.linspace(0, last - 1, NUM_SCANS).astype(int)).tolist():
         try:
             points = scans[row].points
+            points = points[within_range(points, 0.0, FARTHEST_M)]
         except BadScan:
             continue  # reported when the scan is mapped
         distance_m = np.linalg.norm(points[voxel_first(points, VOXEL_M), :2], axis=1)

@@ -192,7 +192,7 @@ def refine(
         num_correspondences=len(source),
         num_inliers=int(result.num_inliers),
         rms_m=float(np.sqrt(np.mean(paired**2))),
-        information=_information((result.H + result.H.T) / 2 * config.information_scale, config),
+        information=limited_information((result.H + result.H.T) / 2 * config.information_scale, config=config),
     )
 
 
@@ -247,8 +247,11 @@ def weakest_level(information: Information) -> Direction:
     return np.array([*np.linalg.eigh(covariance)[1][:, 1], 0.0])
 
 
-def _information(hessian: Information, config: RefineConfig) -> Information:
-    """The information with the noise common to all points, without spurious information along smooth surfaces."""
+def limited_information(hessian: Information, *, config: RefineConfig) -> Information:
+    """The information of a scaled Hessian with the noise common to all points.
+
+    It has no spurious information along smooth surfaces.
+    """
     information = geometry.with_noise(
         hessian, rotation_rad=math.radians(config.shared_noise_deg), translation_m=config.shared_noise_m
     )

@@ -11,17 +11,16 @@ from time import monotonic
 
 import numpy as np
 
+from segslam.adjustment import Adjusted, Progress, adjust, no_progress
 from segslam.config import Config
-from segslam.health import information_of
 from segslam.keyframes import Clouds, CloudStore, downsample_keyframe
 from segslam.loops import ROUNDS, LoopCloser
-from segslam.odometry import Odometry, OdometryResult
+from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
+from segslam.odometry import Tracked as Tracked
 from segslam.pose_graph import Graph, PoseGraph
 from segslam.registration import Labeller, Stopwatch, shape_labels
 from segslam.semantics.late import computed
 from segslam.slam_result import SlamResult as SlamResult
-from segslam.tracker import Tracked as Tracked
-from segslam.tracker import Tracker
 from segslam.trajectory import corrected_poses
 from segslam.types import (
     GraphEstimate,
@@ -31,6 +30,7 @@ from segslam.types import (
     LoopClosure,
     Motion,
     MotionState,
+    Points,
     Scan,
     SegslamError,
     Step,
@@ -138,17 +138,19 @@ class Slam:
         """
         if self._steps:
             T_odom_lidar = np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps])
-            self._tracker.restore(T_odom_lidar, self._motions, self._stamps(), scan_of)
+            self._tracker.resume(T_odom_lidar, self._stamps(), scan_of)
 
-    def finish(self, *, search_s: float = math.inf) -> SlamResult:
+    def finish(self, *, search_s: float = math.inf, progress: Progress = no_progress) -> SlamResult:
         """Final optimisation; returns the pose of every scan. Raises ValueError before the first scan.
 
-        Loops are then searched again with the final poses, for at most `search_s` seconds.
+        Loops are then searched again with the final poses, for at most `search_s` seconds. The adjustment of the whole
+        map follows, with `progress`.
         """
         if not self._steps:
             raise ValueError("no scan was processed")
         self._is_finished = True
         estimate, late = self._settle(monotonic() + search_s)
+        adjusted = self._adjust(estimate, progress)
         odometry = Trajectory(
             scan_index=np.array([index for index, _, _ in self._steps]),
             stamp_ns=self._stamps(),
@@ -163,7 +165,26 @@ class Slam:
         )
         trajectory = replace(odometry, T_world_lidar=T_world_lidar)
         attempts = (*self._attempts, *late)
-        return SlamResult(trajectory, odometry, estimate, rows, attempts, tuple(self._motions), len(late))
+        return SlamResult(
+            trajectory,
+            odometry,
+            estimate if adjusted is None else adjusted.after,
+            rows,
+            attempts,
+            tuple(self._motions),
+            len(late),
+            adjusted=adjusted,
+        )
+
+    def _adjust(self, estimate: GraphEstimate, progress: Progress) -> Adjusted | None:
+        """The adjustment of the whole map; None if it is off, or for a graph in the frame of an existing map."""
+        if not isinstance(self.graph, PoseGraph):
+            return None
+
+        def points_of(keyframe_id: int) -> Points:
+            return self._clouds.cloud(keyframe_id)[0]
+
+        return adjust(self.graph, estimate, points_of, config=self.config, progress=progress)
 
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         """The final estimate, after a second search for loops with better poses; and the attempts of that search.
@@ -173,6 +194,8 @@ class Slam:
         late: list[LoopAttempt] = []
         estimate = self.graph.finish()
         for _ in range(ROUNDS):
+            if monotonic() >= end_s:
+                break
             self._loops.note_estimate(estimate.closure_weights)
             found = list(self._loops.search_again(Stopwatch(), end_s=end_s))
             late += found

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from segslam.adjustment import Adjusted
 from segslam.evaluation import align_positions, trajectory_metrics
 from segslam.system.short_repr import Record
 from segslam.trajectory import Poses, camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
@@ -39,6 +40,7 @@ class SlamResult(Record):
     keyframe_rows: Indices
     """Row of each keyframe, by id, in the two trajectories."""
     attempts: tuple[LoopAttempt, ...]
+    """The last attempt for each pair of keyframes: a loop that waited for confirmation was tried before."""
     motions: tuple[Motion, ...] = ()
     """Check of each scan's motion, one per row of the trajectories; empty for logs of older versions."""
     num_late_attempts: int = 0
@@ -46,6 +48,18 @@ class SlamResult(Record):
     from_map_m: Vector | None = None
     """For a drive localised in an existing map: travel from each scan to the nearest keyframe placed in the map,
     infinite across a break. None without such a map."""
+
+    adjusted: Adjusted | None = None
+    """The adjustment of the whole map, which led to `estimate`; None if there was none, or if the run was read from
+    files."""
+
+    def __post_init__(self) -> None:
+        """Keep the last attempt for each pair."""
+        last = {(one.candidate.source_id, one.candidate.target_id): row for row, one in enumerate(self.attempts)}
+        rows = sorted(last.values())
+        first_late = len(self.attempts) - self.num_late_attempts
+        object.__setattr__(self, "num_late_attempts", sum(row >= first_late for row in rows))
+        object.__setattr__(self, "attempts", tuple(self.attempts[row] for row in rows))
 
     def localised(self) -> Mask:
         """(n,) True for scans near enough to a keyframe placed in the map; True for all scans without such a map."""

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam import geometry
+from segslam.errors import brief
 from segslam.types import IndexPairs, Indices, Mask, SegslamError, Transform
 
 Poses = Float[np.ndarray, "_ 4 4"]
@@ -74,9 +75,9 @@ def nanoseconds(seconds: str) -> int:
     try:
         stamp_ns = int(Decimal(seconds).scaleb(9).to_integral_value())
     except (ArithmeticError, ValueError) as error:
-        raise ValueError(f"{seconds} is not a time in seconds") from error
+        raise ValueError(f"{brief(seconds)} is not a time in seconds") from error
     if abs(stamp_ns) >= 2**63:
-        raise ValueError(f"{seconds} s are more than 292 years")
+        raise ValueError(f"{brief(seconds)} s are more than 292 years")
     return stamp_ns
 
 
@@ -195,9 +196,11 @@ def _numbers(path: Path, number: int, fields: list[str], format: PoseFormat) -> 
     try:
         values = [float(field) for field in fields]
     except ValueError as error:
-        raise SegslamError(f"{path}:{number}: {error}; {LAYOUT[format]}: correct or remove the line") from error
+        raise SegslamError(
+            f"{path}:{number}: {brief(str(error))}; {LAYOUT[format]}: correct or remove the line"
+        ) from error
     if not np.isfinite(values).all():
-        raise SegslamError(f"{path}:{number}: {' '.join(fields)}: every number must be finite")
+        raise SegslamError(f"{path}:{number}: {brief(' '.join(fields))}: every number must be finite")
     return values
 
 

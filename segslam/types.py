@@ -165,9 +165,9 @@ class MotionState(StrEnum):
     REPAIRED = "repaired"
     """Replaced by a registration: the motion of the odometry was off by more than the tolerance."""
     REJOINED = "rejoined"
-    """Registered with the scans before a break. The motion since the scan before, which is at a guess, is unknown."""
+    """Registered with the scans before a break; only in logs of earlier versions."""
     BROKEN = "broken"
-    """A break: the motion is a guess that no scan supports."""
+    """A break: the standard deviation of the motion is above a metre; its mean is the most likely one."""
     BEGUN = "begun"
     """First scan of another session of a merged run: its motion from the scan before is unknown."""
 
@@ -184,12 +184,14 @@ class Motion(Record):
     """Share of the scan that lies on earlier scans, at the registered pose."""
     rms_m: float | None = None
     information: Information | None = None
-    """Information of the motion; None if the noise model of the odometry holds."""
+    """Information of the motion in the graph; None if the noise model of the odometry holds."""
+    covariance: Information | None = None
+    """(6, 6) of the motion since the scan before, tangent in the scan's frame; None if it was not checked."""
 
     @property
     def is_break(self) -> bool:
-        """True if the pose is a guess that no scan supports."""
-        return self.state is MotionState.BEGUN or (self.state is MotionState.BROKEN and self.overlap is None)
+        """True if the motion is almost unknown."""
+        return self.state in (MotionState.BEGUN, MotionState.BROKEN)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from helpers.drives import drifting, round_drive
 
 from segslam import geometry
@@ -11,21 +12,50 @@ from segslam.config import OdometryConfig, load_config
 from segslam.odometry import GivenOdometry, OdometryResult
 from segslam.slam import Slam
 from segslam.slam_result import SlamResult
-from segslam.types import LoopClosure, Motion, MotionState, Rejected, RejectReason, Scan, Trajectory
+from segslam.types import LoopAttempt, LoopClosure, Motion, MotionState, Rejected, RejectReason, Scan, Trajectory
 
 FAR_DEG = 1.0
 """20 m off after a round of 113 m."""
 
 
-@cache
 def mapped(turn_deg: float, *settings: str) -> SlamResult:
     """The drive with an odometry that turns too far, by so much in each step of 2.2 m."""
+    return mapped_and_tried(turn_deg, *settings)[0]
+
+
+@cache
+def mapped_and_tried(turn_deg: float, *settings: str, tries_loops: bool = True) -> tuple[SlamResult, list[LoopAttempt]]:
+    """The same with the attempts as they came; without `tries_loops` they come at the end only."""
     config = load_config(None, ["health.check=false", *settings])
     odometry = drifting(round_drive()[1], turn_deg=turn_deg)
     slam = Slam(config, odometry=GivenOdometry(odometry, config.odometry))
+    tried: list[LoopAttempt] = []
     for scan in round_drive()[0]:
-        slam.process(scan)
-    return slam.finish()
+        tried += slam.close_loops(slam.track(scan), tries_loops=tries_loops).attempts
+    return slam.finish(), tried
+
+
+@pytest.mark.slow
+def test_keyframes_that_were_skipped_are_searched_by_appearance_at_the_end() -> None:
+    result, tried = mapped_and_tried(FAR_DEG, tries_loops=False)
+    assert tried == []
+    assert len(result.closures()) >= 3
+    assert result.errors(round_drive()[1])["ate_m"] < 0.6
+
+
+def test_each_pair_has_the_last_of_its_outcomes() -> None:
+    result, tried = mapped_and_tried(FAR_DEG)
+    pairs = [(one.candidate.source_id, one.candidate.target_id) for one in result.attempts]
+    assert len(pairs) == len(set(pairs)) < len(tried)
+    closed = {(one.source_id, one.target_id) for one in result.closures()}
+    waited = {
+        (one.candidate.source_id, one.candidate.target_id)
+        for one in tried
+        if isinstance(one.outcome, Rejected) and one.outcome.reason is RejectReason.UNCONFIRMED
+    }
+    assert closed & waited
+    late = result.attempts[len(result.attempts) - result.num_late_attempts :]
+    assert {(one.candidate.source_id, one.candidate.target_id) for one in late} <= set(pairs)
 
 
 def test_a_drive_whose_odometry_is_far_off_closes_by_place_recognition() -> None:
@@ -44,8 +74,8 @@ def test_a_drive_whose_odometry_is_far_off_closes_by_place_recognition() -> None
 
 
 def test_one_keyframe_alone_closes_no_far_loop() -> None:
-    result = mapped(FAR_DEG)
-    outcomes = [attempt.outcome for attempt in result.attempts if attempt.candidate.search_radius_m > 20.0]
+    _, tried = mapped_and_tried(FAR_DEG)
+    outcomes = [attempt.outcome for attempt in tried if attempt.candidate.search_radius_m > 20.0]
     first_closure = next(k for k, outcome in enumerate(outcomes) if isinstance(outcome, LoopClosure))
     unconfirmed = [
         outcome
@@ -82,7 +112,7 @@ BEFORE, AFTER = 30, 55
 
 
 @cache
-def carried() -> SlamResult:
+def carried() -> tuple[SlamResult, list[LoopAttempt]]:
     """The drive of a sensor that is carried."""
     scans, truth = round_drive()
     before, after = BEFORE, AFTER
@@ -93,13 +123,12 @@ def carried() -> SlamResult:
     config = load_config(None, ["health.check=false"])
     given = Carried(replace(odometry, T_world_lidar=T_odom), config.odometry, first_after=after)
     slam = Slam(config, odometry=given)
-    for number in kept:
-        slam.process(scans[number])
-    return slam.finish()
+    tried = [attempt for number in kept for attempt in slam.process(scans[number]).attempts]
+    return slam.finish(), tried
 
 
 def test_a_sensor_that_was_carried_to_an_older_place_is_found_there() -> None:
-    result, truth = carried(), round_drive()[1]
+    (result, _), truth = carried(), round_drive()[1]
     assert [motion.is_break for motion in result.motions].index(True) == BEFORE
     assert len(result.closures()) >= 3
     off_m = np.linalg.norm(result.trajectory.T_world_lidar[BEFORE:, :3, 3] - _from_first(truth)[AFTER:], axis=1)
@@ -107,10 +136,10 @@ def test_a_sensor_that_was_carried_to_an_older_place_is_found_there() -> None:
 
 
 def test_a_loop_across_a_break_waits_for_two_others() -> None:
-    result = carried()
+    result, tried = carried()
     across = [
         attempt.outcome
-        for attempt in result.attempts
+        for attempt in tried
         if result.keyframe_rows[attempt.candidate.source_id]
         >= BEFORE
         > result.keyframe_rows[attempt.candidate.target_id]

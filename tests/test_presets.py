@@ -32,6 +32,15 @@ def test_extent_is_the_distance_of_the_surfaces_however_many_points_are_near(tmp
     assert extent_m(open_dataset(folder)) == pytest.approx(distance_m, abs=0.6)
 
 
+@pytest.mark.parametrize("wild", [1e18, 3.4e38, 1e5])
+def test_one_wild_point_does_not_change_the_extent(tmp_path: Path, wild: float) -> None:
+    folder = write_ring(tmp_path / "scans", 6.0)
+    expected = extent_m(open_dataset(folder))
+    with (folder / "000001.bin").open("ab") as stream:
+        stream.write(np.array([wild, 3, 1, 0], np.float32).tobytes())
+    assert extent_m(open_dataset(folder)) == expected
+
+
 def test_an_unusable_scan_is_left_out(tmp_path: Path) -> None:
     folder = write_ring(tmp_path / "scans", 6.0, num_scans=1)
     (folder / "000001.bin").write_bytes(b"")

@@ -10,8 +10,7 @@ from helpers.commands import run
 from segslam.config import Config
 from segslam.datasets import open_dataset
 from segslam.evaluation import trajectory_metrics
-from segslam.health import CheckedOdometry
-from segslam.odometry import KissOdometry
+from segslam.odometry import CheckedOdometry, KissOdometry
 from segslam.registration import register
 from segslam.run.finished import read_run
 

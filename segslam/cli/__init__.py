@@ -1,6 +1,7 @@
 """The command line: one file per command. Only this package prints. Commands import large libraries when they run."""
 
 import errno
+import io
 import logging
 import os
 import sys
@@ -45,7 +46,7 @@ def _segslam(
 def main(arguments: list[str] | None = None) -> None:
     """Run a command, by default that of the command line, and exit.
 
-    Exit status: 0 success, 1 no pose found, 2 wrong usage, bad input or full disk, 130 interrupted by Ctrl-C.
+    Exit status: 0 success, 1 no pose found, 2 wrong usage, bad input or full disk, 130 stopped by Ctrl-C or SIGTERM.
     """
     with ctrl_c_in_order():
         sys.exit(_status(arguments))
@@ -59,8 +60,11 @@ def _status(arguments: list[str] | None) -> int:
     warnings = FirstOfEachKind()
     logging.basicConfig(level=logging.WARNING, handlers=[warnings])
     commands.add_all(app)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be unprintable
     try:
-        app(arguments, prog_name="segslam")
+        given = sys.argv[1:] if arguments is None else arguments
+        app([_with_home(argument) for argument in given], prog_name="segslam")
     except SystemExit as ended:
         status = ended.code if isinstance(ended.code, int) else 0
         if status == EXIT_STATUS:
@@ -73,6 +77,20 @@ def _status(arguments: list[str] | None) -> int:
     finally:
         warnings.print_counts()
     return _flushed(BAD_INPUT)
+
+
+def _with_home(argument: str) -> str:
+    """The argument with the home folder in place of `~`, also behind `--option=`, where a shell leaves it.
+
+    Raises SegslamError for an unknown user.
+    """
+    option, equals, value = argument.rpartition("=") if argument.startswith("--") else ("", "", argument)
+    if not value.startswith("~"):
+        return argument
+    expanded = os.path.expanduser(value)  # the function of Path raises RuntimeError
+    if expanded == value:
+        raise SegslamError(f"{argument}: there is no such user; for a file of this name: ./{value}")
+    return f"{option}{equals}{expanded}"
 
 
 def _of_file(error: OSError) -> str:

@@ -19,6 +19,16 @@ def check_exists(path: Path, hint: str) -> None:
         raise SegslamError(f"{path}: no such file or folder; {hint}")
 
 
+def check_links(folder: Path) -> None:
+    """Raises SegslamError if a file in the folder of a run is a link to outside: writing it would write there."""
+    if not folder.is_dir():
+        return
+    inside = folder.resolve()
+    for file in folder.iterdir():
+        if file.is_symlink() and inside not in file.resolve().parents:
+            raise SegslamError(f"{file}: a link to {file.resolve()}, outside of the run; remove the link")
+
+
 def check_intensities(scans: "Dataset") -> None:
     """Raises SegslamError if the first readable scan has no intensities."""
     from segslam.errors import BadScan
@@ -35,6 +45,7 @@ def log_to_resume(folder: Path) -> "RunLog":
     from segslam.log import is_being_written, read_log
     from segslam.run.folder import LOG
 
+    check_links(folder)
     log = folder / LOG
     if not log.is_file():
         raise SegslamError(
@@ -53,10 +64,12 @@ def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options:
         raise SegslamError(
             f"{key}: {now} now, but {recorded.path} was started with {before}; a resumed run keeps its settings"
         )
-    began = {"data set": recorded.run["dataset"]} | {f"--{name}": value for name, value in recorded.options.items()}
+    began = {"data set": recorded.run.get("dataset", "")} | {
+        f"--{name}": value for name, value in recorded.options.items()
+    }
     given = {"data set": dataset} | {f"--{name}": value for name, value in options.items()}
     for name in given:
-        if began.get(name) != given[name]:
+        if began.get(name, "") != given[name]:
             raise SegslamError(
                 f"{name}: {given[name] or 'none'} now, but {recorded.path} was started with {began.get(name) or 'none'}"
                 "; give the same value to resume it"

@@ -17,6 +17,7 @@ from segslam.cli import (
     map,
     merge,
     optimize,
+    refine,
     register,
     replay,
     report,
@@ -43,6 +44,7 @@ def add_all(app: typer.Typer) -> None:
     app.command("map")(map.map_command)
     app.command("merge")(merge.merge)
     app.command("optimize")(optimize.optimize)
+    app.command("refine")(refine.refine)
     app.command("register", cls=register.LabelsCommand)(register.register)
     app.command("replay")(replay.replay)
     app.command("report")(report.report)

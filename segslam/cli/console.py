@@ -4,6 +4,7 @@ import json
 import logging
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any, Literal, TypeVar
@@ -44,6 +45,15 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change one setting: section.key=value; may be repeated."),
 ]
+RefineMinutesOption = Annotated[
+    float | None,
+    typer.Option(
+        "--refine-minutes",
+        metavar="MINUTES",
+        help="Time limit of the adjustment of the whole map after the loops; 0: no adjustment.",
+        show_default="60",
+    ),
+]
 DatasetOption = Annotated[
     str | None,
     typer.Option("--dataset", help="Kind of data: kitti, or a reader of kiss-icp; detected by default."),
@@ -66,6 +76,12 @@ EncodingOption = Annotated[
 ]
 
 
+def with_minutes(settings: list[str] | None, refine_minutes: float | None) -> list[str]:
+    """The settings of `--set`, followed by that of `--refine-minutes`."""
+    minutes = [] if refine_minutes is None else [f"adjustment.max_minutes={refine_minutes}"]
+    return [*(settings or ()), *minutes]
+
+
 def print_json(values: dict[str, Any]) -> None:
     """Print one JSON object on standard output. Raises ValueError for NaN: callers must omit unknown figures."""
     print_out(json.dumps(values, allow_nan=False))
@@ -85,6 +101,15 @@ def say(text: str, *, quiet: bool = False) -> None:
     """Print a message on standard error; standard output is reserved for results."""
     if not quiet:
         print(text, file=sys.stderr)
+
+
+@contextmanager
+def how_to_go_on(line: str) -> Iterator[None]:
+    """Context manager that adds to the message of WorkFailed, for example of a full disk, how to continue."""
+    try:
+        yield
+    except WorkFailed as error:
+        raise WorkFailed(f"{error}; {line}") from error
 
 
 def announce(text: str, *, quiet: bool) -> None:

@@ -1,11 +1,12 @@
 """End of a mapped or replayed run: results, report, figures."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from segslam.cli.console import print_json, say
+from segslam.cli.console import print_json, progress, say
 from segslam.cli.export import map_summary, write_maps
 
 if TYPE_CHECKING:
@@ -31,12 +32,12 @@ def finish(
     from segslam.calibration import vertical_angle_advice
     from segslam.log import read_log
     from segslam.run.accuracy import accuracy
-    from segslam.run.folder import LOG, write_metrics
+    from segslam.run.folder import LOG, room_for, write_metrics
     from segslam.run.report import write_report
     from segslam.run.run import peak_rss_mb
 
     say("all scans read; final optimisation ...", quiet=quiet)
-    result, metrics = run.finish(search_s=search_s)
+    result, metrics = run.finish(search_s=search_s, progress=partial(_shown, quiet=quiet))
     if reference is not None:
         metrics |= accuracy(result, reference)
     metrics |= more(result)
@@ -48,7 +49,8 @@ def finish(
             metrics["peak_rss_mb"] = peak_rss_mb()
             write_metrics(run.folder, metrics)
     finally:
-        write_report(run.folder)  # before the map: its failure must not prevent the report
+        with room_for(run.folder):
+            write_report(run.folder)  # before the map: its failure must not prevent the report
     if json:
         print_json(metrics)
     else:
@@ -60,8 +62,26 @@ def finish(
     return metrics
 
 
+def _shown(items: Iterable[Any], total: int, title: str, *, quiet: bool) -> Iterator[Any]:
+    return progress(items, total=total, title=title, quiet=quiet)
+
+
 def _counted(number: int, thing: str) -> str:
     return f"{number} {thing}{'s' * (number != 1)}"
+
+
+def _adjustment(metrics: dict[str, Any]) -> str:
+    """A line about the adjustment of the whole map."""
+    line = (
+        f"whole map adjusted by {_counted(metrics['num_submap_pairs'], 'pair')} of submaps: keyframes moved by "
+        f"{metrics['adjustment_moved_m']:.2f} m (rms)"
+    )
+    if "map_thickness_m" in metrics and "map_thickness_before_m" in metrics:
+        before, after = (1000 * metrics[key] for key in ("map_thickness_before_m", "map_thickness_m"))
+        line += f"; thickness of surfaces {before:.0f} mm before, {after:.0f} mm after"
+    if "vertical_correction_deg" in metrics:
+        line += f"; points raised by {metrics['vertical_correction_deg']:.2f} degrees, the measured vertical angle"
+    return line
 
 
 def _after_repairs(metrics: dict[str, Any]) -> str:
@@ -89,6 +109,8 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
             f"odometry: {rejected_motions} motion{'s' * (rejected_motions != 1)} rejected by the optimiser: "
             "loops contradict the odometry there; see the report"
         )
+    if "adjustment_moved_m" in metrics:
+        lines.append(_adjustment(metrics))
     if "ate_m" in metrics:
         lines.append(
             f"error after alignment: {metrics['ate_m']:.3f} m, "

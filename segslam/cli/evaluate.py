@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from segslam.cli.checks import check_links
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ def _score_run(folder: Path, reference_file: Path | None, plot: Path | None, *, 
     from segslam.types import SegslamError
 
     folder = folder_of(folder)
+    check_links(folder)
     run = read_run(folder)
     reference = run.reference if reference_file is None else true_poses(reference_file, run)
     if reference is None:

@@ -92,7 +92,10 @@ def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
 
 
 def _placed(log: "RunLog", *, quiet: bool) -> "Iterator[tuple[Keyframe, Transform]]":
-    """Each keyframe with its final T_world_keyframe."""
+    """Each keyframe, its points corrected as in the adjustment of the run, with its final T_world_keyframe."""
+    from dataclasses import replace
+
+    from segslam.geometry import raise_beams
     from segslam.types import SegslamError
 
     result = log.result()
@@ -101,9 +104,17 @@ def _placed(log: "RunLog", *, quiet: bool) -> "Iterator[tuple[Keyframe, Transfor
             f"{log.path}: the run did not finish; run `segslam replay` on its log, or resume it with --resume"
         )
     estimate, _ = result
+    adjustment = log.adjustment()
+    raised_deg = 0.0 if adjustment is None else adjustment.correction_deg
+    num_gathered = 0
     for step in progress(log.steps(), total=log.num_steps(), title="gather", quiet=quiet):
         if step.keyframe is not None:
-            yield step.keyframe, estimate.T_world_keyframe[step.keyframe.id]
+            num_gathered += 1
+            points = raise_beams(step.keyframe.points, raised_deg)
+            yield replace(step.keyframe, points=points), estimate.T_world_keyframe[step.keyframe.id]
+    if num_gathered < len(estimate.T_world_keyframe):
+        readable = f"only {num_gathered} of its {len(estimate.T_world_keyframe)} keyframes are readable"
+        raise SegslamError(f"{log.path}: damaged, {readable}; the map is not written. Map the data again, or replay it")
 
 
 def _shown(parts: "Iterator[Any]", total: int, *, quiet: bool) -> "Iterator[Any]":

@@ -36,4 +36,6 @@ def serve_foxglove(address: str | None, stack: ExitStack, *, quiet: bool) -> "Fo
         raise SegslamError(f"--foxglove needs a package: {how_to_install('foxglove')}") from error
     server = stack.enter_context(FoxgloveServer(address))
     say(f"Foxglove: open connection to {server.url}", quiet=quiet)
+    if server.is_public:
+        say("Foxglove: there is no password; whoever reaches this address can read the run", quiet=quiet)
     return server

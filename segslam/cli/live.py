@@ -1,6 +1,7 @@
 """`segslam live`."""
 
 import json as json_text
+import shlex
 from collections.abc import Callable
 from contextlib import ExitStack
 from importlib.util import find_spec
@@ -12,7 +13,7 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import announce, say
+from segslam.cli.console import announce, how_to_go_on, say
 from segslam.cli.ending import finish
 from segslam.cli.foxglove import serve_foxglove
 from segslam.cli.live_status import LiveFigures, Status, too_slow
@@ -139,13 +140,14 @@ def map_live(
     from segslam.run.run import Run
     from segslam.slam import Slam
 
-    when_stopped(f"the log in {folder} is kept; make the results from it: segslam replay {folder} --out NEW")
+    go_on = f"make the results from the log: segslam replay {shlex.quote(str(folder))} --out NEW"
+    when_stopped(f"the log in {folder} is kept; {go_on}")
     slam = Slam(settings, labeller=labeller)
 
     def tell(text: str) -> None:
         say(text, quiet=quiet)
 
-    with ExitStack() as stack:
+    with how_to_go_on(go_on), ExitStack() as stack:
         mirror = server.send if server else None
         run = stack.enter_context(Run(folder, slam, dataset=source.name, options=options, mirror=mirror))
         publisher = _publisher(source, run, stack)
@@ -165,7 +167,7 @@ def map_live(
         for file in map_files:
             file.parent.mkdir(parents=True, exist_ok=True)
 
-        more = figures.metrics(ended)
+        more = figures.metrics(ended, num_restarts=front.num_restarts)
         finish(run, None, map_files=map_files, json=json, quiet=quiet, more=lambda _: more, search_s=FINAL_SEARCH_S)
         if advice := too_slow(more, settings.odometry.voxel_size_m):
             say(advice, quiet=quiet)

@@ -31,24 +31,25 @@ class LiveFigures:
 
     def note(self, placed: "Placed", *, lag_s: float, tries_loops: bool) -> None:
         """Record a scan that was mapped and logged."""
-        from segslam.tracker import Tracked
+        from segslam.odometry import Tracked
 
         self._latency_ms.append(1000 * placed.latency_s)
         self._lag_s.append(lag_s)
         is_keyframe = isinstance(placed.tracked, Tracked) and placed.tracked.registered is not None
         self._num_unsearched += is_keyframe and not tries_loops
-        self.num_dropped, self.num_missing = placed.num_dropped, placed.num_missing
+        self.num_dropped, self.num_missing = placed.num_dropped, placed.gaps.num_missing
 
-    def metrics(self, ended: "Ended") -> dict[str, Any]:
+    def metrics(self, ended: "Ended", *, num_restarts: int) -> dict[str, Any]:
         """The figures of `metrics.json` that only live runs have."""
         num_dropped = max(self.num_dropped, ended.num_dropped)
         return {
             "num_scans_arrived": ended.num_arrived or len(self._lag_s) + num_dropped,
             "num_scans_dropped": num_dropped,
-            "num_scans_missing": max(self.num_missing, ended.num_missing),
-            "num_gaps": ended.num_gaps,
-            "longest_gap_s": ended.longest_gap_s,
-            "num_clock_set_back": ended.num_set_back,
+            "num_scans_missing": max(self.num_missing, ended.gaps.num_missing),
+            "num_gaps": ended.gaps.num_gaps,
+            "longest_gap_s": ended.gaps.longest_gap_s,
+            "num_clock_set_back": ended.gaps.num_set_back,
+            "num_restarts": num_restarts,
             "num_keyframes_unsearched": self._num_unsearched,
             "latency_ms": _spread(self._latency_ms),
             "loop_lag_s": _spread(self._lag_s),
@@ -71,9 +72,9 @@ class LiveFigures:
 
 
 def too_slow(metrics: Mapping[str, Any], voxel_size_m: float) -> str:
-    """Advice after a run whose odometry dropped many scans; empty if it dropped few."""
+    """Advice after a run whose odometry dropped many scans; empty if it dropped few, or because a process died."""
     num_dropped, num_arrived = metrics["num_scans_dropped"], metrics["num_scans_arrived"]
-    if num_dropped <= MANY_DROPPED * num_arrived:
+    if num_dropped <= MANY_DROPPED * num_arrived or metrics.get("num_restarts"):
         return ""
     return (
         f"{num_dropped} of {num_arrived} scans were dropped because odometry took too long; "

@@ -39,19 +39,33 @@ def locate(
     announce(f"locate: reading {run}", quiet=quiet)
     from segslam.run.folder import folder_of
     from segslam.run.locator import Locator
+    from segslam.types import SegslamError
 
+    if dataset not in (None, "kitti"):
+        raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; omit the option for other data")
     locator = Locator.from_run(folder_of(run))
     compile_kernels(quiet=quiet)
     locator.floor()  # computed before the first scan is timed
-    clouds = (_read(scan, scans, dataset, labels, encoding, locator) for scan in scans)
+    num_bad = 0
     found = []
-    for points, classes in progress(clouds, total=len(scans), title="locate", quiet=quiet):
+    for scan in progress(scans, total=len(scans), title="locate", quiet=quiet):
         started = perf_counter()
-        found.append(_figures(locator.locate(points, classes)) | {"seconds": perf_counter() - started})
+        try:
+            points, classes = _read(scan, scans, dataset, labels, encoding, locator)
+        except SegslamError as error:
+            num_bad += 1
+            found.append(
+                _not_found("unreadable", str(error).partition("; ")[0]) | {"seconds": perf_counter() - started}
+            )
+        else:
+            started = perf_counter()
+            found.append(_figures(locator.locate(points, classes)) | {"seconds": perf_counter() - started})
     if json:
         print_out(dumps(found, allow_nan=False))
     else:
         _show(scans, found, quiet=quiet)
+    if num_bad:
+        raise SegslamError(f"{num_bad} of {len(scans)} scans cannot be read; copy the files again, or omit them")
     if not any(one["found"] for one in found):
         raise typer.Exit(1)
 
@@ -67,10 +81,7 @@ def _read(
     from segslam.datasets.scans import make_scan
     from segslam.semantics.label_files import encoding_of, read_labels
     from segslam.semantics.late import computed
-    from segslam.types import SegslamError
 
-    if dataset not in (None, "kitti"):
-        raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; omit the option for other data")
     angle_deg = locator.config.sensor.vertical_angle_deg
     if angle_deg is None:
         angle_deg = VERTICAL_ANGLE_DEG if dataset == "kitti" else 0.0
@@ -89,8 +100,7 @@ def _figures(found: "Located | Rejected") -> dict[str, Any]:
     from segslam.types import Rejected
 
     if isinstance(found, Rejected):
-        nothing = dict.fromkeys(("T_world_lidar", "keyframe", "inliers", "overlap"))
-        return {"found": False, **nothing, "reason": found.reason.value, "detail": found.detail}
+        return _not_found(found.reason.value, found.detail)
     return {
         "found": True,
         "T_world_lidar": found.T_world_lidar.ravel().tolist(),
@@ -100,6 +110,11 @@ def _figures(found: "Located | Rejected") -> dict[str, Any]:
         "reason": None,
         "detail": None,
     }
+
+
+def _not_found(reason: str, detail: str) -> dict[str, Any]:
+    nothing = dict.fromkeys(("T_world_lidar", "keyframe", "inliers", "overlap"))
+    return {"found": False, **nothing, "reason": reason, "detail": detail}
 
 
 def _show(scans: list[Path], found: list[dict[str, Any]], *, quiet: bool) -> None:

@@ -1,6 +1,5 @@
 """`segslam map`."""
 
-import json as json_text
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
@@ -12,7 +11,7 @@ import typer
 
 from segslam.cli.checks import check_exists, check_intensities, check_same, is_finished, log_to_resume
 from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import announce, print_json, print_out, progress, say
+from segslam.cli.console import announce, how_to_go_on, print_json, print_out, progress, say
 from segslam.cli.ending import finish
 from segslam.cli.export import map_summary, write_maps
 from segslam.cli.foxglove import serve_foxglove
@@ -33,6 +32,9 @@ if TYPE_CHECKING:
     from segslam.run.map_folder import SlamOf
     from segslam.run.run import Run
     from segslam.types import BadScan, Step
+
+FREE_OPTIONS = ("data", "dataset", "sequence", "map_files")
+"""Options in the log that may be others when the run is resumed, as long as the data is the same."""
 
 
 @with_options
@@ -74,30 +76,26 @@ def map_data(
     settings = output.load_config(base=recorded.config if recorded else None)
     announce(f"map: opening {data}" if in_map is None else f"localise: reading the map of {in_map}", quiet=quiet)
     slam_of = pipeline(in_map)
-    from segslam.run.map_folder import open_scans
+    from segslam.run.map_folder import open_scans, resume_options
 
     map_names, map_files = output.maps(folder)
     scans = open_scans(options.source(data), settings)
     if settings.map.color == "intensity":
         check_intensities(scans)
-    choices = ({"in_map": str(in_map.expanduser().resolve())} if in_map else {}) | options.choices()
-    given = given_odometry(options.odometry, scans, settings.odometry) if options.odometry else None
+    choices = resume_options(options.source(data), odometry=options.odometry, map_files=map_names)
+    choices |= {"in_map": str(in_map.expanduser().resolve())} if in_map else {}
     if recorded is None:
         settings = output.load_config(base=preset_config(options.preset, scans, quiet=quiet))
+    given = given_odometry(options.odometry, scans, settings.odometry) if options.odometry else None
     if dry_run:
         _show_dry_run(scans, settings, json=output.json, quiet=quiet)
         return
     if recorded is not None:
-        check_same(recorded, settings, dataset=scans.name, options=choices)
+        repeated = {name: value for name, value in choices.items() if name not in FREE_OPTIONS}
+        check_same(recorded, settings, dataset=scans.name, options=repeated)
         if is_finished(recorded, scans):
             _complete(recorded, map_files, config=settings.map, json=output.json, quiet=quiet)
             raise typer.Exit(0)
-    source = {
-        "data": str(data.expanduser().resolve()),
-        "dataset": options.dataset or "",
-        "sequence": options.sequence,
-        "map_files": json_text.dumps([str(name) for name in map_names]),
-    }
     scene = open_scene(None, view_every=settings.log.view_every) if output.view else None
     with ExitStack() as stack:
         server = serve_foxglove(output.foxglove, stack, quiet=quiet)
@@ -106,7 +104,7 @@ def map_data(
             folder,
             settings=settings,
             odometry=given,
-            options=choices | source,
+            options=choices,
             recorded=recorded,
             map_files=map_files,
             watch=scene.add if scene else _nobody,
@@ -208,6 +206,7 @@ def map_scans(
     when_stopped(f"the log in {folder} is kept; {go_on}")
     apart = OdometryApart(settings.odometry) if odometry is None else None
     with (
+        how_to_go_on(f"{go_on} when there is space"),
         apart or nullcontext(),
         Run(
             folder,

@@ -10,7 +10,17 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, progress, say
+from segslam.cli.console import (
+    ConfigOption,
+    JsonOption,
+    QuietOption,
+    RefineMinutesOption,
+    SetOption,
+    announce,
+    progress,
+    say,
+    with_minutes,
+)
 from segslam.cli.ending import finish
 from segslam.cli.export import WITH_MAP
 from segslam.cli.run_options import WithMapOption
@@ -26,6 +36,7 @@ def merge(
             "--same-reference", help="The true poses of all runs are in one frame: score the merged trajectory."
         ),
     ] = False,
+    refine_minutes: RefineMinutesOption = None,
     with_map: WithMapOption = False,
     config: ConfigOption = None,
     settings: SetOption = None,
@@ -46,14 +57,15 @@ def merge(
     from segslam.run.folder import check_new, new_folder
 
     check_new(out)
-    load_config(config, settings or ())  # reports a wrong setting before the logs are read
+    settings = with_minutes(settings, refine_minutes)
+    load_config(config, settings)  # reports a wrong setting before the logs are read
     announce(f"merge: reading {len(runs)} runs", quiet=quiet)
     from segslam.sessions.merge import plan, run_of
     from segslam.sessions.recorded import read_sessions
 
     sessions = read_sessions(runs)
     compile_kernels(quiet=quiet)
-    settings_now = load_config(config, settings or (), base=sessions[0].run.config)
+    settings_now = load_config(config, settings, base=sessions[0].run.config)
     merged = plan(sessions, config=settings_now, same_reference=same_reference, progress=partial(_shown, quiet=quiet))
     say(merged.summary(), quiet=quiet)
     folder = new_folder(out)

@@ -39,9 +39,12 @@ def optimize(
     if out.exists() and not force:
         raise SegslamError(f"--out {out}: exists; give another file, or replace it with --force")
     announce(f"optimize: reading {graph}", quiet=quiet)
-    from segslam.pose_graph import optimize_graph, read_g2o, write_g2o
+    from segslam.pose_graph import Unsolvable, optimize_graph, read_g2o, write_g2o
 
-    result = optimize_graph(read_g2o(graph), robust=robust)
+    try:
+        result = optimize_graph(read_g2o(graph), robust=robust)
+    except Unsolvable as error:
+        raise SegslamError(f"{graph}: {error}") from error
     with whole_file(out) as part:
         write_g2o(part, result.graph)
     if json:

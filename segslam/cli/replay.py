@@ -9,7 +9,16 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, progress
+from segslam.cli.console import (
+    ConfigOption,
+    JsonOption,
+    QuietOption,
+    RefineMinutesOption,
+    SetOption,
+    announce,
+    progress,
+    with_minutes,
+)
 from segslam.cli.ending import finish
 from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
 from segslam.cli.in_map import pipeline
@@ -30,6 +39,7 @@ def replay(
     out: Annotated[Path, typer.Option(help="New folder for the run.")],
     config: ConfigOption = None,
     settings: SetOption = None,
+    refine_minutes: RefineMinutesOption = None,
     foxglove: FoxgloveOption = None,
     json: JsonOption = False,
     quiet: QuietOption = False,
@@ -41,7 +51,8 @@ def replay(
     from segslam.config import load_config
 
     check_exists(log, "give a run folder, or its log.mcap")
-    load_config(config, settings or ())  # reports a wrong setting before the log is read
+    settings = with_minutes(settings, refine_minutes)
+    load_config(config, settings)  # reports a wrong setting before the log is read
     announce(f"replay: reading {log}", quiet=quiet)
     from segslam.log import read_log
     from segslam.run.folder import log_of, new_folder
@@ -49,8 +60,8 @@ def replay(
     from segslam.slam import Slam
 
     recorded = read_log(log_of(log))
-    settings_now = load_config(config, settings or (), base=recorded.config)
-    _check_settings(settings_now, recorded)
+    settings_now = load_config(config, settings, base=recorded.config)
+    check_settings(settings_now, recorded)
     reference = recorded.reference()
     in_map = recorded.options.get("in_map")
     slam_of = pipeline(Path(in_map) if in_map else None)
@@ -63,7 +74,7 @@ def replay(
             Run(
                 folder,
                 (slam_of or Slam)(settings_now),
-                dataset=recorded.run["dataset"],
+                dataset=recorded.run.get("dataset", ""),
                 T_camera_lidar=recorded.T_camera_lidar,
                 reference=reference,
                 options={"in_map": in_map} if in_map else {},
@@ -81,7 +92,7 @@ def replay(
         raise typer.Exit(EXIT_STATUS)
 
 
-def _check_settings(settings_now: "Config", recorded: "RunLog") -> None:
+def check_settings(settings_now: "Config", recorded: "RunLog") -> None:
     """Raises SegslamError for a change that would have no effect."""
     from segslam.config import changed_settings
     from segslam.types import SegslamError

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from segslam.cli.checks import check_links
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, say
 
 
@@ -21,6 +22,7 @@ def report(
     from segslam.run.folder import folder_of
     from segslam.run.report import write_report
 
+    check_links(folder_of(run))
     page = write_report(folder_of(run))
     if json:
         print_json({"report": str(page)})

@@ -14,8 +14,10 @@ from segslam.cli.console import (
     JsonOption,
     LabelsOption,
     QuietOption,
+    RefineMinutesOption,
     SequenceOption,
     SetOption,
+    with_minutes,
 )
 from segslam.cli.export import WITH_MAP
 from segslam.cli.foxglove import FoxgloveOption
@@ -59,6 +61,7 @@ class OutputOptions:
 
     config: ConfigOption = None
     settings: SetOption = None
+    refine_minutes: RefineMinutesOption = None
     with_map: WithMapOption = False
     map_file: MapFileOption = None
     view: ViewOption = False
@@ -70,7 +73,7 @@ class OutputOptions:
         """The settings. Raises SegslamError as `segslam.config.load_config`."""
         from segslam.config import load_config
 
-        return load_config(self.config, self.settings or (), base=base)
+        return load_config(self.config, with_minutes(self.settings, self.refine_minutes), base=base)
 
     def maps(self, folder: Path) -> tuple[list[Path], list[Path]]:
         """Map files as given, and as paths in the run folder. Raises SegslamError if one cannot be written."""
@@ -104,13 +107,3 @@ class RunOptions:
         from segslam.datasets import DataSource
 
         return DataSource(data, self.sequence, self.dataset, self.labels, self.encoding, self.frames, self.topic)
-
-    def choices(self) -> dict[str, str]:
-        """The options that a resumed run has to repeat, as the log keeps them."""
-        return {
-            "frames": self.frames or "",
-            "topic": self.topic,
-            "labels": self.labels,
-            "encoding": self.encoding or "",
-            "odometry": str(self.odometry.resolve()) if self.odometry else "",
-        }

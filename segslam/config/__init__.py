@@ -3,6 +3,7 @@
 from segslam.config.files import changed_settings, config_from_yaml, config_to_yaml, load_config
 from segslam.config.sections import (
     USER_SETTINGS,
+    AdjustmentConfig,
     Config,
     GeometricLabelsConfig,
     GraphConfig,
@@ -22,6 +23,7 @@ from segslam.config.sections import (
 
 __all__ = [
     "USER_SETTINGS",
+    "AdjustmentConfig",
     "Config",
     "GeometricLabelsConfig",
     "GraphConfig",

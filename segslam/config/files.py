@@ -9,11 +9,29 @@ import yaml
 from pydantic import ValidationError
 
 from segslam.config.sections import Config, Section
-from segslam.errors import SegslamError
+from segslam.config.yaml_text import parse_yaml, short
+from segslam.errors import SegslamError, brief
 
 logger = logging.getLogger(__name__)
 
-REMOVED = ("graph.systematic_drift",)
+REMOVED = (
+    "graph.systematic_drift",
+    *(
+        f"health.{name}"
+        for name in (
+            "tolerance_m",
+            "tolerance_deg",
+            "watch_scans",
+            "map_scans",
+            "map_spacing_m",
+            "map_spacing_deg",
+            "correspondence_m",
+            "inlier_m",
+            "min_overlap",
+            "max_rms",
+        )
+    ),
+)
 """Settings of older versions that are ignored with a warning, also in files and `--set`."""
 
 
@@ -27,14 +45,11 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base
         key, separator, value = text.partition("=")
         section, dot, name = key.strip().partition(".")
         if not separator or not dot or not name:
-            raise SegslamError(f"--set {text}: write section.key=value, for example keyframes.distance_m=1.5")
+            raise SegslamError(f"--set {brief(text)}: write section.key=value, for example keyframes.distance_m=1.5")
         section_values = values.setdefault(section, {})
         if not isinstance(section_values, dict):
-            raise SegslamError(f"{path}: {section}: expected a section with keys, found {section_values!r}")
-        try:
-            section_values[name] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise SegslamError(f"--set {text}: the value is not valid YAML ({_one_line(error)})") from error
+            raise SegslamError(f"{path}: {section}: expected a section with keys, found {short(section_values)}")
+        section_values[name] = parse_yaml(value, f"--set {brief(text)}")
     source = str(path) if path is not None else "--set"
     source = source if not (path and overrides) else f"{path} and --set"
     return _validate(_without_removed(values, source), source)
@@ -109,25 +124,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return _parse_yaml(text, str(path))
 
 
-class _EachKeyOnce(yaml.SafeLoader):
-    """Rejects duplicate keys; YAML's own loader uses the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """As in the base class. Raises ConstructorError, with its line, for a duplicate key."""
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
-            if isinstance(key, yaml.ScalarNode):
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
 def _parse_yaml(text: str, source: str) -> dict[str, Any]:
-    try:
-        values = yaml.load(text, _EachKeyOnce)
-    except yaml.YAMLError as error:
-        raise SegslamError(f"{source}: not valid YAML ({_one_line(error)})") from error
+    values = parse_yaml(text, source)
     if values is None:
         return {}
     if not isinstance(values, dict):
@@ -140,11 +138,11 @@ def _validate(values: dict[str, Any], source: str) -> Config:
         return Config.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+        key = brief(".".join(str(part) for part in first["loc"]))
         if first["type"] == "extra_forbidden":
             raise SegslamError(f"{source}: unknown key {key}; {_known_keys(first['loc'])}") from error
-        message = first["msg"].removeprefix("Value error, ")
-        got = "" if isinstance(first["input"], dict) else f", got {first['input']!r}"
+        message = brief(first["msg"].removeprefix("Value error, "), 300)
+        got = "" if isinstance(first["input"], dict) else f", got {short(first['input'])}"
         raise SegslamError(f"{source}: {key}: {message}{got}") from error
 
 
@@ -155,7 +153,3 @@ def _known_keys(location: tuple[int | str, ...]) -> str:
         if isinstance(section, type) and issubclass(section, Section):
             fields = section.model_fields
     return "known keys: " + (", ".join(fields) or "none")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

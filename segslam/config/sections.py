@@ -107,52 +107,10 @@ class OdometryConfig(Section):
 
 
 class HealthConfig(Section):
-    """Check of each odometry motion against the scans, and its repair."""
+    """Comparison of the odometry's motions with the scans."""
 
     check: bool = Field(
-        True, description="check the motions of the odometry, and repair those that the scans contradict [chosen]"
-    )
-    tolerance_m: float = Field(
-        0.15,
-        gt=0,
-        description="a motion is replaced if its translation is off by more than this (m) "
-        "[chosen on KITTI 00 and courtyard]",
-    )
-    tolerance_deg: float = Field(
-        0.6,
-        gt=0,
-        description="a motion is replaced if its rotation is off by more than this (degrees) "
-        "[chosen on KITTI 00 and courtyard]",
-    )
-    watch_scans: int = Field(
-        20,
-        ge=1,
-        description="after a repair, scans are registered until this many in a row confirm the odometry, after the "
-        "n-th repair n times as many [chosen on NCLT]",
-    )
-    map_scans: int = Field(10, ge=1, description="number of scans in the local map of the check [chosen]")
-    map_spacing_m: float = Field(
-        0.2, ge=0, description="smallest distance between two scans of the local map (m) [chosen]"
-    )
-    map_spacing_deg: float = Field(
-        4.0,
-        ge=0,
-        description="smallest rotation between two scans of the local map that are nearer than that (degrees) [chosen]",
-    )
-    correspondence_m: tuple[float, ...] = Field(
-        (2.0, 0.7), min_length=1, description="search distances of the registration with the local map (m) [chosen]"
-    )
-    inlier_m: float = Field(
-        0.5, gt=0, description="distance to the local map within which a point overlaps it (m) [chosen]"
-    )
-    min_overlap: float = Field(
-        0.6,
-        ge=0,
-        le=1,
-        description="smallest overlap of a registered scan, relative to the drive's median [chosen on NCLT]",
-    )
-    max_rms: float = Field(
-        2.0, ge=1, description="largest residual of a registered scan, relative to the drive's median [chosen on NCLT]"
+        True, description="compare the motions of the odometry with the scans, and keep more likely ones [chosen]"
     )
 
 
@@ -599,6 +557,35 @@ class GraphConfig(Section):
     )
 
 
+class AdjustmentConfig(Section):
+    """Adjustment of the whole map after the loops: submaps are registered with each other."""
+
+    max_minutes: float = Field(
+        60.0, ge=0, description="time limit, after which the registrations so far are used; 0: off (minutes) [chosen]"
+    )
+    rounds: int = Field(
+        2, ge=1, le=5, description="number of times that submaps are built and registered [chosen on KITTI 00]"
+    )
+    every: int = Field(2, ge=1, description="a submap is registered for every n-th keyframe [chosen on KITTI 00]")
+    reach: int = Field(
+        2, ge=0, description="number of keyframes before and after one that are in its submap [chosen on KITTI 00]"
+    )
+    steps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
+        (5, 10),
+        min_length=1,
+        description="distances of registered submaps along the drive, in keyframes [chosen on KITTI 00]",
+    )
+    radius_m: float = Field(
+        10.0, ge=0, description="largest distance of registered submaps of two passes (m) [chosen on KITTI 00]"
+    )
+    min_overlap: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="smallest share of a submap's points that lie on the other [chosen on KITTI 00]",
+    )
+
+
 class LogConfig(Section):
     """Format of the log."""
 
@@ -657,5 +644,6 @@ class Config(Section):
     refine: RefineConfig = RefineConfig()
     verify: VerifyConfig = VerifyConfig()
     graph: GraphConfig = GraphConfig()
+    adjustment: AdjustmentConfig = AdjustmentConfig()
     log: LogConfig = LogConfig()
     map: MapConfig = MapConfig()

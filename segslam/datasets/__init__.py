@@ -6,6 +6,7 @@ from pathlib import Path
 from segslam.datasets.kitti import is_kitti, open_kitti
 from segslam.datasets.scans import Dataset
 from segslam.semantics.encodings import Encoding
+from segslam.system.paths import expanded
 from segslam.types import SegslamError
 
 __all__ = ["DataSource", "Dataset", "open_dataset"]
@@ -51,7 +52,7 @@ def open_dataset(
     layout, whose points are too low by this angle, and 0 for other data. Raises SegslamError, naming the file and the
     remedy.
     """
-    folder = Path(data).expanduser()
+    folder = expanded(data)
     if not folder.exists():
         raise SegslamError(f"{folder}: no such file or folder; give the folder with sequences/ or with the scans")
     try:

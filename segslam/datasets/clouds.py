@@ -1,70 +1,96 @@
-"""Single scans from files: .bin, .npy, .ply, .pcd."""
+"""Single scans from files: .bin, .npy, .ply, .pcd. All commands read them here."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 
 from segslam.datasets.kitti import read_returns
-from segslam.datasets.point_cloud2 import INTENSITY_FIELDS
-from segslam.types import Points, SegslamError, Vector
+from segslam.datasets.npy import parse_npy
+from segslam.datasets.pcd import parse_pcd
+from segslam.datasets.ply import parse_ply
+from segslam.datasets.point_cloud2 import INTENSITY_FIELDS, TIME_FIELDS
+from segslam.datasets.scan_files import Columns, read_bytes
+from segslam.types import BadScan, Points, SegslamError, Vector
+
+SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
+TIMES = (*TIME_FIELDS, "timestamps", "stamps")
+"""Names of the field with the time of a point; the first that exists is used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The points of a file, as stored: float32 if the file has this type, otherwise float64."""
+
+    points: Points
+    times: Vector
+    """(n,) in any unit, from any origin; empty if the file has none."""
+    intensities: Vector | None
+    """The fourth column of .bin and .npy, a field with one of the usual names in .ply and .pcd; None without."""
+
+
+def read_file(file: Path) -> Cloud:
+    """The points of a file: .bin (float32 x y z intensity), .npy (n, 3 or more), .ply, .pcd.
+
+    Raises SegslamError, naming the file: BadScan for one that is missing, invalid, truncated or too large.
+    """
+    try:
+        match file.suffix:
+            case ".bin":
+                return _from_rows(read_returns(file))
+            case ".npy":
+                return _from_rows(parse_npy(read_bytes(file)))
+            case ".ply":
+                return _from_columns(parse_ply(read_bytes(file)))
+            case ".pcd":
+                return _from_columns(parse_pcd(read_bytes(file)))
+            case other:
+                raise SegslamError(f"{file}: unknown format {other or '(no extension)'}; give .bin, .npy, .ply or .pcd")
+    except (ValueError, MemoryError) as error:
+        raise BadScan(
+            f"{file}: {str(error) or 'not enough memory'}; copy the file again, convert it, or remove it"
+        ) from error
 
 
 def read_cloud(file: Path) -> Points:
-    """Points (n, 3) of a file, as stored: .bin (float32 x y z intensity), .npy (n, 3 or more), .ply, .pcd.
-
-    Raises SegslamError (BadScan for an invalid .bin), naming the file.
-    """
-    if not file.is_file():
-        raise SegslamError(f"{file}: no such file; give a scan (.bin, .npy, .ply, .pcd)")
-    match file.suffix:
-        case ".bin":
-            return read_returns(file)[:, :3]
-        case ".npy":
-            return _read_npy(file)[:, :3]
-        case ".ply" | ".pcd":
-            return _read_by_open3d(file)
-    raise SegslamError(f"{file}: unknown format {file.suffix or '(no extension)'}; give .bin, .npy, .ply or .pcd")
+    """The points (n, 3) of a file. Raises SegslamError as `read_file` does."""
+    return read_file(file).points
 
 
 def read_intensities(file: Path) -> Vector | None:
-    """Intensities (n,) of a file that `read_cloud` reads; None if it has none.
-
-    They are the fourth column of .bin and .npy files, and a field with one of the usual names in .ply and .pcd files.
-    """
-    if file.suffix == ".bin":
-        return read_returns(file)[:, 3]
-    if file.suffix == ".npy":
-        values = _read_npy(file)
-        return values[:, 3] if values.shape[1] > 3 else None
-    return _intensities_by_open3d(file) if file.suffix in (".ply", ".pcd") else None
+    """Intensities (n,) of a file; None if it has none. Raises SegslamError as `read_file` does."""
+    return read_file(file).intensities
 
 
-def _read_npy(file: Path) -> Float64[np.ndarray, "_ _"]:
-    try:
-        values = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise SegslamError(f"{file}: cannot be read ({error}); save an array by numpy.save") from error
-    if values.ndim != 2 or values.shape[1] < 3 or values.dtype.kind not in "fiu":
-        raise SegslamError(f"{file}: contains {values.dtype} of shape {values.shape}; expected (n, 3) numbers, x y z")
-    return values.astype(np.float64)
+def _from_rows(rows: np.ndarray) -> Cloud:
+    if rows.dtype != np.float32:
+        rows = rows.astype(np.float64)
+    return Cloud(rows[:, :3], np.empty(0), rows[:, 3] if rows.shape[1] > 3 else None)
 
 
-def _read_by_open3d(file: Path) -> Points:
-    import open3d
+def _from_columns(columns: Columns) -> Cloud:
+    """Raises ValueError without x, y and z, and without any point."""
+    if not {"x", "y", "z"} <= set(columns):
+        raise ValueError(f"it has no fields x y z, only {' '.join(columns)[:80] or 'none'}")
+    if len(columns["x"]) == 0:
+        raise ValueError("it has no points")
+    intensities = next((columns[name] for name in INTENSITY_FIELDS if name in columns), None)
+    times = next((columns[name] for name in TIMES if name in columns), np.empty(0))
+    return Cloud(
+        _stacked([columns[axis] for axis in "xyz"]),
+        times.astype(np.float64),
+        None if intensities is None else _float(intensities),
+    )
 
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        cloud = open3d.io.read_point_cloud(file)
-    points = np.asarray(cloud.points)
-    if not len(points):
-        raise SegslamError(f"{file}: no points could be read; is it a whole {file.suffix} file?")
+
+def _stacked(axes: list[np.ndarray]) -> Points:
+    dtype = np.float32 if all(axis.dtype.kind == "f" and axis.dtype.itemsize <= 4 for axis in axes) else np.float64
+    points = np.empty((len(axes[0]), 3), dtype)
+    for k, axis in enumerate(axes):
+        points[:, k] = axis
     return points
 
 
-def _intensities_by_open3d(file: Path) -> Vector | None:
-    import open3d
-
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        fields = open3d.t.io.read_point_cloud(file).point
-    name = next((name for name in INTENSITY_FIELDS if name in fields), None)
-    return fields[name].numpy().ravel().astype(np.float64) if name else None
+def _float(values: np.ndarray) -> Vector:
+    """The values as float32 or float64 in the byte order of this machine."""
+    return values.astype(np.float32 if values.dtype.itemsize <= 4 and values.dtype.kind == "f" else np.float64)

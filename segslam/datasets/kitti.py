@@ -12,10 +12,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from segslam import geometry
+from segslam.datasets.scan_files import read_bytes
 from segslam.datasets.scans import check_num_poses, make_scan, read_stamps, selected_rows, usable_scans
+from segslam.errors import brief
 from segslam.semantics.encodings import Encoding
 from segslam.semantics.label_files import LabelSource, open_labels
-from segslam.trajectory import lidar_from_camera, read_poses
+from segslam.trajectory import ROTATION_TOLERANCE, lidar_from_camera, read_poses
 from segslam.types import BadScan, Indices, Scan, SegslamError, Trajectory, Transform
 
 VERTICAL_ANGLE_DEG = 0.205
@@ -116,10 +118,7 @@ def open_kitti(
 
 def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
     """(n, 4) x, y, z, intensity of a velodyne file, as stored. Raises BadScan if it is invalid."""
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise BadScan(f"{file}: cannot read the scan ({error})") from error
+    content = read_bytes(file)
     if len(content) % 16:
         raise BadScan(
             f"{file}: {len(content)} bytes are not a multiple of 16 (float32 x y z intensity): truncated, or not 4 "
@@ -168,10 +167,17 @@ def _rigid(texts: list[str], place: str) -> Transform:
     try:
         matrix = np.array(texts, dtype=float).reshape(3, 4)
     except ValueError as error:
-        raise SegslamError(f"{place}: expected 12 numbers, a 3x4 matrix by rows ({error})") from error
+        raise SegslamError(f"{place}: expected 12 numbers, a 3x4 matrix by rows ({brief(str(error))})") from error
     if not np.isfinite(matrix).all():
         raise SegslamError(f"{place}: all numbers must be finite")
-    return geometry.nearest_transform(matrix)
+    T_camera_lidar = geometry.nearest_transform(matrix)
+    off = np.abs(matrix[:, :3] - T_camera_lidar[:3, :3]).max()
+    if not off <= ROTATION_TOLERANCE:
+        raise SegslamError(
+            f"{place}: the 3x3 part is not a rotation (error {off:.3g}); give the transform from LiDAR to camera "
+            "coordinates, not a projection"
+        )
+    return T_camera_lidar
 
 
 def _is_sequence(folder: Path) -> bool:
@@ -195,7 +201,7 @@ def _numbered_scans(velodyne: Path) -> tuple[list[Path], Indices]:
     files = [file for file in velodyne.glob("*.bin") if not file.name.startswith(".")]
     if not files:
         raise SegslamError(f"{velodyne}: contains no .bin file; put KITTI's scans there, 000000.bin and so on")
-    misnamed = [file for file in files if not file.stem.isdecimal()]
+    misnamed = [file for file in files if not file.stem.isdecimal() or int(file.stem) >= 2**63]
     if misnamed:
         raise SegslamError(f"{misnamed[0]}: the name is not a scan number; rename the file, for example 000000.bin")
     files.sort(key=lambda file: int(file.stem))

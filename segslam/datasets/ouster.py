@@ -51,6 +51,8 @@ CHANNELS = {
 """By profile name."""
 HEADER_BYTES = FOOTER_BYTES = 32
 """Bytes around the columns of a packet, except in the legacy profile."""
+MAX_COLUMNS, MAX_BEAMS = 4096, 256
+"""Largest numbers in metadata. Chosen: the largest sensors have 4096 columns and 128 beams."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,17 @@ class _Sensor:
     @property
     def header_bytes(self) -> int:
         return 0 if self.profile == "LEGACY" else HEADER_BYTES
+
+    def contradiction(self) -> str:
+        """What no sensor has; empty if there is nothing of the kind."""
+        numbers = (self.altitude_rad, self.azimuth_rad, self.T_sensor_lidar_mm, np.array(self.beam_origin_mm))
+        if not 1 <= self.columns_per_packet <= self.columns_per_frame <= MAX_COLUMNS:
+            return f"{self.columns_per_frame} columns per frame, {self.columns_per_packet} per packet"
+        if self.altitude_rad.shape != self.azimuth_rad.shape or not 1 <= self.altitude_rad.size <= MAX_BEAMS:
+            return f"{self.altitude_rad.size} elevations and {self.azimuth_rad.size} azimuths of beams"
+        if self.altitude_rad.ndim != 1 or not all(np.isfinite(each).all() for each in numbers):
+            return "angles or distances that are not numbers"
+        return ""
 
     @property
     def packet_bytes(self) -> int:
@@ -176,12 +189,13 @@ def _metadata_of(file: Path) -> Path:
 
 
 def _read_sensor(file: Path) -> _Sensor:
+    """Raises ValueError, naming the file, for metadata that no sensor has."""
     try:
         values = _flat(json.loads(file.read_text(encoding="utf-8")))
         profile = str(values.get("udp_profile_lidar", "LEGACY"))
         if profile not in CHANNELS:
             raise ValueError(f"packets of profile {profile}; known: {', '.join(CHANNELS)}")
-        return _Sensor(
+        sensor = _Sensor(
             profile=profile,
             port=int(values.get("udp_port_lidar") or 0) or None,
             columns_per_frame=int(values["columns_per_frame"]),
@@ -193,6 +207,12 @@ def _read_sensor(file: Path) -> _Sensor:
         )
     except KeyError as error:
         raise ValueError(f"{file.name} has no key {error}; it must be the metadata of an Ouster sensor") from error
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{file.name} is not the metadata of an Ouster sensor ({error})") from error
+    wrong = sensor.contradiction()
+    if wrong:
+        raise ValueError(f"{file.name} is not the metadata of an Ouster sensor ({wrong})")
+    return sensor
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:

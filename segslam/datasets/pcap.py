@@ -1,9 +1,12 @@
 """UDP datagrams of a pcap file as written by tcpdump and Wireshark."""
 
+import logging
 import mmap
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+
+logger = logging.getLogger(__name__)
 
 BYTE_ORDERS = {
     b"\xd4\xc3\xb2\xa1": "<",
@@ -17,6 +20,7 @@ LINK_HEADER_BYTES = {0: 4, 1: 14, 101: 0, 113: 16, 276: 20}
 """Header size by link type: loopback, Ethernet, raw IP, and both Linux cooked captures."""
 ETHERNET, VLAN_TAG = 1, 0x8100
 IPV4, UDP = 4, 17
+FILE_HEADER_BYTES = 24
 UDP_HEADER_BYTES = 8
 
 Content = bytes | mmap.mmap
@@ -43,7 +47,7 @@ def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Itera
         header_end = start + 4 * (content[start] & 0xF)
         flags, protocol = struct.unpack_from(">HxB", content, start + 6)
         offset, more = 8 * (flags & 0x1FFF), bool(flags & 0x2000)
-        if protocol != UDP or header_end >= end:
+        if protocol != UDP or header_end + (0 if offset else UDP_HEADER_BYTES) >= end:
             continue
         if offset == 0:
             sent_to, length = struct.unpack_from(">HH", content, header_end + 2)
@@ -51,14 +55,17 @@ def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Itera
                 continue
             header_end += UDP_HEADER_BYTES
             if not more:
-                yield [slice(header_end, end)]
+                if end - header_end == num_bytes:
+                    yield [slice(header_end, end)]
                 continue
         key = content[start + 12 : start + 20] + content[start + 4 : start + 6]  # source, destination, datagram number
         fragments = waiting.setdefault(key, _Fragments())
         fragments.pieces[offset] = slice(header_end, end)
         fragments.missing_bytes += (num_bytes if offset == 0 else 0) - (end - header_end)
         if fragments.missing_bytes == 0:
-            yield [fragments.pieces[place] for place in sorted(fragments.pieces)]
+            pieces = [fragments.pieces[place] for place in sorted(fragments.pieces)]
+            if sum(piece.stop - piece.start for piece in pieces) == num_bytes:
+                yield pieces
             del waiting[key]
 
 
@@ -68,10 +75,12 @@ def _ip_packets(content: Content) -> Iterator[tuple[int, int]]:
     if order is None:
         remedy = "; convert it with `editcap -F pcap IN OUT`" if content[:4] == PCAPNG else ""
         raise ValueError(f"this is not the classic pcap format{remedy}")
+    if len(content) < FILE_HEADER_BYTES:
+        raise ValueError("its header is truncated")
     (link,) = struct.unpack_from(order + "I", content, 20)
     if link not in LINK_HEADER_BYTES:
         raise ValueError(f"unknown link type {link}; known: {', '.join(map(str, LINK_HEADER_BYTES))}")
-    record = 24
+    record = FILE_HEADER_BYTES
     while record + 16 <= len(content):
         (captured,) = struct.unpack_from(order + "I", content, record + 8)
         start = record + 16 + LINK_HEADER_BYTES[link]
@@ -83,3 +92,5 @@ def _ip_packets(content: Content) -> Iterator[tuple[int, int]]:
         end = start + int.from_bytes(content[start + 2 : start + 4], "big")  # the frame may be padded
         if end <= min(record, len(content)):
             yield start, end
+    if record != len(content):
+        logger.warning("the recording is cut short: its last packet is incomplete, and what followed is missing")

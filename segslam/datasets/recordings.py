@@ -1,4 +1,4 @@
-"""Recordings read through kiss_icp's readers: folders of clouds, rosbag, mcap, pcap and other data sets.
+"""Folders of scan files, rosbag, mcap and pcap recordings, and the data sets that kiss_icp reads.
 
 The number of a scan is its position in the recording.
 """
@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
 
+from segslam.datasets.bag_clouds import BagClouds
 from segslam.datasets.clouds import read_intensities
-from segslam.datasets.kitti import read_returns
 from segslam.datasets.mcap_clouds import McapClouds
+from segslam.datasets.message_clouds import MessageClouds
 from segslam.datasets.ouster import OusterFrames
-from segslam.datasets.point_cloud2 import CloudReader
+from segslam.datasets.scan_folder import ScanFolder, scan_files
 from segslam.datasets.scans import (
     ASSUMED_PERIOD_NS,
     check_num_poses,
@@ -27,29 +27,20 @@ from segslam.datasets.scans import (
     usable_scans,
 )
 from segslam.datasets.sweep_times import sweep_times
+from segslam.errors import brief
 from segslam.semantics.encodings import Encoding
 from segslam.semantics.label_files import LabelSource, open_labels
 from segslam.trajectory import read_poses
 from segslam.types import BadScan, Indices, Scan, SegslamError, Trajectory, Vector
 
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
-READ_IN_ORDER = ("mcap", "rosbag")
-"""Kinds of recordings that are read in order: the reader returns the next scan, whatever the index."""
-LOADER_ERRORS = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    ImportError,
-    LookupError,
-    McapError,
-    OSError,
-    RuntimeError,
-    StopIteration,
-    SystemExit,
-    TypeError,
-    ValueError,
-)
-"""Exceptions that readers raise for missing or invalid data."""
+WITH_TOPICS = ("mcap", "rosbag")
+REMEDIES = {
+    "mcap": "; `mcap recover IN -o OUT` copies what can be read",
+    "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",
+}
+FOREIGN_ERRORS = (Exception, SystemExit)
+"""Readers of other projects raise anything for damaged data; it becomes an error that names the file."""
 
 
 class Recording:
@@ -75,13 +66,8 @@ class Recording:
         self._loader = loader
         self._has_intensities = intensities
         self.vertical_angle_deg = vertical_angle_deg
-        self.is_sequential = kind in READ_IN_ORDER
-        self._clouds = CloudReader()
-        if self.is_sequential:
-            loader.read_point_cloud = self._clouds
-        self._next = 0
+        self.is_sequential = bool(getattr(loader, "is_sequential", False))
         self._stamps = _whole_stamps(beside / "times.txt", len(loader)) if kind == "generic" else None
-        self._is_folder = kind == "generic"
         self.num_recorded = len(loader)
         self.scan_index = selected_rows(np.arange(len(loader)), frames, source)
         self.names = [self._file(int(index)).stem for index in self.scan_index]
@@ -92,12 +78,14 @@ class Recording:
         return len(self.scan_index)
 
     def __getitem__(self, row: int) -> Scan:
-        """The scan. Raises BadScan if kiss_icp's reader fails on it or its labels cannot be used."""
+        """The scan. Raises BadScan if its reader fails on it or its labels cannot be used."""
         index = int(self.scan_index[row])
         file = self._file(index)
         points, times = self._read(index, file)
         intensities = self._intensities(file, len(points))
         stamp_ns = self._stamp_ns(index)
+        if abs(stamp_ns) >= 2**63:
+            raise BadScan(f"{file}: its stamp {stamp_ns} ns is more than 292 years; correct the sensor's clock")
         return make_scan(
             file,
             index,
@@ -115,48 +103,35 @@ class Recording:
     def _read(self, index: int, file: Path) -> tuple[np.ndarray, np.ndarray]:
         try:
             with contextlib.redirect_stdout(io.StringIO()):
-                self._go_to(index)
-                is_bin = self._is_folder and file.suffix == ".bin"
-                item = read_returns(file)[:, :3] if is_bin else self._loader[index]
+                item = self._loader[index]
             points, times = item if isinstance(item, tuple) else (item, np.empty(0))
-            return np.asarray(points, dtype=np.float64).reshape(-1, 3), np.asarray(times, dtype=np.float64).ravel()
-        except LOADER_ERRORS as error:
+            points = np.asarray(points).reshape(-1, 3)
+            points = points if points.dtype == np.float32 else points.astype(np.float64)
+            return points, np.asarray(times, dtype=np.float64).ravel()
+        except BadScan:
+            raise
+        except FOREIGN_ERRORS as error:
             raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
 
     def _intensities(self, file: Path, num_points: int) -> Vector | None:
         """Intensities of the scan read last, if requested and known."""
         if not self._has_intensities and self.labels.network is None:
             return None
-        known = self._clouds.intensities if self.is_sequential else getattr(self._loader, "intensities", None)
-        if known is None and not self.is_sequential:
-            with contextlib.suppress(BadScan):  # a .bin file with another layout than KITTI's
+        known = getattr(self._loader, "intensities", None)
+        if not hasattr(self._loader, "intensities"):
+            with contextlib.suppress(SegslamError):  # a file with another layout than KITTI's
                 known = read_intensities(file)
         return known if known is not None and len(known) == num_points else None
-
-    def _go_to(self, index: int) -> None:
-        """Skip the scans before `index`, if the recording can only be read in order."""
-        if not self.is_sequential:
-            return
-        if index < self._next:
-            self._loader.reset()
-            self._next = 0
-        while self._next < index:
-            self._next += 1
-            with contextlib.suppress(*LOADER_ERRORS):  # an invalid scan that is not selected
-                self._loader[self._next - 1]
-        self._next += 1
 
     def _stamp_ns(self, index: int) -> int:
         """Stamp of the scan that was read last; some readers know it only then."""
         if self._stamps is not None:
             return int(self._stamps[index])
-        stamp_ns = self._clouds.stamp_ns or getattr(self._loader, "stamp_ns", 0)
-        if stamp_ns:
-            return stamp_ns
+        if hasattr(self._loader, "stamp_ns"):
+            return int(self._loader.stamp_ns)
         if not hasattr(self._loader, "get_frames_timestamps"):
             return index * ASSUMED_PERIOD_NS
-        seconds = self._loader.get_frames_timestamps()[-1 if self.is_sequential else index]
-        return round(float(np.squeeze(seconds)) * 1e9)
+        return round(float(np.squeeze(self._loader.get_frames_timestamps()[index])) * 1e9)
 
     def _file(self, index: int) -> Path:
         """The file of a scan; a name with its number for recordings of many scans."""
@@ -187,39 +162,32 @@ def open_recording(
     intensities: bool = False,
     vertical_angle_deg: float = 0.0,
 ) -> Recording:
-    """A recording by the name of its kind in kiss_icp, or by detecting the kind from the file or folder.
+    """A recording by the name of its kind, or by detecting the kind from the file or folder.
 
     Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan.
     """
-    from kiss_icp.datasets import available_dataloaders, dataset_factory
+    from kiss_icp.datasets import available_dataloaders
 
     kinds = sorted({"kitti", *available_dataloaders()})
     if kind is not None and kind not in kinds:
         raise SegslamError(f"--dataset {kind}: no such kind of data; known: {', '.join(kinds)}")
     kind = kind or _kind_of(data)
-    if topic and kind not in READ_IN_ORDER:
+    if topic and kind not in WITH_TOPICS:
         raise SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); omit the option")
     source = _scans_folder(data) if kind == "generic" else data
-    if kind == "generic":
-        _check_one_kind(source)
     printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(printed), warnings.catch_warnings():
+        silence = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO())
+        with silence[0], silence[1], warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings about kiss_icp's sources, which it parses to find its readers
-            if kind == "mcap":
-                loader: Any = McapClouds(source, topic)
-            elif kind == "ouster":
-                loader = OusterFrames(source)
-            else:
-                loader = dataset_factory(kind, source, sequence=sequence, topic=topic)
+            loader = _loader(kind, source, sequence, topic)
             num_scans = len(loader)
-    except LOADER_ERRORS as error:
-        if isinstance(error, SystemExit) and kind == "generic":
-            raise SegslamError(
-                f"{source}: its first scan has no readable points x y z; copy the file again, or remove it"
-            ) from error
+    except SegslamError:
+        raise
+    except FOREIGN_ERRORS as error:
         complaint = " ".join(printed.getvalue().split()) if isinstance(error, SystemExit) else _reason(error)
-        raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset") from error
+        remedy = REMEDIES.get(kind, "") if "mcap recover" not in complaint else ""
+        raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset{remedy}") from error
     if num_scans == 0:
         raise SegslamError(f"{data}: the reader for {kind} data finds no scan in it; see --dataset")
     return Recording(
@@ -232,6 +200,22 @@ def open_recording(
         intensities=intensities,
         vertical_angle_deg=vertical_angle_deg,
     )
+
+
+def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
+    """The reader of a kind of data: scans by their number, as points and times, or as points alone."""
+    match kind:
+        case "generic":
+            return ScanFolder(source)
+        case "mcap":
+            return MessageClouds(McapClouds(source, topic))
+        case "rosbag":
+            return MessageClouds(BagClouds(source, topic))
+        case "ouster":
+            return OusterFrames(source)
+    from kiss_icp.datasets import dataset_factory
+
+    return dataset_factory(kind, source, sequence=sequence, topic=topic)
 
 
 def _kind_of(data: Path) -> str:
@@ -252,24 +236,7 @@ def _scans_folder(data: Path) -> Path:
 
 
 def _has_clouds(folder: Path) -> bool:
-    from kiss_icp.datasets import supported_file_extensions
-
-    suffixes = {f".{extension}" for extension in supported_file_extensions()}
-    return any(file.suffix in suffixes for file in folder.iterdir())
-
-
-def _check_one_kind(folder: Path) -> None:
-    """Raises SegslamError for scans of several formats: only the first format would be read."""
-    from kiss_icp.datasets import supported_file_extensions
-
-    counts = {
-        f".{extension}": sum(1 for file in folder.glob(f"*.{extension}") if file.is_file())
-        for extension in supported_file_extensions()
-    }
-    found = {suffix: count for suffix, count in counts.items() if count}
-    if len(found) > 1:
-        listed = ", ".join(f"{suffix} {count}" for suffix, count in found.items())
-        raise SegslamError(f"{folder}: {len(found)} kinds of scans ({listed}); put each kind into its own folder")
+    return bool(scan_files(folder))
 
 
 def _beside(source: Path) -> Path:
@@ -287,6 +254,4 @@ def _whole_stamps(times_file: Path, num_scans: int) -> Indices | None:
 
 
 def _reason(error: BaseException) -> str:
-    if "positions" in str(error):
-        return "no fields x y z"
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return brief(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__, 300)

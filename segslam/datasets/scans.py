@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from segslam.errors import brief
 from segslam.geometry import raise_beams
 from segslam.points import squared_ranges
 from segslam.semantics.label_files import LabelSource
@@ -28,6 +29,7 @@ logger = logging.getLogger(__name__)
 
 ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
 NO_TIMES = np.empty(0)
+NO_LIMIT = 2**63 - 1
 
 
 @runtime_checkable
@@ -113,10 +115,13 @@ def make_scan(
 ) -> Scan:
     """The scan without invalid points: those with a NaN or infinity, and those at the origin, which mean "no return".
 
-    This function alone applies `vertical_angle_deg`; label sources see the points as stored. Labels, times and
+    A distance whose square exceeds float32 (1.8e19 m) is infinite. This
+    function alone applies `vertical_angle_deg`; label sources see the points as stored. Labels, times and
     intensities are reduced to the same points. Raises BadScan, naming `source`, if no point remains.
     """
-    squared_range = squared_ranges(points)
+    with np.errstate(over="ignore", invalid="ignore"):  # wild numbers, and NaNs that signal
+        points = points.astype(np.float32, copy=False)
+        squared_range = squared_ranges(points)
     kept = np.isfinite(squared_range) & (squared_range > 0)
     if not kept.any():
         what = "has no points" if len(points) == 0 else f"none of its {len(points)} points is finite and not 0, 0, 0"
@@ -127,7 +132,7 @@ def make_scan(
     if intensities is not None:
         intensities = np.ascontiguousarray(intensities, dtype=np.float32)
     return Scan(
-        np.ascontiguousarray(raise_beams(points, vertical_angle_deg), dtype=np.float32),
+        np.ascontiguousarray(raise_beams(points, vertical_angle_deg)),
         stamp_ns,
         index,
         labels,
@@ -156,7 +161,7 @@ def selected_rows(scan_index: Indices, frames: str | None, source: Path) -> Indi
     first, colon, last = frames.partition(":")
     if not colon or not all(text.strip().isdecimal() for text in (first, last) if text):
         raise SegslamError(f"--frames {frames}: write A:B, scans A to B - 1, for example 0:100")
-    start, stop = int(first or 0), int(last or np.iinfo(np.int64).max)
+    start, stop = min(int(first or 0), NO_LIMIT), min(int(last or NO_LIMIT), NO_LIMIT)
     if start >= stop:
         raise SegslamError(f"--frames {frames}: selects no scan, B must be greater than A")
     if last and stop > scan_index[-1] + 1 and start <= scan_index[-1]:
@@ -182,7 +187,9 @@ def read_stamps(file: Path) -> Indices:
         except ValueError as error:
             raise SegslamError(f"{file}:{number}: {error}; correct the line") from error
         if stamp_ns < 0 or (stamps and stamp_ns <= stamps[-1]):
-            wrong = "is negative" if stamp_ns < 0 else f"is not later than the previous line, {lines[number - 2]}"
-            raise SegslamError(f"{file}:{number}: {line} {wrong}; times must ascend and not be negative")
+            wrong = (
+                "is negative" if stamp_ns < 0 else f"is not later than the previous line, {brief(lines[number - 2])}"
+            )
+            raise SegslamError(f"{file}:{number}: {brief(line)} {wrong}; times must ascend and not be negative")
         stamps.append(stamp_ns)
     return np.array(stamps, dtype=np.int64)

@@ -27,9 +27,11 @@ def sweep_times(times: np.ndarray, num_points: int, stamp_s: float | None = None
     that a sweep without returns at its start or end is not stretched; otherwise by their span. Empty if times are
     missing, not finite, all equal, or not one per point.
     """
-    if len(times) != num_points or num_points == 0 or not np.isfinite(times).all() or np.ptp(times) == 0:
+    if len(times) != num_points or num_points == 0 or not np.isfinite(times).all():
         return np.empty(0)
     first, last = float(times.min()), float(times.max())
+    if not 0.0 < last - first < np.inf:
+        return np.empty(0)
     if first >= 0.0 and last <= 1.0 and last - first >= LEAST_SHARE:
         return times
     for unit_s in UNITS_S:

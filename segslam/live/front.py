@@ -1,61 +1,31 @@
-"""The front process: receives scans, estimates their poses by odometry and publishes the poses.
+"""The front process as seen from the main process: poses of the scans, as they come.
 
 Loop closing, graph, log and viewers run in the main process. They cannot delay a pose: poses are sent to the main
-process by a separate thread, and the only message in the other direction is the request to stop.
+process by a separate thread, and the only message in the other direction is the request to stop. If the front process
+dies, for example for lack of memory, another one continues from its last poses.
 """
 
 import multiprocessing
 import signal
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from dataclasses import replace
+from multiprocessing.sharedctypes import RawValue
 from queue import SimpleQueue
-from threading import Event, Thread
-from time import monotonic
+from threading import Thread
 from typing import Any
 
-import numpy as np
-
 from segslam.config import Config
+from segslam.live.placed import Ended, Past, Placed
+from segslam.live.serve import END_S, READY, serve
 from segslam.live.source import Source
-from segslam.live.waiting import Waiting
-from segslam.odometry import KissOdometry, OdometryApart
-from segslam.system.memory import keep_freed_memory
-from segslam.tracker import Tracked, Tracker
-from segslam.types import BadScan, Scan, SegslamError
+from segslam.live.waiting import Tally
+from segslam.odometry import Tracked
+from segslam.types import SegslamError, Step
 
-READY = b"ready"
-END_S = 5.0
-"""Chosen: time for a source to end; the process does not wait longer for a middleware that hangs."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Placed:
-    """A scan with its odometry pose, or an unusable scan, and the counts so far."""
-
-    tracked: Tracked | BadScan
-    latency_s: float
-    """Time from the arrival of the scan to the publication of its pose."""
-    placed_s: float
-    """Time of the publication, by time.monotonic."""
-    num_dropped: int
-    num_missing: int
-
-
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """End of the stream: reason and final counts."""
-
-    why: str = ""
-    """Empty if the stop was requested."""
-    failed: bool = False
-    num_arrived: int = 0
-    num_dropped: int = 0
-    num_gaps: int = 0
-    num_missing: int = 0
-    longest_gap_s: float = 0.0
-    num_set_back: int = 0
+CLOUDS_KEPT = 20
+"""Chosen: number of keyframes whose points are kept for a new front process, about 1.5 MB each."""
 
 
 class Front:
@@ -69,15 +39,18 @@ class Front:
         The stream ends after `idle_s` without a scan, unless it is None.
         """
         self._tell = tell
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, source, config, idle_s), name="front")
-        self._process.start()
-        theirs.close()
+        self._serving = source, config, idle_s
+        self._is_ready = self._is_stopping = False
+        self._tally = RawValue(Tally)
+        self._past = Past([], deque(maxlen=CLOUDS_KEPT))
+        self._num_placed = 0
         self._received: SimpleQueue[Any] = SimpleQueue()
         self.num_keyframes_waiting = 0
+        self.num_restarts = 0
         self.ended = Ended()
-        Thread(target=self._receive, name="receive", daemon=True).start()
+        self._start()
+        self._receiver = Thread(target=self._receive, name="receive", daemon=True)
+        self._receiver.start()
 
     def wait_until_ready(self) -> None:
         """Wait until arriving scans are processed. Raises SegslamError if the source cannot be opened."""
@@ -94,6 +67,7 @@ class Front:
 
     def stop(self) -> None:
         """Accept no more scans; waiting scans are still processed."""
+        self._is_stopping = True
         with suppress(OSError):
             self._pipe.send(None)
 
@@ -101,138 +75,101 @@ class Front:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.stop()
+        while self._receiver.is_alive():
+            self._process.join(2 * END_S)
+            self._process.kill()  # no effect on a process that has ended
+            self._receiver.join(END_S)
         self._pipe.close()
-        self._process.join()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        arguments = (theirs, *self._serving, self._past, self._tally)
+        self._process = context.Process(target=serve, args=arguments, name="front")
+        self._process.start()
+        theirs.close()
+        if self._is_stopping:
+            self.stop()
 
     def _receive(self) -> None:
+        """Pass on what the front process sends, and start another one if it dies."""
+        while True:
+            died = self._receive_until_dead()
+            if died is None:
+                return
+            self._process.join(timeout=1.0)
+            num_lost = self._tally.num_arrived - self._tally.num_dropped - self._num_placed
+            self._tally.num_dropped += num_lost
+            if self._is_stopping or not self._is_ready:
+                self._received.put(self._final(died))
+                return
+            lost = f"{num_lost} scan{'s' * (num_lost != 1)} lost" if num_lost else "no scan lost"
+            self._tell(f"{died.why}: {lost}; starting it again ...")
+            self._is_ready = False
+            self.num_restarts += 1
+            self._pipe.close()
+            self._start()
+
+    def _final(self, died: Ended) -> Ended:
+        """The end of the stream with the process that died; a death after the request to stop is no failure."""
+        return replace(
+            died,
+            failed=not self._is_stopping,
+            num_arrived=self._tally.num_arrived,
+            num_dropped=self._tally.num_dropped,
+            gaps=self._past.gaps,
+        )
+
+    def _receive_until_dead(self) -> Ended | None:
+        """None after the regular end of the stream, otherwise what the process died of."""
         try:
             while True:
                 item = self._pipe.recv()
-                if _is_keyframe(item):
-                    self.num_keyframes_waiting += 1
-                if isinstance(item, str):
-                    self._tell(item)
-                else:
+                if isinstance(item, Ended):
+                    if item.died:
+                        return item
                     self._received.put(item)
+                    return None
+                self._take(item)
         except (EOFError, OSError):
             self._process.join(timeout=1.0)
-            code = self._process.exitcode
-            why = f"the odometry process has ended (exit code {code}; -9 is often a lack of memory)"
-            self._received.put(Ended(why, failed=True))
+            return Ended(f"the odometry process has ended ({_cause(self._process.exitcode)})", failed=True, died=True)
+
+    def _take(self, item: object) -> None:
+        if isinstance(item, str):
+            self._tell(item)
+            return
+        if item == READY:
+            self._is_ready = True
+            if self.num_restarts:
+                self._tell("the odometry runs again")
+                return
+        if isinstance(item, Placed):
+            self._num_placed += 1
+            self._note(item)
+        self._received.put(item)
+
+    def _note(self, placed: Placed) -> None:
+        """Note what another front process needs to continue after this scan."""
+        tracked = placed.tracked
+        self._past.gaps = placed.gaps
+        if not isinstance(tracked, Tracked):
+            return
+        if tracked.registered is not None:
+            self.num_keyframes_waiting += 1
+            self._past.clouds.append((len(self._past.steps), tracked.registered.points))
+        step = Step(tracked.scan_index, tracked.stamp_ns, tracked.T_odom_lidar, None, (), None, {}, tracked.motion)
+        self._past.steps.append(step)
 
 
 def _is_keyframe(item: object) -> bool:
     return isinstance(item, Placed) and isinstance(item.tracked, Tracked) and item.tracked.registered is not None
 
 
-def _serve(pipe: Connection, source: Source, config: Config, idle_s: float | None) -> None:
-    """Process scans until the source ends, `idle_s` pass without a scan, or the main process sends or closes."""
-    keep_freed_memory()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # the main process handles both, and then stops this process
-    to_send: SimpleQueue[Any] = SimpleQueue()
-    sender = Thread(target=_send, args=(pipe, to_send), daemon=True)
-    sender.start()
-    waiting, stopped = Waiting(), Event()
-    why, failed = "", False
-    feeder: _Feeder | None = None
-    try:
-        with OdometryApart(config.odometry) as odometry:
-            _warm_up(config, odometry)
-            source.open(to_send.put)
-            to_send.put(READY)
-            feeder = _Feeder(source, waiting, stopped)
-            Thread(target=_listen, args=(pipe, waiting, stopped), daemon=True).start()
-            try:
-                is_idle = _place_all(Tracker(config, odometry=odometry), source, waiting, to_send, idle_s)
-            finally:
-                stopped.set()
-                feeder.join(timeout=END_S)
-            why = f"no scan for {idle_s:g} s" if is_idle else feeder.why
-            failed = feeder.failed
-            if feeder.is_alive():
-                why, failed = f"the source did not end within {END_S:g} s", False
-    except SegslamError as error:
-        why, failed = str(error), True
-    finally:
-        if feeder is None or not feeder.is_alive():
-            source.close()
-    rhythm = waiting.rhythm
-    to_send.put(
-        Ended(
-            why,
-            failed,
-            waiting.num_arrived,
-            waiting.num_dropped,
-            rhythm.num_gaps,
-            rhythm.num_missing,
-            rhythm.longest_gap_s,
-            rhythm.num_set_back,
-        )
-    )
-    to_send.put(None)
-    sender.join()
-
-
-def _warm_up(config: Config, odometry: OdometryApart) -> None:
-    """Load what the first scan needs; this takes seconds, in which the first scans would be dropped."""
-    odometry.follow([], np.eye(4), np.eye(4))
-    throwaway = Tracker(config, odometry=KissOdometry(config.odometry))
-    points = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
-    points *= 0.5 * (config.odometry.min_range_m + config.odometry.max_range_m) / np.abs(points).max(axis=1)[:, None]
-    for stamp_ns in (0, 100_000_000, 400_000_000):  # the last one after a gap, so that its motion is checked
-        throwaway.track(Scan(points, stamp_ns))
-
-
-def _place_all(
-    tracker: Tracker, source: Source, waiting: Waiting, to_send: "SimpleQueue[Any]", idle_s: float | None
-) -> bool:
-    """Process each scan. Returns True if it ended because no scan came for `idle_s`."""
-    last_ns: int | None = None
-    while (arrival := waiting.take(idle_s)) is not None:
-        tracked: Tracked | BadScan
-        try:
-            gap = 1.0 if last_ns is None else waiting.rhythm.intervals(last_ns, arrival.stamp_ns)
-            tracked = tracker.track(arrival.read(arrival.index, arrival.stamp_ns), gap=gap)
-            source.publish(arrival, tracked.T_odom_lidar)
-            last_ns = arrival.stamp_ns
-        except BadScan as error:
-            tracked = error
-        now = monotonic()
-        counts = (waiting.num_dropped, waiting.rhythm.num_missing)
-        to_send.put(Placed(tracked, now - arrival.arrived_s, now, *counts))
-    return not waiting.is_closed
-
-
-class _Feeder(Thread):
-    """Thread that runs the source's `feed`."""
-
-    def __init__(self, source: Source, waiting: Waiting, stopped: Event) -> None:
-        super().__init__(name="feed", daemon=True)
-        self._source, self._waiting, self._stopped = source, waiting, stopped
-        self.why, self.failed = "", False
-        self.start()
-
-    def run(self) -> None:
-        """Run until the source ends; the queue is then closed."""
-        self.why, self.failed = "the source has failed", True  # remains after an unexpected exception
-        try:
-            self.why, self.failed = self._source.feed(self._waiting, self._stopped), False
-        except (SegslamError, OSError) as error:
-            self.why, self.failed = str(error), True
-        finally:
-            self._waiting.close()
-
-
-def _listen(pipe: Connection, waiting: Waiting, stopped: Event) -> None:
-    """Stop when the main process requests it or has ended."""
-    with suppress(EOFError, OSError):
-        pipe.recv()
-    stopped.set()
-    waiting.close()
-
-
-def _send(pipe: Connection, to_send: "SimpleQueue[Any]") -> None:
-    with suppress(OSError):
-        while (item := to_send.get()) is not None:
-            pipe.send(item)
+def _cause(exit_code: int | None) -> str:
+    """The exit code of a process in words."""
+    if exit_code is None or exit_code >= 0:
+        return f"exit code {exit_code}"
+    number = signal.Signals(-exit_code)
+    return f"signal {number.name}{', often a lack of memory' if number == signal.SIGKILL else ''}"

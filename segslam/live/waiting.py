@@ -1,5 +1,6 @@
 """Queue of scans that wait for the odometry; the oldest are dropped if it is full."""
 
+import ctypes
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,10 +8,20 @@ from threading import Condition
 from time import monotonic
 
 from segslam.live.rhythm import Rhythm
-from segslam.types import Scan
+from segslam.types import BadScan, Scan
 
 MOST_WAITING = 4
 """Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
+END_NS = 2**62
+"""Stamps are below this one, in the year 2116: 64 bits hold them also if they are shifted."""
+
+
+class Tally(ctypes.Structure):
+    """Counts that can lie in memory shared by two processes: they survive the process that counts."""
+
+    _fields_ = (("num_arrived", ctypes.c_int64), ("num_dropped", ctypes.c_int64))
+    num_arrived: int
+    num_dropped: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,27 +43,50 @@ class Arrival:
 class Waiting:
     """A bounded queue between the thread that receives scans and the one that processes them."""
 
-    def __init__(self, *, most: int = MOST_WAITING) -> None:
+    def __init__(self, *, most: int = MOST_WAITING, tally: Tally | None = None) -> None:
         self._most = most
         self._arrivals: deque[Arrival] = deque()
         self._changed = Condition()
+        self._tally = tally or Tally()
         self.is_closed = False
         self.rhythm = Rhythm()
-        self.num_arrived = 0
-        self.num_dropped = 0
+
+    @property
+    def num_arrived(self) -> int:
+        """Number of scans that arrived."""
+        return self._tally.num_arrived
+
+    @property
+    def num_dropped(self) -> int:
+        """Number of scans that were dropped, because the queue was full."""
+        return self._tally.num_dropped
 
     def put(self, sent_ns: int, read: Callable[[int, int], Scan]) -> None:
-        """Add a scan; drop the oldest if the queue is full. Does not wait."""
+        """Add a scan; drop the oldest if the queue is full. Does not wait. Without a usable stamp it is unusable."""
+        if 0 <= sent_ns < END_NS:
+            self._put(sent_ns, read)
+        else:
+            self.put_unusable(f"a scan: its stamp {sent_ns} ns is no time between 1970 and 2116; correct the stamps")
+
+    def put_unusable(self, why: str) -> None:
+        """Add a scan that cannot be read: it is counted, and reported with this reason when its turn comes."""
+
+        def read(index: int, stamp_ns: int) -> Scan:
+            raise BadScan(why)
+
+        self._put(None, read)
+
+    def _put(self, sent_ns: int | None, read: Callable[[int, int], Scan]) -> None:
         arrived_s = monotonic()
         with self._changed:
             if self.is_closed:
                 return
-            stamp_ns = self.rhythm.note(sent_ns)
-            self._arrivals.append(Arrival(self.num_arrived, stamp_ns, sent_ns, arrived_s, read))
-            self.num_arrived += 1
+            stamp_ns = 0 if sent_ns is None else self.rhythm.note(sent_ns)
+            self._arrivals.append(Arrival(self.num_arrived, stamp_ns, sent_ns or 0, arrived_s, read))
+            self._tally.num_arrived += 1
             if len(self._arrivals) > self._most:
                 self._arrivals.popleft()
-                self.num_dropped += 1
+                self._tally.num_dropped += 1
             self._changed.notify()
 
     def take(self, timeout_s: float | None) -> Arrival | None:

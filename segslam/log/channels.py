@@ -18,6 +18,7 @@ PROTOBUF_TOPICS: dict[str, Any] = {
     schema.MAP: PointCloud,
     schema.ODOMETRY: PosesInFrame,
     schema.TRAJECTORY: PosesInFrame,
+    schema.TRAJECTORY_BEFORE: PosesInFrame,
     schema.GROUND_TRUTH: PosesInFrame,
     schema.ACCEPTED: SceneUpdate,
     schema.REJECTED: SceneUpdate,

@@ -2,26 +2,38 @@
 
 import os
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Message, Metadata, Schema
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, DataEnd, Footer, Header, Message, MessageIndex, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError
+from zstandard import ZstdError, frame_content_size
 
-_DAMAGE = (ValueError, struct.error, McapError, ZstdError, RuntimeError)
+_DAMAGE = (ValueError, struct.error, McapError, ZstdError, RuntimeError, MemoryError, OverflowError)
 """Exceptions on damaged data: a wrong checksum, a short field, data that zstd or lz4 cannot decompress."""
 _RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length at the start of each record."""
+_FOOTER_BYTES = _RECORD_HEAD.size + 20
+_KINDS: dict[Opcode, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.METADATA: Metadata,
+    Opcode.CHUNK: Chunk,
+    Opcode.MESSAGE_INDEX: MessageIndex,
+    Opcode.DATA_END: DataEnd,
+}
+"""The records of the data section of a log."""
+_MOST_CHUNK_BYTES = 2**30
+"""Chosen: a step has some megabytes; more than this is a damaged size, or data made to exhaust the memory."""
 
 
 class CutError(Exception):
@@ -62,41 +74,40 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
         if since_last is not None and (summary := _summary(stream)) is not None:
             schemas, channels = dict(summary.schemas), dict(summary.channels)
             start = _last_chunk_with(since_last, summary)
-        for offset, opcode, body in _records(stream, start):
-            span = Span(offset, _RECORD_HEAD.size + len(body))
-            for record in _records_of_chunk(offset, body) if opcode == Opcode.CHUNK else ():
+        for offset, size, outer in _records(stream, start):
+            for record in _records_of_chunk(offset, outer) if isinstance(outer, Chunk) else ():
                 if isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
                     channels[record.id] = record
                 elif isinstance(record, Message):
-                    channel = channels[record.channel_id]
-                    yield Stored(channel.topic, schemas[channel.schema_id], record.data, channel.id, span)
+                    channel = channels.get(record.channel_id)
+                    if channel is None or channel.schema_id not in schemas:
+                        raise CutError(offset)
+                    yield Stored(channel.topic, schemas[channel.schema_id], record.data, channel.id, Span(offset, size))
 
 
 def messages_within(records: bytes) -> Iterator[tuple[int, bytes]]:
     """Channel and data of each message in a sequence of complete records. Raises CutError if they are damaged."""
-    offset = 0
-    while offset < len(records):
-        opcode, length = _RECORD_HEAD.unpack_from(records, offset)
-        body = records[offset + _RECORD_HEAD.size :][:length]
-        for record in _records_of_chunk(offset, body) if opcode == Opcode.CHUNK else ():
+    for offset, _, outer in _records(BytesIO(records), within=True):
+        for record in _records_of_chunk(offset, outer) if isinstance(outer, Chunk) else ():
             if isinstance(record, Message):
                 yield record.channel_id, record.data
-        offset += _RECORD_HEAD.size + length
 
 
-def metadata(path: Path) -> dict[str, dict[str, str]]:
-    """The metadata before the first message, by name. Raises CutError, or OSError if the file cannot be opened."""
+def metadata(path: Path) -> tuple[dict[str, dict[str, str]], CutError | None]:
+    """The metadata before the first message, by name, and a cut before it. Raises OSError as `open`."""
     found: dict[str, dict[str, str]] = {}
     with path.open("rb") as stream:
-        for _, opcode, body in _records(stream):
-            if opcode == Opcode.CHUNK:
-                break
-            if opcode == Opcode.METADATA:
-                record = Metadata.read(ReadDataStream(BytesIO(body)))
-                found[record.name] = record.metadata
-    return found
+        try:
+            for _, _, record in _records(stream):
+                if isinstance(record, Chunk):
+                    break
+                if isinstance(record, Metadata):
+                    found[record.name] = record.metadata
+        except CutError as cut:
+            return found, cut
+    return found, None
 
 
 def count(path: Path, topic: str) -> int:
@@ -115,9 +126,27 @@ def count(path: Path, topic: str) -> int:
 
 def _summary(stream: IO[bytes]) -> Summary | None:
     """The index at the end of a file; None if it is missing or damaged."""
-    with suppress(*_DAMAGE):
-        return make_reader(stream).get_summary()
+    with suppress(OSError, *_DAMAGE):
+        if _has_whole_summary(stream):
+            most = _size(stream)
+            stream.seek(0)
+            return SeekingReader(stream, record_size_limit=most).get_summary()
     return None
+
+
+def _has_whole_summary(stream: IO[bytes]) -> bool:
+    """True if the checksum of the index is correct; the index has no other."""
+    end = _size(stream) - len(MCAP0_MAGIC)
+    stream.seek(end - _FOOTER_BYTES)
+    footer = Footer.read(ReadDataStream(BytesIO(stream.read(_FOOTER_BYTES)[_RECORD_HEAD.size :])))
+    if not len(MCAP0_MAGIC) <= footer.summary_start < end:
+        return False
+    stream.seek(footer.summary_start)
+    return zlib.crc32(stream.read(end - footer.summary_start)[:-4]) == footer.summary_crc
+
+
+def _size(stream: IO[bytes] | BytesIO) -> int:
+    return stream.seek(0, os.SEEK_END)
 
 
 def _last_chunk_with(topic: str, summary: Summary) -> int:
@@ -127,34 +156,56 @@ def _last_chunk_with(topic: str, summary: Summary) -> int:
     return max((chunk.chunk_start_offset for chunk in holding), default=0)
 
 
-def _records(stream: IO[bytes], start: int = 0) -> Iterator[tuple[int, int, bytes]]:
-    """Offset, opcode and body of each record of a file, starting at `start`, up to the end of the data section.
+def _records(stream: IO[bytes] | BytesIO, start: int = 0, *, within: bool = False) -> Iterator[tuple[int, int, object]]:
+    """Offset, size and content of each record of a file from `start`, up to the end of the data section.
 
-    Raises CutError for an incomplete record, and for a file that is not MCAP.
+    `within`: the stream has some complete records only. Raises CutError for an incomplete or damaged record, for a
+    record that a log does not have there, and for a file that is not MCAP.
     """
+    size = _size(stream)
     stream.seek(0)
-    if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+    if not within and stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise CutError(0)
-    stream.seek(max(start, len(MCAP0_MAGIC)))
-    while True:
-        offset, head = stream.tell(), stream.read(_RECORD_HEAD.size)
+    if start > size:
+        raise CutError(size)
+    offset = 0 if within else max(start, len(MCAP0_MAGIC))
+    stream.seek(offset)
+    while not within or offset < size:
+        head = stream.read(_RECORD_HEAD.size)
         if len(head) < _RECORD_HEAD.size:
             raise CutError(offset)
         opcode, length = _RECORD_HEAD.unpack(head)
-        if opcode not in set(Opcode):  # after a power failure, pages that were not written read as zeros
+        if length > size - offset:  # cut, or a damaged length, which may not even fit in memory
             raise CutError(offset)
-        if length > os.fstat(stream.fileno()).st_size:  # a damaged length may not even fit in memory
-            raise CutError(offset)
-        body = stream.read(length)
-        if len(body) < length:
-            raise CutError(offset)
-        if opcode == Opcode.DATA_END:
+        record = _record(offset, opcode, stream.read(length))
+        if isinstance(record, DataEnd):
             return
-        yield offset, opcode, body
+        yield offset, _RECORD_HEAD.size + length, record
+        offset += _RECORD_HEAD.size + length
 
 
-def _records_of_chunk(offset: int, body: bytes) -> list[object]:
+def _record(offset: int, opcode: int, body: bytes) -> object:
+    """A record of the data section. Raises CutError for another one, and if it does not fill its length."""
+    stream = BytesIO(body)
     try:
-        return list(breakup_chunk(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True))
+        kind = _KINDS[Opcode(opcode)]  # after a power failure, pages that were not written read as zeros
+        record = kind.read(ReadDataStream(stream))
+    except (KeyError, *_DAMAGE) as error:
+        raise CutError(offset) from error
+    if stream.tell() != len(body):  # a damaged length, which contains the records behind
+        raise CutError(offset)
+    return record
+
+
+def _records_of_chunk(offset: int, chunk: Chunk) -> list[object]:
+    try:
+        if max(chunk.uncompressed_size, _claimed_size(chunk)) > _MOST_CHUNK_BYTES:
+            raise CutError(offset)
+        return list(breakup_chunk(chunk, validate_crc=True))
     except _DAMAGE as error:
         raise CutError(offset) from error
+
+
+def _claimed_size(chunk: Chunk) -> int:
+    """The size of the data after decompression, as zstd allocates it."""
+    return frame_content_size(chunk.data) if chunk.compression == "zstd" else 0

@@ -71,6 +71,8 @@ class Drawing:
         self._T_world_keyframe: Mapping[int, Transform] = {}
         self._T_world_odom = np.eye(4)
         self._num_on_path = 0
+        self._rejected: set[str] = set()
+        """Identities of the drawn rejected loops."""
 
     def draw(self, step: Step, *, path: bool = True) -> Iterator[Topical]:
         """The messages of the next step.
@@ -99,6 +101,11 @@ class Drawing:
             poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
             yield schema.TRAJECTORY, poses
             yield schema.GRAPH, self._graph(estimate, stamp_ns)
+
+    def draw_path(self, estimate: GraphEstimate, *, stamp_ns: int) -> Topical:
+        """The path before the adjustment of the whole map."""
+        poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
+        return schema.TRAJECTORY_BEFORE, poses
 
     def draw_map(self, estimate: GraphEstimate, cloud: CloudOf, *, stamp_ns: int) -> Iterator[Topical]:
         """One cloud of the whole drive in world.
@@ -135,8 +142,14 @@ class Drawing:
                 for attempt in attempts
                 if isinstance(attempt.outcome, Rejected) is wanted
             ]
+            outdated = self._rejected & {entity.id for entity in entities} if topic == schema.ACCEPTED else set()
             if entities:
                 yield topic, foxglove.scene(entities)
+            if outdated:  # loops that waited for confirmation
+                yield schema.REJECTED, foxglove.scene([], deleted=outdated)
+                self._rejected -= outdated
+            if topic == schema.REJECTED:
+                self._rejected |= {entity.id for entity in entities}
 
     def _attempt(self, attempt: LoopAttempt, stamp_ns: int) -> foxglove.SceneEntity:
         outcome, pair = attempt.outcome, (attempt.candidate.source_id, attempt.candidate.target_id)

@@ -14,6 +14,7 @@ from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -105,9 +106,11 @@ def entity(
     )
 
 
-def scene(entities: Iterable[SceneEntity]) -> SceneUpdate:
-    """One message with all entities."""
-    return SceneUpdate(entities=entities)
+def scene(entities: Iterable[SceneEntity], *, deleted: Iterable[str] = ()) -> SceneUpdate:
+    """One message with all entities; those with the identities `deleted` disappear."""
+    kind = SceneEntityDeletion.MATCHING_ID
+    deletions = [SceneEntityDeletion(type=kind, id=identity) for identity in deleted]
+    return SceneUpdate(entities=entities, deletions=deletions)
 
 
 def _poses(T_frame_each: np.ndarray) -> list[Pose]:

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from google.protobuf.message import DecodeError
+
 from segslam.log.cloud import KeyframePoints, points_and_labels
 from segslam.log.container import CutError, Span, messages_within
 from segslam.types import Keyframe, Labels, Points, SegslamError
@@ -46,6 +48,6 @@ class RecordedKeyframes:
             for channel_id, data in messages_within(records):
                 if channel_id == one.channel_id:
                     return points_and_labels(KeyframePoints.FromString(data))
-        except (OSError, CutError) as error:
+        except (OSError, CutError, ValueError, DecodeError) as error:
             raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
         raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")

@@ -23,6 +23,16 @@ def metadata(
     config: Config, dataset: str, T_camera_lidar: Transform | None, options: Mapping[str, str]
 ) -> dict[str, dict[str, str]]:
     """Metadata records by name, as documented in `schema`."""
+    records = {
+        name: {key: _printable(value) for key, value in values.items()}
+        for name, values in _records(config, dataset, T_camera_lidar, options).items()
+    }
+    return {**records, schema.CHECK_METADATA: {"crc32": str(schema.checksum(records))}}
+
+
+def _records(
+    config: Config, dataset: str, T_camera_lidar: Transform | None, options: Mapping[str, str]
+) -> dict[str, dict[str, str]]:
     calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
     return {
         schema.RUN_METADATA: {
@@ -39,6 +49,11 @@ def metadata(
         schema.OPTIONS_METADATA: dict(options),
         schema.PACKAGES_METADATA: {name: _version(name) for name in PACKAGES},
     }
+
+
+def _printable(text: str) -> str:
+    """The text with bytes of file names that are not UTF-8, which a log cannot hold, as escapes."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def _command() -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from google.protobuf.message import DecodeError
 
+from segslam.adjustment import Adjustment
 from segslam.config import Config, config_from_yaml
 from segslam.log import container, schema
 from segslam.log.cloud import KeyframePoints, intensities, place_of, points_and_labels
@@ -24,6 +25,8 @@ from segslam.types import GraphEstimate, Keyframe, LateLoops, LoopAttempt, Segsl
 logger = logging.getLogger(__name__)
 
 NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
+NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, RecursionError, DecodeError)
+"""Exceptions on content of another program, or damaged in spite of a correct checksum."""
 Parts = Mapping[str, bytes]
 """The latest message of each topic."""
 Encoded = TypeVar("Encoded")
@@ -47,7 +50,7 @@ class RunLog:
     @property
     def T_camera_lidar(self) -> Transform | None:  # noqa: N802  (a transform)
         """Calibration of KITTI data; None for other data."""
-        return np.array(json.loads(self.run["T_camera_lidar"])) if "T_camera_lidar" in self.run else None
+        return self._decoded(_calibration, self.run["T_camera_lidar"]) if "T_camera_lidar" in self.run else None
 
     def num_steps(self) -> int:
         """Number of complete steps in the log."""
@@ -99,6 +102,11 @@ class RunLog:
             return ()
         return self._decoded(_late_loops, parts[schema.LATE_LOOPS]).attempts
 
+    def adjustment(self) -> Adjustment | None:
+        """The adjustment of the whole map; None without one, or if the run did not finish."""
+        parts = self._ending()
+        return self._decoded(_adjustment, parts[schema.ADJUSTMENT]) if schema.ADJUSTMENT in parts else None
+
     def _ending(self) -> Parts:
         """The messages of the result; empty if the run did not finish."""
         parts: dict[str, bytes] = {}
@@ -145,7 +153,15 @@ class RunLog:
     def _decoded(self, decode: Callable[[Encoded], Decoded], encoded: Encoded) -> Decoded:
         try:
             return decode(encoded)
-        except (KeyError, ValueError, TypeError, DecodeError) as error:
+        except (
+            LookupError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+            DecodeError,
+        ) as error:
             raise SegslamError(f"{self.path}: not written by segslam ({error!r}); map the data again") from error
 
 
@@ -153,13 +169,16 @@ def read_log(path: Path) -> RunLog:
     """Open the log of a run, complete or not. Raises SegslamError if it is missing or has another schema version."""
     remedy = "give the log.mcap of a run"
     try:
-        metadata = container.metadata(path)
+        metadata, cut = container.metadata(path)
     except OSError as error:
         raise SegslamError(f"{path}: cannot read the log ({error.strerror}); {remedy}") from error
-    except CutError as cut:
+    check = metadata.get(schema.CHECK_METADATA)
+    if cut is not None and check is None:
         raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}") from cut
+    if check is not None and check.get("crc32") != str(schema.checksum(metadata)):
+        raise SegslamError(f"{path}: the settings at its start are damaged (wrong checksum); map the data again")
     run = metadata.get(schema.RUN_METADATA, {})
-    if schema.CONFIG_METADATA not in metadata or "schema_version" not in run:
+    if "yaml" not in metadata.get(schema.CONFIG_METADATA, {}) or "schema_version" not in run:
         raise SegslamError(f"{path}: an MCAP file, but not a log of segslam; {remedy}")
     packages = metadata.get(schema.PACKAGES_METADATA, {})
     if run["schema_version"] != str(schema.VERSION):
@@ -209,8 +228,16 @@ def _estimate(parts: Parts) -> GraphEstimate:
     return codec(GraphEstimate).decode(values, {GraphEstimate: {"T_world_keyframe": T_world_keyframe}})
 
 
+def _calibration(text: str) -> Transform:
+    return np.array(json.loads(text), np.float64).reshape(4, 4)
+
+
 def _late_loops(data: bytes) -> LateLoops:
     return codec(LateLoops).decode(json.loads(data), {})
+
+
+def _adjustment(data: bytes) -> Adjustment:
+    return codec(Adjustment).decode(json.loads(data), {})
 
 
 def _trajectory(data: bytes) -> Trajectory:

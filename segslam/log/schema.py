@@ -1,8 +1,11 @@
 """Topics, frames and metadata of a log, and the version of this format."""
 
 import json
+import zlib
+from collections.abc import Mapping
 from typing import Any
 
+from segslam.adjustment import Adjustment
 from segslam.log.records import codec
 from segslam.types import GraphEstimate, LateLoops, Step, Trajectory
 
@@ -20,6 +23,8 @@ RESULT = "/result"
 """segslam.Result (JSON): the pose of every scan; once, after the last step and the last estimate."""
 LATE_LOOPS = "/late_loops"
 """segslam.LateLoops (JSON): loops tried after the last scan; once, after the last estimate; missing if none."""
+ADJUSTMENT = "/adjustment"
+"""segslam.Adjustment (JSON): the adjustment of the whole map; once, before the result; missing if none."""
 REFERENCE = "/reference"
 """segslam.Reference (JSON): the true poses of the scans, if known; before the first step."""
 TRANSFORMS = "/tf"
@@ -34,6 +39,8 @@ ODOMETRY = "/odometry"
 """foxglove.PosesInFrame: the keyframes by odometry alone; world and odom coincide at the start."""
 TRAJECTORY = "/trajectory"
 """foxglove.PosesInFrame: the keyframes in world, as often as /estimate."""
+TRAJECTORY_BEFORE = "/trajectory_before"
+"""foxglove.PosesInFrame: the keyframes in world before the adjustment of the whole map; once, if there was one."""
 GROUND_TRUTH = "/ground_truth"
 """foxglove.PosesInFrame: the true poses in world, moved to start at the origin of odom."""
 ACCEPTED = "/loops/accepted"
@@ -55,6 +62,15 @@ OPTIONS_METADATA = "segslam.options"
 PACKAGES_METADATA = "segslam.packages"
 """Metadata record: package -> version."""
 
+CHECK_METADATA = "segslam.check"
+"""Metadata record: `crc32`, the checksum of the other records, because MCAP has none; missing in older logs."""
+
+
+def checksum(metadata: Mapping[str, Mapping[str, str]]) -> int:
+    """CRC-32 of metadata records."""
+    named = {name: dict(values) for name, values in metadata.items() if name != CHECK_METADATA}
+    return zlib.crc32(json.dumps(named, sort_keys=True).encode())
+
 
 def json_schemas() -> dict[str, dict[str, Any]]:
     """Topic -> JSON Schema of its messages, for topics without a Foxglove schema."""
@@ -66,6 +82,7 @@ def json_schemas() -> dict[str, dict[str, Any]]:
         ESTIMATE: estimate | {"title": "segslam.Estimate"},
         MEMORY: {"title": "segslam.Memory", "type": "object", "properties": {"rss_mb": {"type": "number"}}},
         RESULT: codec(Trajectory).schema | {"title": "segslam.Result"},
+        ADJUSTMENT: codec(Adjustment).schema | {"title": "segslam.Adjustment"},
         LATE_LOOPS: codec(LateLoops).schema | {"title": "segslam.LateLoops"},
         REFERENCE: codec(Trajectory).schema | {"title": "segslam.Reference"},
     }

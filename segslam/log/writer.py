@@ -11,6 +11,7 @@ from typing import IO, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
+from segslam.adjustment import Adjusted, Adjustment
 from segslam.config import Config
 from segslam.log import schema
 from segslam.log.channels import channels
@@ -106,24 +107,39 @@ class LogWriter:
         self._newest = keyframe
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
-        """Points and labels of a keyframe, read from the file."""
-        if self._newest is not None and self._newest.id == keyframe_id:
-            return self._newest.points, self._newest.labels
+        """Points and labels of a keyframe, read from the file. Raises SegslamError if the log is closed.
+
+        Another thread may write the next step meanwhile.
+        """
+        newest = self._newest
+        if newest is not None and newest.id == keyframe_id:
+            return newest.points, newest.labels
         offset, size = self._steps_of_keyframes[keyframe_id]
-        for channel_id, data in messages_within(self._output.read(offset, size)):
+        try:
+            records = self._output.read(offset, size)
+        except (OSError, ValueError) as error:  # ValueError: closed, perhaps just now
+            raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read, the log is closed") from error
+        for channel_id, data in messages_within(records):
             if channel_id == self._channels[schema.KEYFRAME]:
                 return points_and_labels(KeyframePoints.FromString(data))
         raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
 
     def write_result(
-        self, estimate: GraphEstimate, trajectory: Trajectory, late_loops: tuple[LoopAttempt, ...] = ()
+        self,
+        estimate: GraphEstimate,
+        trajectory: Trajectory,
+        late_loops: tuple[LoopAttempt, ...] = (),
+        adjusted: Adjusted | None = None,
     ) -> None:
-        """Write the final estimate, the pose of every scan, and loops tried after the last scan."""
+        """Write the final estimate, the pose of every scan, loops tried after the last scan, and the adjustment."""
         drawn = self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns)
         whole_map = self._drawing.draw_map(estimate, self.cloud, stamp_ns=self._stamp_ns)
         messages = [*_serialised(whole_map), *_serialised(drawn), _estimate_message(estimate)]
         if late_loops:
             messages.append((schema.LATE_LOOPS, _json(LateLoops, LateLoops(late_loops))))
+        if adjusted is not None:
+            path = self._drawing.draw_path(adjusted.before, stamp_ns=self._stamp_ns)
+            messages += [*_serialised([path]), (schema.ADJUSTMENT, _json(Adjustment, adjusted.record))]
         self._write([*messages, (schema.RESULT, _json(Trajectory, trajectory))], stamp_ns=self._stamp_ns)
 
     def move(self, path: Path) -> None:

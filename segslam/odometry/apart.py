@@ -55,25 +55,17 @@ class _AlignerApart:
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
         """T_odom_lidar of the next sweep, `gap` intervals after the previous one."""
-        return self._request(gap, points)
-
-    def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
-        """As `KissAligner.restore`."""
-        self._request(T_odom_lidar, points)
+        sent: Points | int = points
+        if len(points) <= len(self._shared):
+            self._shared[: len(points)] = points
+            sent = len(points)
+        return self._exchange((sent, gap))
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
         """As `Odometry.follow`."""
         self._exchange((list(scans), T_odom_lidar, T_before_lidar))
-
-    def _request(self, known: Transform | float, points: Points | None) -> Transform:
-        """The pose from the other process; `known` is the pose of the sweep, or the gap before it."""
-        sent: Points | int | None = points
-        if points is not None and len(points) <= len(self._shared):
-            self._shared[: len(points)] = points
-            sent = len(points)
-        return self._exchange((known, sent))
 
     def _exchange(self, request: tuple[Any, ...]) -> Transform:
         try:
@@ -112,8 +104,8 @@ def _as_points(shared: Any) -> Points:
 def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
     """Answer requests with a pose until the other side closes the pipe.
 
-    Points with a gap are aligned, points with a pose are restored, three values are the arguments of `follow`. Points
-    are sent themselves or, if they are in the shared memory, as their number.
+    Two values are the points and the gap of a sweep to align, three the arguments of `follow`. Points are sent
+    themselves or, if they are in the shared memory, as their number.
     """
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and then closes the pipe
@@ -126,12 +118,7 @@ def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
                 aligner.follow(*request)
                 pipe.send(request[1])
                 continue
-            known, sent = request
-            points = shared_points[:sent] if isinstance(sent, int) else sent
-            if isinstance(known, float):
-                known = aligner.align(points, known)
-            else:
-                aligner.restore(known, points)
-            pipe.send(known)
+            sent, gap = request
+            pipe.send(aligner.align(shared_points[:sent] if isinstance(sent, int) else sent, gap))
     except (EOFError, OSError):
         return

@@ -1,14 +1,13 @@
 """Odometry from a given trajectory."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
 from segslam import geometry
 from segslam.config import OdometryConfig
-from segslam.odometry.sweep import Followed, OdometryResult, deskew_scan
-from segslam.trajectory import Poses
+from segslam.odometry.sweep import OdometryResult, deskew_scan
 from segslam.types import BadScan, Points, Scan, Trajectory, Transform
 
 
@@ -41,19 +40,17 @@ class GivenOdometry:
         self._T_odom_given, self._T_odom_last, self._T_given_last = T_odom_given, T_odom_lidar, T_given_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
-    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan], *, since: Followed | None = None) -> None:
-        """Continue after the scans with these poses (n, 4, 4); only the first scan is read, with `scan_of`."""
-        row = 0 if since is None else since[0]
-        T_given_lidar = self._trajectory.T_world_lidar[self._row(scan_of(row))]
-        T_first_given = geometry.inverse(T_given_lidar)
-        self._T_odom_given = T_first_given if since is None else T_odom_lidar[row] @ T_first_given
-        self._T_given_last = self._trajectory.T_world_lidar[self._row(scan_of(len(T_odom_lidar) - 1))]
-        self._T_odom_last = T_odom_lidar[-1]
-
     def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+        self,
+        scans: Sequence[tuple[Transform, Points]],
+        T_odom_lidar: Transform,
+        T_before_lidar: Transform,
+        *,
+        last: Scan | None = None,
     ) -> None:
-        """Continue from another pose of the last scan."""
+        """Continue from another pose of the last scan. Raises BadScan if `last` has no pose."""
+        if last is not None:
+            self._T_given_last = self._trajectory.T_world_lidar[self._row(last)]
         self._T_odom_given = T_odom_lidar @ geometry.inverse(self._T_given_last)
         self._T_odom_last = T_odom_lidar
 

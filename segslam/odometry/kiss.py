@@ -1,6 +1,6 @@
 """KISS-ICP (Vizzo et al., RA-L 2023), using the package of its authors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -10,8 +10,7 @@ from kiss_icp.kiss_icp import KissICP
 
 from segslam import geometry
 from segslam.config import OdometryConfig
-from segslam.odometry.sweep import Followed, OdometryResult, deskew_scan
-from segslam.trajectory import Poses
+from segslam.odometry.sweep import OdometryResult, deskew_scan
 from segslam.types import Points, Scan, Transform
 
 
@@ -21,10 +20,6 @@ class Aligner(Protocol):
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
         """T_odom_lidar of the next sweep from its points (n, 3), float64, `gap` intervals after the previous one."""
-        ...
-
-    def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
-        """Set the state after aligning a sweep at this pose; `points`: None if the local map has dropped them all."""
         ...
 
     def follow(
@@ -63,16 +58,6 @@ class KissAligner:
         kiss.last_delta = geometry.scaled(kiss.last_delta, 1 / gap)
         return np.array(kiss.last_pose)
 
-    def restore(self, T_odom_lidar: Transform, points: Points | None) -> None:
-        """Set the state after aligning a sweep at this pose; `points`: None if the local map has dropped them all."""
-        kiss = self._kiss
-        if points is not None:
-            kiss.local_map.update(kiss.voxelize(points)[1], T_odom_lidar)
-        T_odom_predicted = kiss.last_pose @ kiss.last_delta
-        kiss.adaptive_threshold.update_model_deviation(np.linalg.inv(T_odom_predicted) @ T_odom_lidar)
-        kiss.last_delta = _since(kiss.last_pose, T_odom_lidar)
-        kiss.last_pose = T_odom_lidar
-
 
 class KissOdometry:
     """Scan-to-map odometry: deskews and crops scans and aligns them, by default with KISS-ICP in this process."""
@@ -95,28 +80,13 @@ class KissOdometry:
         self._T_last_lidar = geometry.scaled(self._T_last_lidar, 1 / gap)
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
-    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan], *, since: Followed | None = None) -> None:
-        """Set the exact state after registering scans with these poses (n, 4, 4). `scan_of` reads the scan of a row.
-
-        Only scans that can have points in the local map are read: the map drops points beyond its range, so all scans
-        up to the last one that is more than twice this range away are skipped.
-        """
-        done = 0
-        if since is not None:
-            row, scans = since
-            T_before = np.eye(4) if row == 0 else T_odom_lidar[row - 1]
-            self.follow(scans, T_odom_lidar[row], np.linalg.inv(T_before) @ T_odom_lidar[row])
-            done = row + 1
-        apart_m = np.linalg.norm(T_odom_lidar[:, :3, 3] - T_odom_lidar[-1, :3, 3], axis=1)
-        forgotten = np.flatnonzero(apart_m > 2 * self._config.max_range_m)
-        first = forgotten[-1] + 1 if len(forgotten) else 0
-        for row, T_odom_now in enumerate(T_odom_lidar[done:], start=done):
-            points = deskew_scan(scan_of(row), self._T_last_lidar, self._config)[0] if row >= first else None
-            self._aligner.restore(T_odom_now, points)
-            self._now_at(T_odom_now)
-
     def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+        self,
+        scans: Sequence[tuple[Transform, Points]],
+        T_odom_lidar: Transform,
+        T_before_lidar: Transform,
+        *,
+        last: Scan | None = None,
     ) -> None:
         """Continue from another pose of the last scan, with a local map of these scans alone."""
         self._aligner.follow(scans, T_odom_lidar, T_before_lidar)

@@ -1,6 +1,6 @@
 """Interface of all odometries: scans in, poses and motion-compensated, cropped points out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -10,7 +10,6 @@ from kiss_icp.preprocess import Preprocessor
 from segslam.config import OdometryConfig
 from segslam.points import is_finite, within_range
 from segslam.semantics.late import of_rows
-from segslam.trajectory import Poses
 from segslam.types import BadScan, Motion, Points, Scan, ScanLabels, Transform, Vector
 
 
@@ -30,10 +29,6 @@ class OdometryResult:
     """Result of the check of the motion; None if it was not checked."""
 
 
-Followed = tuple[int, Sequence[tuple[Transform, Points]]]
-"""Row of a scan, and the scans (pose, downsampled points) passed to `Odometry.follow` after it."""
-
-
 @runtime_checkable
 class Odometry(Protocol):
     """Estimates the pose of each scan in the frame of the first."""
@@ -50,19 +45,18 @@ class Odometry(Protocol):
         """
         ...
 
-    def restore(self, T_odom_lidar: Poses, scan_of: Callable[[int], Scan], *, since: Followed | None = None) -> None:
-        """Continue after scans with these poses (n, 4, 4), n >= 1; `scan_of` reads the scan of a row.
-
-        `since`: the last row after which `follow` was called, and the scans passed to it.
-        """
-        ...
-
     def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+        self,
+        scans: Sequence[tuple[Transform, Points]],
+        T_odom_lidar: Transform,
+        T_before_lidar: Transform,
+        *,
+        last: Scan | None = None,
     ) -> None:
         """Continue from another pose of the last scan, with a local map of these scans (poses and downsampled points).
 
-        `T_before_lidar`: the motion between the last two scans.
+        `T_before_lidar`: the motion between the last two scans, per interval of the sensor. `last`: the last scan, if
+        it was registered by another instance, as before an interruption.
         """
         ...
 

@@ -13,7 +13,7 @@ from segslam.pose_graph.closure_pairs import adjoints, consistent_pairs, ends_m,
 from segslam.pose_graph.edges import Edge
 from segslam.pose_graph.g2o import G2oGraph
 from segslam.pose_graph.gnc import Solution, TruncatedProblem, better, settle, solve
-from segslam.pose_graph.levenberg_marquardt import Search, search
+from segslam.pose_graph.levenberg_marquardt import Search, deeply, search
 from segslam.pose_graph.selection import exchange_groups, large_groups
 from segslam.types import Mask, Vector
 
@@ -79,7 +79,7 @@ def least_squares(factors: gtsam.NonlinearFactorGraph, start: gtsam.Values, *, r
     if plausible(2.0 * near.error, redundancy):
         return near
     logger.info("the optimum near the file's poses does not fit the edges: searching from chordal poses too")
-    other = search(factors, gtsam.InitializePose3.initialize(factors))
+    other = search(factors, deeply(start.size(), lambda: gtsam.InitializePose3.initialize(factors)))
     best = min(near, other, key=lambda found: found.error)
     return best._replace(iterations=near.iterations + other.iterations)
 

@@ -15,6 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation as ScipyRotation
 
+from segslam.errors import brief
 from segslam.pose_graph.edges import Edge, Transforms
 from segslam.types import Indices, SegslamError, Transform
 
@@ -26,6 +27,7 @@ PLANAR = ("VERTEX_SE2", "EDGE_SE2")
 UPPER = np.triu_indices(6)
 OTHER_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 """Turns [translation; rotation] into [rotation; translation], and back."""
+MAX_ID = 2**63
 QUATERNION_TOLERANCE = 0.01  # chosen: above the rounding of any writer met, far below any other four numbers
 
 
@@ -119,7 +121,7 @@ def _complaint(tag: str, num_fields: int) -> str:
     if tag in PLANAR:
         return f"{tag} belongs to a graph in the plane; only graphs in space ({VERTEX}, {EDGE}) can be read"
     if tag not in NUM_FIELDS:
-        return f"unknown tag {tag}; known are {', '.join(NUM_FIELDS)}: remove the line"
+        return f"unknown tag {brief(tag)}; known are {', '.join(NUM_FIELDS)}: remove the line"
     return f"{tag} takes {NUM_FIELDS[tag]} numbers, found {num_fields}; correct or remove the line"
 
 
@@ -131,9 +133,9 @@ def _table(path: Path, tag: str, line_numbers: list[int], fields: list[list[str]
             table.ids.append([int(text) for text in texts[:num_ids]])
             table.numbers[row] = texts[num_ids:]
         except ValueError as error:
-            raise table.refusal(row, str(error)) from error
-        if min(table.ids[row]) < 0:
-            raise table.refusal(row, "ids are not negative")
+            raise table.refusal(row, brief(str(error))) from error
+        if not 0 <= min(table.ids[row]) <= max(table.ids[row]) < MAX_ID:
+            raise table.refusal(row, "ids are at least 0 and below 2**63")
     for broken in np.flatnonzero(~np.isfinite(table.numbers).all(axis=1)):
         raise table.refusal(broken, "every number must be finite")
     return table

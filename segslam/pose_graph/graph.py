@@ -5,6 +5,7 @@ keyframes with 396 closures take about 15 ms per iteration, and two or three ite
 several closures are collected before an optimisation.
 """
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,16 +16,19 @@ import numpy as np
 from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import noise
+from segslam.pose_graph.adjusted import solve_adjusted
 from segslam.pose_graph.breaks import is_break, relinked
 from segslam.pose_graph.closure_pairs import consistent_pairs, largest_consistent
 from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors, values_of
 from segslam.pose_graph.final import Measured, solve_consistent, solve_gnc
 from segslam.pose_graph.g2o import G2oGraph, write_g2o
-from segslam.pose_graph.levenberg_marquardt import search
+from segslam.pose_graph.levenberg_marquardt import Search, Unsolvable, search
 from segslam.pose_graph.motions import MotionSolution, without
 from segslam.pose_graph.rows import Rows
 from segslam.pose_graph.steady_drift import noise_factor, steady_drift, turned
 from segslam.types import GraphEstimate, Information, LoopClosure, Mask, SegslamError, Transform, Vector
+
+logger = logging.getLogger(__name__)
 
 RUNNING_TOLERANCE = 1e-3
 """Relative tolerance of the optimisations while running. Chosen: the same trajectories to a centimetre, with a third
@@ -64,6 +68,8 @@ class PoseGraph:
         self._T_world = Rows(np.empty((0, 4, 4)))
         """The poses in `_values`, as an array."""
         self._num_closures_in_estimate = 0
+        self._weights: list[float] = []
+        """Weights of the closures in the last estimate."""
         self._T_odom_last = np.eye(4)
         self._travel_m = Rows(np.empty(0))
         self._time_s = Rows(np.empty(0))
@@ -202,10 +208,26 @@ class PoseGraph:
         robust = self._optimize(FINAL_TOLERANCE)
         if self._config.final == "none":
             return robust
-        final = self._solve_final()
+        try:
+            final = self._solve_final()
+        except Unsolvable as error:
+            logger.warning("no final optimisation, the estimate under the robust kernel remains: %s", error)
+            return robust
         if self._corrects_steady_drift(final.solution.weights):
             final = self._solve_final()
         return self._estimate(final.solution.search.error, final.solution.weights)
+
+    def adjust(self, measured: Sequence[Edge]) -> tuple[GraphEstimate, tuple[float, float]]:
+        """The estimate with further relative poses, after `finish`, and factors of noise (`solve_adjusted`).
+
+        Rejected closures and motions stay rejected. `measured` replaces that of an earlier call.
+        """
+        kept = [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
+        found, factors = solve_adjusted(
+            self._prior(), self._kept_odometry(), kept, measured, self._values, self._kernel
+        )
+        self._take(found.values)
+        return self._estimate(found.error, self._weights), factors
 
     def _solve_final(self) -> MotionSolution:
         measured = Measured(
@@ -275,7 +297,12 @@ class PoseGraph:
         self._backbone = joined(self._prior(), factor_graph(self._kept_odometry()))
 
     def _optimize(self, tolerance: float) -> GraphEstimate:
-        found = search(joined(self._backbone, self._robust), self._linked(), tolerance=tolerance)
+        factors, start = joined(self._backbone, self._robust), self._linked()
+        try:
+            found = search(factors, start, tolerance=tolerance)
+        except Unsolvable as error:
+            logger.warning("the poses remain as they were before the last loops: %s", error)
+            found = Search(start, factors.error(start), 0, converged=False)
         self._take(found.values)
         errors = np.sqrt(squared_errors(self._closure_factors, self._values))
         weights = [1.0 if self._kernel is None else self._kernel.weight(float(error)) for error in errors]
@@ -298,9 +325,10 @@ class PoseGraph:
 
     def _estimate(self, error: float, weights: Iterable[float]) -> GraphEstimate:
         pairs = [(closure.b, closure.a) for closure in self._closures]
+        self._weights = list(map(float, weights))
         return GraphEstimate(
             dict(enumerate(self.T_world_keyframes)),
             float(error),
-            dict(zip(pairs, map(float, weights), strict=True)),
+            dict(zip(pairs, self._weights, strict=True)),
             {(int(row), int(row) + 1): 0.0 for row in np.flatnonzero(self._rejected)},
         )

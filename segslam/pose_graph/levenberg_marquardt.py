@@ -1,11 +1,14 @@
 """Local optimisation of a graph by Levenberg-Marquardt."""
 
+import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
 
 import gtsam
+
+from segslam.types import SegslamError
 
 LAMBDA_FACTOR = 100.0
 """Factor of the damping (GTSAM: 10); near the optimum, where most searches start, it saves an iteration."""
@@ -16,6 +19,10 @@ STACK_BYTES_PER_POSE = 4096
 """Chosen: 8 MB are enough for 50,000 poses of `tools/benchmarks/speed`, not for 100,000. Unused stack costs nothing."""
 
 Done = TypeVar("Done")
+
+
+class Unsolvable(SegslamError):
+    """The optimum cannot be computed: the edges do not determine all poses, or their numbers are too different."""
 
 
 class Search(NamedTuple):
@@ -33,13 +40,13 @@ def search(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, *, tolerance:
     """Minimise the error from `start` by Levenberg-Marquardt.
 
     It ends with an iteration that lowers the error by a share below `tolerance`. The distance left to the optimum is
-    far less, because the search converges quadratically.
+    far less, because the search converges quadratically. Raises Unsolvable.
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(tolerance)
     parameters.setlambdaFactor(LAMBDA_FACTOR)
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
-    values = _deeply(start.size(), optimizer.optimize)
+    values = deeply(start.size(), optimizer.optimize)
     stopped = (
         optimizer.iterations() >= parameters.getMaxIterations()
         or optimizer.lambda_() >= parameters.getlambdaUpperBound()
@@ -48,19 +55,34 @@ def search(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, *, tolerance:
 
 
 def step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    """One Gauss-Newton step."""
-    return values.retract(_deeply(values.size(), graph.linearize(values).optimize))
+    """One Gauss-Newton step. Raises Unsolvable."""
+    return values.retract(deeply(values.size(), graph.linearize(values).optimize))
 
 
-def _deeply(num_poses: int, work: Callable[[], Done]) -> Done:
-    """Work done on a stack deep enough for GTSAM, which calls itself along the drive and crashes where a stack ends."""
+def deeply(num_poses: int, work: Callable[[], Done]) -> Done:
+    """Work done on a stack deep enough for GTSAM, which calls itself along the drive and crashes where a stack ends.
+
+    Raises Unsolvable for an error of GTSAM.
+    """
     if num_poses <= SHALLOW:
-        return work()
+        return _solved(work)
     usual = threading.stack_size(num_poses * STACK_BYTES_PER_POSE)
     try:
         thread = ThreadPoolExecutor(1)
-        done = thread.submit(work)  # this is when the thread begins
+        done = thread.submit(_solved, work)  # this is when the thread begins
     finally:
         threading.stack_size(usual)
     with thread:
         return done.result()
+
+
+def _solved(work: Callable[[], Done]) -> Done:
+    try:
+        return work()
+    except RuntimeError as error:
+        found = re.search(r"near variable (\w+)", " ".join(str(error).split()))
+        where = f" near vertex {found[1]}" if found else ""
+        raise Unsolvable(
+            f"the poses{where} cannot be computed: an edge has far larger numbers than the others, or the edges leave "
+            "a direction open; correct or remove the edge"
+        ) from error

@@ -47,6 +47,11 @@ FIGURES = {
     "loop_recall": "share of the revisits within 4 m that a correct loop closes",
     "vertical_deg": "remaining error of the vertical angles; positive: points are too low (degrees)",
     "vertical_sigma_deg": "standard deviation of this error (degrees)",
+    "vertical_correction_deg": "elevation added to all points for the adjustment and the map (degrees)",
+    "map_thickness_before_m": "thickness of surfaces in the map before the adjustment (m)",
+    "map_thickness_m": "thickness of surfaces in the map: median standard deviation about local planes (m)",
+    "num_submap_pairs": "pairs of submaps registered for the adjustment",
+    "adjustment_moved_m": "distance by which the adjustment moved keyframes, rms (m)",
     "seconds_total": "total time (s)",
     "scans_per_second": "scans per second",
     "peak_rss_mb": "peak memory (MB)",
@@ -100,9 +105,25 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     """The figures of `metrics.json`. Raises SegslamError if there are none."""
     file = folder / "metrics.json"
     try:
-        return dict(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
+        return _checked_metrics(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, RecursionError) as error:
         raise SegslamError(f"{file}: cannot read the figures of the run ({error}); replay its log.mcap") from error
+
+
+def _checked_metrics(values: Any) -> dict[str, Any]:
+    """The figures, without those that are null. Raises ValueError if a figure that is shown is no number."""
+    if not isinstance(values, dict):
+        raise ValueError("not a JSON object")
+    known = {key: value for key, value in values.items() if value is not None}
+    times = known.get("stage_ms", {})
+    if not isinstance(times, dict) or not all(isinstance(one, dict) for one in times.values()):
+        raise ValueError("stage_ms is not a JSON object of objects")
+    shown = {key: value for key, value in known.items() if key.removeprefix("odometry_") in FIGURES}
+    shown |= {f"stage_ms.{stage}.{name}": one.get(name) for stage, one in times.items() for name in ("median", "p95")}
+    for key, value in shown.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{key} is no number")
+    return known
 
 
 def true_poses(file: Path, run: FinishedRun) -> Trajectory:

@@ -121,8 +121,7 @@ def room_for(folder: Path) -> Iterator[None]:
         cause = error if isinstance(error, OSError) else error.__cause__
         why = reason(cause) if isinstance(cause, OSError) else str(error)
         raise WorkFailed(
-            f"{folder}: cannot write the results ({why}); free space on the disk, then continue with --resume: "
-            "the log is complete"
+            f"{folder}: cannot write the results ({why}); free space on the disk; the log is complete"
         ) from error
 
 

@@ -9,6 +9,7 @@ from segslam.errors import SegslamError
 from segslam.log import schema
 from segslam.log.channels import channels
 from segslam.log.drawing import map_message
+from segslam.run.origin_check import OriginCheck, hidden_address
 from segslam.types import Labels, Points
 
 LASTING = (schema.MAP, schema.ODOMETRY, schema.TRAJECTORY, schema.GROUND_TRUTH, schema.GRAPH, schema.RESULT)
@@ -40,17 +41,22 @@ class FoxgloveServer(ServerListener):
         self._last: dict[str, tuple[bytes, int]] = {}
         self._lock = Lock()
         try:
+            inner = hidden_address()
             self._server = foxglove.start_server(
                 name="segslam",
-                host=host,
-                port=port,
+                host=inner,
+                port=0,
                 server_listener=self,
                 context=context,
                 message_backlog_size=MOST_MESSAGES,
             )
+            self._check = OriginCheck(host, port, (inner, self._server.port))
         except (OSError, RuntimeError) as error:
             raise SegslamError(f"--foxglove {address}: cannot listen there ({error}); give another port") from error
-        self.url = f"ws://{host}:{self._server.port}"
+        shown = f"[{host}]" if ":" in host else host
+        self.url = f"ws://{shown}:{self._check.port}"
+        self.is_public = host != "localhost" and not host.startswith("127.") and host != "::1"
+        """True if other machines can connect; there is no password."""
 
     def send(self, topic: str, data: bytes, stamp_ns: int) -> None:
         """Send a message of the log to the subscribers of its topic."""
@@ -75,6 +81,7 @@ class FoxgloveServer(ServerListener):
 
     def __exit__(self, *_: object) -> None:
         self._server.stop()
+        self._check.close()
 
 
 def parse_address(address: str) -> tuple[str, int]:

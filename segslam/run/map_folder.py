@@ -1,6 +1,7 @@
 """Mapping of a data set into a run folder with one call."""
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -60,16 +61,19 @@ def map_folder(
     from segslam.run.report import write_report
 
     given, config = config, config or Config()
-    scans = open_scans(DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic), config)
+    source = DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic)
+    scans = open_scans(source, config)
     config = in_effect(given or preset(preset_for(extent_m(scans))), scans)
     folder = new_folder(Path(out))
+    own = {"odometry": odometry, "slam_of": None if slam_of is Slam or "in_map" in options else slam_of}
+    not_resumed = [name for name, value in own.items() if value is not None]
     with Run(
         folder,
         slam_of(config, odometry=odometry, labeller=labeller_of(scans)),
         dataset=scans.name,
         T_camera_lidar=scans.T_camera_lidar,
         reference=scans.reference,
-        options=options,
+        options={**resume_options(source), "python": ", ".join(not_resumed), **options},
     ) as run:
         for step in run.map(scans):
             if not isinstance(step, BadScan):
@@ -82,6 +86,23 @@ def map_folder(
     write_metrics(folder, metrics)
     write_report(folder)
     return read_run(folder)
+
+
+def resume_options(
+    source: DataSource, *, odometry: Path | None = None, map_files: Sequence[Path] = ()
+) -> dict[str, str]:
+    """The options that `segslam resume` reads from the log of a run."""
+    return {
+        "data": str(Path(source.data).expanduser().resolve()),
+        "dataset": source.dataset or "",
+        "sequence": source.sequence,
+        "frames": source.frames or "",
+        "topic": source.topic,
+        "labels": source.labels,
+        "encoding": source.encoding or "",
+        "odometry": str(odometry.resolve()) if odometry else "",
+        "map_files": json.dumps([str(name) for name in map_files]),
+    }
 
 
 def open_scans(source: DataSource, config: Config) -> Dataset:

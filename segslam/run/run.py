@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from segslam.adjustment import Progress, no_progress
 from segslam.calibration import measure_vertical_angle
 from segslam.config import config_to_yaml
 from segslam.datasets import Dataset
@@ -87,7 +88,7 @@ class Run:
                 options=options,
                 mirror=mirror,
             )
-        except SegslamError:
+        except BaseException:
             self._remove_unbegun()
             raise
         slam.keep_clouds_in(self._log)
@@ -127,7 +128,13 @@ class Run:
 
         def scan_of(number: int) -> Scan:
             row, stamp_ns = taken[number]
-            scan = dataset[row]
+            try:
+                scan = dataset[row]
+            except BadScan as error:
+                raise SegslamError(
+                    f"{error}; {recorded.path} has it mapped, so restore it to resume, or: segslam replay "
+                    f"{recorded.path.parent} --out NEW"
+                ) from error
             if scan.stamp_ns != stamp_ns:
                 raise _other_data(recorded.path, f"has scan {scan.index} at {stamp_ns} ns, the data {scan.stamp_ns} ns")
             return scan
@@ -170,21 +177,28 @@ class Run:
 
         return in_other_thread(steps, taken, max_waiting=MOST_WAITING)
 
-    def finish(self, *, search_s: float = math.inf) -> tuple[SlamResult, dict[str, Any]]:
+    def finish(
+        self, *, search_s: float = math.inf, progress: Progress = no_progress
+    ) -> tuple[SlamResult, dict[str, Any]]:
         """Final optimisation; writes all results. Returns the result and the figures that need no reference.
 
-        `search_s` limits the last search for loops, as in `Slam.finish`. Raises SegslamError if there was no step.
+        `search_s` limits the last search for loops, and `progress` shows the adjustment, as in `Slam.finish`. Raises
+        SegslamError if there was no step.
         """
         if self.num_steps == 0:
             raise SegslamError(f"{self._dataset}: {self._why_nothing()}")
         started = perf_counter()
-        result = self._slam.finish(search_s=search_s)
+        result = self._slam.finish(search_s=search_s, progress=progress)
         self._note_ms("finish", perf_counter() - started)
-        started = perf_counter()
-        vertical = self._vertical_angle(result)
-        self._note_ms("calibrate", perf_counter() - started)
+        if result.adjusted is None:
+            started = perf_counter()
+            figures = self._vertical_angle(result)
+            self._note_ms("calibrate", perf_counter() - started)
+        else:
+            figures = result.adjusted.record.figures()
+            self._note_ms("adjust", result.adjusted.record.seconds)
         late = result.attempts[len(result.attempts) - result.num_late_attempts :]
-        self._log.write_result(result.estimate, result.trajectory, late)
+        self._log.write_result(result.estimate, result.trajectory, late, result.adjusted)
         self._log.close()
         seconds, seconds_mapping = (perf_counter() - since for since in (self._started, self._started_mapping))
         with room_for(self.folder):
@@ -208,7 +222,7 @@ class Run:
             "seconds_total": seconds,
             "scans_per_second": (len(result.trajectory) - self.num_scans_resumed) / seconds_mapping,
             "peak_rss_mb": peak_rss_mb(),
-            **vertical,
+            **figures,
             **({} if result.from_map_m is None else {"localised_percent": 100.0 * float(result.localised().mean())}),
             "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
         }

@@ -149,6 +149,8 @@ class Scene:
         color = REJECTED_COLORS[outcome.reason] if isinstance(outcome, Rejected) else ACCEPTED_COLOR
         shown = f"{outcome.reason}: {outcome.detail}" if isinstance(outcome, Rejected) else "accepted"
         ends = [self._T_world_keyframe[keyframe_id][:3, 3] for keyframe_id in ids]
+        if not rejected:  # it may have waited for confirmation
+            self._viewer.log(f"{WORLD}/loops/rejected/{ids[0]}-{ids[1]}", rr.Clear(recursive=False))
         self._viewer.log(
             f"{WORLD}/loops/{'rejected' if rejected else 'accepted'}/{ids[0]}-{ids[1]}",
             rr.LineStrips3D([ends], colors=[_rgb(color)], labels=[shown], show_labels=False),

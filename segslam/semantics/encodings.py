@@ -105,7 +105,8 @@ def detect_encoding(num_points_of_id: Histogram) -> Encoding:
 
 def _looks_like_a_street(num_points_of_id: Histogram, encoding: Encoding) -> bool:
     ids = np.flatnonzero(num_points_of_id)
-    share = np.bincount(to_labels(ids, encoding), num_points_of_id[ids], minlength=len(Label)) / num_points_of_id.sum()
+    share = np.bincount(to_labels(ids, encoding), num_points_of_id[ids], minlength=len(Label))
+    share = share / max(1, num_points_of_id.sum())
     return bool(share[list(RARE)].sum() <= RARE_MAX_SHARE and share[Label.ROAD] >= ROAD_MIN_SHARE)
 
 

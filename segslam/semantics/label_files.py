@@ -10,6 +10,7 @@ import numpy as np
 
 from segslam.semantics.encodings import Encoding, Histogram, Ids, detect_encoding, to_ids, to_labels
 from segslam.semantics.network import Network, open_network
+from segslam.system.paths import expanded
 from segslam.system.whole_files import whole_file
 from segslam.types import BadScan, Label, Labels, Mask, Points, ScanLabels, SegslamError, Vector
 
@@ -70,12 +71,12 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
     if source in ("none", "geometric"):
         return LabelSource(None, geometric=source == "geometric")
     if source.startswith(NETWORK):
-        return LabelSource(None, geometric=False, network=open_network(Path(source.removeprefix(NETWORK)).expanduser()))
+        return LabelSource(None, geometric=False, network=open_network(expanded(source.removeprefix(NETWORK))))
     if source == "auto":
         if not _labelled(beside / "labels", scan_names):
             return LabelSource(None, geometric=True)
         return LabelSource(_open_folder(beside / "labels", scan_names, encoding), geometric=True)
-    folder = beside / Path(source).expanduser()
+    folder = beside / expanded(source)
     if not folder.is_dir():
         raise SegslamError(f"--labels {source}: no folder {folder}; give one, auto, none, geometric or network:MODEL")
     if not _labelled(folder, scan_names):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from segslam.errors import brief
 from segslam.points import within_range
 from segslam.semantics.network_settings import NetworkSettings, read_settings, settings_file
 from segslam.semantics.range_image import network_input, project
@@ -47,12 +48,12 @@ class Network:
 
     def label_image(self, image: np.ndarray) -> LabelImage:
         """(height, width) labels for an input (1, channels, height, width) float32."""
-        from onnxruntime.capi import onnxruntime_pybind11_state as errors
-
         try:
             output = self._session.run(None, {self._input: image})[0]
-        except (errors.Fail, errors.InvalidArgument, errors.RuntimeException) as error:
+        except _runtime_errors() as error:
             raise SegslamError(f"{self._model}: fails on an input {_shape(image.shape)} ({_brief(error)})") from error
+        if not isinstance(output, np.ndarray):
+            raise SegslamError(f"{self._model}: gives a {type(output).__name__}; export it with one array as output")
         return self._label_of_class[self._class_image(output)]
 
     def _class_image(self, output: np.ndarray) -> np.ndarray:
@@ -99,17 +100,25 @@ def open_network(model: Path) -> Network:
 def _session(model: Path) -> Any:
     try:
         import onnxruntime
-        from onnxruntime.capi import onnxruntime_pybind11_state as errors
     except ImportError as error:
         raise SegslamError(f"--labels network: needs a package ({error}): {how_to_install('network')}") from error
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3  # errors, which are raised anyway
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave the cores to others
-    broken = (errors.Fail, errors.InvalidGraph, errors.InvalidProtobuf, errors.NotImplemented, errors.RuntimeException)
     try:
-        return onnxruntime.InferenceSession(model, options, providers=onnxruntime.get_available_providers())
-    except broken as error:
+        session = onnxruntime.InferenceSession(model, options, providers=onnxruntime.get_available_providers())
+        [(each.name, each.type, each.shape) for each in session.get_inputs()]  # fails for names that are not UTF-8
+        return session
+    except _runtime_errors() as error:
         raise SegslamError(f"{model}: onnxruntime cannot load it ({_brief(error)}); {_remedy(error)}") from error
+
+
+def _runtime_errors() -> tuple[type[Exception], ...]:
+    """Exceptions of onnxruntime for models that it cannot use."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+    own = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    return (*own, RuntimeError, ValueError, LookupError)
 
 
 def _remedy(error: Exception) -> str:
@@ -147,4 +156,4 @@ def _shape(sizes: Any) -> str:
 
 
 def _brief(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]
+    return brief(str(error), 300)

@@ -3,10 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-import yaml
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from segslam.config import LabelName, Section
+from segslam.config.yaml_text import parse_yaml
+from segslam.errors import brief
 from segslam.semantics.network_import import ARCH, DATA, Architecture, ClassMap, class_map_file, is_architecture
 from segslam.types import SegslamError
 
@@ -24,7 +25,7 @@ class VoteSettings(Section):
     """Voting of neighbouring pixels on the class of a point; defaults of RangeNet++ (Milioto et al. 2019)."""
 
     window: Annotated[int, AfterValidator(_check_odd)] = Field(5, ge=1, le=15, description="window side (pixels)")
-    neighbours: int = Field(5, ge=1, description="number of voting pixels, the nearest ones in range")
+    neighbours: int = Field(5, ge=1, le=225, description="number of voting pixels, the nearest ones in range")
     sigma_px: float = Field(1.0, gt=0, description="sigma of the Gaussian weight by distance in the image (pixels)")
     cutoff_m: float = Field(1.0, gt=0, description="largest weighted range difference of a voting pixel (m)")
 
@@ -33,8 +34,8 @@ class ImageSettings(Section):
     """Size of a range image. Columns go clockwise, starting behind the sensor; rows go from top to bottom."""
 
     field_of_view_deg: tuple[float, float] = Field(description="elevation of the lowest and highest row (degrees)")
-    height: int = Field(ge=1, description="rows of the image, one per beam")
-    width: int = Field(ge=1, description="columns of the image, for the full circle")
+    height: int = Field(ge=1, le=1024, description="rows of the image, one per beam")
+    width: int = Field(ge=1, le=16384, description="columns of the image, for the full circle")
 
 
 class NetworkSettings(ImageSettings):
@@ -90,7 +91,10 @@ def read_settings(file: Path) -> NetworkSettings:
         return _checked(NetworkSettings, _imported(file, {}), file)
     if isinstance(values, dict) and isinstance(values.get("import"), str):
         source = file.parent / values.pop("import")
-        values = _imported(source, values) | values
+        try:
+            values = _imported(source, values) | values
+        except SegslamError as error:
+            raise SegslamError(f"{file}: import: {brief(str(error), 300)}") from error
     return _checked(NetworkSettings, values, file)
 
 
@@ -114,14 +118,12 @@ def _imported(architecture: Path, given: dict[str, Any]) -> dict[str, Any]:
 
 def _read_yaml(file: Path) -> Any:
     try:
-        return yaml.safe_load(file.read_text(encoding="utf-8"))
+        return parse_yaml(file.read_text(encoding="utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(
             f"{file}: cannot be read ({error}); a network needs this file beside its model, or the {ARCH} and {DATA} "
             "that were published with it"
         ) from error
-    except yaml.YAMLError as error:
-        raise SegslamError(f"{file}: not valid YAML ({' '.join(str(error).split())})") from error
 
 
 def _checked(model: type[Model], values: Any, file: Path) -> Model:
@@ -129,6 +131,6 @@ def _checked(model: type[Model], values: Any, file: Path) -> Model:
         return model.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+        key = brief(".".join(str(part) for part in first["loc"]))
         known = f"; known: {', '.join(model.model_fields)}" if first["type"] == "extra_forbidden" else ""
-        raise SegslamError(f"{file}: {key + ': ' if key else ''}{first['msg']}{known}") from error
+        raise SegslamError(f"{file}: {key + ': ' if key else ''}{brief(first['msg'], 300)}{known}") from error

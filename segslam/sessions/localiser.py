@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from segslam.adjustment import Progress, no_progress
 from segslam.config import Config
 from segslam.odometry import Odometry
 from segslam.pose_graph import Graph
@@ -55,9 +56,9 @@ class Localiser(Slam):
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         return self.graph.finish(), []
 
-    def finish(self, *, search_s: float = math.inf) -> SlamResult:
+    def finish(self, *, search_s: float = math.inf, progress: Progress = no_progress) -> SlamResult:
         """As `Slam.finish`, in the map's frame; `from_map_m` determines which scans are localised."""
-        return replace(super().finish(search_s=search_s), from_map_m=self._from_map_m())
+        return replace(super().finish(search_s=search_s, progress=progress), from_map_m=self._from_map_m())
 
     def _from_map_m(self) -> Vector:
         """(n,) travel from each scan to the nearest keyframe whose placement was kept; infinite across a break."""

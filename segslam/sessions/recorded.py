@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from segslam.config import Config
-from segslam.health import information_of
 from segslam.log import RunLog, read_log
+from segslam.odometry import information_of
 from segslam.proximity import BREAK_TRAVEL_M
 from segslam.registration import shape_labels
 from segslam.run.finished import FinishedRun, read_run

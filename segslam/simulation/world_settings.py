@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import yaml
 from pydantic import Field, ValidationError
 
 from segslam.config import Section
+from segslam.config.yaml_text import parse_yaml, short
+from segslam.errors import brief
 from segslam.types import SegslamError
 
 SensorName = Literal["hdl64", "os1-64", "vlp16"]
@@ -79,13 +80,15 @@ def simulation_config(sensor: str, overrides: Sequence[str] = ()) -> SimulationC
         key, _, value = text.partition("=")
         section, _, name = key.strip().partition(".")
         if section not in values or not name or not value:
-            raise SegslamError(f"--set {text}: write world.key=value or sensor.key=value, for example world.cars=3")
-        values[section][name] = yaml.safe_load(value)
+            raise SegslamError(
+                f"--set {brief(text)}: write world.key=value or sensor.key=value, for example world.cars=3"
+            )
+        values[section][name] = parse_yaml(value, f"--set {brief(text)}")
     try:
         return SimulationConfig.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         section, name = (str(part) for part in first["loc"])
         known = ", ".join((WorldConfig if section == "world" else SensorConfig).model_fields)
-        remedy = f"known keys: {known}" if first["type"] == "extra_forbidden" else f"got {first['input']!r}"
+        remedy = f"known keys: {known}" if first["type"] == "extra_forbidden" else f"got {short(first['input'])}"
         raise SegslamError(f"{section}.{name}: {first['msg']}; {remedy}") from error

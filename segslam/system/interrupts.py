@@ -1,4 +1,4 @@
-"""Ctrl-C: one message at the end of a command, and sections that Ctrl-C does not interrupt."""
+"""Ctrl-C and SIGTERM: one message at the end of a command, and sections that neither interrupts."""
 
 import os
 import shlex
@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 EXIT_STATUS = 130
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = 2
 """Number of Ctrl-C that end the command in order; the next one ends it at once. The log stays readable."""
 
@@ -51,20 +52,32 @@ def same_command_with(option: str) -> str:
 
 @contextmanager
 def ctrl_c_in_order() -> Iterator[None]:
-    """Within it Ctrl-C raises KeyboardInterrupt, except during an import, where it ends the process at once.
+    """Within it Ctrl-C and SIGTERM raise KeyboardInterrupt; during an import they end the process at once.
 
     An extension module that is interrupted while it is imported raises another error, or none.
     """
     _State.times, _State.line = 0, "nothing was written"
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+    with _handled_by(_interrupt):
         yield
-        return
-    signal.signal(signal.SIGINT, _interrupt)
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[int, Any]]:
+    """Context manager that replaces the handlers of both signals; yields the handlers before.
+
+    A signal that was ignored, as in background jobs of a script, stays ignored. Only the main thread receives signals.
+    """
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
+    before: dict[int, Any] = {number: one for number, one in handlers.items() if one is not signal.SIG_IGN}
+    if threading.current_thread() is not threading.main_thread():
+        before = {}
+    for number in before:
+        signal.signal(number, handler)
     try:
-        yield
+        yield before
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, one in before.items():
+            signal.signal(number, one)
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:
@@ -96,42 +109,25 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 @contextmanager
 def interrupts_wait() -> Iterator[list[int]]:
-    """Context manager in which Ctrl-C has no effect until the end; the yielded list receives an entry for each Ctrl-C.
+    """Context manager in which Ctrl-C and SIGTERM wait until the end; the yielded list receives their numbers.
 
-    A list entry cannot be lost in a callback of a library, unlike an exception. If Ctrl-C was ignored before, as in
-    background jobs of a script, it stays ignored. Only the main thread receives Ctrl-C.
+    A list entry cannot be lost in a callback of a library, unlike an exception.
     """
     interrupts: list[int] = []
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+    with _handled_by(lambda number, _: interrupts.append(number)):
         yield interrupts
-        return
-    signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
-    try:
-        yield interrupts
-    finally:
-        signal.signal(signal.SIGINT, before)
     if interrupts:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(interrupts[0])
 
 
 @contextmanager
 def stopped_by_signals(stop: Callable[[], object]) -> Iterator[None]:
     """The first Ctrl-C or SIGTERM calls `stop` instead of ending the process; the next one has its usual effect."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
-    if threading.current_thread() is not threading.main_thread():
-        before = {}
 
     def hear(_: int, __: FrameType | None) -> None:
         for number, handler in before.items():
             signal.signal(number, handler)
         stop()
 
-    for number in before:
-        signal.signal(number, hear)
-    try:
+    with _handled_by(hear) as before:
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -40,7 +40,10 @@ MODULES = (
     "segregator.ground_patches",
     "pose_graph.closure_pairs",
     "map.views",
+    "datasets.lzf",
+    "datasets.numbers",
     "verification.free_space",
+    "adjustment.alignment",
     "points",
 )
 """Modules of this package that define kernels, the slowest to compile first."""

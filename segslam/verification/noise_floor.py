@@ -44,7 +44,7 @@ class NeighbourNoise:
     def at(self, keyframe_id: int) -> gates.NoiseFloor:
         """The floor when this keyframe is the newest; registers further pairs when they are due."""
         if self._last_id is None:
-            ids = np.unique(np.linspace(1, keyframe_id, NUM_FIRST).astype(int))
+            ids = np.unique(np.linspace(min(1, keyframe_id), keyframe_id, NUM_FIRST).astype(int))
         elif keyframe_id - self._last_id >= EVERY:
             ids = np.array([keyframe_id])
         else:

@@ -7,6 +7,7 @@ import pytest
 from helpers.commands import run
 from helpers.drives import round_drive, write_kitti_sequence
 
+from segslam.config import OdometryConfig
 from segslam.errors import SegslamError
 from segslam.log import read_log
 from segslam.trajectory import read_poses, write_kitti
@@ -90,6 +91,21 @@ def test_bad_usage_is_reported_in_one_line_and_nothing_is_written(
     assert expected in message
     assert len(message.splitlines()) == 1
     assert not out.exists()
+
+
+def test_a_given_odometry_is_cropped_by_the_ranges_of_the_preset(
+    kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ranges_m: list[float] = []
+
+    def given(file: Path, scans: object, config: OdometryConfig) -> None:
+        ranges_m.append(config.max_range_m)
+        raise SegslamError("far enough")
+
+    monkeypatch.setattr("segslam.cli.map.given_odometry", given)
+    words = ("--odometry", "poses.txt", "--preset", "indoor")
+    assert run("map", kitti, "--out", tmp_path / "run", *words) == 2
+    assert ranges_m == [40.0]
 
 
 def test_a_given_odometry_is_used_unchanged(kitti: Path, tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -252,3 +253,16 @@ def test_a_missing_folder_for_the_result_is_found_before_the_work(tmp_path: Path
     done = run(tmp_path / "in.g2o", "--out", tmp_path / "nowhere" / "out.g2o")
     assert done.returncode == 2
     assert "no folder" in done.stderr
+
+
+@pytest.mark.parametrize("robust", ["none", "gnc", "consistent"])
+def test_a_graph_that_cannot_be_solved_is_one_line_with_its_vertex(tmp_path: Path, robust: str) -> None:
+    graph, _ = square()
+    edges = [*graph.edges]
+    far = edges[3].T_a_b.copy()
+    far[2, 3] = 1e12
+    edges[3] = Edge(3, 4, far, TIGHT)
+    write_g2o(tmp_path / "in.g2o", G2oGraph(graph.T_world_vertex, edges))
+    done = run(tmp_path / "in.g2o", "--out", tmp_path / "out.g2o", "--robust", robust)
+    assert done.returncode == 2
+    assert re.fullmatch(r"(?s).*in\.g2o: the poses near vertex \d+ cannot be computed: [^\n]*\n", done.stderr)

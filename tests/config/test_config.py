@@ -104,3 +104,34 @@ def test_settings_that_users_need_are_the_first_of_their_sections_and_every_defa
         for key, setting in fields.items():
             assert re.search(r"\[[^\]]+\]$", setting.description or ""), f"{section}.{key}"
     assert len(wanted) <= 16
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{[a]: b}", "a key must be a name"),
+        ("a: 0x_", "not valid YAML"),
+        ("a: 2001-99-99", "not valid YAML"),
+        ("[" * 3000, "nested too deeply"),
+        ("a: &a [x]\nodometry: {max_range_m: *a}", r"\*a: write the value itself"),
+        (f"odometry: {{max_range_m: {'x' * 5000}}}", r"odometry\.max_range_m: .* got 'x{79}\.\.\.$"),
+        (f"odometry: {{max_range_m: 0x{'f' * 9000}}}", r"odometry\.max_range_m: .* got a int with too many digits"),
+        (f"odometry: {{{'k' * 500}: 1}}", "unknown key odometry.k+"),
+    ],
+)
+def test_yaml_that_is_no_settings_is_refused_in_one_short_line(tmp_path: Path, text: str, complaint: str) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text(text)
+    with pytest.raises(SegslamError, match=complaint) as refused:
+        load_config(file)
+    assert str(refused.value).startswith(f"{file}: ")
+    assert len(str(refused.value)) < len(str(file)) + 1000
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("value", ["{[a]: b}", "0x_", "2001-99-99", "[" * 2000, "*a", "x" * 5000])
+def test_a_value_of_set_that_is_no_yaml_is_refused_in_one_short_line(value: str) -> None:
+    with pytest.raises(SegslamError) as refused:
+        load_config(None, [f"odometry.max_range_m={value}"])
+    assert "odometry.max_range_m" in str(refused.value)
+    assert len(str(refused.value)) < 1000

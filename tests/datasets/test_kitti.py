@@ -302,3 +302,26 @@ def test_real_labels_have_a_row_for_each_point(data_dir: Path) -> None:
 def test_real_file_reads_as_it_was_written(data_dir: Path) -> None:
     file = data_dir / "kitti" / "sequences" / "00" / "velodyne" / "000000.bin"
     np.testing.assert_array_equal(read_returns(file), np.fromfile(file, np.float32).reshape(-1, 4))
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        "0 0 0 0 0 0 0 0 0 0 0 0",
+        "-1 0 0 0 0 1 0 0 0 0 1 0",
+        "718 0 607 0 0 718 185 0 0 0 1 0",
+        "1 0 0 0 0 1 0.05 0 0 0 1 0",
+    ],
+)
+def test_a_calibration_that_is_no_rotation_is_refused(tmp_path: Path, numbers: str) -> None:
+    file = tmp_path / "calib.txt"
+    file.write_text(f"Tr: {numbers}\n")
+    with pytest.raises(SegslamError, match=r"calib\.txt:1: the 3x3 part is not a rotation"):
+        read_calibration(file)
+
+
+def test_a_scan_number_beyond_64_bits_is_refused(tmp_path: Path) -> None:
+    folder = _write_sequence(tmp_path, [0, 1])
+    (folder / "velodyne" / "99999999999999999999.bin").write_bytes(bytes(16))
+    with pytest.raises(SegslamError, match=r"99999999999999999999\.bin: the name is not a scan number"):
+        _open(tmp_path)

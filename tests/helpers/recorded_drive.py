@@ -67,6 +67,10 @@ def swept(scan: Scan, T_last_now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points, times
 
 
+Drive = tuple[tuple[int, np.ndarray], ...]
+"""Stamp (ns) and CLOUD rows of each sweep."""
+
+
 @cache
 def clouds(num_scans: int = 30) -> tuple[tuple[int, np.ndarray], ...]:
     """Stamp and CLOUD rows of each sweep; a beam in a hundred returned nothing, which is NaN."""
@@ -90,11 +94,11 @@ def truth(num_scans: int = 30) -> Trajectory:
     return Trajectory(*(getattr(whole, name)[:num_scans] for name in ("scan_index", "stamp_ns", "T_world_lidar")))
 
 
-def write_mcap(file: Path) -> Path:
+def write_mcap(file: Path, drive: Drive = (), *, chunk_size: int = 2**20) -> Path:
     """ROS 2, with a second topic of clouds."""
-    with file.open("wb") as stream, McapWriter(stream) as writer:
+    with file.open("wb") as stream, McapWriter(stream, chunk_size=chunk_size) as writer:
         schema = writer.register_msgdef(MESSAGE, DEFINITION)
-        for stamp_ns, rows in clouds():
+        for stamp_ns, rows in drive or clouds():
             for topic in (TOPIC, OTHER_TOPIC):
                 writer.write_message(
                     topic, schema, _as_dict(stamp_ns, rows[: None if topic == TOPIC else 10]), stamp_ns
@@ -102,20 +106,20 @@ def write_mcap(file: Path) -> Path:
     return file
 
 
-def write_bag1(file: Path) -> Path:
+def write_bag1(file: Path, drive: Drive = ()) -> Path:
     store = get_typestore(Stores.ROS1_NOETIC)
     with Bag1Writer(file) as writer:
         connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
-        for received_ns, message in _messages(store):
+        for received_ns, message in _messages(store, drive):
             writer.write(connection, received_ns, store.serialize_ros1(message, MESSAGE))
     return file
 
 
-def write_bag2(folder: Path) -> Path:
+def write_bag2(folder: Path, drive: Drive = ()) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Bag2Writer(folder, version=8) as writer:
         connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
-        for received_ns, message in _messages(store):
+        for received_ns, message in _messages(store, drive):
             writer.write(connection, received_ns, store.serialize_cdr(message, MESSAGE))
     return folder
 
@@ -139,11 +143,11 @@ def _as_dict(stamp_ns: int, rows: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _messages(store: Any) -> Iterator[tuple[int, Any]]:
+def _messages(store: Any, drive: Drive) -> Iterator[tuple[int, Any]]:
     """When each message was received, some time after its stamp, and the message in rosbags' types."""
     types = store.types
     more = {"seq": 0} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
-    for stamp_ns, rows in clouds():
+    for stamp_ns, rows in drive or clouds():
         values = _as_dict(stamp_ns, rows)
         stamp = types["builtin_interfaces/msg/Time"](**values["header"]["stamp"])
         values["header"] = types["std_msgs/msg/Header"](stamp=stamp, frame_id="lidar", **more)

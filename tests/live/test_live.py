@@ -1,6 +1,5 @@
 """Scans that arrive during mapping: waiting and dropped scans, gaps, and the end of a run."""
 
-import os
 import signal
 import threading
 from pathlib import Path
@@ -134,7 +133,7 @@ def test_a_file_that_is_no_scan_is_a_bad_scan(tmp_path: Path) -> None:
     finally:
         stopped.set()
     assert arrival is not None
-    with pytest.raises(BadScan, match=r"a\.npy: cannot be read"):
+    with pytest.raises(BadScan, match=r"a\.npy: it is not a \.npy file"):
         arrival.read(0, 0)
 
 
@@ -206,27 +205,6 @@ def test_a_signal_ends_a_live_run_with_all_its_results(tmp_path: Path, number: i
     assert status == 0, command.output
     assert metrics["num_scans"] + metrics["num_scans_dropped"] == 3
     assert (run / "report.html").is_file()
-
-
-@pytest.mark.slow
-def test_odometry_that_dies_leaves_a_finished_run_and_is_reported(tmp_path: Path) -> None:
-    folder, run = tmp_path / "scans", tmp_path / "run"
-    folder.mkdir()
-    with LiveCommand(folder, "--out", run, *SETTINGS) as command:
-        command.wait_for("waiting for scans")
-        record(folder, list(round_drive()[0][:3]), every_s=0.5)
-        for pid in _children(command.pid):
-            if "resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_text():
-                os.kill(pid, signal.SIGKILL)
-        status, metrics = command.ended()
-    assert status == 2
-    assert "the odometry process has ended" in command.output
-    assert metrics["num_scans"] >= 1
-    assert (run / "report.html").is_file()
-
-
-def _children(pid: int) -> list[int]:
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def test_without_a_scan_nothing_is_left_behind(tmp_path: Path) -> None:
@@ -323,6 +301,7 @@ def test_loops_that_are_not_tried_in_time_are_searched_at_the_end() -> None:
 
 def test_a_faster_odometry_is_recommended_where_many_scans_were_dropped() -> None:
     assert too_slow({"num_scans_dropped": 1, "num_scans_arrived": 100}, 1.0) == ""
+    assert too_slow({"num_scans_dropped": 30, "num_scans_arrived": 100, "num_restarts": 1}, 0.4) == ""
     advice = too_slow({"num_scans_dropped": 30, "num_scans_arrived": 100}, 0.4)
     assert advice.startswith("30 of 100 scans were dropped")
     assert "--set odometry.voxel_size_m=0.6 " in advice

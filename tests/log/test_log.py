@@ -55,6 +55,35 @@ def test_a_keyframe_s_cloud_is_read_back_while_the_log_grows(steps: list[Step], 
     assert len(keyframes) > 5
 
 
+def test_a_cloud_is_read_while_another_thread_brings_the_next_keyframe(steps: list[Step], tmp_path: Path) -> None:
+    """The writer looks up its newest keyframe once."""
+    first, second = [step.keyframe for step in steps if step.keyframe is not None][:2]
+
+    class Replaced:
+        """The first keyframe, which is no longer the newest after one look."""
+
+        id = first.id
+
+        @property
+        def points(self) -> np.ndarray:
+            log._newest = second
+            return first.points
+
+        labels = first.labels
+
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
+        log._newest = Replaced()
+        assert_same(log.cloud(first.id), (first.points, first.labels))
+
+
+def test_a_cloud_asked_for_after_the_log_is_closed_is_an_error_of_our_own(steps: list[Step], tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
+        for step in steps[:4]:
+            log.write(step)
+    with pytest.raises(SegslamError, match="the log is closed"):
+        log.cloud(0)
+
+
 def test_the_poses_of_all_estimates_stay_in_proportion_to_the_keyframes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

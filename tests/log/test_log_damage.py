@@ -121,6 +121,19 @@ def test_a_file_that_is_no_log_is_refused(tmp_path: Path, content: bytes) -> Non
         read_log(tmp_path / "log.mcap")
 
 
+def test_a_log_that_ends_before_its_first_step_has_its_settings_and_no_step(tmp_path: Path) -> None:
+    """What a kill leaves while the first scan is mapped."""
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG, options={"data": "scans"}):
+        head = (tmp_path / "log.mcap").read_bytes()
+    (tmp_path / "log.mcap").write_bytes(head)
+    log = read_log(tmp_path / "log.mcap")
+    assert dict(log.options) == {"data": "scans"}
+    assert list(log.steps()) == []
+    (tmp_path / "log.mcap").write_bytes(head[:-1])
+    with pytest.raises(SegslamError, match="truncated at its start"):
+        read_log(tmp_path / "log.mcap")
+
+
 def test_a_missing_log_and_a_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "absent.mcap", tmp_path):
         with pytest.raises(SegslamError, match="cannot read the log"):

@@ -3,7 +3,7 @@
 import json
 import re
 import resource
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from segslam import geometry
 from segslam.log import LogWriter, drawing, schema
-from segslam.log.drawing import MAP_RANGE_M, REJECTED_COLORS, weight_color
+from segslam.log.drawing import MAP_RANGE_M, REJECTED_COLORS, Drawing, weight_color
 from segslam.log.records import BULK, codec
 from segslam.semantics.class_colors import of_classes
 from segslam.types import Rejected, RejectReason, Step
@@ -135,6 +135,26 @@ def test_each_attempt_is_a_line_between_its_keyframes_with_its_outcome(steps: li
     np.testing.assert_array_equal(ends[0], step.estimate.T_world_keyframe[source_id][:3, 3])
 
 
+def test_a_rejected_line_disappears_when_its_loop_is_accepted(steps: list[Step]) -> None:
+    step = next(step for step in steps if step.estimate is not None)
+    (accepted,) = step.attempts
+    waiting = replace(accepted, outcome=Rejected(RejectReason.UNCONFIRMED, "0 of 2"))
+    drawing = Drawing(CONFIG.log)
+    for one in steps[: steps.index(step)]:
+        list(drawing.draw(one))
+    assert not _deleted(drawing, replace(step, attempts=()))
+    assert not _deleted(drawing, replace(step, keyframe=None, attempts=(waiting,)))
+    pair = f"{accepted.candidate.source_id} to {accepted.candidate.target_id}"
+    assert _deleted(drawing, replace(step, keyframe=None)) == [pair]
+    assert not _deleted(drawing, replace(step, keyframe=None))
+
+
+def _deleted(drawing: Drawing, step: Step) -> list[str]:
+    """Lines of rejected loops that a step removes."""
+    drawn = [message for topic, message in drawing.draw(step) if topic == schema.REJECTED]
+    return [deletion.id for message in drawn for deletion in message.deletions]
+
+
 def test_every_reason_has_a_colour_of_its_own() -> None:
     assert set(REJECTED_COLORS) == set(RejectReason)
     assert len(set(REJECTED_COLORS.values())) == len(RejectReason)
@@ -178,7 +198,7 @@ def test_the_layout_plots_the_stages_that_a_scan_has() -> None:
     """Those that the pipeline times: a stage of another name would never show."""
     paths = [path["value"] for path in LAYOUT["configById"]["Plot!stages"]["paths"]]
     package = Path(schema.__file__).parents[1]
-    files = [package / name for name in ("tracker.py", "slam.py", "loops.py")]
+    files = [package / name for name in ("odometry/tracker.py", "slam.py", "loops.py")]
     files += sorted((package / "registration").glob("*.py"))
     source = "".join(file.read_text() for file in files)
     stages = {*re.findall(r'(?:watch|own)\("(\w+)"\)', source)}

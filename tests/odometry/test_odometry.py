@@ -70,7 +70,7 @@ def test_one_thread_repeats_to_the_bit() -> None:
 
 
 def test_a_process_of_its_own_changes_nothing() -> None:
-    """Poses, points, labels; a scan that cannot be used between them; and what follows a resumed run.
+    """Poses, points, labels, and a scan that cannot be used between them.
 
     Threads add up in any order: equal to 1e-9 m is equal.
     """
@@ -82,10 +82,7 @@ def test_a_process_of_its_own_changes_nothing() -> None:
         with pytest.raises(BadScan, match="scan 5: none of its 1 points"):
             apart.register(_scan(np.zeros((1, 3)), index=5))
         found.append(apart.register(scans[5]))
-    with OdometryApart(CONFIG) as resumed:
-        resumed.restore(np.stack([result.T_odom_lidar for result in expected[:5]]), scans.__getitem__)
-        found.append(resumed.register(scans[5]))
-    for mine, theirs in zip(found, [*expected, expected[5]], strict=True):
+    for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(mine.T_odom_lidar, theirs.T_odom_lidar, atol=1e-9)
         np.testing.assert_allclose(mine.points, theirs.points, atol=1e-5)  # float32
         np.testing.assert_array_equal(mine.labels, theirs.labels)
@@ -241,33 +238,16 @@ def _street(num_scans: int) -> list[Scan]:
     return scans
 
 
-def test_restored_kiss_continues_exactly_and_reads_only_scans_in_reach() -> None:
-    config = ONE_THREAD.model_copy(update={"max_range_m": 15.4, "min_range_m": 1.0})
-    scans, read = _street(34), []
-
-    def scan_of(row: int) -> Scan:
-        read.append(row)
-        return scans[row]
-
-    with OdometryApart(config) as uninterrupted, OdometryApart(config) as resumed:
-        resumed.restore(np.stack([uninterrupted.register(scan).T_odom_lidar for scan in scans[:30]]), scan_of)
-        for scan in scans[30:]:
-            expected, found = uninterrupted.register(scan), resumed.register(scan)
-            np.testing.assert_array_equal(found.T_odom_lidar, expected.T_odom_lidar)
-            np.testing.assert_array_equal(found.points, expected.points)
-    assert np.linalg.norm(expected.T_odom_lidar[:3, 3]) > 45.0, "the drive leaves the reach of its first scans"
-    assert read == list(range(9, 30)), "20 steps are 30 m, and 30.8 m the reach"
-
-
-def test_restored_poses_are_given_as_before() -> None:
+def test_a_given_odometry_continues_from_the_last_scan_of_another_instance() -> None:
     poses = np.array([_forward(7.0 + i) for i in range(5)])
     scans = [_scan(_room(np.random.default_rng(i)), index=i, times=np.linspace(0, 1, 4000)) for i in range(5)]
     uninterrupted, resumed = (GivenOdometry(_trajectory(poses), CONFIG) for _ in range(2))
-    resumed.restore(np.stack([uninterrupted.register(scan).T_odom_lidar for scan in scans[:3]]), scans.__getitem__)
+    last = [uninterrupted.register(scan).T_odom_lidar for scan in scans[:3]][-1]
+    resumed.follow([], last, _forward(1.0), last=scans[2])
     for scan in scans[3:]:
         expected, found = uninterrupted.register(scan), resumed.register(scan)
-        np.testing.assert_array_equal(found.T_odom_lidar, expected.T_odom_lidar)
-        np.testing.assert_array_equal(found.points, expected.points)
+        np.testing.assert_allclose(found.T_odom_lidar, expected.T_odom_lidar, atol=1e-12)
+        np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
 
 
 def test_a_sweep_whose_seam_has_no_returns_is_not_stretched() -> None:

@@ -14,6 +14,7 @@ from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import PoseGraph, read_g2o
 from segslam.pose_graph.edges import Edge, factor_graph, squared_errors
+from segslam.pose_graph.levenberg_marquardt import Unsolvable
 from segslam.pose_graph.noise import closure_information, inlier_bound, odometry_information
 from segslam.types import Alignment, GraphEstimate, LoopClosure, Registration, SegslamError
 
@@ -468,3 +469,28 @@ def test_errors_of_true_edges_match_their_information(tmp_path: Path) -> None:
     ]
     assert kstest(squared[:119], chi2(6).cdf).pvalue > 0.01, "odometry"
     assert kstest(squared[119:], chi2(6).cdf).pvalue > 0.01, "closures"
+
+
+def _fails(*_: object, **__: object) -> None:
+    raise Unsolvable("near vertex 3")
+
+
+def test_a_final_optimisation_that_fails_leaves_the_estimate_before_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    expected = graph_of(DRIFT, TRUE_LOOPS, GraphConfig(final="none")).finish()
+    monkeypatch.setattr("segslam.pose_graph.graph.solve_consistent", _fails)
+    found = graph_of(DRIFT, TRUE_LOOPS, GraphConfig(final="consistent")).finish()
+    assert "no final optimisation" in caplog.text
+    for keyframe, T_world_keyframe in expected.T_world_keyframe.items():
+        np.testing.assert_allclose(found.T_world_keyframe[keyframe], T_world_keyframe, atol=1e-9)
+
+
+def test_an_optimisation_that_fails_leaves_all_poses(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    graph = graph_of(DRIFT, TRUE_LOOPS)
+    monkeypatch.setattr("segslam.pose_graph.graph.search", _fails)
+    found = graph.optimize()
+    assert "the poses remain" in caplog.text
+    np.testing.assert_allclose(np.array(list(found.T_world_keyframe.values())), DRIFT, atol=1e-9)

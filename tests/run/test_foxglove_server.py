@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from threading import Thread
 from time import monotonic, sleep
@@ -18,12 +19,15 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from helpers.commands import run
 from helpers.finished_run import make_run
 from helpers.foxglove_client import PROTOCOL, Viewer
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
-from websockets.typing import Subprotocol
+from websockets.typing import Origin, Subprotocol
 
+from segslam.cli.foxglove import serve_foxglove
 from segslam.log import read_log, schema
 from segslam.log.channels import channels
 from segslam.run.foxglove_server import MOST_MESSAGES, FoxgloveServer, parse_address
+from segslam.run.origin_check import is_allowed
 from segslam.types import SegslamError
 
 
@@ -49,6 +53,46 @@ def test_a_viewer_is_offered_every_channel_of_a_log_and_gets_what_is_sent() -> N
 
         _wait(send)  # again and again: the subscription takes its time
         assert viewer.messages[schema.MEMORY][0] == (7, b'{"rss_mb": 1}')
+
+
+@pytest.mark.parametrize(
+    ("origin", "allowed"),
+    [
+        ("https://app.foxglove.dev", True),
+        ("https://foxglove.dev", True),
+        ("http://localhost:8080", True),
+        ("http://[::1]:8080", True),
+        ("file://", True),
+        ("http://evil.example", False),
+        ("https://evilfoxglove.dev", False),
+        ("http://app.foxglove.dev", False),
+        ("https://foxglove.dev.evil.example", False),
+        ("http://127.0.0.1.evil.example:8765", False),
+        ("null", False),
+        ("", False),
+        ("http://[", False),
+    ],
+)
+def test_a_web_page_reads_a_run_only_if_its_site_is_a_viewer(origin: str, allowed: bool) -> None:
+    assert is_allowed(origin) == allowed
+
+
+def test_a_page_of_another_site_is_refused_and_others_are_served() -> None:
+    with FoxgloveServer("0") as server:
+        for origin in (Origin("http://evil.example"), Origin("null")):
+            with pytest.raises(InvalidStatus, match="403"):
+                connect(server.url, subprotocols=[Subprotocol(PROTOCOL)], origin=origin)
+        with connect(
+            server.url, subprotocols=[Subprotocol(PROTOCOL)], origin=Origin("https://app.foxglove.dev")
+        ) as one:
+            assert json.loads(one.recv())["op"] == "serverInfo"
+
+
+def test_an_address_that_others_reach_is_announced(capsys: pytest.CaptureFixture[str]) -> None:
+    for address, shown in (("0.0.0.0:0", True), ("127.0.0.1:0", False)):
+        with ExitStack() as stack:
+            serve_foxglove(address, stack, quiet=False)
+        assert ("there is no password" in capsys.readouterr().err) == shown
 
 
 def test_late_subscribers_receive_the_last_map() -> None:

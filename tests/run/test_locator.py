@@ -108,6 +108,22 @@ def test_the_command_prints_a_pose_a_scan_and_fails_where_it_finds_none(
     assert len(capsys.readouterr().out.split()) == 17
 
 
+def test_poses_are_printed_though_another_scan_is_unreadable(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan, bad = tmp_path / "a.npy", tmp_path / "b.bin"
+    np.save(scan, round_drive()[0][55].points)
+    bad.write_bytes(b"")
+    assert commands.run("locate", run, bad, scan, "--quiet") == 2
+    out, err = capsys.readouterr()
+    assert out.startswith(f"{scan} ")
+    assert "b.bin: not found: unreadable" in err
+    assert "1 of 2 scans cannot be read" in err
+    assert "--frames" not in err
+    assert commands.run("locate", run, bad, scan, "--json", "--quiet") == 2
+    assert [one["found"] for one in json.loads(capsys.readouterr().out)] == [False, True]
+
+
 @pytest.mark.parametrize(
     ("arguments", "output"),
     [

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from segslam.semantics.label_files import LabelFiles, open_labels, read_ids
+from segslam.semantics.label_files import LabelFiles, encoding_of, open_labels, read_ids
 from segslam.types import BadScan, Label, SegslamError
 
 NAMES = ["000000", "000001"]
@@ -140,3 +140,15 @@ def test_real_predictions_agree_with_the_real_truth(data_dir: Path) -> None:
     )
     known = truth != Label.UNLABELLED
     assert np.mean(truth[known] == prediction[known]) > 0.9  # chance is about 0.2, the network's accuracy some 0.9
+
+
+@pytest.mark.parametrize("source", ["~unknown-user/labels", "network:~unknown-user/model.onnx"])
+def test_the_home_of_an_unknown_user_is_refused(tmp_path: Path, source: str) -> None:
+    with pytest.raises(SegslamError, match=r"~unknown-user/.*: there is no user with this name"):
+        open_labels(source, beside=tmp_path, scan_names=NAMES, encoding=None)
+
+
+def test_files_without_any_label_do_not_decide_the_encoding(tmp_path: Path) -> None:
+    (tmp_path / "000000.label").write_bytes(b"123")
+    with pytest.raises(SegslamError, match="cannot be detected"):
+        encoding_of([tmp_path / "000000.label"] * 3)

@@ -65,7 +65,7 @@ def _true_world(run: FinishedRun) -> np.ndarray:
 def test_two_days_become_one_frame(days: Days, merged: FinishedRun) -> None:
     assert merged.reference is not None
     distance_m, angle_deg = _errors(merged.result.trajectory, merged.reference, _true_world(days.monday))
-    assert distance_m.max() < 0.3
+    assert distance_m.max() < 0.35
     assert angle_deg.max() < 1.0
     assert merged.metrics["num_sessions"] == 2
     assert merged.metrics["num_loops_between"] >= 3

@@ -34,6 +34,7 @@ from tools.benchmarks import (
 )
 from tools.benchmarks import map as map_benchmark
 from tools.benchmarks.back_end import __main__ as back_end
+from tools.benchmarks.faults import __main__ as faults
 from tools.benchmarks.labels import __main__ as labels
 from tools.benchmarks.live import __main__ as live
 from tools.benchmarks.registration import __main__ as registration
@@ -270,6 +271,22 @@ def test_live_run_of_a_folder_that_fills_equals_the_offline_run(data: Path, tmp_
     figures = json.loads((tmp_path / "live" / "bench.json").read_text())
     assert figures["num_sent"] == NUM_SCANS
     assert figures["against_offline"]["largest_apart_m"] < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["live", "map", "disk"])
+def test_after_a_drive_of_faults_every_scan_is_accounted_for(data: Path, tmp_path: Path, kind: str) -> None:
+    scans = data / "sequences" / "00" / "velodyne"
+    words = ["faults", str(scans), "--seconds", "1", "--only", kind, "--out", str(tmp_path / "faults")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", words)
+        with pytest.raises(SystemExit) as ended:
+            faults.main()
+    figures = json.loads((tmp_path / "faults" / "bench.json").read_text())
+    assert figures["problems"] == []
+    assert figures["num_unaccounted"] == ended.value.code == 0
+    assert figures["num_runs"] == 1
+    assert figures["num_faults"] > 0
 
 
 @pytest.mark.slow

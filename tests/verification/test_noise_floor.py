@@ -56,6 +56,12 @@ def test_neighbours_are_ignored_where_odometry_failed() -> None:
     assert _Drive(0.02, slip_m=15.0).noise().at(101) == SINGLE_PAIR
 
 
+def test_a_run_of_one_keyframe_has_the_floor_of_a_single_pair() -> None:
+    drive = _Drive(0.02)
+    assert drive.noise().at(0) == SINGLE_PAIR
+    assert drive.asked == []
+
+
 def test_too_short_a_drive_has_the_floor_of_a_single_pair() -> None:
     assert MIN_PAIRS > 2
     assert _Drive(0.02).noise().at(2) == SINGLE_PAIR

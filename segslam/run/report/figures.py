@@ -21,7 +21,14 @@ from segslam.types import LoopClosure, MotionState, Rejected, RejectReason, Vect
 TRUTH, CORRECTED, ODOMETRY = "#B8B8B8", "#0072B2", "#E69F00"
 ACCEPTED, OPTIMISED_AWAY, FALSE = "#009E73", "#CC79A7", "#D55E00"
 REJECTED = ("#56B4E9", "#8C564B", "#7F7F7F", "#9467BD", "#BCBD22", "#17BECF", "#1F3A93")
-STYLE: Any = {"svg.fonttype": "none", "font.size": 11, "axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
+STYLE: Any = {
+    "svg.fonttype": "none",
+    "font.size": 11,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "legend.frameon": False,
+    "text.parse_math": False,  # names of files may contain a dollar sign
+}
 WIDTH_IN = 5.4
 """Text of 11 points is then 10 pixels high on a phone."""
 

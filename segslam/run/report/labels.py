@@ -32,7 +32,7 @@ def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: 
         panels |= {"true labels": _colors(truth), f"{wrong.sum() / max(known.sum(), 1):.1%} wrong (red)": colors}
     figure = Figure(figsize=(15, 1.2 * len(panels) + (8.5 if len(panels) == 1 else 5.8)), layout="constrained")
     ranges, above, legend = figure.subfigures(3, 1, squeeze=False, height_ratios=[1.2 * len(panels), 5.0, 0.8])[:, 0]
-    ranges.suptitle(title)
+    ranges.suptitle(title, parse_math=False)  # names of files may contain a dollar sign
     strips = ranges.subplots(len(panels), 1, squeeze=False)[:, 0]
     squares = above.subplots(1, len(panels), squeeze=False)[0]
     for (name, colors), strip, square in zip(panels.items(), strips, squares, strict=True):

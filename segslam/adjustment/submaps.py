@@ -1,0 +1,74 @@
+"""Submaps: the cloud of a keyframe merged with those of its neighbours along the drive, as a surface."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import AdjustmentConfig, RefineConfig
+from segslam.points import cell_keys, group_means, hash_keys
+from segslam.proximity import BREAK_TRAVEL_M
+from segslam.refinement import Surface, downsample, make_surface
+from segslam.trajectory import Poses
+from segslam.types import Points, Vector
+
+PointsOf = Callable[[int], Points]
+"""Returns the points of a keyframe, by id, in its own frame."""
+
+MOST_SUBMAPS = 16
+"""Chosen: submaps in memory, about 1.5 MB each; a drive needs 6, and 2 more for each other pass beside it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Submap:
+    """The surface around a keyframe, in its frame."""
+
+    surface: Surface
+    points: Points
+    normals: Points
+    raising: Points
+    """(n, 3) motion of each point per radian of elevation added to all beams of its scan (m)."""
+
+
+class Submaps:
+    """Submaps by the id of their keyframe, made when they are needed."""
+
+    def __init__(
+        self,
+        points_of: PointsOf,
+        T_world: Poses,
+        travel_m: Vector,
+        *,
+        config: AdjustmentConfig,
+        refine: RefineConfig,
+    ) -> None:
+        self._points_of, self._T_world, self._travel_m = points_of, T_world, travel_m
+        self._config, self._refine = config, refine
+        self._scan = lru_cache(4 * config.reach + config.every + 2)(self._with_raising)
+        self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
+
+    def _with_raising(self, keyframe_id: int) -> tuple[Points, Points]:
+        points = downsample(self._points_of(keyframe_id), config=self._refine).astype(np.float64)
+        return points, geometry.raising(points)
+
+    def _submap(self, keyframe_id: int) -> Submap:
+        T_keyframe_world = geometry.inverse(self._T_world[keyframe_id])
+        parts = []
+        for other in members(keyframe_id, self._travel_m, reach=self._config.reach):
+            T_keyframe_other = T_keyframe_world @ self._T_world[other]
+            points, raising = self._scan(other)
+            parts.append(np.hstack([geometry.apply(T_keyframe_other, points), raising @ T_keyframe_other[:3, :3].T]))
+        rows = np.vstack(parts)
+        keys, _ = cell_keys(rows[:, :3], self._refine.voxel_m)
+        voxels, group = np.unique(hash_keys(keys)[1], return_inverse=True)
+        merged = group_means(rows, group, len(voxels)) if len(rows) else rows
+        surface = make_surface(merged[:, :3], config=self._refine)
+        return Submap(surface, surface.points.copy(), surface.normals.copy(), merged[:, 3:])
+
+
+def members(keyframe_id: int, travel_m: Vector, *, reach: int) -> list[int]:
+    """The keyframes of a submap: up to `reach` before and after one, without those beyond a break."""
+    near = range(max(0, keyframe_id - reach), min(len(travel_m), keyframe_id + reach + 1))
+    return [other for other in near if abs(travel_m[other] - travel_m[keyframe_id]) < BREAK_TRAVEL_M]

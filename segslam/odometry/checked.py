@@ -1,0 +1,271 @@
+"""An odometry whose motions are compared with the most likely ones, given the map of the last scans.
+
+As long as the odometry is sound, a scan every `keyframes.distance_m` is compared with the previous one in a few
+milliseconds. If this contradicts the motion, the scan is registered with the last scans from several proposals: the
+odometry's motion, the last motion, no motion; and, if none of them explains the scan as scans of this drive usually are
+explained, from poses all around and from place recognition. The most likely pose is kept. Each following scan is
+registered as well, until the odometry agrees with a window of registrations, after the n-th repair with n windows.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from segslam import geometry
+from segslam.config import Config
+from segslam.odometry.likelihood import Fit
+from segslam.odometry.local_map import MAP_SCANS, LocalMap, SeenScan, displacement_m
+from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual
+from segslam.odometry.search import PoseSearch, Recover, as_likely
+from segslam.odometry.sweep import Odometry, OdometryResult
+from segslam.pose_graph.noise import odometry_information
+from segslam.types import Information, Motion, MotionState, Points, Scan, Transform
+
+RESOLUTION = math.sqrt(1.0 / 20.0)
+"""Distance between points in KISS-ICP's map, in voxels: at most 20 points a voxel."""
+ACCURACY = 0.6
+"""Chosen: accuracy of a pose as a share of the resolution of its map; half repairs thin scans of KITTI without need."""
+ELSEWHERE_M = 30.0
+ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
+"""Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
+SIGNIFICANT = 0.001
+"""Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans."""
+BREAK_M = 1.0
+"""A motion with a larger standard deviation is called a break; as in `pose_graph.breaks`."""
+
+
+class CheckedOdometry:
+    """Another odometry with its motions checked and replaced by more likely ones; itself an `Odometry`."""
+
+    def __init__(self, inner: Odometry, config: Config, *, recover: Recover) -> None:
+        """`recover` registers two clouds without initial guess."""
+        self._inner = inner
+        self._config = config
+        self._refine = config.refine
+        self._shared = geometry.tangent(
+            rotation_rad=math.radians(config.refine.shared_noise_deg), translation_m=config.refine.shared_noise_m
+        )
+        self._tolerance_m = ACCURACY * RESOLUTION * math.hypot(config.odometry.voxel_size_m, config.refine.voxel_m)
+        self._map = LocalMap(config.refine)
+        self._search = PoseSearch(recover, voxel_m=config.refine.voxel_m, dense_voxels=config.keyframes.dense_voxels)
+        self._lost: tuple[LocalMap, int] | None = None
+        """The map before a break, in which the next scans are tried, and the number of scans since then."""
+        self._intervals = Intervals()
+        self._motion = MotionModel()
+        self._usual_check, self._usual_fit = Usual(), Usual()
+        self._T_odom_last = np.eye(4)
+        self._num_unchecked = self._num_repaired = self._num_to_watch = 0
+
+    @property
+    def is_from_scans(self) -> bool:
+        """As that of the inner odometry."""
+        return self._inner.is_from_scans
+
+    def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
+        """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry."""
+        gap = max(gap, self._intervals.gap(scan.stamp_ns))
+        proposed = self._inner.register(scan, gap=gap)
+        self._intervals.note(scan.stamp_ns)
+        if not self._config.health.check:
+            return proposed
+        seen = SeenScan(proposed.points, self._refine)
+        T_odom_lidar, motion = self._checked(proposed.T_odom_lidar, seen, gap)
+        self._T_odom_last = T_odom_lidar
+        return OdometryResult(T_odom_lidar, proposed.points, proposed.labels, proposed.intensities, motion)
+
+    def follow(
+        self,
+        scans: Sequence[tuple[Transform, Points]],
+        T_odom_lidar: Transform,
+        T_before_lidar: Transform,
+        *,
+        last: Scan | None = None,
+    ) -> None:
+        """As `Odometry.follow`; the scans have all their cropped points. What is usual on the drive is learnt again."""
+        seen = [(T_odom_scan, SeenScan(points, self._refine)) for T_odom_scan, points in scans]
+        for T_odom_scan, scan in seen:
+            if len(scan.thinned) >= self._refine.min_points:
+                self._map.add(T_odom_scan, scan)
+        self._motion.restart(T_before_lidar)
+        self._T_odom_last = T_odom_lidar
+        downsampled = [(T_odom_scan, scan.thinned) for T_odom_scan, scan in seen]
+        self._inner.follow(downsampled, T_odom_lidar, T_before_lidar, last=last)
+
+    def _checked(self, T_odom_proposed: Transform, scan: SeenScan, gap: float) -> tuple[Transform, Motion]:
+        """The pose of a scan and the result of its check, if one is due."""
+        T_odom_predicted = self._T_odom_last @ self._motion.predicted(gap)
+        if not self._is_due(T_odom_proposed, T_odom_predicted, scan, gap):
+            self._num_unchecked += 1
+            self._motion.T_step = geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_proposed, 1.0 / gap)
+            return T_odom_proposed, Motion(MotionState.UNCHECKED)
+        self._num_unchecked = 0
+        if len(scan.thinned) < self._refine.min_points:
+            return T_odom_proposed, Motion(MotionState.UNCHECKED)  # too sparse for a check
+        if len(self._map) == 0:
+            self._map.add(T_odom_proposed, scan)
+            return T_odom_proposed, Motion(MotionState.UNCHECKED)
+        if self._num_to_watch == 0 and gap == 1.0:
+            confirmed = self._confirmed(T_odom_proposed, scan, gap)
+            if confirmed is not None:
+                return confirmed
+        return self._registered(T_odom_proposed, T_odom_predicted, scan, gap)
+
+    def _is_due(self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float) -> bool:
+        """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion."""
+        if len(self._map) == 0 or self._num_to_watch > 0 or gap > 1.0 or self._num_unchecked >= MAP_SCANS - 1:
+            return True
+        moved_m = displacement_m(scan.few, T_odom_proposed, self._map.T_odom_map)
+        sudden_m = displacement_m(scan.few, T_odom_proposed, T_odom_predicted)
+        return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._refine.voxel_m
+
+    def _confirmed(self, T_odom_proposed: Transform, scan: SeenScan, gap: float) -> tuple[Transform, Motion] | None:
+        """The proposed pose, if a few steps to the last checked scan leave it and fit as usual; else None."""
+        T_odom_map = self._map.T_odom_map
+        T_map_proposed = geometry.inverse(T_odom_map) @ T_odom_proposed
+        found = self._map.check(scan, T_map_proposed)
+        if found is None:
+            return None
+        moved_m = displacement_m(scan.few, found.T_map_lidar, T_map_proposed)
+        is_usual = self._usual_check.includes(found.mean_log, least_spread=found.num_patches**-0.5)
+        if moved_m > self._tolerance_m or not is_usual:
+            if moved_m <= self._tolerance_m:
+                self._usual_check.note(found.mean_log)
+            return None
+        self._usual_check.note(found.mean_log)
+        if not self._inner.is_from_scans:
+            return self._kept(T_odom_proposed, T_map_proposed, found, scan, gap, is_unsure=False)
+        T_last_lidar = geometry.inverse(self._T_odom_last) @ T_odom_proposed
+        T_last_fused = self._motion.fused(T_last_lidar, self._covariance(found), gap)
+        if displacement_m(scan.few, T_last_fused, T_last_lidar) > self._tolerance_m:
+            return None  # the last motions say more than the scan does
+        _, covariance = self._motion.update(T_last_lidar, self._covariance(found), gap)
+        self._map.add(T_odom_proposed, scan)
+        return T_odom_proposed, self._result(MotionState.CONFIRMED, T_map_proposed, found, covariance)
+
+    def _registered(
+        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float
+    ) -> tuple[Transform, Motion]:
+        """The most likely pose of the scan in the local map."""
+        is_rejoined = self._lost is not None and self._rejoins(T_odom_proposed, T_odom_predicted, scan)
+        T_odom_map = self._map.T_odom_map
+        T_map_odom = geometry.inverse(T_odom_map)
+        T_map_proposed, T_map_last = T_map_odom @ T_odom_proposed, T_map_odom @ self._T_odom_last
+        fits = self._search.near(self._map, scan, [T_map_proposed, T_map_odom @ T_odom_predicted, T_map_last])
+        unsure, elsewhere = np.zeros((6, 6)), float(is_rejoined)  # the scan before is not in the map before a break
+
+        if not is_rejoined and not (fits and self._is_usual(fits[0])):
+            T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
+            fits = self._search.around(self._map, scan, T_map_last, T_step, fits)
+            elsewhere = self._search.elsewhere(scan, fits)
+            if elsewhere * ELSEWHERE_M**2 > BREAK_M**2 or not self._motion.is_known:
+                recognised = self._search.without_guess(self._map, scan)
+                if recognised and (not fits or recognised[0].mean_log >= fits[0].mean_log):
+                    fits, elsewhere = recognised, 0.0
+            unsure = self._search.spread(scan, fits)
+        best = fits[0] if fits else self._map.fit(scan, T_map_proposed)
+        self._usual_fit.note(best.mean_log)
+        unsure = unsure + elsewhere * np.diag(ANYWHERE**2)
+        is_unsure = bool(unsure[3:, 3:].max() > BREAK_M**2)
+        if not self._inner.is_from_scans and (is_unsure or not self._contradicts(fits, T_map_proposed, scan)):
+            return self._kept(T_odom_proposed, T_map_proposed, best, scan, gap, is_unsure=is_unsure)
+        is_lost = elsewhere * ELSEWHERE_M**2 > BREAK_M**2 and not is_rejoined
+        T_last_lidar = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_map @ best.T_map_lidar)
+        T_last_lidar, covariance = self._motion.update(T_last_lidar, self._covariance(best), gap)
+        T_odom_lidar, covariance = geometry.nearest_transform(self._T_odom_last @ T_last_lidar), covariance + unsure
+        state = self._state(T_odom_proposed, T_odom_lidar, covariance, scan)
+        if state is MotionState.CONFIRMED:
+            T_odom_lidar = T_odom_proposed
+        if is_lost:
+            self._lost = self._lost or (self._map, 0)
+            self._map = LocalMap(self._refine)
+        self._map.add(T_odom_lidar, scan)
+        if state is not MotionState.CONFIRMED:
+            self._inner.follow(self._map.scans, T_odom_lidar, self._motion.T_step)
+        return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
+
+    def _contradicts(self, fits: Sequence[Fit], T_map_proposed: Transform, scan: SeenScan) -> bool:
+        """True if the most likely pose is significantly more likely than one at the proposed pose, or near it."""
+        near = [fit for fit in fits if self._search.is_same(scan, fit.T_map_lidar, T_map_proposed)]
+        return as_likely(max([*near, self._map.fit(scan, T_map_proposed)], key=_mean_log), fits[0]) < SIGNIFICANT
+
+    def _kept(
+        self,
+        T_odom_proposed: Transform,
+        T_map_proposed: Transform,
+        best: Fit,
+        scan: SeenScan,
+        gap: float,
+        *,
+        is_unsure: bool,
+    ) -> tuple[Transform, Motion]:
+        """The pose of an odometry of other sensors, which the scans do not contradict."""
+        self._map.add(T_odom_proposed, scan)
+        self._motion.restart(geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_proposed, 1.0 / gap))
+        self._num_to_watch = max(self._num_to_watch - 1, 0)
+        state = MotionState.UNCHECKED if is_unsure else MotionState.CONFIRMED
+        return T_odom_proposed, self._result(state, T_map_proposed, best, None)
+
+    def _rejoins(self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan) -> bool:
+        """True if the map before a break explains the scan as usual; it is then the local map again."""
+        assert self._lost is not None
+        local, num_scans = self._lost
+        T_map_odom = geometry.inverse(local.T_odom_map)
+        starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4)]
+        fits = self._search.around(local, scan, np.eye(4), self._motion.T_step, self._search.near(local, scan, starts))
+        is_found = bool(fits) and self._is_usual(fits[0])
+        if is_found:
+            self._map = local
+        self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, num_scans + 1)
+        return is_found
+
+    def _is_usual(self, fit: Fit) -> bool:
+        return self._usual_fit.includes(fit.mean_log, least_spread=fit.num_patches**-0.5)
+
+    def _state(
+        self, T_odom_proposed: Transform, T_odom_lidar: Transform, covariance: Information, scan: SeenScan
+    ) -> MotionState:
+        """Name of the result; the next scans are watched after a repair."""
+        is_break = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > BREAK_M**2
+        if displacement_m(scan.few, T_odom_lidar, T_odom_proposed) > self._tolerance_m:
+            self._num_repaired += 1
+            self._num_to_watch = WINDOW * self._num_repaired
+            return MotionState.BROKEN if is_break else MotionState.REPAIRED
+        is_watched = self._num_to_watch > 0
+        self._num_to_watch = max(self._num_to_watch - 1, 0)
+        if is_break:
+            return MotionState.BROKEN
+        return MotionState.REFINED if is_watched and self._inner.is_from_scans else MotionState.CONFIRMED
+
+    def _covariance(self, fit: Fit) -> Information:
+        """Covariance of a registered pose: of its likelihood, and of errors that all points share."""
+        return np.linalg.inv(fit.information) + np.diag(self._shared**2)
+
+    def _result(
+        self, state: MotionState, T_map_proposed: Transform, fit: Fit, covariance: Information | None
+    ) -> Motion:
+        off = geometry.inverse(T_map_proposed) @ fit.T_map_lidar
+        return Motion(
+            state,
+            geometry.distance(off),
+            float(np.degrees(geometry.angle(off))),
+            fit.overlap,
+            fit.rms_m,
+            information=None if covariance is None else self._own_information(covariance),
+            covariance=covariance,
+        )
+
+    def _own_information(self, covariance: Information) -> Information | None:
+        """Information of a motion that is less certain than the graph's noise model of odometry; else None."""
+        step = geometry.transform(np.eye(3), np.array([self._config.keyframes.distance_m, 0.0, 0.0]))
+        model = np.linalg.inv(odometry_information(0.0, step, self._config.graph)) + np.diag(self._shared**2)
+        whiten = np.diag(np.diag(model) ** -0.5)
+        excess, directions = np.linalg.eigh(whiten @ (covariance - model) @ whiten)
+        if excess[-1] <= 0.0:
+            return None
+        half = np.linalg.inv(whiten) @ directions
+        return np.linalg.inv(model + (half * np.maximum(excess, 0.0)) @ half.T)
+
+
+def _mean_log(fit: Fit) -> float:
+    return fit.mean_log

@@ -1,0 +1,150 @@
+"""The last scans of a drive in one cloud, registration of the next scan with it, and the likelihood of the result."""
+
+from collections import deque
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from segslam import geometry, refinement
+from segslam.config import RefineConfig
+from segslam.odometry.likelihood import Fit, fit
+from segslam.odometry.nudge import CHECK_VOXELS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
+from segslam.types import Points, Registration, Transform
+
+MAP_SCANS = 10
+"""Chosen: number of scans in the map."""
+SPACING_VOXELS = 0.4
+"""Chosen: a scan nearer than this to the last one in the map (`displacement_m`) adds nothing to it."""
+SEARCH_VOXELS_GICP = (4.0, 1.4)
+"""Chosen: search distances of GICP, in voxels."""
+
+
+def displacement_m(points: Points, T_a_points: Transform, T_a_other: Transform) -> float:
+    """Root mean square distance between the points (n, 3) at two poses: one figure for translation and rotation."""
+    T = geometry.inverse(T_a_other) @ T_a_points - np.eye(4)
+    return float(np.sqrt(np.mean(np.sum((points @ T[:3, :3].T + T[:3, 3]) ** 2, axis=1))))
+
+
+class SeenScan:
+    """A scan: all its points, its downsampled points, and their surfaces, each computed on first use."""
+
+    def __init__(self, points: Points, config: RefineConfig) -> None:
+        """`points` (n, 3) in the scan's frame."""
+        self.points = points
+        self._config = config
+
+    @cached_property
+    def few(self) -> Points:
+        """(k, 3) some hundred of the points, float64."""
+        return self.points[:: max(1, len(self.points) // 500)].astype(np.float64)
+
+    @cached_property
+    def thinned(self) -> Points:
+        """(m, 3) the downsampled points."""
+        return refinement.downsample(self.points, config=self._config)
+
+    @cached_property
+    def light(self) -> refinement.LightSurface:
+        """The surface for the quick check."""
+        return refinement.LightSurface(self.thinned)
+
+    @cached_property
+    def surface(self) -> refinement.Surface:
+        """The surface for a registration."""
+        return refinement.make_surface(self.thinned, config=self._config)
+
+
+class LocalMap:
+    """The last scans that moved, in the frame of the newest one."""
+
+    def __init__(self, config: RefineConfig) -> None:
+        self._voxel_m = config.voxel_m
+        reaches_m = tuple(reach * config.voxel_m for reach in SEARCH_VOXELS_GICP)
+        self._config = config.model_copy(update={"correspondence_m": reaches_m})
+        self._scans: deque[tuple[Transform, SeenScan]] = deque(maxlen=MAP_SCANS)
+        self._surface: refinement.Surface | None = None
+
+    @property
+    def scans(self) -> list[tuple[Transform, Points]]:
+        """T_odom_lidar and downsampled points (n, 3) of each scan, oldest first."""
+        return [(T_odom_lidar, scan.thinned) for T_odom_lidar, scan in self._scans]
+
+    @property
+    def T_odom_map(self) -> Transform:  # noqa: N802
+        """Pose of the newest scan, whose frame is the map's."""
+        return self._scans[-1][0]
+
+    @property
+    def newest(self) -> SeenScan:
+        """The newest scan."""
+        return self._scans[-1][1]
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def add(self, T_odom_lidar: Transform, scan: SeenScan) -> None:
+        """Add a scan, unless it is too near to the newest one."""
+        if self._scans:
+            moved_m = displacement_m(scan.few, T_odom_lidar, self.T_odom_map)
+            if moved_m < SPACING_VOXELS * self._voxel_m:
+                return
+        self._scans.append((T_odom_lidar, scan))
+        self._surface = None
+
+    def cloud(self, enough: int) -> Points:
+        """All points of the newest scans, in the frame of the newest one: as many scans as give `enough` voxels."""
+        T_map_odom = geometry.inverse(self.T_odom_map)
+        gathered, num_thinned = [], 0
+        for T_odom_lidar, scan in reversed(self._scans):
+            gathered.append(geometry.apply(T_map_odom @ T_odom_lidar, scan.points.astype(np.float64)))
+            num_thinned += len(scan.thinned)
+            if num_thinned >= enough:
+                break
+        return np.vstack(gathered).astype(np.float32)
+
+    def surface(self) -> refinement.Surface:
+        """The surface of all scans, in the frame of the newest one; cached."""
+        if self._surface is None:
+            T_map_odom = geometry.inverse(self.T_odom_map)
+            clouds = [geometry.apply(T_map_odom @ T_odom_lidar, scan.thinned) for T_odom_lidar, scan in self._scans]
+            merged = clouds[0] if len(clouds) == 1 else refinement.merge_clouds(clouds, config=self._config)
+            self._surface = refinement.make_surface(merged, config=self._config)
+        return self._surface
+
+    def check(self, scan: SeenScan, T_map_lidar: Transform) -> Fit | None:
+        """The pose after a few steps from this one to the newest scan alone; None if the two scans do not overlap."""
+        found = nudge(scan.thinned, self.newest.light, T_map_lidar, voxel_m=self._voxel_m, reaches=CHECK_VOXELS)
+        return None if found is None else fit(scan.thinned, self.newest.light, found, voxel_m=self._voxel_m)
+
+    def register(self, scan: SeenScan, T_map_guess: Transform) -> list[Fit]:
+        """Poses of a scan in the map near an initial guess: by GICP, and by robust steps from the guess.
+
+        GICP reaches farther. The robust steps end at the static scene where a vehicle ahead attracts GICP.
+        """
+        found = refinement.refine(scan.surface, self.surface(), T_map_guess, config=self._config, must_converge=False)
+        starts: list[tuple[Transform, Sequence[float]]] = [(T_map_guess, SEARCH_VOXELS)]
+        if isinstance(found, Registration):
+            starts.append((found.T_target_source, POLISH_VOXELS))
+        poses = [
+            nudge(scan.surface.points, self.surface(), T_start, voxel_m=self._voxel_m, reaches=reaches)
+            for T_start, reaches in starts
+        ]
+        return [self.fit(scan, pose) for pose in poses if pose is not None]
+
+    def approach(self, scan: SeenScan, T_map_guess: Transform) -> Fit | None:
+        """The pose to which robust steps with few points lead from a guess; None if too few points are near the map."""
+        found = nudge(
+            scan.surface.points,
+            self.surface(),
+            T_map_guess,
+            voxel_m=self._voxel_m,
+            reaches=SEARCH_VOXELS,
+            num_points=NUM_SEARCH,
+        )
+        return None if found is None else self.fit(scan, found)
+
+    def fit(self, scan: SeenScan, T_map_lidar: Transform) -> Fit:
+        """The likelihood of the scan at this pose."""
+        surface = self.surface()
+        return fit(scan.surface.points, surface, T_map_lidar, voxel_m=self._voxel_m, sigma_m=surface.roughness_m)

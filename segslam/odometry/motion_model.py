@@ -1,0 +1,149 @@
+"""Prediction of the next motion, and its covariance: a Kalman filter whose noise is learnt from the drive.
+
+The state is the motion of the sensor per interval. It is predicted to stay the same; how much motions change is
+measured on the last ones. Where the scans constrain the pose, the prediction has no weight. Where they do not, as along
+a tunnel, the motion continues as before, and its covariance grows from scan to scan.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from statistics import median
+
+import numpy as np
+
+from segslam import geometry
+from segslam.types import Information, Motion, Transform
+
+WINDOW = 30
+"""Chosen: number of scans from which the usual values of a drive are learnt."""
+LEAST_KNOWN = 5
+"""Chosen: number of values from which a median and a spread are known."""
+LONG_GAP = 1.5
+"""Chosen: a time between scans above this many usual intervals means that scans are missing."""
+CHI_SQUARE_MEDIAN = 0.455
+"""Median of the chi-square distribution with one degree of freedom."""
+
+
+class Intervals:
+    """The usual time between scans, and gaps."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._intervals_s: deque[float] = deque(maxlen=WINDOW)
+
+    def gap(self, stamp_ns: int) -> float:
+        """Time since the last scan in usual intervals; 1 if no scan is missing, or if the stamps are unknown."""
+        interval_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) * 1e-9
+        if interval_s <= 0.0 or not self._intervals_s:
+            return 1.0
+        gap = interval_s / median(self._intervals_s)
+        return gap if gap > LONG_GAP else 1.0
+
+    def note(self, stamp_ns: int) -> None:
+        """Note the stamp of a scan."""
+        if self._last_ns is not None and stamp_ns > self._last_ns:
+            self._intervals_s.append((stamp_ns - self._last_ns) * 1e-9)
+        self._last_ns = stamp_ns
+
+
+class Usual:
+    """The last values of a quantity, and whether another one is unusually small."""
+
+    def __init__(self) -> None:
+        self._values: deque[float] = deque(maxlen=WINDOW)
+
+    def includes(self, value: float, *, least_spread: float) -> bool:
+        """True if the value is not below the median by more than three standard deviations; False if none is known.
+
+        The standard deviation is that of a normal distribution with the same median absolute deviation.
+        """
+        if not self._values:
+            return False
+        middle = median(self._values)
+        spread = 1.4826 * median(abs(other - middle) for other in self._values)
+        return value >= middle - 3.0 * max(spread, least_spread)
+
+    def note(self, value: float) -> None:
+        """Add a value."""
+        self._values.append(value)
+
+
+class MotionModel:
+    """The motion per interval and its covariance, updated with the motion of each scan."""
+
+    def __init__(self) -> None:
+        self.T_step: Transform = np.eye(4)
+        """Motion per interval of the sensor."""
+        self._covariance: Information | None = None
+        self._accumulated = np.zeros((6, 6))
+        """Covariance of the error of the position since the last observation with that of the motion."""
+        self._changes: deque[np.ndarray] = deque(maxlen=WINDOW)
+
+    @property
+    def is_known(self) -> bool:
+        """True once a motion was measured; the first has no prediction, and an odometry is easily wrong there."""
+        return self._covariance is not None
+
+    def predicted(self, gap: float) -> Transform:
+        """The motion over `gap` intervals, if it does not change."""
+        return geometry.scaled(self.T_step, gap)
+
+    def restart(self, T_step: Transform) -> None:
+        """Continue with a motion per interval that is known exactly."""
+        self.T_step, self._covariance, self._accumulated = T_step, None, np.zeros((6, 6))
+
+    def _predicted_covariance(self, gap: float) -> Information | None:
+        """(6, 6) of the predicted motion; None while too few motions are known."""
+        if len(self._changes) < LEAST_KNOWN:
+            return None
+        noise = np.diag(np.median(np.square(self._changes), axis=0) / CHI_SQUARE_MEDIAN)
+        before = np.zeros((6, 6)) if self._covariance is None else self._covariance
+        return gap**2 * (before + gap * noise)
+
+    def fused(self, T_last_lidar: Transform, measured: Information, gap: float) -> Transform:
+        """The most likely motion since the last scan, given a measured one with its covariance and the prediction."""
+        return self._fuse(T_last_lidar, measured, gap)[0]
+
+    def update(self, T_last_lidar: Transform, measured: Information, gap: float) -> tuple[Transform, Information]:
+        """As `fused`, with the covariance of the result; it becomes the motion that predicts the next one.
+
+        The covariance is the increase of that of the position: errors of predicted motions add up linearly.
+        """
+        T_fused, gain, prior = self._fuse(T_last_lidar, measured, gap)
+        if gap == 1.0:
+            self._learn(geometry.log(geometry.inverse(self.T_step) @ T_last_lidar), measured, prior)
+        posterior, carried = measured, np.zeros((6, 6))
+        if prior is not None:
+            left = np.eye(6) - gain
+            posterior, carried = left @ prior, self._accumulated @ left.T
+        self._covariance, self._accumulated = posterior / gap**2, carried + posterior
+        self.T_step = geometry.scaled(T_fused, 1.0 / gap)
+        total = posterior + carried + carried.T
+        return T_fused, (total + total.T) / 2
+
+    def _fuse(
+        self, T_last_lidar: Transform, measured: Information, gap: float
+    ) -> tuple[Transform, Information, Information | None]:
+        """The fused motion, the Kalman gain, and the covariance of the prediction; None if nothing is known of it."""
+        prior = self._predicted_covariance(gap)
+        if prior is None:
+            return T_last_lidar, np.eye(6), None
+        T_predicted = self.predicted(gap)
+        change = geometry.log(geometry.inverse(T_predicted) @ T_last_lidar)
+        prior = prior + np.outer(change, change)  # a change that the scans show may be larger than all before
+        gain = prior @ np.linalg.inv(prior + measured)
+        return geometry.nearest_transform(T_predicted @ geometry.exp(gain @ change)), gain, prior
+
+    def _learn(self, change: np.ndarray, measured: Information, prior: Information | None) -> None:
+        """Learn how much motions change, in the directions that the scans observe better than the prediction."""
+        if prior is None or (np.diag(measured) < np.diag(prior)).all():
+            self._changes.append(change)
+
+
+def information_of(motions: Sequence[Motion]) -> Information | None:
+    """Information of successive motions together; None if none has an information of its own.
+
+    Their covariances are added: the motions between two keyframes are too short for their lever arms to matter.
+    """
+    own = [motion.information for motion in motions if motion.information is not None]
+    return np.linalg.inv(sum(np.linalg.inv(information) for information in own)) if own else None

@@ -1,0 +1,105 @@
+"""Poses of a scan in a local map: proposed in several ways, registered, and ordered by likelihood."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from segslam import geometry
+from segslam.odometry.likelihood import Fit
+from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan, displacement_m
+from segslam.odometry.nudge import SEARCH_VOXELS
+from segslam.types import Alignment, Information, Points, Rejected, Transform
+
+Recover = Callable[[Points, Points], Alignment | Rejected]
+"""Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
+TURNS_RAD = np.radians(np.arange(-45.0, 46.0, 15.0))
+TRAVELS = (0.0, 0.5, 1.0, 1.5)
+"""Chosen: turns, and shares of the predicted motion, from which a scan is registered that no proposal explains.
+Registration reaches half as far."""
+NUM_REGISTERED = 3
+"""Chosen: number of the most likely of these that are registered with all points."""
+
+
+class PoseSearch:
+    """Registers scans with a local map from several proposals."""
+
+    def __init__(self, recover: Recover, *, voxel_m: float, dense_voxels: int) -> None:
+        """`recover` receives the newest scans of a map, as many as have `dense_voxels` voxels."""
+        self._recover = recover
+        self._same_m = SEARCH_VOXELS_GICP[-1] * voxel_m
+        self._far_m = SEARCH_VOXELS[0] * voxel_m
+        self._dense_voxels = dense_voxels
+
+    def is_same(self, scan: SeenScan, T_map_a: Transform, T_map_b: Transform) -> bool:
+        """True if a registration from one of two poses reaches the other."""
+        return displacement_m(scan.few, T_map_a, T_map_b) < self._same_m
+
+    def near(self, local: LocalMap, scan: SeenScan, T_map_proposed: Sequence[Transform]) -> list[Fit]:
+        """The different poses to which registrations from the proposals lead, the most likely first."""
+        starts: list[Transform] = []
+        for T_map_start in T_map_proposed:
+            if not any(self.is_same(scan, T_map_start, T_map_other) for T_map_other in starts):
+                starts.append(T_map_start)
+        return self._different(scan, [fit for T_map_start in starts for fit in local.register(scan, T_map_start)])
+
+    def around(
+        self, local: LocalMap, scan: SeenScan, T_map_last: Transform, T_step: Transform, known: Sequence[Fit]
+    ) -> list[Fit]:
+        """`known` poses and those reached from poses around the last one: turned, and moved by shares of `T_step`."""
+        starts = [
+            T_map_last @ geometry.transform(geometry.yaw(turn), travel * T_step[:3, 3])
+            for travel in TRAVELS
+            for turn in TURNS_RAD.tolist()
+        ]
+        reached = [local.approach(scan, T_map_start) for T_map_start in starts]
+        found = self._different(scan, [*known, *(fit for fit in reached if fit is not None)])
+        others = [fit.T_map_lidar for fit in found if not any(fit is other for other in known)]
+        registered = [fit for T_map_start in others[:NUM_REGISTERED] for fit in local.register(scan, T_map_start)]
+        return self._different(scan, [*found, *registered])
+
+    def without_guess(self, local: LocalMap, scan: SeenScan) -> list[Fit]:
+        """Poses reached from the one that place recognition finds and verifies; none if it finds none."""
+        alignment = self._recover(scan.points, local.cloud(self._dense_voxels))
+        if isinstance(alignment, Rejected):
+            return []
+        return self._different(scan, local.register(scan, alignment.fine.T_target_source))
+
+    def elsewhere(self, scan: SeenScan, fits: Sequence[Fit]) -> float:
+        """Probability that the most likely of different poses is as wrong as those far from it; 1 without any pose."""
+        if not fits:
+            return 1.0
+        far = [fit for fit in fits[1:] if self._apart_m(scan, fits[0], fit) > self._far_m]
+        return as_likely(far[0], fits[0]) if far else 0.0
+
+    def spread(self, scan: SeenScan, fits: Sequence[Fit]) -> Information:
+        """Covariance (6, 6) of the choice between poses near the most likely one, tangent in the scan's frame."""
+        covariance, total = np.zeros((6, 6)), 1.0
+        for fit in fits[1:]:
+            if self._apart_m(scan, fits[0], fit) <= self._far_m:
+                offset = geometry.log(geometry.inverse(fits[0].T_map_lidar) @ fit.T_map_lidar)
+                weight = as_likely(fit, fits[0])
+                covariance += weight * np.outer(offset, offset)
+                total += weight
+        return covariance / total
+
+    def _apart_m(self, scan: SeenScan, one: Fit, other: Fit) -> float:
+        return displacement_m(scan.few, one.T_map_lidar, other.T_map_lidar)
+
+    def _different(self, scan: SeenScan, fits: Sequence[Fit]) -> list[Fit]:
+        """The fits, the most likely first, without those that are near a more likely one."""
+        kept: list[Fit] = []
+        for fit in sorted(fits, key=lambda each: -each.mean_log):
+            if not any(self.is_same(scan, fit.T_map_lidar, other.T_map_lidar) for other in kept):
+                kept.append(fit)
+        return kept
+
+
+def as_likely(fit: Fit, best: Fit) -> float:
+    """Probability of at least the difference between the likelihoods of two poses, if both are wrong.
+
+    The mean log-likelihood of n patches fluctuates by 1 / sqrt(n); spacings of order statistics are exponentially
+    distributed (Renyi 1953). Measured on scans of NCLT in maps of other places: 95 % of the differences are below 0.14
+    where this expects 0.135.
+    """
+    return math.exp(min(0.0, (fit.mean_log - best.mean_log) * math.sqrt(best.num_patches)))

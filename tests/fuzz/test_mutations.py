@@ -1,0 +1,62 @@
+"""Damaged files: an error that names the file or a result, in a second and with little memory, and nothing else."""
+
+import mmap
+import os
+import re
+import signal
+from pathlib import Path
+
+import pytest
+
+from fuzz.__main__ import contents, warm_up
+from fuzz.children import defects
+from fuzz.targets import Target, targets
+
+CORPUS = Path(__file__).parent / "corpus"
+NUM_INPUTS = 100
+"""For each reader, in about 10 s for all; `bash tools/fuzz.sh` tries more."""
+
+
+@pytest.fixture(scope="module")
+def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
+    made = {target.name: target for target in targets(tmp_path_factory.mktemp("readers"))}
+    warm_up(list(made.values()))
+    return made
+
+
+def test_no_damaged_file_does_more_than_fail(readers: dict[str, Target]) -> None:
+    for name, target in readers.items():
+        found = defects(target.read, target.file, contents(target, 0, NUM_INPUTS))
+        assert not found, f"{name}: {found}"
+
+
+def test_what_once_did_more_fails_now(readers: dict[str, Target]) -> None:
+    kept = {name: sorted((CORPUS / name).iterdir()) for name in readers if (CORPUS / name).is_dir()}
+    assert sum(map(len, kept.values())) > 10
+    for name, files in kept.items():
+        found = defects(readers[name].read, readers[name].file, [file.read_bytes() for file in files])
+        assert not found, f"{name}: {[(kind, data[:100]) for kind, data in found]}"
+
+
+def _fail(file: Path) -> None:
+    match file.read_bytes():
+        case b"signal":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        case b"exception":
+            raise KeyError("x")
+        case b"memory":
+            fresh = mmap.mmap(-1, 205 * 2**20, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)  # not memory freed before
+            for page in range(0, len(fresh), 4096):
+                fresh[page] = 1
+        case b"time":
+            sum(range(10**8))
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [(b"signal", "signal 11"), (b"exception", "KeyError "), (b"memory", "20. MB"), (b"time", r"\d+ s")],
+)
+def test_a_defect_is_found_and_the_files_after_it_are_tried(tmp_path: Path, content: bytes, kind: str) -> None:
+    found = defects(_fail, tmp_path / "file", [b"good", content, b"exception"])
+    assert [data for _, data in found] == [content, b"exception"]
+    assert re.fullmatch(kind, found[0].kind)

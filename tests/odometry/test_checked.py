@@ -1,0 +1,365 @@
+"""Wrong motions of an odometry are detected with the scans, and repaired."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.drives import STEP_M, round_drive, round_sweeps
+
+from segslam import geometry
+from segslam.config import Config, load_config
+from segslam.evaluation import trajectory_metrics
+from segslam.odometry import CheckedOdometry, GivenOdometry, KissOdometry, OdometryResult, Tracker, information_of
+from segslam.odometry.likelihood import fit
+from segslam.odometry.local_map import LocalMap, SeenScan
+from segslam.odometry.motion_model import Intervals
+from segslam.odometry.nudge import CHECK_VOXELS, nudge
+from segslam.refinement import refine as refined
+from segslam.registration import register
+from segslam.slam import Slam
+from segslam.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Trajectory
+
+CONFIG = load_config(None, ["proximity.min_travel_m=60"])
+SLIP_AT = 20
+
+
+def _given(poses: np.ndarray, config: Config = CONFIG) -> GivenOdometry:
+    return GivenOdometry(replace(round_drive()[1], T_world_lidar=poses), config.odometry)
+
+
+def _checked(poses: np.ndarray, config: Config = CONFIG) -> CheckedOdometry:
+    return CheckedOdometry(_given(poses, config), config, recover=partial(register, config=config))
+
+
+def _registered(odometry: CheckedOdometry, scans: Sequence[Scan]) -> list[OdometryResult]:
+    return [odometry.register(scan) for scan in scans]
+
+
+def _slipped(*, metres: float = 0.0, degrees: float = 0.0, at: int = SLIP_AT) -> np.ndarray:
+    """True poses, all from one scan on moved along the drive and turned."""
+    poses = round_drive()[1].T_world_lidar.copy()
+    slip = poses[at - 1] @ geometry.transform(geometry.yaw(np.radians(degrees)), [metres, 0.0, 0.0])
+    poses[at:] = slip @ geometry.inverse(poses[at - 1]) @ poses[at:]
+    return poses
+
+
+def _worst_step_m(results: Sequence[OdometryResult]) -> float:
+    truth = round_drive()[1].T_world_lidar
+    steps = [
+        geometry.distance(
+            geometry.inverse(geometry.inverse(truth[k - 1]) @ truth[k])
+            @ geometry.inverse(results[k - 1].T_odom_lidar)
+            @ results[k].T_odom_lidar
+        )
+        for k in range(1, len(results))
+    ]
+    return max(steps)
+
+
+def test_a_sound_odometry_is_left_as_it_is() -> None:
+    scans, truth = round_drive()
+    results = _registered(_checked(truth.T_world_lidar), scans[:40])
+    plain = [result.T_odom_lidar for result in map(_given(truth.T_world_lidar).register, scans[:40])]
+    np.testing.assert_array_equal([result.T_odom_lidar for result in results], plain)
+    states = {result.motion.state for result in results if result.motion}
+    assert states <= {MotionState.UNCHECKED, MotionState.CONFIRMED}
+    assert MotionState.CONFIRMED in states
+
+
+@pytest.mark.parametrize(("metres", "degrees"), [(3.0, 0.0), (-1.0, 0.0), (0.0, 40.0), (0.4, 3.0)])
+def test_a_jump_of_the_odometry_is_repaired(metres: float, degrees: float) -> None:
+    scans, _ = round_drive()
+    results = _registered(_checked(_slipped(metres=metres, degrees=degrees)), scans[: SLIP_AT + 10])
+    motion = results[SLIP_AT].motion
+    assert motion is not None
+    assert motion.state is MotionState.REPAIRED
+    assert motion.moved_m is not None
+    assert motion.moved_deg is not None
+    along_m = 2 * np.sin(np.radians(degrees) / 2) * STEP_M  # a turn before the step moves its end
+    assert motion.moved_m == pytest.approx(np.hypot(metres, along_m), abs=0.1)
+    assert motion.moved_deg == pytest.approx(degrees, abs=0.5)
+    assert _worst_step_m(results) < 0.06
+
+
+class _LikeKiss(GivenOdometry):
+    """Poses that are given, as if they came from the scans."""
+
+    is_from_scans = True
+
+
+@pytest.mark.parametrize("metres", [-2.5, -STEP_M, 0.0])
+def test_a_wrong_first_motion_is_repaired_and_a_right_one_is_kept(metres: float) -> None:
+    scans, truth = round_drive()
+    trajectory = replace(truth, T_world_lidar=_slipped(metres=metres, at=1))
+    odometry = CheckedOdometry(_LikeKiss(trajectory, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, scans[:3])
+    motion = results[1].motion
+    assert motion is not None
+    assert (motion.state is MotionState.REPAIRED) == (metres != 0.0)
+    assert _worst_step_m(results[:2]) < 0.06
+
+
+def test_without_the_check_a_jump_remains() -> None:
+    config = load_config(None, ["health.check=false"])
+    results = _registered(_checked(_slipped(metres=3.0), config), round_drive()[0][: SLIP_AT + 2])
+    assert _worst_step_m(results) == pytest.approx(3.0, abs=0.01)
+    assert results[-1].motion is None
+
+
+def test_scans_that_are_missing_do_not_break_a_drive() -> None:
+    scans, truth = round_drive()
+    kept = [*scans[:20], *scans[23:40]]  # three scans, 9 m of the drive
+    slam = Slam(CONFIG, odometry=KissOdometry(CONFIG.odometry))
+    for scan in kept:
+        slam.process(scan)
+    result = slam.finish()
+    assert not any(motion.is_break for motion in result.motions)
+    found = trajectory_metrics(result.trajectory.T_world_lidar, truth.T_world_lidar[[scan.index for scan in kept]])
+    assert found["ate_m"] < 0.15
+
+
+def _elsewhere(scan: Scan) -> Scan:
+    """The same scan as if nothing of what was seen before stood here: its points in a heap of another shape."""
+    rng = np.random.default_rng(scan.index)
+    points = rng.uniform([-40, -40, -2], [40, 40, 6], size=(20_000, 3))
+    return replace(scan, points=points.astype(np.float32), labels=np.zeros(20_000, np.uint8))
+
+
+@pytest.mark.parametrize("interval_s", [0.3, 6.0])
+def test_a_scan_from_another_town_is_a_break_though_the_odometry_is_steady(interval_s: float) -> None:
+    scans, _ = round_drive()
+    odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    before = _registered(odometry, scans[:20])
+    sweeps = round_sweeps(seed=13, only=range(20, 22))
+    since_ns = scans[19].stamp_ns + int(interval_s * 1e9)
+    others = [one.scan(index=20 + k, stamp_ns=since_ns + k * 300_000_000) for k, one in enumerate(sweeps)]
+    results = _registered(odometry, others)
+    states = [result.motion.state for result in results if result.motion]
+    assert states[0] is MotionState.BROKEN
+    assert states[1] is MotionState.REFINED
+    T_break = geometry.inverse(before[-1].T_odom_lidar) @ results[0].T_odom_lidar
+    assert np.degrees(geometry.angle(T_break)) < 60.0, "the turn, 7 degrees a scan, ends in the gap of 20 scans"
+
+
+def test_a_long_pause_before_the_second_scan_does_not_set_the_usual_interval() -> None:
+    intervals = Intervals()
+    gaps = []
+    for stamp_s in [0.0, 6.0, 6.1, 6.2, 6.3, 6.4, 7.4, 7.5]:
+        gaps.append(intervals.gap(int(stamp_s * 1e9)))
+        intervals.note(int(stamp_s * 1e9))
+    np.testing.assert_allclose(gaps, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 10.0, 1.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("is_given", [True, False])
+def test_a_scan_that_nothing_explains_is_no_evidence_against_the_drive(is_given: bool) -> None:
+    scans, truth = round_drive()
+    given = [*scans[:20], _elsewhere(scans[20]), *scans[21:26]]
+    odometry = _checked(truth.T_world_lidar)
+    if not is_given:
+        odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, given)
+    states = [result.motion.state for result in results if result.motion]
+    assert states[20] is (MotionState.UNCHECKED if is_given else MotionState.BROKEN)
+    T_found = geometry.inverse(results[19].T_odom_lidar) @ results[22].T_odom_lidar
+    T_true = geometry.inverse(truth.T_world_lidar[19]) @ truth.T_world_lidar[22]
+    assert geometry.distance(geometry.inverse(T_true) @ T_found) < 0.1
+
+
+def test_a_sparse_first_scan_does_not_end_the_checks_of_a_drive() -> None:
+    scans, _ = round_drive()
+    thin = replace(scans[0], points=scans[0].points[::700], labels=scans[0].labels[::700])
+    results = _registered(_checked(_slipped(metres=3.0)), [thin, *scans[1:40]])
+    assert MotionState.REPAIRED in {result.motion.state for result in results if result.motion}
+    assert _worst_step_m(results[1:]) < 0.2
+
+
+@pytest.mark.parametrize("degrees", [-25.0, 32.0])
+def test_a_sudden_turn_is_found_by_the_search_around_the_last_pose(degrees: float) -> None:
+    """Both the odometry and its prediction miss the turn, and no registration without initial guess is accepted."""
+    scans, truth = round_drive()
+    turn = geometry.transform(geometry.yaw(np.radians(degrees)), np.zeros(3))
+    turned = replace(scans[SLIP_AT], points=geometry.apply(geometry.inverse(turn), scans[SLIP_AT].points))
+    none = Rejected(RejectReason.HIGH_RESIDUAL)
+    odometry = CheckedOdometry(_given(truth.T_world_lidar), CONFIG, recover=lambda source, target: none)
+    results = _registered(odometry, [*scans[:SLIP_AT], turned])
+    motion = results[-1].motion
+    assert motion is not None
+    assert motion.state is MotionState.REPAIRED
+    before, now = truth.T_world_lidar[SLIP_AT - 1 : SLIP_AT + 1]
+    T_before_found = geometry.inverse(results[-2].T_odom_lidar) @ results[-1].T_odom_lidar
+    T_true_found = geometry.inverse(now @ turn) @ before @ T_before_found
+    assert geometry.distance(T_true_found) < 0.1
+    assert np.degrees(geometry.angle(T_true_found)) < 0.3
+
+
+def test_a_keyframe_follows_a_break_and_its_motion_has_nearly_no_information() -> None:
+    scans, _ = round_drive()
+    slam = Slam(CONFIG)
+    steps = [slam.process(scan) for scan in [*scans[:20], _elsewhere(scans[20]), *scans[21:24]]]
+    keyframe, before = steps[20].keyframe, steps[19].keyframe
+    assert keyframe is not None
+    assert before is not None
+    assert keyframe.travel_m - before.travel_m > 1e4
+    assert [step.motion.state for step in steps if step.motion][20] is MotionState.BROKEN
+
+
+def test_the_uncertainties_of_several_motions_add_up() -> None:
+    motions = [Motion(MotionState.CONFIRMED)]
+    motions += [Motion(MotionState.BROKEN, information=information * np.eye(6)) for information in (1.0, 0.25)]
+    np.testing.assert_allclose(information_of(motions), np.eye(6) / 5.0)
+    assert information_of(motions[:1]) is None
+
+
+def test_too_few_points_are_not_checked() -> None:
+    scans, truth = round_drive()
+    thin = [replace(scan, points=scan.points[::700], labels=scan.labels[::700]) for scan in scans[:10]]
+    results = _registered(_checked(truth.T_world_lidar), thin)
+    assert {result.motion.state for result in results if result.motion} == {MotionState.UNCHECKED}
+
+
+def test_recovery_without_initial_guess_runs_only_where_guesses_fail() -> None:
+    asked = []
+
+    def recover(source: np.ndarray, target: np.ndarray) -> Rejected:
+        asked.append((len(source), len(target)))
+        return Rejected(RejectReason.SMALL_CLIQUE)
+
+    scans, truth = round_drive()
+    odometry = CheckedOdometry(_given(truth.T_world_lidar), CONFIG, recover=recover)
+    _registered(odometry, [*scans[:20], _elsewhere(scans[20])])
+    assert len(asked) == 2, "at the first motion, and for the scan that nothing explains"
+
+
+@pytest.mark.parametrize("moved_m", [0.1, 0.2])
+def test_the_quick_check_measures_a_small_slip(moved_m: float) -> None:
+    scans, truth = round_drive()
+    seen = [SeenScan(scan.points, CONFIG.refine) for scan in scans[:2]]
+    T_target_source = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[1]
+    slip = geometry.transform(np.eye(3), [moved_m, 0.0, 0.0])
+    T_slipped = T_target_source @ slip
+    found = nudge(seen[1].thinned, seen[0].light, T_slipped, voxel_m=CONFIG.refine.voxel_m, reaches=CHECK_VOXELS)
+    assert found is not None
+    assert geometry.distance(geometry.inverse(T_slipped) @ found) == pytest.approx(moved_m, abs=0.06)
+
+
+@pytest.mark.parametrize("last", [15, SLIP_AT + 1, SLIP_AT + 12])
+def test_an_interrupted_drive_continues_from_its_last_scans(last: int) -> None:
+    scans, _ = round_drive()
+    config = CONFIG
+    whole = Tracker(config, odometry=_given(_slipped(metres=2.0)))
+    head = [whole.track(scan) for scan in scans[: last + 1]]
+    resumed = Tracker(config, odometry=_given(_slipped(metres=2.0)))
+    poses = np.stack([tracked.T_odom_lidar for tracked in head])
+    resumed.resume(poses, np.array([scan.stamp_ns for scan in scans[: last + 1]]), lambda row: scans[row])
+    for scan in scans[last + 1 : 36]:
+        whole_now, resumed_now = whole.track(scan), resumed.track(scan)
+        apart = geometry.inverse(whole_now.T_odom_lidar) @ resumed_now.T_odom_lidar
+        assert geometry.distance(apart) < 0.1
+
+
+def _behind_a_van(scan: Scan) -> np.ndarray:
+    """What a sensor with 40 degrees of view sees behind a van that drives as fast as its own vehicle."""
+    in_view = np.abs(np.arctan2(scan.points[:, 1], scan.points[:, 0])) < np.radians(20.0)
+    sides = np.mgrid[9:15:0.25, -1:1.1:2, -1.5:1:0.25].reshape(3, -1).T
+    back = np.mgrid[9:10, -1:1.1:0.25, -1.5:1:0.25].reshape(3, -1).T
+    return np.vstack([scan.points[in_view], sides, back]).astype(np.float32)
+
+
+def test_a_vehicle_that_drives_ahead_does_not_hold_a_registration_back() -> None:
+    scans, truth = round_drive()
+    local = LocalMap(CONFIG.refine)
+    for row in range(10):
+        local.add(truth.T_world_lidar[row], SeenScan(_behind_a_van(scans[row]), CONFIG.refine))
+    scan = SeenScan(_behind_a_van(scans[10]), CONFIG.refine)
+    T_true = geometry.inverse(local.T_odom_map) @ truth.T_world_lidar[10]
+    best = max(local.register(scan, T_true), key=lambda found: found.mean_log)
+    error_m = geometry.distance(geometry.inverse(T_true) @ best.T_map_lidar)
+    refine = CONFIG.refine.model_copy(update={"correspondence_m": (2.0, 0.7)})
+    by_gicp = refined(scan.surface, local.surface(), T_true, config=refine, must_converge=False)
+    assert isinstance(by_gicp, Registration)
+    assert error_m < 0.7 * geometry.distance(geometry.inverse(T_true) @ by_gicp.T_target_source)
+
+
+def test_kiss_icp_follows_a_repair() -> None:
+    scans, truth = round_drive()
+    odometry = KissOdometry(CONFIG.odometry)
+    for scan in scans[:5]:
+        odometry.register(scan)
+    T_first = geometry.inverse(truth.T_world_lidar[0])
+    placed = [(T_first @ truth.T_world_lidar[k], SeenScan(scans[k].points, CONFIG.refine).thinned) for k in range(5)]
+    moved = geometry.transform(np.eye(3), [100.0, 0.0, 0.0])
+    odometry.follow(
+        [(moved @ T_odom_lidar, points) for T_odom_lidar, points in placed],
+        moved @ placed[-1][0],
+        geometry.inverse(placed[-2][0]) @ placed[-1][0],
+    )
+    expected = moved @ T_first @ truth.T_world_lidar[5]
+    assert geometry.distance(geometry.inverse(expected) @ odometry.register(scans[5]).T_odom_lidar) < 0.1
+
+
+def _tunnel_scan(index: int) -> Scan:
+    """A smooth tube of 5 m radius along x, with a floor 1.7 m below the sensor."""
+    rng = np.random.default_rng(index)
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(-180, 180, 0.5)), np.radians(np.arange(-24, 25, 2)))
+    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    rays = rays.reshape(-1, 3)
+    to_tube = 5.0 / np.maximum(np.hypot(rays[:, 1], rays[:, 2]), 1e-9)
+    to_floor = 1.7 / np.maximum(-rays[:, 2], 1e-9)
+    ranges = np.minimum(to_tube, to_floor) + rng.normal(scale=0.01, size=len(rays))
+    seen = ranges < 40.0
+    return Scan((rays[seen] * ranges[seen, None]).astype(np.float32), stamp_ns=index * 100_000_000, index=index)
+
+
+def _into_a_tunnel(num_scans: int = 40) -> list[Scan]:
+    """The tunnel begins at scan 11, and the sensor continues as before."""
+    street = [replace(scan, index=row, stamp_ns=row * 100_000_000) for row, scan in enumerate(round_drive()[0][:11])]
+    return street + [_tunnel_scan(row) for row in range(11, num_scans)]
+
+
+def test_a_scan_of_a_smooth_tunnel_does_not_constrain_the_position_along_it() -> None:
+    R = geometry.yaw(0.3)
+    sigmas_m = []
+    for points in ((_tunnel_scan(0).points @ R.T).astype(np.float32), round_drive()[0][0].points):
+        scan = SeenScan(points, CONFIG.refine)
+        found = fit(scan.thinned, scan.light, np.eye(4), voxel_m=CONFIG.refine.voxel_m)
+        covariance = np.linalg.inv(found.information)[3:, 3:]
+        sigmas_m.append(np.sqrt(np.linalg.eigvalsh(covariance)))
+        if len(sigmas_m) == 1:
+            assert abs(np.linalg.eigh(covariance)[1][:, 2] @ R[:, 0]) > 0.999
+    assert sigmas_m[0][2] > 5.0
+    assert sigmas_m[0][1] < 0.1
+    assert sigmas_m[1][2] < 0.1
+
+
+def test_in_a_smooth_tunnel_the_motion_along_it_is_reported_as_uncertain() -> None:
+    odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, _into_a_tunnel(20))
+    covariances = [result.motion.covariance for result in results[13:] if result.motion is not None]
+    sigmas_m = np.median([np.sqrt(np.diag(covariance))[3:] for covariance in covariances], axis=0)
+    assert sigmas_m[0] > 5.0 * max(sigmas_m[1:])
+
+
+def test_a_given_odometry_is_kept_in_a_smooth_tunnel() -> None:
+    poses = round_drive()[1].T_world_lidar[:40].copy()
+    for row in range(11, 40):
+        poses[row] = poses[row - 1] @ geometry.transform(np.eye(3), [STEP_M, 0.0, 0.0])
+    scans = _into_a_tunnel()
+    given = GivenOdometry(
+        Trajectory(np.arange(40), np.array([scan.stamp_ns for scan in scans]), poses), CONFIG.odometry
+    )
+    results = _registered(CheckedOdometry(given, CONFIG, recover=partial(register, config=CONFIG)), scans)
+    steps = [geometry.inverse(before.T_odom_lidar) @ after.T_odom_lidar for before, after in pairwise(results[13:])]
+    np.testing.assert_allclose([T[:3, 3] for T in steps], [[STEP_M, 0.0, 0.0]] * len(steps), atol=0.05)
+
+
+def test_an_odometry_that_reports_no_motion_is_checked_too() -> None:
+    scans, truth = round_drive()
+    standing = [replace(scans[0], index=row, stamp_ns=row * 100_000_000) for row in range(21)]
+    poses = np.repeat(truth.T_world_lidar[:1], 21, axis=0)
+    given = GivenOdometry(Trajectory(np.arange(21), np.arange(21) * 100_000_000, poses), CONFIG.odometry)
+    results = _registered(CheckedOdometry(given, CONFIG, recover=partial(register, config=CONFIG)), standing)
+    checked = [row for row, result in enumerate(results) if result.motion and result.motion.overlap is not None]
+    assert checked == [10, 20]

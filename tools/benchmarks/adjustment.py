@@ -1,0 +1,64 @@
+"""The adjustment of the whole map on finished runs: error, thickness and time before and after.
+
+    python -m tools.benchmarks.adjustment OUT.json RUN[=POSES.txt] ... [--set adjustment.rounds=2]
+
+POSES.txt: true poses in KITTI format, a line per scan, for runs without ground truth in their log. Runs are refined
+into a scratch folder; their time of `map` is that of their `metrics.json`.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+from segslam.cli import main
+from segslam.run.accuracy import trajectory_accuracy
+from segslam.run.finished import read_metrics, read_run, true_poses
+
+FIGURES = ("vertical_deg", "vertical_sigma_deg", "map_thickness_before_m", "map_thickness_m", "num_submap_pairs")
+
+
+def row(run: Path, poses: Path | None, settings: list[str]) -> dict[str, Any]:
+    """The figures of one run."""
+    before = read_run(run)
+    reference = before.reference if poses is None else true_poses(poses, before)
+    with TemporaryDirectory() as scratch:
+        started = perf_counter()
+        changes = [word for setting in settings for word in ("--set", setting)]
+        try:
+            main(["refine", str(run), "--out", f"{scratch}/run", "--quiet", *changes])
+        except SystemExit as ended:
+            if ended.code:
+                raise
+        seconds = perf_counter() - started
+        after = read_run(f"{scratch}/run")
+        adjustment_s = read_metrics(after.folder)["stage_ms"]["adjust"]["median"] / 1000
+    found: dict[str, Any] = {"run": run.name, "refine_s": seconds, "adjustment_s": adjustment_s}
+    found["map_s"] = before.metrics["seconds_total"]
+    found |= {name: after.metrics[name] for name in FIGURES if name in after.metrics}
+    if reference is not None:
+        for name, made in (("before", before), ("after", after)):
+            figures = trajectory_accuracy(made.result.trajectory, reference)
+            found |= {f"{key}_{name}": figures[key] for key in ("ate_m", "height_m") if key in figures}
+    return found
+
+
+def run_benchmark() -> None:
+    """Write the rows to a file, and print them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("runs", nargs="+")
+    parser.add_argument("--set", dest="settings", action="append", default=[])
+    options = parser.parse_args()
+    rows = []
+    for text in options.runs:
+        run, _, poses = text.partition("=")
+        rows.append(row(Path(run), Path(poses) if poses else None, options.settings))
+        print(json.dumps(rows[-1]))
+    options.out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    run_benchmark()

@@ -1,0 +1,95 @@
+"""A drive of faults: live runs and mapped folders, with files damaged, processes killed and disks full at random.
+
+python -m tools.benchmarks.faults SCANS --out DIR                  ten minutes; SCANS: a folder of scans
+python -m tools.benchmarks.faults SCANS --out DIR --seconds 60     shorter
+
+At the end, every scan is accounted for (mapped, skipped with a reason, dropped), each log reads, and each interrupted
+run was resumed or replayed. Figures go to DIR/bench.json; the exit status is 1 if something is wrong.
+"""
+
+import json
+import random
+import sys
+from collections import Counter
+from importlib.util import find_spec
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from segslam.datasets import open_dataset
+from tools.benchmarks import common
+from tools.benchmarks.faults.episodes import Outcome, disk_episode, live_episode, map_episode, topic_episode
+
+MOST_POINTS = 8000
+"""Chosen: points of a scan, so that a run with a fault takes seconds."""
+
+
+def main() -> None:
+    parser = common.parser(__doc__, "faults")
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--every", type=float, default=0.5, help="seconds between two scans of a live run")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=("live", "map", "disk", "topic"))
+    chosen = parser.parse_args()
+    chosen.out.mkdir(parents=True)
+    dataset = open_dataset(chosen.data, labels="none", vertical_angle_deg=0.0)
+    scans = [_rows(dataset[row].points) for row in range(min(len(dataset), 40))]
+    outcomes = run_all(scans, chosen.out, chosen.seconds, every_s=chosen.every, seed=chosen.seed, only=chosen.only)
+    figures = summary(outcomes)
+    if find_spec("rclpy") is None:
+        figures["skipped"] = "topics that stop: rclpy is not installed"
+    common.write_report(chosen.out / "bench.json", figures)
+    print(json.dumps(figures, indent=2))
+    sys.exit(1 if figures["problems"] or figures["num_unaccounted"] else 0)
+
+
+def run_all(
+    scans: list[np.ndarray], out: Path, seconds: float, *, every_s: float, seed: int, only: str | None = None
+) -> list[Outcome]:
+    """Episodes in turn, until the time is over."""
+    rng, end = random.Random(seed), monotonic() + seconds
+    outcomes: list[Outcome] = []
+    kinds = [only] if only else ["live", "map", "disk", *(["topic"] if find_spec("rclpy") else [])]
+    while not outcomes or monotonic() < end:
+        kind = kinds[len(outcomes) % len(kinds)]
+        folder = out / f"{len(outcomes):03d}-{kind}"
+        folder.mkdir(parents=True)
+        match kind:
+            case "live":
+                outcome = live_episode(scans, folder, rng, every_s=every_s)
+            case "map":
+                outcome = map_episode(scans, folder, rng)
+            case "disk":
+                outcome = disk_episode(scans, folder, rng, every_s=every_s)
+            case _:
+                outcome = topic_episode(scans, folder, rng, every_s=every_s)
+        print(f"{folder.name}: {outcome}", file=sys.stderr, flush=True)
+        outcomes.append(outcome)
+    return outcomes
+
+
+def summary(outcomes: list[Outcome]) -> dict[str, Any]:
+    """The figures of all episodes."""
+    faults: Counter[str] = sum((outcome.faults for outcome in outcomes), Counter())
+    return {
+        "num_runs": len(outcomes),
+        "num_scans": sum(outcome.num_scans for outcome in outcomes),
+        "num_faults": sum(faults.values()),
+        "faults": dict(faults.most_common()),
+        "num_unaccounted": sum(outcome.num_unaccounted for outcome in outcomes),
+        "problems": [problem for outcome in outcomes for problem in outcome.problems],
+    }
+
+
+def _rows(points: np.ndarray) -> np.ndarray:
+    """Some points of a scan, with an intensity."""
+    some = points[:: 1 + len(points) // MOST_POINTS]
+    return np.column_stack([some, np.zeros(len(some))]).astype(np.float32)
+
+
+if __name__ == "__main__":
+    main()

@@ -15,7 +15,7 @@ import numpy as np
 from segslam import geometry
 from segslam.config import Config
 from segslam.odometry.likelihood import Fit
-from segslam.odometry.local_map import MAP_SCANS, LocalMap, SeenScan, displacement_m
+from segslam.odometry.local_map import LocalMap, SeenScan, displacement_m
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual
 from segslam.odometry.search import PoseSearch, Recover, as_likely
 from segslam.odometry.sweep import Odometry, OdometryResult
@@ -31,6 +31,8 @@ ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHE
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
 SIGNIFICANT = 0.001
 """Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans."""
+MOST_UNCHECKED = 9
+"""Chosen: number of scans after which a sensor that seems to stand still is checked."""
 BREAK_M = 1.0
 """A motion with a larger standard deviation is called a break; as in `pose_graph.breaks`."""
 
@@ -113,7 +115,7 @@ class CheckedOdometry:
 
     def _is_due(self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float) -> bool:
         """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion."""
-        if len(self._map) == 0 or self._num_to_watch > 0 or gap > 1.0 or self._num_unchecked >= MAP_SCANS - 1:
+        if len(self._map) == 0 or self._num_to_watch > 0 or gap > 1.0 or self._num_unchecked >= MOST_UNCHECKED:
             return True
         moved_m = displacement_m(scan.few, T_odom_proposed, self._map.T_odom_map)
         sudden_m = displacement_m(scan.few, T_odom_proposed, T_odom_predicted)
@@ -147,11 +149,13 @@ class CheckedOdometry:
         self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float
     ) -> tuple[Transform, Motion]:
         """The most likely pose of the scan in the local map."""
-        is_rejoined = self._lost is not None and self._rejoins(T_odom_proposed, T_odom_predicted, scan)
+        fits = self._rejoined(T_odom_proposed, T_odom_predicted, scan)
+        is_rejoined = bool(fits)
         T_odom_map = self._map.T_odom_map
         T_map_odom = geometry.inverse(T_odom_map)
         T_map_proposed, T_map_last = T_map_odom @ T_odom_proposed, T_map_odom @ self._T_odom_last
-        fits = self._search.near(self._map, scan, [T_map_proposed, T_map_odom @ T_odom_predicted, T_map_last])
+        starts = [T_map_proposed, T_map_odom @ T_odom_predicted, T_map_last]
+        fits = fits or self._search.near(self._map, scan, starts)
         unsure, elsewhere = np.zeros((6, 6)), float(is_rejoined)  # the scan before is not in the map before a break
 
         if not is_rejoined and not (fits and self._is_usual(fits[0])):
@@ -206,18 +210,20 @@ class CheckedOdometry:
         state = MotionState.UNCHECKED if is_unsure else MotionState.CONFIRMED
         return T_odom_proposed, self._result(state, T_map_proposed, best, None)
 
-    def _rejoins(self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan) -> bool:
-        """True if the map before a break explains the scan as usual; it is then the local map again."""
-        assert self._lost is not None
+    def _rejoined(self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan) -> Sequence[Fit]:
+        """Poses in the map before a break, if it explains the scan as usual; it is then the local map again."""
+        if self._lost is None:
+            return []
         local, num_scans = self._lost
         T_map_odom = geometry.inverse(local.T_odom_map)
         starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4)]
-        fits = self._search.around(local, scan, np.eye(4), self._motion.T_step, self._search.near(local, scan, starts))
+        near = self._search.near(local, scan, starts)
+        fits = self._search.around(local, scan, np.eye(4), self._motion.T_step, near)
         is_found = bool(fits) and self._is_usual(fits[0])
         if is_found:
             self._map = local
         self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, num_scans + 1)
-        return is_found
+        return fits if is_found else []
 
     def _is_usual(self, fit: Fit) -> bool:
         return self._usual_fit.includes(fit.mean_log, least_spread=fit.num_patches**-0.5)

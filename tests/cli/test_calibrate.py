@@ -59,7 +59,7 @@ def test_a_run_reports_the_angle_with_the_setting_that_corrects_it(
     yard: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_kitti(tmp_path / "given.txt", POSES)
-    options = ["--odometry", tmp_path / "given.txt", "--labels", "none"]
+    options = ["--odometry", tmp_path / "given.txt", "--labels", "none", "--set", "adjustment.max_minutes=0"]
     assert run("map", yard, "--out", tmp_path / "run", *options) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["vertical_deg"] == pytest.approx(0.3, abs=0.06)

@@ -73,11 +73,12 @@ def test_an_unfinished_run_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "did not finish" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("blank_reports")
 def test_map_writes_the_map_with_the_run_and_adds_missing_maps_to_a_finished_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     kitti = tmp_path / "kitti"
-    write_kitti_sequence(kitti, num_scans=6)
+    write_kitti_sequence(kitti, num_scans=4)
     out = tmp_path / "run"
     assert run("map", kitti, "--out", out, "--map", "--json", "--quiet") == 0
     metrics = json.loads(capsys.readouterr().out)
@@ -87,6 +88,7 @@ def test_map_writes_the_map_with_the_run_and_adds_missing_maps_to_a_finished_run
     assert (out / "grid.pgm").is_file()
 
 
+@pytest.mark.usefixtures("blank_reports")
 def test_a_map_that_cannot_be_made_does_not_affect_other_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

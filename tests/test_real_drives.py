@@ -19,7 +19,8 @@ EVERY_THIRD = range(0, 100, 3)  # turns of up to 95 degrees between scans
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("rows", [FIRST_SLIP, pytest.param(EVERY_THIRD, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [FIRST_SLIP, EVERY_THIRD])
 def test_a_slip_of_kiss_icp_in_the_courtyard_is_repaired(data_dir: Path, rows: range) -> None:
     dataset = open_dataset(data_dir / "courtyard")
     assert dataset.reference is not None

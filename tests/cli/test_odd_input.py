@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -86,7 +87,25 @@ def test_a_home_folder_is_expanded_behind_an_option_and_an_unknown_user_is_refus
     assert "~nosuch/x: there is no such user" in capsys.readouterr().err
 
 
-def test_a_run_whose_data_is_not_utf_8_is_mapped_and_leaves_no_stub(scans: Path, tmp_path: Path) -> None:
+def test_a_run_whose_data_has_an_odd_name_is_resumed(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A byte that is not UTF-8, its escape as a name, and a letter that is not ASCII."""
+    odd, folder = tmp_path / os.fsdecode(b"\xff \\udcff \xc3\xa9"), tmp_path / os.fsdecode(b"run\xff")
+    shutil.copytree(scans, odd)
+    assert run("map", odd, "--out", folder, "--map-file", os.fsdecode(b"top\xff.png"), "-q") == 0
+    options, log = read_log(folder / "log.mcap").options, (folder / "log.mcap").read_bytes()
+    assert options["data"] == str(odd)
+    for file in folder.iterdir():
+        file.unlink()
+    folder.joinpath("log.mcap").write_bytes(log[: len(log) // 2])
+    assert run("resume", folder, "--json", "-q") == 0
+    assert json.loads(capsys.readouterr().out)["num_scans"] == 4
+    assert (folder / os.fsdecode(b"top\xff.png")).is_file()
+
+
+@pytest.mark.slow
+def test_a_command_of_a_shell_takes_a_name_that_is_not_utf_8(scans: Path, tmp_path: Path) -> None:
     odd = tmp_path / os.fsdecode(b"scans\xff")
     odd.symlink_to(scans)
     words = [sys.executable, "-m", "segslam", "map", os.fsencode(odd), "--out", str(tmp_path / "run"), "--json", "-q"]

@@ -167,6 +167,7 @@ def test_odometry_compares_voxel_sizes_and_another_library(call: Call, data: Pat
     assert all(row["median_ms"] > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_trouble_is_applied_to_the_drive_that_is_mapped(call: Call, data: Path) -> None:
     words = ["--sequence", "00", "--frames", "0:20", "--at", "8", "--only", "given odometry, jump of 3 m"]
     (row,) = call(trouble, data, *words)["rows"].values()

@@ -78,6 +78,7 @@ def test_a_drive_too_short_for_the_angle_gives_none(tmp_path: Path, capsys: pyte
     assert "the vertical angle cannot be measured" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("short_runs")
 @pytest.mark.parametrize(("options", "kept_deg"), [([], 0.205), (["--set", "sensor.vertical_angle_deg=0"], 0.0)])
 def test_a_run_keeps_the_angle_that_its_scans_were_read_with(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], kept_deg: float

@@ -12,6 +12,8 @@ from matplotlib.image import imread
 
 from segslam.types import WorkFailed
 
+pytestmark = pytest.mark.usefixtures("short_runs")
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -73,7 +75,6 @@ def test_an_unfinished_run_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "did not finish" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("blank_reports")
 def test_map_writes_the_map_with_the_run_and_adds_missing_maps_to_a_finished_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -88,7 +89,6 @@ def test_map_writes_the_map_with_the_run_and_adds_missing_maps_to_a_finished_run
     assert (out / "grid.pgm").is_file()
 
 
-@pytest.mark.usefixtures("blank_reports")
 def test_a_map_that_cannot_be_made_does_not_affect_other_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,7 +26,7 @@ from segslam.run.run import Run
 from segslam.slam import Slam
 from segslam.types import SegslamError
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 @pytest.fixture(scope="module")

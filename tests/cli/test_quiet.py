@@ -15,12 +15,16 @@ import numpy as np
 import pytest
 from helpers.commands import all_commands, run
 from helpers.drives import write_kitti_sequence
-from helpers.finished_run import make_run, write_blank_report
+from helpers.finished_run import make_run
 from typer.main import get_command
 
 from segslam import cli, simulation
 from segslam.cli import commands
+from segslam.run import report
 
+pytestmark = pytest.mark.usefixtures("short_runs")
+
+WRITE_REPORT = report.write_report
 Words = list[object]
 FEW = ("--method", "segregator", "--labels", "true_labels", "--pairs")
 
@@ -107,8 +111,8 @@ def short_demo(monkeypatch: pytest.MonkeyPatch) -> None:
 def words(request: pytest.FixtureRequest, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Words:
     """A command with its arguments; `report` alone draws."""
     name, out = str(request.param), tmp_path / "out"
-    if name != "report":
-        monkeypatch.setattr("segslam.run.report.write_report", write_blank_report)
+    if name == "report":
+        monkeypatch.setattr("segslam.run.report.write_report", WRITE_REPORT)
     if name in OF_MAPPED:
         return [*name.split(), *OF_MAPPED[name](data, request.getfixturevalue("mapped"), out)]
     return [*name.split(), *COMMANDS[name](data, request.getfixturevalue("finished"), out)]

@@ -7,7 +7,7 @@ from helpers.commands import run
 from segslam.log import read_log
 from segslam.run.finished import read_metrics
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 def test_a_run_is_refined_and_keeps_its_loops(log: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from helpers.drives import SLAM_CONFIG
 from segslam.log import read_log
 from segslam.types import LoopAttempt, LoopClosure
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 def _attempts(log: Path) -> list[LoopAttempt]:

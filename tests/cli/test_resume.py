@@ -10,7 +10,7 @@ from helpers.drives import write_kitti_sequence
 
 from segslam.log import read_log
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 OPTIONS = ("--frames", "1:7", "--labels", "true_labels", "--set", "keyframes.distance_m=4", "--map-file", "top.png")
 

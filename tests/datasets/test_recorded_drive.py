@@ -24,7 +24,7 @@ from segslam.evaluation import trajectory_metrics
 from segslam.trajectory import read_poses
 from segslam.types import SegslamError
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_a_recording_without_an_index_is_reported_with_the_remedy(tmp_path: Path
 def test_folders_of_clouds_are_mapped_as_the_recording_of_them(tmp_path: Path) -> None:
     (tmp_path / "ply").mkdir()
     (tmp_path / "pcd").mkdir()
-    for number, (_, rows) in enumerate(clouds()[:8]):
+    for number, (_, rows) in enumerate(clouds()[:5]):
         rows = rows[np.isfinite(rows["x"])]
         cloud = o3d.t.geometry.PointCloud(np.column_stack([rows[axis] for axis in "xyz"]))
         cloud.point["t"] = o3d.core.Tensor(rows["t"].astype(np.float32)[:, None])
@@ -92,7 +92,7 @@ def test_folders_of_clouds_are_mapped_as_the_recording_of_them(tmp_path: Path) -
     poses = []
     for data, options in ((recording, ("--topic", TOPIC)), (tmp_path / "ply", ()), (tmp_path / "pcd", ())):
         out = tmp_path / f"run-{data.name}"
-        words = ("map", data, "--out", out, "--frames", "0:8", "--quiet", *options)
+        words = ("map", data, "--out", out, "--frames", "0:5", "--quiet", *options)
         assert run(*words, "--set", "adjustment.max_minutes=0") == 0
         poses.append(read_poses(out / "odometry_tum.txt").T_a_b)
     np.testing.assert_allclose(poses[1], poses[0], atol=1e-4)  # times in float32

@@ -258,6 +258,7 @@ def test_the_same_scans_live_and_offline_close_the_same_loops_on_the_same_trajec
     assert np.abs(apart_m).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_live_run_shows_how_it_stands_in_a_terminal(tmp_path: Path) -> None:
     folder, ended = tmp_path / "scans", threading.Event()
     folder.mkdir()

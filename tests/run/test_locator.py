@@ -20,7 +20,7 @@ NUM_MAPPED = 50
 """A round of the drive; the scans after it see it again."""
 
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from segslam.run.finished import read_run
 from segslam.run.folder import POSE_COLUMNS
 from segslam.types import LoopClosure
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 OPTIONS = ("--labels", "true_labels", "--quiet")
 FAST = (

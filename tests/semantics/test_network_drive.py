@@ -24,7 +24,7 @@ from segslam.simulation.files import uncorrected
 from segslam.trajectory import write_kitti
 from segslam.types import LoopClosure
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 CHANGED = ("keyframes.distance_m=4", "proximity.min_travel_m=60", "adjustment.max_minutes=0")
 SETTINGS = ("--quiet", *(word for setting in CHANGED for word in ("--set", setting)))

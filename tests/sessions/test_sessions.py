@@ -21,7 +21,7 @@ from segslam.run.finished import FinishedRun
 from segslam.sessions import session_pose
 from segslam.types import LoopClosure, MotionState, Trajectory
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 UNADJUSTED = load_config(None, ["adjustment.max_minutes=0"])
 """Of a single day; both are adjusted together."""

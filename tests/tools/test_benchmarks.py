@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers.commands import run
 from helpers.drives import write_kitti_sequence
-from helpers.finished_run import make_run, write_blank_report
+from helpers.finished_run import make_run
 
 from segslam import geometry
 from segslam.config import Config
@@ -68,14 +68,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def mapped(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mapped(short_runs: None, data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of those scans, the odometry given."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("segslam.run.report.write_report", write_blank_report)
-        out = tmp_path_factory.mktemp("runs") / "run"
-        poses = data / "poses" / "00.txt"
-        words = ("--labels", "true_labels", "--odometry", poses, "--set", "adjustment.max_minutes=0", "--quiet")
-        assert run("map", data, "--out", out, *words) == 0
+    out = tmp_path_factory.mktemp("runs") / "run"
+    poses = data / "poses" / "00.txt"
+    words = ("--labels", "true_labels", "--odometry", poses, "--set", "adjustment.max_minutes=0", "--quiet")
+    assert run("map", data, "--out", out, *words) == 0
     return out
 
 

@@ -132,6 +132,13 @@ def test_the_page_of_options_is_that_of_the_configuration() -> None:
     assert (ROOT / "docs" / "options.md").read_text(encoding="utf-8") == page(), "run: python tools/options.py"
 
 
+def test_commands_are_added_once_however_many_are_run() -> None:
+    for _ in range(2):
+        commands.add_all(cli.app)
+    names = [command.name for command in cli.app.registered_commands]
+    assert len(names) == len(set(names)) > 20
+
+
 def test_every_command_has_an_example_and_every_option_is_explained() -> None:
     commands.add_all(cli.app)
     for name, command in all_commands(get_command(cli.app)):

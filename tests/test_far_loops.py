@@ -14,6 +14,8 @@ from segslam.slam import Slam
 from segslam.slam_result import SlamResult
 from segslam.types import LoopAttempt, LoopClosure, Motion, MotionState, Rejected, RejectReason, Scan, Trajectory
 
+PLAIN = ("health.check=false", "adjustment.max_minutes=0")
+"""Loops alone."""
 FAR_DEG = 1.0
 """20 m off after a round of 113 m."""
 
@@ -26,7 +28,7 @@ def mapped(turn_deg: float, *settings: str) -> SlamResult:
 @cache
 def mapped_and_tried(turn_deg: float, *settings: str, tries_loops: bool = True) -> tuple[SlamResult, list[LoopAttempt]]:
     """The same with the attempts as they came; without `tries_loops` they come at the end only."""
-    config = load_config(None, ["health.check=false", *settings])
+    config = load_config(None, [*PLAIN, *settings])
     odometry = drifting(round_drive()[1], turn_deg=turn_deg)
     slam = Slam(config, odometry=GivenOdometry(odometry, config.odometry))
     tried: list[LoopAttempt] = []
@@ -120,7 +122,7 @@ def carried() -> tuple[SlamResult, list[LoopAttempt]]:
     odometry = drifting(truth)
     T_odom = odometry.T_world_lidar.copy()
     T_odom[after:] = T_odom[before - 1] @ geometry.inverse(T_odom[after]) @ T_odom[after:]
-    config = load_config(None, ["health.check=false"])
+    config = load_config(None, [*PLAIN])
     given = Carried(replace(odometry, T_world_lidar=T_odom), config.odometry, first_after=after)
     slam = Slam(config, odometry=given)
     tried = [attempt for number in kept for attempt in slam.process(scans[number]).attempts]

@@ -19,6 +19,7 @@ EVERY_THIRD = range(0, 100, 3)  # turns of up to 95 degrees between scans
 
 
 @pytest.mark.data
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [FIRST_SLIP, EVERY_THIRD])
 def test_a_slip_of_kiss_icp_in_the_courtyard_is_repaired(data_dir: Path, rows: range) -> None:
     dataset = open_dataset(data_dir / "courtyard")

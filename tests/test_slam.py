@@ -54,7 +54,9 @@ def test_repeating_the_steps_gives_the_same_attempts_and_poses(run: tuple[list[S
     assert [[_outcome(attempt.outcome) for attempt in step.attempts] for step in again] == outcomes
 
 
-@pytest.mark.parametrize(("max_waiting", "slow"), [(1, "tracking"), (8, "closing"), (8, "neither")])
+@pytest.mark.parametrize(
+    ("max_waiting", "slow"), [(1, "tracking"), (8, "closing"), pytest.param(8, "neither", marks=pytest.mark.slow)]
+)
 def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
     run: tuple[list[Step], SlamResult], max_waiting: int, slow: str
 ) -> None:

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Runs the tests in a process a core, after setting up what they need. Options go to pytest: `bash tools/test.sh -m slow`
-# runs the long ones, `-n 0` runs all in one process.
+# Runs the tests in a process a core until the first failure, after setting up what they need; six minutes on two cores.
+# Options go to pytest: `bash tools/test.sh -m slow` runs the long ones, `--maxfail 0` does not stop at a failure, `-n 0`
+# runs all in one process.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . tools/setup.sh dev
-exec "$PYTHON" -m pytest -n "$(nproc)" --maxprocesses 4 --dist worksteal "$@"
+exec "$PYTHON" -m pytest -n "$(nproc)" --maxprocesses 4 --dist worksteal --exitfirst "$@"

@@ -48,7 +48,7 @@ class LiveFigures:
             "num_scans_missing": max(self.num_missing, ended.gaps.num_missing),
             "num_gaps": ended.gaps.num_gaps,
             "longest_gap_s": ended.gaps.longest_gap_s,
-            "num_clock_set_back": ended.gaps.num_set_back,
+            "num_clock_set": ended.gaps.num_clock_set,
             "num_restarts": num_restarts,
             "num_keyframes_unsearched": self._num_unsearched,
             "latency_ms": _spread(self._latency_ms),

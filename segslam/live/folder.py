@@ -60,8 +60,6 @@ class FolderSource:
             why = os.strerror(ctypes.get_errno())
             raise SegslamError(f"{self._folder}: cannot be watched ({why}); give a folder on a local disk")
         there = [entry for entry in self._folder.iterdir() if entry.suffix in SUFFIXES]
-        if not there or there[0].suffix in (".ply", ".pcd"):
-            import open3d  # noqa: F401  (takes seconds: now instead of at the first scan)
         self._has_missed = self._noted_ns.value > 0
         if there and not self._has_missed:
             tell(f"{len(there)} scans already in {self._folder} are ignored; use segslam map for these")

@@ -15,13 +15,13 @@ class Gaps(NamedTuple):
     num_gaps: int = 0
     num_missing: int = 0
     longest_gap_s: float = 0.0
-    num_set_back: int = 0
+    num_clock_set: int = 0
 
     @classmethod
     def of(cls, waiting: Waiting) -> "Gaps":
         """Those of the scans that have arrived."""
         rhythm = waiting.rhythm
-        return cls(rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_set_back)
+        return cls(rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_clock_set)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,8 @@ LONGEST_PREDICTED = 10.0
 """Chosen: after more intervals (1 s at 10 Hz), prediction with constant velocity is useless."""
 SET_BACK_NS = 1_000_000_000
 """Chosen: the sender's clock was set back if a stamp is this much earlier than the last, as in a replay."""
+SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
+"""Chosen: the sender's clock was set forward if a stamp is this much later than the last: no drive has such a gap."""
 
 
 class Rhythm:
@@ -22,16 +24,16 @@ class Rhythm:
         self.num_missing = 0
         """Number of missing scans, estimated from the length of the gaps."""
         self.longest_gap_s = 0.0
-        self.num_set_back = 0
+        self.num_clock_set = 0
 
     def note(self, sent_ns: int) -> int:
-        """The stamp of the next scan: as sent, or shifted to follow the last one if the clock was set back."""
+        """The stamp of the next scan: as sent, or shifted to follow the last one if the clock was set."""
         stamp_ns = sent_ns + self._shift_ns
         last_ns = self._last_ns
-        if last_ns is not None and stamp_ns < last_ns - SET_BACK_NS:
+        if last_ns is not None and not last_ns - SET_BACK_NS <= stamp_ns <= last_ns + SET_FORWARD_NS:
             self._shift_ns += last_ns + self._usual_ns() - stamp_ns
             stamp_ns = sent_ns + self._shift_ns
-            self.num_set_back += 1
+            self.num_clock_set += 1
         if last_ns is not None and stamp_ns > last_ns:
             self._note_interval(stamp_ns - last_ns)
         self._last_ns = max(stamp_ns, last_ns or 0)

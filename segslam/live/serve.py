@@ -93,7 +93,7 @@ def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
     for step in past.steps[-ROWS_CONTINUED:]:
         waiting.rhythm.note(step.stamp_ns)
     rhythm = waiting.rhythm
-    rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_set_back = past.gaps
+    rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_clock_set = past.gaps
     keyframes = [row for row, _ in past.clouds]
     last = range(max(len(past.steps) - ROWS_CONTINUED, keyframes[0]), len(past.steps))
     rows = sorted({*keyframes, *last})

@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import shlex
 import sys
 from collections.abc import Mapping
@@ -15,6 +16,8 @@ from segslam.log import schema
 from segslam.types import Transform
 
 CPU_INFO = Path("/proc/cpuinfo")
+ESCAPED = re.compile(r"\\u(dc[89a-f][0-9a-f])")
+"""A byte of a file name that is not UTF-8, as Python writes it (PEP 383)."""
 PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
 """Packages whose versions a log records, because results depend on them."""
 
@@ -53,7 +56,16 @@ def _records(
 
 def _printable(text: str) -> str:
     """The text with bytes of file names that are not UTF-8, which a log cannot hold, as escapes."""
-    return text.encode(errors="backslashreplace").decode()
+    return text.replace(r"\udc", r"\x5cudc").encode(errors="backslashreplace").decode()
+
+
+def restored(values: Mapping[str, str]) -> dict[str, str]:
+    """The values of a metadata record with the bytes of which `metadata` has made escapes."""
+
+    def as_it_was(text: str) -> str:
+        return ESCAPED.sub(lambda found: chr(int(found[1], 16)), text).replace(r"\x5cudc", r"\udc")
+
+    return {key: as_it_was(value) for key, value in values.items()}
 
 
 def _command() -> str:

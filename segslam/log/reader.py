@@ -19,6 +19,7 @@ from segslam.log.cloud import KeyframePoints, intensities, place_of, points_and_
 from segslam.log.container import CutError
 from segslam.log.foxglove import transforms
 from segslam.log.keyframes import RecordedKeyframe, RecordedKeyframes
+from segslam.log.origin import restored
 from segslam.log.records import codec
 from segslam.types import GraphEstimate, Keyframe, LateLoops, LoopAttempt, SegslamError, Step, Trajectory, Transform
 
@@ -177,7 +178,7 @@ def read_log(path: Path) -> RunLog:
         raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}") from cut
     if check is not None and check.get("crc32") != str(schema.checksum(metadata)):
         raise SegslamError(f"{path}: the settings at its start are damaged (wrong checksum); map the data again")
-    run = metadata.get(schema.RUN_METADATA, {})
+    run = restored(metadata.get(schema.RUN_METADATA, {}))
     if "yaml" not in metadata.get(schema.CONFIG_METADATA, {}) or "schema_version" not in run:
         raise SegslamError(f"{path}: an MCAP file, but not a log of segslam; {remedy}")
     packages = metadata.get(schema.PACKAGES_METADATA, {})
@@ -187,7 +188,7 @@ def read_log(path: Path) -> RunLog:
             f"use segslam {packages.get('segslam', 'of that time')}, which wrote it"
         )
     config = config_from_yaml(metadata[schema.CONFIG_METADATA]["yaml"], f"{path} (settings)")
-    options = metadata.get(schema.OPTIONS_METADATA, {})
+    options = restored(metadata.get(schema.OPTIONS_METADATA, {}))
     return RunLog(path=path, config=config, run=run, packages=packages, options=options)
 
 

@@ -59,7 +59,7 @@ def test_a_run_reports_the_angle_with_the_setting_that_corrects_it(
     yard: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_kitti(tmp_path / "given.txt", POSES)
-    options = ["--odometry", tmp_path / "given.txt", "--labels", "none"]
+    options = ["--odometry", tmp_path / "given.txt", "--labels", "none", "--set", "adjustment.max_minutes=0"]
     assert run("map", yard, "--out", tmp_path / "run", *options) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["vertical_deg"] == pytest.approx(0.3, abs=0.06)
@@ -78,6 +78,7 @@ def test_a_drive_too_short_for_the_angle_gives_none(tmp_path: Path, capsys: pyte
     assert "the vertical angle cannot be measured" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("short_runs")
 @pytest.mark.parametrize(("options", "kept_deg"), [([], 0.205), (["--set", "sensor.vertical_angle_deg=0"], 0.0)])
 def test_a_run_keeps_the_angle_that_its_scans_were_read_with(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], kept_deg: float

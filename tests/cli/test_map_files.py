@@ -12,6 +12,8 @@ from matplotlib.image import imread
 
 from segslam.types import WorkFailed
 
+pytestmark = pytest.mark.usefixtures("short_runs")
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -77,7 +79,7 @@ def test_map_writes_the_map_with_the_run_and_adds_missing_maps_to_a_finished_run
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     kitti = tmp_path / "kitti"
-    write_kitti_sequence(kitti, num_scans=6)
+    write_kitti_sequence(kitti, num_scans=4)
     out = tmp_path / "run"
     assert run("map", kitti, "--out", out, "--map", "--json", "--quiet") == 0
     metrics = json.loads(capsys.readouterr().out)

@@ -1,12 +1,14 @@
 import json
+import logging
 import re
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 import pytest
+from helpers import commands
 from scipy.spatial.transform import Rotation
 
 from segslam import geometry
@@ -37,9 +39,26 @@ def square(*, num_false: int = 0) -> tuple[G2oGraph, np.ndarray]:
     return G2oGraph(guesses, edges), np.array(truth)
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "segslam", "optimize", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+Optimize = Callable[..., "Ended"]
+
+
+class Ended(NamedTuple):
+    """Exit status and output of a command, including that of libraries."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Optimize:
+    """Runs `segslam optimize`."""
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])  # pytest's would take the warnings
+
+    def ended(*arguments: object) -> Ended:
+        return Ended(commands.run("optimize", *arguments), *capfd.readouterr())
+
+    return ended
 
 
 def poses(graph: G2oGraph) -> np.ndarray:
@@ -201,7 +220,7 @@ def test_three_hundred_false_edges_of_a_published_graph_are_all_found(data_dir: 
     assert found.converged
 
 
-def test_the_command_prints_the_robust_cost_and_reports_doubtful_results(tmp_path: Path) -> None:
+def test_the_command_prints_the_robust_cost_and_reports_doubtful_results(run: Optimize, tmp_path: Path) -> None:
     graph, _ = square()
     wrong = [Edge(e.a, e.b, np.eye(4), e.information) if e is graph.edges[20] else e for e in graph.edges]
     write_g2o(tmp_path / "in.g2o", G2oGraph(graph.T_world_vertex, wrong))
@@ -214,7 +233,7 @@ def test_the_command_prints_the_robust_cost_and_reports_doubtful_results(tmp_pat
     assert "the result may be wrong: the edges fit worse" in done.stderr
 
 
-def test_the_command_writes_the_optimum_and_prints_one_json_object(tmp_path: Path) -> None:
+def test_the_command_writes_the_optimum_and_prints_one_json_object(run: Optimize, tmp_path: Path) -> None:
     graph, truth = square()
     write_g2o(tmp_path / "in.g2o", graph)
     done = run(tmp_path / "in.g2o", "--out", tmp_path / "out.g2o", "--json")
@@ -237,7 +256,7 @@ def test_the_command_writes_the_optimum_and_prints_one_json_object(tmp_path: Pat
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
-    tmp_path: Path, text: str | None, arguments: list[str], complaint: str
+    run: Optimize, tmp_path: Path, text: str | None, arguments: list[str], complaint: str
 ) -> None:
     if text is not None:
         (tmp_path / "in.g2o").write_text(text)
@@ -248,7 +267,7 @@ def test_bad_input_is_one_line_and_status_2(
     assert not (tmp_path / "out.g2o").exists()
 
 
-def test_a_missing_folder_for_the_result_is_found_before_the_work(tmp_path: Path) -> None:
+def test_a_missing_folder_for_the_result_is_found_before_the_work(run: Optimize, tmp_path: Path) -> None:
     (tmp_path / "in.g2o").write_text("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n")
     done = run(tmp_path / "in.g2o", "--out", tmp_path / "nowhere" / "out.g2o")
     assert done.returncode == 2
@@ -256,7 +275,7 @@ def test_a_missing_folder_for_the_result_is_found_before_the_work(tmp_path: Path
 
 
 @pytest.mark.parametrize("robust", ["none", "gnc", "consistent"])
-def test_a_graph_that_cannot_be_solved_is_one_line_with_its_vertex(tmp_path: Path, robust: str) -> None:
+def test_a_graph_that_cannot_be_solved_is_one_line_with_its_vertex(run: Optimize, tmp_path: Path, robust: str) -> None:
     graph, _ = square()
     edges = [*graph.edges]
     far = edges[3].T_a_b.copy()

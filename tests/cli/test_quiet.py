@@ -20,7 +20,11 @@ from typer.main import get_command
 
 from segslam import cli, simulation
 from segslam.cli import commands
+from segslam.run import report
 
+pytestmark = pytest.mark.usefixtures("short_runs")
+
+WRITE_REPORT = report.write_report
 Words = list[object]
 FEW = ("--method", "segregator", "--labels", "true_labels", "--pairs")
 
@@ -44,8 +48,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("made") / "run").folder
 
 
-def _mapped(data: Path, out: Path) -> Path:
-    """The folder of a finished run, made without output."""
+@pytest.fixture(scope="module")
+def mapped(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run of the scans, made without output."""
+    out = tmp_path_factory.mktemp("mapped") / "run"
     assert run("map", data, "--out", out, "--labels", "true_labels", "--quiet") == 0
     return out
 
@@ -76,16 +82,8 @@ COMMANDS: dict[str, Callable[[Path, Path, Path], Words]] = {
     ],
     "warm-up": lambda *_: [],
     "doctor": lambda *_: [],
-    "locate": lambda data, _, out: [
-        _mapped(data, out),
-        data / "sequences/00/velodyne/000003.bin",
-        "--dataset",
-        "kitti",
-    ],
-    "localise": lambda data, _, out: [_mapped(data, out), data, "--out", out.with_name("again")],
     "bench places": lambda _, __, out: [_places(out), "--database", "0:4", "--queries", "4:6"],
     "compare": lambda _, finished, out: [finished, shutil.copytree(finished, out)],
-    "resume": lambda data, _, out: [_mapped(data, out)],
     "calibrate": lambda data, *_: [data],
     "demo": lambda _, __, out: ["--out", out],
     "bench pairs": lambda data, _, out: [data, *FEW, data / "pairs.txt", "--out", out],
@@ -93,6 +91,13 @@ COMMANDS: dict[str, Callable[[Path, Path, Path], Words]] = {
     "bench yaw": lambda data, _, __: [data, *FEW, data / "pairs.txt", "--step-deg", 180],
     "bench deterioration": lambda data, _, __: [data, *FEW, data / "pairs.txt", "--lost", 50, "--draws", 1],
 }
+"""Arguments of each command, given the data, a run that was made up, and a new name."""
+OF_MAPPED: dict[str, Callable[[Path, Path, Path], Words]] = {
+    "locate": lambda data, mapped, _: [mapped, data / "sequences/00/velodyne/000003.bin", "--dataset", "kitti"],
+    "localise": lambda data, mapped, out: [mapped, data, "--out", out],
+    "resume": lambda _, mapped, __: [mapped],
+}
+"""The same, given a run of the data."""
 
 
 @pytest.fixture(autouse=True)
@@ -102,31 +107,33 @@ def short_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulation, "example_drive", lambda *_, **__: short)
 
 
+@pytest.fixture(params=[*COMMANDS, *OF_MAPPED])
+def words(request: pytest.FixtureRequest, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Words:
+    """A command with its arguments; `report` alone draws."""
+    name, out = str(request.param), tmp_path / "out"
+    if name == "report":
+        monkeypatch.setattr("segslam.run.report.write_report", WRITE_REPORT)
+    if name in OF_MAPPED:
+        return [*name.split(), *OF_MAPPED[name](data, request.getfixturevalue("mapped"), out)]
+    return [*name.split(), *COMMANDS[name](data, request.getfixturevalue("finished"), out)]
+
+
 def test_every_command_is_tried_here() -> None:
     commands.add_all(cli.app)
     elsewhere = {"live", "merge"}  # an endless source, and two longer drives: tests/live, tests/sessions
-    assert set(COMMANDS) | elsewhere == {name for name, _ in all_commands(get_command(cli.app))}
+    assert {*COMMANDS, *OF_MAPPED} | elsewhere == {name for name, _ in all_commands(get_command(cli.app))}
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_json_is_one_value_and_nothing_else(
-    name: str, data: Path, finished: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    assert run(*name.split(), *COMMANDS[name](data, finished, tmp_path / "out"), "--json") == 0
-    assert isinstance(json.loads(capfd.readouterr().out), list if name == "locate" else dict)
+def test_json_is_one_value_and_nothing_else(words: Words, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(*words, "--json") == 0
+    assert isinstance(json.loads(capfd.readouterr().out), list if words[0] == "locate" else dict)
 
 
-@pytest.mark.parametrize("name", COMMANDS)
 def test_quiet_prints_failures_only(
-    name: str,
-    data: Path,
-    finished: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    words: Words, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(logging.getLogger(), "handlers", [])  # pytest's would take the warnings
-    assert run(*name.split(), *COMMANDS[name](data, finished, tmp_path / "out"), "--quiet") == 0
+    assert run(*words, "--quiet") == 0
     assert capfd.readouterr().err == ""
 
 

@@ -3,31 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.commands import run
-from helpers.drives import drifting, round_drive
 
-from segslam.config import load_config
-from segslam.log import LogWriter, read_log
-from segslam.odometry import GivenOdometry
+from segslam.log import read_log
 from segslam.run.finished import read_metrics
-from segslam.slam import Slam
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
-
-CONFIG = load_config(None, ["proximity.min_travel_m=60", "adjustment.max_minutes=0"])
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a drive around a block, with loops, not adjusted."""
-    scans, truth = round_drive()
-    slam = Slam(CONFIG, odometry=GivenOdometry(drifting(truth), CONFIG.odometry))
-    path = tmp_path_factory.mktemp("run") / "log.mcap"
-    with LogWriter(path, config=CONFIG, dataset="round", reference=truth) as log:
-        for scan in scans:
-            log.write(slam.process(scan))
-        result = slam.finish()
-        log.write_result(result.estimate, result.trajectory)
-    return path
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 def test_a_run_is_refined_and_keeps_its_loops(log: Path, tmp_path: Path) -> None:

@@ -6,31 +6,12 @@ import numpy as np
 import pytest
 import yaml
 from helpers.commands import run
-from helpers.drives import drifting, round_drive
+from helpers.drives import SLAM_CONFIG
 
-from segslam.config import load_config
-from segslam.log import LogWriter, read_log
-from segslam.odometry import GivenOdometry
-from segslam.slam import Slam
+from segslam.log import read_log
 from segslam.types import LoopAttempt, LoopClosure
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
-
-CONFIG = load_config(None, ["proximity.min_travel_m=60"])
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a drive around a block and a bit more, with loops."""
-    scans, truth = round_drive()
-    slam = Slam(CONFIG, odometry=GivenOdometry(drifting(truth), CONFIG.odometry))
-    path = tmp_path_factory.mktemp("run") / "log.mcap"
-    with LogWriter(path, config=CONFIG, dataset="round", reference=truth) as log:
-        for scan in scans:
-            log.write(slam.process(scan))
-        result = slam.finish()
-        log.write_result(result.estimate, result.trajectory)
-    return path
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 def _attempts(log: Path) -> list[LoopAttempt]:
@@ -76,7 +57,7 @@ def test_other_settings_change_the_loops_and_the_change_is_printed(
     assert output in capsys.readouterr().err
     settings = read_log(out / "log.mcap").config
     assert settings.verify.min_overlap == pytest.approx(np.median(overlaps), abs=1e-5)
-    assert settings.proximity == CONFIG.proximity, "settings of the log that were not changed remain"
+    assert settings.proximity == SLAM_CONFIG.proximity, "settings of the log that were not changed remain"
 
 
 def test_a_setting_that_acts_before_the_keyframes_is_refused_and_nothing_written(

@@ -48,7 +48,8 @@ def shown_by_command(folder: Path, commands: list[list[str]], *, num_scans: int)
     return [(name, int(ended), text) for text, name, ended in zip(parts[0::3], parts[1::3], parts[2::3], strict=False)]
 
 
-@pytest.mark.parametrize("num_scans", [pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("num_scans", [1, 3])
 def test_every_command_works_in_a_terminal(tmp_path: Path, num_scans: int) -> None:
     data, run, again = (str(tmp_path / name) for name in ("data", "run", "again"))
     scan = f"{data}/sequences/00/velodyne/000000.bin"

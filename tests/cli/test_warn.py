@@ -10,7 +10,7 @@ import pytest
 
 from segslam.cli.warn import FirstOfEachKind
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 def test_first_warning_of_each_kind_is_printed_and_the_others_counted(capsys: pytest.CaptureFixture[str]) -> None:

@@ -51,6 +51,7 @@ def worker_pids(client: "distributed.Client") -> list[int]:
     return list(client.run(os.getpid).values())
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_changes_nothing_in_the_table(
     job: Job, trials: list[Trial], here: list[Row], tmp_path: Path
 ) -> None:

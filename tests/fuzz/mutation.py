@@ -8,9 +8,11 @@ from collections.abc import Callable
 WORDS = (
     *(b"nan", b"-inf", b"1e999", b"1e308", b"1e-400", b"-1", b"0", b"", b"9" * 30, b"0x10", b"1_0", b"1:60", b"0x_"),
     *(b"1000000000000", b"2147483648", b"4294967295", b"18446744073709551616", b"2001-99-99", b"true", b"~"),
+    *(b"null", b"NaN", b"[]", b"{}", b"[" * 3000),
     *(b"\xff\xfe", b"\x00", b"'", b'"', b"[", b"]", b"{", b"}", b":", b"#", b"&a", b"*a", b"<<: *a", b"- ", b"\r\n"),
 )
 """What has confused readers of text."""
+WORD = re.compile(rb"[^\s,=]+")
 INTEGERS = (0, 1, 10**12, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
 
 
@@ -67,12 +69,17 @@ def _integer(rng: random.Random, data: bytearray) -> bytearray:
     return data
 
 
+def replaced(rng: random.Random, data: bytes, word: re.Pattern[bytes]) -> bytes:
+    """A copy with one of the words replaced."""
+    words = [found.span() for found in word.finditer(data)]
+    if not words:
+        return data
+    begin, end = rng.choice(words)
+    return data[:begin] + rng.choice(WORDS) + data[end:]
+
+
 def _word(rng: random.Random, data: bytearray) -> bytearray:
-    words = [found.span() for found in re.finditer(rb"[^\s,=]+", data)]
-    if words:
-        begin, end = rng.choice(words)
-        data[begin:end] = rng.choice(WORDS)
-    return data
+    return bytearray(replaced(rng, bytes(data), WORD))
 
 
 def _line(rng: random.Random, data: bytearray) -> bytearray:

@@ -4,13 +4,14 @@ import random
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
 
-from fuzz import seeds
+from fuzz import own_log, seeds
 from fuzz.mutation import mutate
 from fuzz.rewriting import rewritten
 from segslam.config import load_config
@@ -19,6 +20,7 @@ from segslam.datasets.clouds import read_file
 from segslam.datasets.kitti import read_calibration
 from segslam.datasets.point_cloud2 import CloudReader
 from segslam.datasets.scans import make_scan, read_stamps
+from segslam.log import read_log
 from segslam.pose_graph import Robust, optimize_graph, read_g2o
 from segslam.semantics.label_files import encoding_of, read_labels
 from segslam.semantics.network import open_network
@@ -60,6 +62,7 @@ def targets(folder: Path) -> list[Target]:
         (at(name) / "arch_cfg.yaml").write_bytes(seeds.ARCHITECTURE)
     (at("settings") / "data_cfg.yaml").write_bytes(seeds.CLASS_MAP)
     (at("messages") / "whole.mcap").write_bytes(seeds.mcap(at("seed"), 2**20))
+    whole_log = own_log.write_whole(at("whole") / "log.mcap")
     stored = next(database.glob("*.db3"))
     return [
         Target("bin", at("bin") / "0.bin", [seeds.rows(seeds.ROW, num).tobytes() for num in (40, 1000)], _scan),
@@ -92,6 +95,8 @@ def targets(folder: Path) -> list[Target]:
         Target("g2o", at("g2o") / "a.g2o", [seeds.G2O + b"\n" * k for k in range(len(ROBUST))], _graph, is_text=True),
         Target("config", at("config") / "a.yaml", [seeds.CONFIG], load_config, is_text=True),
         Target("set", at("set") / "text", list(seeds.OVERRIDES), _override, is_text=True),
+        Target("log", at("log") / "log.mcap", [whole_log.read_bytes()], _log(whole_log)),
+        Target("log messages", at("log messages") / "seed", [bytes(8)], _log_messages(whole_log)),
         Target("labels", at("labels") / "0.label", [seeds.labels()], _labels),
         Target(
             "settings",
@@ -172,6 +177,26 @@ def _override(file: Path) -> None:
     except SegslamError as error:
         if "--set" not in str(error) or len(str(error)) > 1000:
             raise AssertionError(str(error)[:200]) from error
+
+
+def _log(whole: Path) -> Callable[[Path], None]:
+    all_of_it = cache(lambda: own_log.Read(read_log(whole)))  # read once, before there are children
+
+    def read(file: Path) -> None:
+        own_log.Read(read_log(file)).check_part_of(all_of_it())
+
+    return read
+
+
+def _log_messages(whole: Path) -> Callable[[Path], None]:
+    """A log with valid checksums and odd content, as the bytes of the file determine."""
+
+    def read(file: Path) -> None:
+        log = file.with_name("log.mcap")
+        log.write_bytes(own_log.odd(random.Random(file.read_bytes()), whole))
+        own_log.Read(read_log(log))
+
+    return read
 
 
 def _labels(file: Path) -> None:

@@ -92,7 +92,8 @@ def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
     return folder / "velodyne"
 
 
-SLAM_CONFIG = load_config(None, ["proximity.min_travel_m=60"])
+SLAM_CONFIG = load_config(None, ["proximity.min_travel_m=60", "adjustment.max_minutes=0"])
+"""Without the final adjustment, which takes longer than all else; tests/adjustment and tests/run have it."""
 
 
 def drifting_slam() -> Slam:

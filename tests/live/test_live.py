@@ -71,7 +71,25 @@ def test_stamps_continue_when_the_clock_of_the_sender_is_set_back() -> None:
     stamps = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
     again = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
     assert np.all(np.diff([*stamps, *again]) == INTERVAL_NS)
-    assert (rhythm.num_set_back, rhythm.num_gaps) == (1, 0)
+    assert (rhythm.num_clock_set, rhythm.num_gaps) == (1, 0)
+
+
+@pytest.mark.parametrize("ahead_ns", [25 * 3600 * 10**9, 2_000_000_000 * 10**9])
+def test_stamps_of_a_clock_that_is_set_forward_continue_and_count_no_missing_scans(ahead_ns: int) -> None:
+    """Also if it is set for one scan only, as by a damaged packet."""
+    first_ns, rhythm = 1_700_000_000 * 10**9, Rhythm()
+    sent = [first_ns + INTERVAL_NS * number for number in range(12)]
+    sent[4] += ahead_ns
+    sent[8:] = [stamp_ns + ahead_ns for stamp_ns in sent[8:]]
+    assert np.all(np.diff([rhythm.note(stamp_ns) for stamp_ns in sent]) == INTERVAL_NS)
+    assert (rhythm.num_clock_set, rhythm.num_gaps, rhythm.num_missing) == (3, 0, 0)
+
+
+def test_a_pause_of_an_hour_is_a_gap() -> None:
+    rhythm = Rhythm()
+    for stamp_s in (0, 1, 2, 3, 3603):
+        rhythm.note(stamp_s * 10**9)
+    assert (rhythm.num_clock_set, rhythm.num_gaps, rhythm.longest_gap_s) == (0, 1, 3600.0)
 
 
 @pytest.mark.parametrize(
@@ -240,6 +258,7 @@ def test_the_same_scans_live_and_offline_close_the_same_loops_on_the_same_trajec
     assert np.abs(apart_m).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_live_run_shows_how_it_stands_in_a_terminal(tmp_path: Path) -> None:
     folder, ended = tmp_path / "scans", threading.Event()
     folder.mkdir()

@@ -15,7 +15,7 @@ from segslam.datasets import open_dataset
 from segslam.log import read_log
 from segslam.types import Scan
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 BY_INTENSITY = ("--set", "map.color=intensity")
 

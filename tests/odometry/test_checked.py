@@ -109,6 +109,7 @@ def test_without_the_check_a_jump_remains() -> None:
     assert results[-1].motion is None
 
 
+@pytest.mark.slow
 def test_scans_that_are_missing_do_not_break_a_drive() -> None:
     scans, truth = round_drive()
     kept = [*scans[:20], *scans[23:40]]  # three scans, 9 m of the drive

@@ -113,6 +113,7 @@ def test_a_loop_of_two_closures_is_as_unlikely_as_gtsam_finds_it() -> None:
     assert pairwise_chi2(edges, [p, q])[0, 1] == pytest.approx(2.0 * search(loop, start).error, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_loops_of_true_closures_follow_the_chi_square_that_they_claim() -> None:
     """400 independent pairs, a drive each.
 

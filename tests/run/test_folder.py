@@ -4,17 +4,16 @@ import csv
 from pathlib import Path
 
 import numpy as np
-from helpers.drives import drifting_slam, round_drive
+from helpers.finished_run import make_run
 
 from segslam.run.folder import POSE_COLUMNS, write_loops
 from segslam.types import Rejected
 
 
 def test_loops_csv_has_a_row_for_every_attempt(tmp_path: Path) -> None:
-    slam = drifting_slam()
-    attempts = [attempt for scan in round_drive()[0] for attempt in slam.process(scan).attempts]
-    weights = slam.finish().estimate.closure_weights
-    write_loops(tmp_path / "loops.csv", tuple(attempts), weights)
+    result = make_run(tmp_path / "run").result
+    attempts, weights = result.attempts, result.estimate.closure_weights
+    write_loops(tmp_path / "loops.csv", attempts, weights)
     with (tmp_path / "loops.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(attempts) > 0

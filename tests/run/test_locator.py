@@ -20,12 +20,15 @@ NUM_MAPPED = 50
 """A round of the drive; the scans after it see it again."""
 
 
+pytestmark = pytest.mark.usefixtures("short_runs")
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that mapped the first round."""
     folder = tmp_path_factory.mktemp("located")
     write_kitti_sequence(folder / "data", num_scans=NUM_MAPPED)
-    config = load_config(None, ["health.check=false"])
+    config = load_config(None, ["health.check=false", "adjustment.max_minutes=0"])
     odometry = GivenOdometry(drifting(round_drive()[1], turn_deg=0.0, climb_m=0.0), config.odometry)
     segslam.map_folder(folder / "data", folder / "run", config=config, labels="geometric", odometry=odometry)
     return folder / "run"

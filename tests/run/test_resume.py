@@ -23,10 +23,13 @@ from segslam.run.finished import read_run
 from segslam.run.folder import POSE_COLUMNS
 from segslam.types import LoopClosure
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
 OPTIONS = ("--labels", "true_labels", "--quiet")
-FAST = ("odometry.max_range_m=40", "odometry.voxel_size_m=1.5", "keyframes.distance_m=6", "proximity.min_travel_m=60")
+FAST = (
+    *("odometry.max_range_m=40", "odometry.voxel_size_m=1.5", "keyframes.distance_m=6"),
+    *("proximity.min_travel_m=60", "adjustment.max_minutes=0"),
+)
 SETTINGS = tuple(word for setting in FAST for word in ("--set", setting))
 
 

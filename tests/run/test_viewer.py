@@ -50,6 +50,7 @@ def test_motions_that_were_repaired_or_broken_or_rejected_are_marked(steps: list
     assert "/world/motions_rejected" in entities
 
 
+@pytest.mark.usefixtures("short_runs")
 def test_mapping_can_be_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A viewer that opens no window, and writes what it is sent to a file."""
     monkeypatch.setenv("DISPLAY", ":0")

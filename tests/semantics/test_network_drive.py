@@ -24,9 +24,10 @@ from segslam.simulation.files import uncorrected
 from segslam.trajectory import write_kitti
 from segslam.types import LoopClosure
 
-pytestmark = pytest.mark.usefixtures("blank_reports")
+pytestmark = pytest.mark.usefixtures("short_runs")
 
-SETTINGS = ("--quiet", "--set", "keyframes.distance_m=4", "--set", "proximity.min_travel_m=60")
+CHANGED = ("keyframes.distance_m=4", "proximity.min_travel_m=60", "adjustment.max_minutes=0")
+SETTINGS = ("--quiet", *(word for setting in CHANGED for word in ("--set", setting)))
 SENSOR = {"field_of_view_deg": [-22.8, 22.5], "height": 64, "width": 1024}
 
 

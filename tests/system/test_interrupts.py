@@ -15,7 +15,7 @@ from helpers.drives import write_kitti_sequence
 from segslam import cli
 from segslam.cli import map as map_module
 
-pytestmark = pytest.mark.usefixtures("ctrl_c_works", "blank_reports")
+pytestmark = pytest.mark.usefixtures("ctrl_c_works", "short_runs")
 
 LOADING = """
 import os, signal, sys

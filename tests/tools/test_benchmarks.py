@@ -68,13 +68,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def mapped(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def mapped(short_runs: None, data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of those scans, the odometry given."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("segslam.run.report.write_report", lambda folder: (folder / "report.html").write_text(""))
-        out = tmp_path_factory.mktemp("runs") / "run"
-        poses = data / "poses" / "00.txt"
-        assert run("map", data, "--labels", "true_labels", "--odometry", poses, "--out", out, "--quiet") == 0
+    out = tmp_path_factory.mktemp("runs") / "run"
+    poses = data / "poses" / "00.txt"
+    words = ("--labels", "true_labels", "--odometry", poses, "--set", "adjustment.max_minutes=0", "--quiet")
+    assert run("map", data, "--out", out, *words) == 0
     return out
 
 
@@ -166,6 +165,7 @@ def test_odometry_compares_voxel_sizes_and_another_library(call: Call, data: Pat
     assert all(row["median_ms"] > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_trouble_is_applied_to_the_drive_that_is_mapped(call: Call, data: Path) -> None:
     words = ["--sequence", "00", "--frames", "0:20", "--at", "8", "--only", "given odometry, jump of 3 m"]
     (row,) = call(trouble, data, *words)["rows"].values()

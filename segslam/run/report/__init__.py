@@ -33,7 +33,9 @@ def write_report(folder: Path) -> Path:
     with matplotlib.rc_context(figures.STYLE):
         plots = _plots(run)
     about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
-    return _write(folder / "report.html", page(run, plots, _pictures(run), about=about).encode())
+    return _write(
+        folder / "report.html", page(run, plots, _pictures(run), about=about).encode(errors="backslashreplace")
+    )
 
 
 def write_before_after(folder: Path, file: Path) -> Path:

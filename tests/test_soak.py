@@ -73,7 +73,8 @@ def _rss_mb(log: Path) -> np.ndarray:
 @pytest.mark.slow
 def test_continuous_mapping_has_no_leak_lag_or_lost_record(tmp_path: Path) -> None:
     rounds = Rounds(SECONDS)
-    config = load_config(None, ["odometry.min_range_m=1", "proximity.min_travel_m=60"])
+    settings = ["odometry.min_range_m=1", "proximity.min_travel_m=60"]
+    config = load_config(None, [*settings, "adjustment.max_minutes=0"])  # at the end, and up to an hour
     slam = Slam(config, odometry=GivenOdometry(rounds.poses(), config.odometry))
     with Run(tmp_path, slam, dataset="rounds") as run:
         steps = run.map(rounds)

@@ -26,10 +26,7 @@ from segslam.types import LoopClosure
 pytestmark = pytest.mark.usefixtures("short_runs")
 
 OPTIONS = ("--labels", "true_labels", "--quiet")
-FAST = (
-    *("odometry.max_range_m=40", "odometry.voxel_size_m=1.5", "keyframes.distance_m=6"),
-    *("proximity.min_travel_m=60", "adjustment.max_minutes=0"),
-)
+FAST = ("odometry.max_range_m=40", "odometry.voxel_size_m=1.5", "keyframes.distance_m=6", "proximity.min_travel_m=60")
 SETTINGS = tuple(word for setting in FAST for word in ("--set", setting))
 
 

@@ -10,7 +10,7 @@ ALIGNMENT = Alignment(REGISTRATION, REGISTRATION, 0.62, 0.1, 0.01)
 CLOSURE = LoopClosure(5, 2, np.eye(4), np.eye(6), ALIGNMENT)
 
 
-def test_a_rejection_says_that_it_is_none_and_has_no_truth_value() -> None:
+def test_a_rejection_raises_where_its_truth_is_tested() -> None:
     rejected = Rejected(RejectReason.LOW_OVERLAP, "0.1 < 0.2")
     assert not rejected.ok
     for careless in (lambda: not rejected, lambda: rejected or ALIGNMENT, lambda: 1 if rejected else 2):

@@ -111,12 +111,12 @@ def test_a_pose_within_reach_of_the_best_is_no_rival() -> None:
     assert SCORE.scored(Pair(STREET, True, [one, same], "right", 0.1), TRAINED).lead == np.inf
 
 
-def test_where_impossible_pairs_fit_well_more_is_asked() -> None:
+def test_where_impossible_pairs_fit_well_a_pose_is_less_likely() -> None:
     """The same poses, in a run whose impossible pairs fit badly, and in one where they fit nearly as well."""
     corridor = _run(good=97)
-    look_alike = [_pair(corridor, None, (88, 12)) for _ in range(6)]
+    similar = [_pair(corridor, None, (88, 12)) for _ in range(6)]
     here, there = (_pair(run, (90, 10), (70, 30)) for run in (STREET, corridor))
-    assert _log_odds(there, look_alike) < _log_odds(here, TRAINED) - 1.0
+    assert _log_odds(there, similar) < _log_odds(here, TRAINED) - 1.0
 
 
 def test_few_patches_prove_less_than_many() -> None:

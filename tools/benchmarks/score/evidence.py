@@ -30,7 +30,7 @@ Counts = Float[np.ndarray, "2 12"]
 
 
 class _Fates(NamedTuple):
-    """What becomes of points in the view of another scan; flags (n,) each."""
+    """What happens to points in the view of another scan; flags (n,) each."""
 
     violates: Mask
     matches: Mask

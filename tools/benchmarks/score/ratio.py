@@ -2,7 +2,7 @@
 
 A pose is right if it is no chance fit of two places, and if no other pose that was tried explains the scans as well.
 The first is judged against the run itself: its neighbours, whose poses are known, and its impossible pairs, each at its
-best pose. In a corridor both look alike, and the demand rises by itself.
+best pose. In a corridor both look similar, and the demand rises by itself.
 """
 
 from collections.abc import Sequence
@@ -99,7 +99,7 @@ def _shares(counts: Counts) -> Counts:
 
 
 def mean_ratio(counts: Counts, ratios: Counts) -> float:
-    """Mean log ratio of a patch (nats): what the pose says for itself."""
+    """Mean log ratio of a patch (nats), whatever the other poses show."""
     return float((_shares(counts) * ratios).sum())
 
 

@@ -9,6 +9,7 @@ Shapes are checked under pytest only.
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
+from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -274,13 +275,13 @@ class Registration(Record):
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """A failed registration or rejected loop. It has no pose; its truth value is False."""
+    """A failed registration or rejected loop. It has no pose, and no truth value: ask `isinstance`, or `ok`."""
 
     reason: RejectReason
     detail: str = ""
 
-    def __bool__(self) -> bool:
-        return False
+    def __bool__(self) -> NoReturn:
+        raise TypeError("a Rejected is neither true nor false; ask isinstance(found, Rejected), or found.ok")
 
     @property
     def ok(self) -> bool:

@@ -1,4 +1,4 @@
-"""A `Rejected` is false, so a rejection that is tested for its truth value is lost."""
+"""A `Rejected` has no truth value: nothing tests whether a call rejects but by `isinstance` or `is None`."""
 
 import ast
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ def _tested(tree: ast.AST) -> Iterator[ast.expr]:
 
 
 def _lost_rejections(tree: ast.AST) -> list[str]:
-    """Calls whose rejection is lost; results stored in a variable first are not followed."""
+    """Calls whose rejection raises where it is tested; results stored in a variable first are not followed."""
     names = (
         (test.func.attr if isinstance(test.func, ast.Attribute) else getattr(test.func, "id", ""), test.lineno)
         for test in _tested(tree)

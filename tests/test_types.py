@@ -10,13 +10,13 @@ ALIGNMENT = Alignment(REGISTRATION, REGISTRATION, 0.62, 0.1, 0.01)
 CLOSURE = LoopClosure(5, 2, np.eye(4), np.eye(6), ALIGNMENT)
 
 
-def test_a_rejection_is_false_and_a_pose_is_true() -> None:
+def test_a_rejection_raises_where_its_truth_is_tested() -> None:
     rejected = Rejected(RejectReason.LOW_OVERLAP, "0.1 < 0.2")
-    assert not rejected
     assert not rejected.ok
-    for found in (REGISTRATION, ALIGNMENT, CLOSURE):
-        assert found
-        assert found.ok
+    for careless in (lambda: not rejected, lambda: rejected or ALIGNMENT, lambda: 1 if rejected else 2):
+        with pytest.raises(TypeError, match="isinstance"):
+            careless()
+    assert all(found.ok for found in (REGISTRATION, ALIGNMENT, CLOSURE))
 
 
 @pytest.mark.parametrize(

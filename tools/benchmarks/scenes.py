@@ -96,10 +96,19 @@ class Judge:
         return register_prepared(source, target, config=self._config, floor=self._floor, gate=gate)
 
 
-def _prior(T_target_source: Transform, rng: np.random.Generator) -> Transform:
+def prior(T_target_source: Transform, rng: np.random.Generator) -> Transform:
+    """A pose as odometry would give it after a loop."""
     drift = rng.normal(scale=[DRIFT_M, DRIFT_M, HEIGHT_M])
     turn = geometry.yaw(math.radians(rng.normal(scale=DRIFT_DEG)))
     return geometry.transform(np.eye(3), drift) @ T_target_source @ geometry.transform(turn, 0.0)
+
+
+def beside(scene: Scene, source: int, target: int, rng: np.random.Generator, *, is_same: bool) -> Transform:
+    """A pose near the target's, as if the places of a false pair lay side by side; storeys of one scene keep theirs."""
+    T_near = geometry.transform(geometry.yaw(rng.choice([0.0, np.pi])), [*rng.uniform(-4.0, 4.0, 2), 0.0])
+    if is_same:
+        T_near[2, 3] = scene.path[source, 2] - scene.path[target, 2]
+    return T_near
 
 
 def bench(name: str, sensor: str, noise_m: float, *, count: int, seed: int, config: Config) -> dict[str, object]:
@@ -123,7 +132,7 @@ def _true(place: Place, judge: Judge, count: int, rng: np.random.Generator, conf
         one, other = place.prepared(source, visits[0]), place.prepared(target, visits[1])
         T_true = geometry.inverse(T_target) @ T_source
         counts = agreement(one.observed, other.observed, T_true, config=config.verify).overlap > 0.4
-        found = judge(one, other, _prior(T_true, rng), T_target[:3, :3])
+        found = judge(one, other, prior(T_true, rng), T_target[:3, :3])
         right = isinstance(found, Alignment) and common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
         wrong += isinstance(found, Alignment) and not right
         overlapping += counts
@@ -142,11 +151,9 @@ def _false(here: Place, elsewhere: Place, judge: Judge, count: int, rng: np.rand
         source %= len(place.scene.path)
         visits = int(rng.integers(2)), int(rng.integers(2)) + 2
         T_source, T_target = place.pose(source, visits[0]), here.pose(target, visits[1])
-        T_near = geometry.transform(geometry.yaw(rng.choice([0.0, np.pi])), [*rng.uniform(-4.0, 4.0, 2), 0.0])
-        if place is here:
-            T_near[2, 3] = here.scene.path[source, 2] - here.scene.path[target, 2]
+        T_near = beside(here.scene, source, target, rng, is_same=place is here)
         found = judge(
-            place.prepared(source, visits[0]), here.prepared(target, visits[1]), _prior(T_near, rng), np.eye(3)
+            place.prepared(source, visits[0]), here.prepared(target, visits[1]), prior(T_near, rng), np.eye(3)
         )
         if isinstance(found, Rejected):
             rejected[found.reason.value] += 1

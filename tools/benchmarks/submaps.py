@@ -32,8 +32,8 @@ class Submaps:
     def __init__(self, folder: Path, config: Config) -> None:
         self._scans = open_dataset(folder)
         self._config = config
-        self.T_world_lidar = _poses(folder / "poses.txt")[: len(self._scans)]
-        self._T_odom_lidar = _poses(folder / "lio.txt")
+        self.T_world_lidar = poses_of(folder / "poses.txt")[: len(self._scans)]
+        self._T_odom_lidar = poses_of(folder / "lio.txt")
         self.prepared = cache(self._prepare)
         self._points = cache(self._read)
 
@@ -65,7 +65,8 @@ class Submaps:
         return prepare_scan(points, labels, config=self._config, seen_from_here=self._points(index))
 
 
-def _poses(file: Path) -> np.ndarray:
+def poses_of(file: Path) -> np.ndarray:
+    """(n, 4, 4) from rows of 3 x 4."""
     rows = np.loadtxt(file).reshape(-1, 3, 4)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows

@@ -5,7 +5,6 @@ contradict themselves and each other: after a solution, the median of the square
 its median in a simulation with the noise as claimed, whose solution has the same degrees of freedom.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -45,8 +44,7 @@ def solve_adjusted(
 ) -> tuple[Search, tuple[float, float]]:
     """The optimum near `start`, and the factors of the standard deviations of odometry and of the measurements.
 
-    Closures and measurements are under the kernel. Breaks of the odometry keep their noise. An error that all other
-    motions have in common is taken from them.
+    Closures and measurements are under the kernel. Breaks of the odometry keep their noise.
     """
     fixed = [edge for edge in odometry if is_break(edge)]
     groups = [edge for edge in odometry if not is_break(edge)], list(measured)
@@ -73,30 +71,9 @@ def solve_adjusted(
         )
         before = factors
         factors = np.clip(factors * change, LEAST, MOST)
-        groups = _without_shared_error(groups[0], poses_by_id(start)), groups[1]
         if np.abs(factors / before - 1.0).max() < SETTLED:
             break
     return found, (float(before[0]), float(before[1]))
-
-
-def _without_shared_error(motions: list[Edge], T_world: Transforms) -> list[Edge]:
-    """The motions without the error that they have in common, as of a sensor whose beams point too low.
-
-    The error is the median difference to the solution `T_world`, shrunk by its own variance (James and Stein 1961).
-    """
-    if not motions:
-        return motions
-    errors = np.array(
-        [
-            geometry.log(geometry.inverse(edge.T_a_b) @ geometry.inverse(T_world[edge.a]) @ T_world[edge.b])
-            for edge in motions
-        ]
-    )
-    shared = np.median(errors, axis=0)
-    spread = 1.4826 * np.median(np.abs(errors - shared), axis=0)
-    variance = math.pi / 2 * spread**2 / len(errors)
-    shared *= np.maximum(1.0 - variance / np.maximum(shared**2, 1e-18), 0.0)
-    return [replace(edge, T_a_b=geometry.nearest_transform(edge.T_a_b @ geometry.exp(shared))) for edge in motions]
 
 
 def _scaled(edges: Sequence[Edge], factor: float) -> list[Edge]:

@@ -1,5 +1,3 @@
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -36,24 +34,3 @@ def test_the_noise_of_odometry_and_of_measurements_is_estimated(odometry: float,
     ]
     _, found = made.adjust(edges)
     assert found == pytest.approx((odometry, measured), rel=0.25)
-
-
-def test_an_error_that_all_motions_have_in_common_is_taken_from_them() -> None:
-    """Beams that point too low pitch every motion; measurements without that error show it."""
-    made, T_odom, pitch_rad = PoseGraph(GraphConfig()), np.eye(4), 5e-4
-    T_step = geometry.transform(np.eye(3), [STEP_M, 0.0, 0.0])
-    rng = np.random.default_rng(2)
-    slight = INFORMATION * 25.0
-    T_pitched = T_step @ geometry.exp(np.array([0.0, pitch_rad, 0.0, 0.0, 0.0, 0.0]))
-    for keyframe_id in range(NUM):
-        made.add_keyframe(keyframe_id, T_odom, STEP_M * keyframe_id)
-        T_odom = T_odom @ T_pitched @ noisy(rng, slight, 1.0)
-    made.finish()
-    edges = [
-        Edge(older, older + 10, np.linalg.matrix_power(T_step, 10) @ noisy(rng, INFORMATION, 1.0), INFORMATION)
-        for older in range(0, NUM - 10, 5)
-    ]
-    made.adjust(edges)
-    T_world = made.T_world_keyframes
-    pitches = [geometry.log(geometry.inverse(T_step) @ geometry.inverse(a) @ b)[1] for a, b in pairwise(T_world)]
-    assert abs(float(np.median(pitches))) < 0.1 * pitch_rad

@@ -92,6 +92,7 @@ def test_the_example_that_scores_agrees_with_the_known_error(
     assert float(ate) == pytest.approx(1.30, abs=0.005)  # as the data's description has it
 
 
+@pytest.mark.slow
 def test_the_notebook_maps_and_registers_simulated_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")

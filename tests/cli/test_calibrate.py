@@ -55,6 +55,7 @@ def test_the_angle_is_measured_and_no_error_remains_after_setting_it(
     assert again["set_deg"] == pytest.approx(found["set_deg"], abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_run_reports_the_angle_with_the_setting_that_corrects_it(
     yard: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -247,6 +247,7 @@ def _fails_within(front: Front) -> None:
         raise SegslamError("disk full")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small disk")
 def test_a_full_disk_ends_a_live_run_with_the_remedy_though_no_scan_comes(tmp_path: Path) -> None:
     folder, disk = tmp_path / "scans", tmp_path / "disk"

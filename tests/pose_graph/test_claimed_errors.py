@@ -120,6 +120,7 @@ def _odometry() -> tuple[np.ndarray, np.ndarray]:
     return poses[rows], truth[rows]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [1, 8])
 def test_odometry_errors_match_the_information_of_the_edges(length: int) -> None:
     """Single edges, and chains of 8 (17 m). Identities would claim a ten-thousandth of it, sigmas thrice as large nine

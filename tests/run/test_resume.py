@@ -156,9 +156,8 @@ def _head_of_log(tmp_path: Path, whole: Path) -> bytes:
 @pytest.mark.parametrize(
     "part",
     [
-        "half a step",
         "all steps, no result",
-        *(pytest.param(part, marks=pytest.mark.slow) for part in ("no step", "result, no files")),
+        *(pytest.param(part, marks=pytest.mark.slow) for part in ("no step", "half a step", "result, no files")),
     ],
 )
 def test_a_run_that_lost_its_end_is_resumed(kitti: Path, whole: Path, tmp_path: Path, part: str) -> None:
@@ -167,6 +166,7 @@ def test_a_run_that_lost_its_end_is_resumed(kitti: Path, whole: Path, tmp_path: 
     _resumed_as_whole(kitti, whole, _cut(whole, tmp_path / "run", log_bytes=size))
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_with_status_2_and_the_run_is_resumed_when_there_is_space(
     kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

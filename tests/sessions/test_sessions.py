@@ -182,6 +182,7 @@ def _contents(folder: Path) -> dict[str, str]:
     return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(folder.iterdir())}
 
 
+@pytest.mark.slow
 def test_missing_scans_do_not_affect_the_result(days: Days, tmp_path: Path) -> None:
     gap = write_day(tmp_path / "gap", day=1, first=0, num_scans=18, without=range(6, 12))
     run_there = segslam.localise(days.monday.folder, gap, tmp_path / "run")

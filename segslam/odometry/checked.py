@@ -4,7 +4,8 @@ As long as the odometry is sound, a scan every `keyframes.distance_m` is compare
 milliseconds. If this contradicts the motion, the scan is registered with the last scans from several proposals: the
 odometry's motion, the last motion, no motion; and, if none of them explains the scan as scans of this drive usually are
 explained, from poses all around and from place recognition. The most likely pose is kept. Each following scan is
-registered as well, until the odometry agrees with a window of registrations, after the n-th repair with n windows.
+registered as well, until the odometry agrees with a window of registrations, after the n-th repair with n windows. So
+are the first scans of a drive, where KISS-ICP has few points in its map.
 """
 
 import math
@@ -57,7 +58,8 @@ class CheckedOdometry:
         self._motion = MotionModel()
         self._usual_check, self._usual_fit = Usual(), Usual()
         self._T_odom_last = np.eye(4)
-        self._num_unchecked = self._num_repaired = self._num_to_watch = 0
+        self._num_unchecked = self._num_repaired = 0
+        self._num_to_watch = WINDOW if inner.is_from_scans else 0
 
     @property
     def is_from_scans(self) -> bool:

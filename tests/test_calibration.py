@@ -20,6 +20,7 @@ from segslam.config import RefineConfig, SensorCalibrationConfig
 from segslam.datasets.kitti import read_calibration, read_returns
 from segslam.geometry import raise_beams
 from segslam.points import voxel_first, within_range
+from segslam.proximity import BREAK_TRAVEL_M
 from segslam.trajectory import lidar_from_camera, read_poses
 
 CONFIG = RefineConfig()
@@ -77,9 +78,16 @@ def test_a_standing_sensor_gives_no_angle_however_long_its_jitter_grows() -> Non
     assert measured(places_m) is None
 
 
-@pytest.mark.parametrize("gap_m", [16.0, 31.0])
-def test_keyframes_farther_apart_than_a_pair_give_no_angle(gap_m: float) -> None:
-    assert measured(gap_m * np.arange(40)) is None
+def test_keyframes_farther_apart_than_a_pair_give_no_angle() -> None:
+    assert measured(50.0 * np.arange(40)) is None
+
+
+def test_a_drive_with_a_break_shows_the_angle_too() -> None:
+    places_m = np.arange(-30.0, 31.0, 2.0)
+    travel_m = places_m + 30.0 + np.where(places_m > 0.0, BREAK_TRAVEL_M, 0.0)
+    found = measure_vertical_angle(lambda i: points_at(float(places_m[i])), poses_at(places_m), travel_m, config=CONFIG)
+    assert found is not None
+    assert found.angle_deg == pytest.approx(LOW_DEG, abs=0.04)
 
 
 def test_a_gap_in_the_drive_is_passed_over() -> None:

@@ -1,8 +1,7 @@
 """Alignment of two submaps: point to plane, robust against surfaces that only one of them contains.
 
 Each point of the source is paired with the nearest point of the target. Its squared distance to the plane there counts
-under the Geman-McClure kernel, which is wide at first and then as wide as surfaces are rough. If all beams point lower
-than assumed, every surface is bent differently in both submaps, and the angle can be a seventh unknown.
+under the Geman-McClure kernel, which is wide at first and then as wide as surfaces are rough.
 """
 
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 from segslam import geometry
 from segslam.adjustment.submaps import Submap
 from segslam.system.kernels import kernel
-from segslam.types import Information, Tangent, Transform, Vector
+from segslam.types import Information, Transform, Vector
 
 SEARCH_M = (1.0, 0.8, 0.7)
 """Chosen: search distance of each iteration, the last one for all others; odometry errs by less over 30 m."""
@@ -33,60 +32,30 @@ MIN_PAIRED = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The pose of one submap in another, by the points as they are."""
+    """The pose of one submap in another."""
 
     T_target_source: Transform
     information: Information
     """Inverse covariance for independent errors of the points."""
     overlap: float
     """Share of the source's points that are paired."""
-    angle_rad: float
-    """Elevation that, added to all beams, makes the two submaps fit best; 0 if it is undetermined."""
-    angle_sigma_rad: float
-    """Its standard deviation for independent errors of the points."""
-    by_angle: Tangent
-    """Motion of the pose per radian of elevation added to all beams."""
-
-    def at_angle(self, angle_rad: float) -> Transform:
-        """The pose once the beams of both submaps are raised by a small angle."""
-        return self.T_target_source @ geometry.exp(angle_rad * self.by_angle)
 
 
-def align(source: Submap, target: Submap, T_target_source: Transform, *, with_angle: bool = False) -> Alignment | None:
-    """The pose that aligns source and target near an initial guess; None if it does not converge.
-
-    With `with_angle`, iterations with the angle as a further unknown follow; without, its sigma is infinite.
-    """
+def align(source: Submap, target: Submap, T_target_source: Transform) -> Alignment | None:
+    """The pose that aligns source and target near an initial guess; None if it does not converge."""
     fit = _Fit(source, target)
     length = np.inf
     for iteration in range(MOST_ITERATIONS):
-        step = fit.step(T_target_source, 0.0, iteration, unknowns=6)
+        step = fit.step(T_target_source, iteration)
         if step is None:
             return None
         length = float(np.linalg.norm(step))
-        T_target_source = T_target_source @ geometry.exp(step[:6])
+        T_target_source = T_target_source @ geometry.exp(step)
         if length < CONVERGED and iteration >= len(KERNEL_M) - 1:
             break
     if length > SETTLED:
         return None
-    by_angle = -np.linalg.lstsq(fit.hessian[:6, :6], fit.hessian[:6, 6])[0]
-    information, overlap = fit.hessian[:6, :6] / fit.variance, fit.num / len(fit.points)
-    angle_rad, sigma_rad = _angle(fit, T_target_source) if with_angle else (0.0, np.inf)
-    return Alignment(T_target_source, information, overlap, angle_rad, sigma_rad, by_angle)
-
-
-def _angle(fit: "_Fit", T_target_source: Transform) -> tuple[float, float]:
-    """The angle and its standard deviation, which is infinite if the angle does not converge."""
-    angle_rad = 0.0
-    for _ in range(MOST_ITERATIONS):
-        step = fit.step(T_target_source, angle_rad, MOST_ITERATIONS, unknowns=7)
-        if step is None:
-            return 0.0, np.inf
-        T_target_source = T_target_source @ geometry.exp(step[:6])
-        angle_rad += float(step[6])
-        if np.linalg.norm(step) < CONVERGED:
-            return angle_rad, float(np.sqrt(fit.variance * np.linalg.pinv(fit.hessian, hermitian=True)[6, 6]))
-    return 0.0, np.inf
+    return Alignment(T_target_source, fit.hessian / fit.variance, fit.num / len(fit.points))
 
 
 class _Fit:
@@ -94,39 +63,36 @@ class _Fit:
 
     def __init__(self, source: Submap, target: Submap) -> None:
         rows = slice(None, None, max(1, -(-len(source.points) // MOST_POINTS)))
-        self.points, self._normals, self._raising = source.points[rows], source.normals[rows], source.raising[rows]
+        self.points, self._normals = source.points[rows], source.normals[rows]
         self._target = target
 
-    def step(self, T_target_source: Transform, angle_rad: float, iteration: int, *, unknowns: int) -> Vector | None:
-        """The next step of the pose (right perturbation) and, with 7 unknowns, of the angle; None with few pairs."""
-        points, target = self.points + angle_rad * self._raising, self._target
-        nearest, distance_m = target.surface.nearest(geometry.apply(T_target_source, points))
+    def step(self, T_target_source: Transform, iteration: int) -> Vector | None:
+        """The next step of the pose (right perturbation); None with few pairs."""
+        target = self._target
+        nearest, distance_m = target.surface.nearest(geometry.apply(T_target_source, self.points))
         self.hessian, gradient, squares, weights, self.num = _normal_equations(
-            points,
+            self.points,
             self._normals,
-            self._raising,
             target.points,
             target.normals,
-            target.raising,
             nearest,
             distance_m < SEARCH_M[min(iteration, len(SEARCH_M) - 1)],
             np.ascontiguousarray(T_target_source),
-            angle_rad,
             KERNEL_M[min(iteration, len(KERNEL_M) - 1)],
         )
         if self.num < MIN_PAIRED or weights == 0.0:
             return None
         self.variance = squares / weights
-        return -np.linalg.lstsq(self.hessian[:unknowns, :unknowns], gradient[:unknowns])[0]
+        return -np.linalg.lstsq(self.hessian, gradient)[0]
 
 
 @kernel(
-    "Tuple((float64[:, ::1], float64[::1], float64, float64, int64))(float64[:, :], float64[:, :], float64[:, :], "
-    "float64[:, :], float64[:, :], float64[:, :], int64[:], boolean[:], float64[:, ::1], float64, float64)"
+    "Tuple((float64[:, ::1], float64[::1], float64, float64, int64))(float64[:, :], float64[:, :], "
+    "float64[:, :], float64[:, :], int64[:], boolean[:], float64[:, ::1], float64)"
 )
-def _normal_equations(source, normals, raising, target, target_normals, target_raising, nearest, near, T, angle, width):
-    """Hessian and gradient of half the weighted squares by pose and angle; weighted squares, weights, paired points."""
-    hessian, gradient, row = np.zeros((7, 7)), np.zeros(7), np.empty(7)
+def _normal_equations(source, normals, target, target_normals, nearest, near, T, width):
+    """Hessian and gradient of half the weighted squares by the pose; weighted squares, weights, paired points."""
+    hessian, gradient, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     squares = weights = 0.0
     num = 0
     for k in range(len(source)):
@@ -140,16 +106,14 @@ def _normal_equations(source, normals, raising, target, target_normals, target_r
         if abs(a * m[0] + b * m[1] + c * m[2]) < SAME_NORMAL:
             continue
         e = a * p[0] + b * p[1] + c * p[2]
-        row[6] = a * raising[k, 0] + b * raising[k, 1] + c * raising[k, 2]
         for i in range(3):
-            e += n[i] * (T[i, 3] - target[j, i] - angle * target_raising[j, i])
-            row[6] -= n[i] * target_raising[j, i]
+            e += n[i] * (T[i, 3] - target[j, i])
         row[0], row[1], row[2] = p[1] * c - p[2] * b, p[2] * a - p[0] * c, p[0] * b - p[1] * a
         row[3], row[4], row[5] = a, b, c
         w = (1.0 + (e / width) ** 2) ** -2.0
-        for i in range(7):
+        for i in range(6):
             gradient[i] += w * e * row[i]
-            for k2 in range(7):
+            for k2 in range(6):
                 hessian[i, k2] += w * row[i] * row[k2]
         squares += w * e * e
         weights += w

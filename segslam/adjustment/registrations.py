@@ -12,9 +12,6 @@ from segslam.refinement import limited_information
 from segslam.trajectory import Poses
 from segslam.types import IndexPairs, Information
 
-MOST_ANGLES = 300
-"""Chosen: number of pairs that measure the vertical angle, evenly among all; each takes half as long again."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegisteredPair:
@@ -26,9 +23,9 @@ class RegisteredPair:
     information: Information
     """That of the alignment, with the errors that its points have in common."""
 
-    def edge(self, *, angle_rad: float, share: float) -> Edge:
-        """The edge with a share of the information, once all beams are raised by an angle."""
-        T_target_source = geometry.nearest_transform(self.alignment.at_angle(angle_rad))
+    def edge(self, *, share: float) -> Edge:
+        """The edge with a share of the information."""
+        T_target_source = geometry.nearest_transform(self.alignment.T_target_source)
         return Edge(self.target_id, self.source_id, T_target_source, share * self.information)
 
 
@@ -36,10 +33,9 @@ def register_pairs(
     pairs: IndexPairs, submaps: Submaps, T_world: Poses, *, config: Config
 ) -> Iterator[RegisteredPair | None]:
     """Register each pair (target, source) from its current pose; None without convergence or enough overlap."""
-    angle_every = max(1, len(pairs) // MOST_ANGLES)
-    for row, (target_id, source_id) in enumerate(pairs.tolist()):
+    for target_id, source_id in pairs.tolist():
         T_prior = geometry.inverse(T_world[target_id]) @ T_world[source_id]
-        found = align(submaps.submap(source_id), submaps.submap(target_id), T_prior, with_angle=row % angle_every == 0)
+        found = align(submaps.submap(source_id), submaps.submap(target_id), T_prior)
         if found is None or found.overlap < config.adjustment.min_overlap:
             yield None
             continue

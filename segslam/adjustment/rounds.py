@@ -1,8 +1,7 @@
 """Rounds of the adjustment: register submaps, solve the graph, build the submaps again from the result."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
 from time import monotonic
@@ -11,14 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from segslam import geometry
-from segslam.adjustment.angle import vertical_angle
 from segslam.adjustment.pairs import all_pairs
 from segslam.adjustment.progress import Progress, no_progress
 from segslam.adjustment.record import Adjustment
 from segslam.adjustment.registrations import RegisteredPair, register_pairs
 from segslam.adjustment.submaps import PointsOf, Submaps
 from segslam.adjustment.thickness import map_thickness_m
-from segslam.calibration import VerticalAngle
+from segslam.calibration import measure_vertical_angle
 from segslam.config import Config
 from segslam.pose_graph import PoseGraph
 from segslam.types import GraphEstimate, IndexPairs, Mask, Points, Vector
@@ -39,15 +37,8 @@ class _Round(NamedTuple):
     num_pairs: int
     registered: list[RegisteredPair]
     is_complete: bool
-    angle: VerticalAngle | None
-    """The whole vertical angle of the scans, of which some was corrected before the round."""
     estimate: GraphEstimate
     noise_factors: tuple[float, float]
-
-    @property
-    def correction_deg(self) -> float:
-        """Elevation that corrects the scans; 0 if no significant angle was measured."""
-        return self.angle.angle_deg if self.angle is not None and self.angle.is_significant else 0.0
 
 
 def adjust(
@@ -62,11 +53,13 @@ def adjust(
     if started >= end_s:
         return None
     T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
+    angle = measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
+    correction_deg = angle.angle_deg if angle is not None and angle.is_significant else 0.0
+    corrected = partial(_raised, points_of, correction_deg)
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
         title = f"refine {number}/{config.adjustment.rounds}"
-        corrected_deg = 0.0 if last is None else last.correction_deg
-        made = _round(graph, points_of, corrected_deg, config, end_s, partial(_titled, progress, title))
+        made = _round(graph, corrected, config, end_s, partial(_titled, progress, title))
         last = made or last
         if made is None or not made.is_complete:
             break
@@ -83,11 +76,11 @@ def adjust(
         moved_m=float(np.sqrt(np.mean(np.sum((T_after - T_before)[:, :3, 3] ** 2, axis=1)))),
         is_complete=last.is_complete,
         seconds=monotonic() - started,
-        vertical_deg=None if last.angle is None else last.angle.angle_deg,
-        vertical_sigma_deg=None if last.angle is None else last.angle.sigma_deg,
-        correction_deg=last.correction_deg,
+        vertical_deg=None if angle is None else angle.angle_deg,
+        vertical_sigma_deg=None if angle is None else angle.sigma_deg,
+        correction_deg=correction_deg,
         thickness_before_m=map_thickness_m(points_of, T_before, shared),
-        thickness_m=map_thickness_m(partial(_raised, points_of, last.correction_deg), T_after, shared),
+        thickness_m=map_thickness_m(corrected, T_after, shared),
     )
     return Adjusted(record, before, last.estimate)
 
@@ -103,32 +96,23 @@ def _titled(progress: Progress, title: str, items: Iterable[Any], total: int) ->
 def _round(
     graph: PoseGraph,
     points_of: PointsOf,
-    corrected_deg: float,
     config: Config,
     end_s: float,
     show: Callable[[Iterable[Any], int], Iterator[Any]],
 ) -> _Round | None:
-    """Register submaps by the current poses, and solve the graph; None if no pair could be registered.
-
-    The beams of all scans are raised by `corrected_deg` before, and by the rest of the angle after the registrations.
-    """
+    """Register submaps by the current poses, and solve the graph; None if no pair could be registered."""
     settings = config.adjustment
     T_world, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
     pairs = all_pairs(T_world, travel_m, config=settings, min_travel_m=config.proximity.min_travel_m)
-    corrected = partial(_raised, points_of, corrected_deg)
-    submaps = Submaps(corrected, T_world, travel_m, config=settings, refine=config.refine)
+    submaps = Submaps(points_of, T_world, travel_m, config=settings, refine=config.refine)
     in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, submaps, T_world, config=config))
     tried = list(show(in_time, len(pairs)))
     registered = [one for one in tried if one is not None]
     if not registered:
         return None
     share = min(1.0, settings.every / (2 * settings.reach + 1))  # so that every scan counts once
-    left = vertical_angle(registered)
-    angle = None if left is None else replace(left, angle_deg=corrected_deg + left.angle_deg)
-    wanted_deg = angle.angle_deg if angle is not None and angle.is_significant else 0.0
-    rest_rad = math.radians(wanted_deg - corrected_deg)
-    estimate, noise_factors = graph.adjust([one.edge(angle_rad=rest_rad, share=share) for one in registered])
-    return _Round(len(pairs), registered, len(tried) == len(pairs), angle, estimate, noise_factors)
+    estimate, noise_factors = graph.adjust([one.edge(share=share) for one in registered])
+    return _Round(len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
 
 
 def _is_between_passes(factors: Sequence[RegisteredPair], travel_m: Vector, config: Config) -> Mask:

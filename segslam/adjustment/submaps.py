@@ -28,8 +28,6 @@ class Submap:
     surface: Surface
     points: Points
     normals: Points
-    raising: Points
-    """(n, 3) motion of each point per radian of elevation added to all beams of its scan (m)."""
 
 
 class Submaps:
@@ -46,26 +44,21 @@ class Submaps:
     ) -> None:
         self._points_of, self._T_world, self._travel_m = points_of, T_world, travel_m
         self._config, self._refine = config, refine
-        self._scan = lru_cache(4 * config.reach + config.every + 2)(self._with_raising)
+        self._scan = lru_cache(4 * config.reach + config.every + 2)(self._scan_of)
         self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
 
-    def _with_raising(self, keyframe_id: int) -> tuple[Points, Points]:
-        points = downsample(self._points_of(keyframe_id), config=self._refine).astype(np.float64)
-        return points, geometry.raising(points)
+    def _scan_of(self, keyframe_id: int) -> Points:
+        return downsample(self._points_of(keyframe_id), config=self._refine).astype(np.float64)
 
     def _submap(self, keyframe_id: int) -> Submap:
         T_keyframe_world = geometry.inverse(self._T_world[keyframe_id])
-        parts = []
-        for other in members(keyframe_id, self._travel_m, reach=self._config.reach):
-            T_keyframe_other = T_keyframe_world @ self._T_world[other]
-            points, raising = self._scan(other)
-            parts.append(np.hstack([geometry.apply(T_keyframe_other, points), raising @ T_keyframe_other[:3, :3].T]))
-        rows = np.vstack(parts)
-        keys, _ = cell_keys(rows[:, :3], self._refine.voxel_m)
+        near = members(keyframe_id, self._travel_m, reach=self._config.reach)
+        points = np.vstack([geometry.apply(T_keyframe_world @ self._T_world[one], self._scan(one)) for one in near])
+        keys, _ = cell_keys(points, self._refine.voxel_m)
         voxels, group = np.unique(hash_keys(keys)[1], return_inverse=True)
-        merged = group_means(rows, group, len(voxels)) if len(rows) else rows
-        surface = make_surface(merged[:, :3], config=self._refine)
-        return Submap(surface, surface.points.copy(), surface.normals.copy(), merged[:, 3:])
+        merged = group_means(points, group, len(voxels)) if len(points) else points
+        surface = make_surface(merged, config=self._refine)
+        return Submap(surface, surface.points.copy(), surface.normals.copy())
 
 
 def members(keyframe_id: int, travel_m: Vector, *, reach: int) -> list[int]:

@@ -21,11 +21,16 @@ def parse_numbers(text: bytes, begin: int, num: int) -> tuple[np.ndarray, int]:
         begin, count, num_hard = _parse(source, begin, numbers, count, hard, POWERS)
         for start, end, row in hard[:num_hard].tolist():
             word = text[start:end]
-            if b"_" in word:
-                raise ValueError(f"{word[:40]!r} is not a number")
-            numbers[row] = float(word)
+            numbers[row] = _number(word)
         if num_hard < HARD_AT_ONCE:
             return numbers[:count], begin
+
+
+def _number(word: bytes) -> float:
+    try:
+        return float(word.replace(b"_", b"no number"))
+    except ValueError as error:
+        raise ValueError(f"{word[:40]!r} is not a number") from error
 
 
 @kernel(

@@ -14,6 +14,7 @@ from google.protobuf.message import DecodeError
 
 from segslam.adjustment import Adjustment
 from segslam.config import Config, config_from_yaml
+from segslam.errors import brief
 from segslam.log import container, schema
 from segslam.log.cloud import KeyframePoints, intensities, place_of, points_and_labels
 from segslam.log.container import CutError
@@ -163,7 +164,9 @@ class RunLog:
             RecursionError,
             DecodeError,
         ) as error:
-            raise SegslamError(f"{self.path}: not written by segslam ({error!r}); map the data again") from error
+            raise SegslamError(
+                f"{self.path}: not written by segslam ({brief(repr(error))}); map the data again"
+            ) from error
 
 
 def read_log(path: Path) -> RunLog:
@@ -184,8 +187,8 @@ def read_log(path: Path) -> RunLog:
     packages = metadata.get(schema.PACKAGES_METADATA, {})
     if run["schema_version"] != str(schema.VERSION):
         raise SegslamError(
-            f"{path}: a log of schema version {run['schema_version']}, but this version reads {schema.VERSION}; "
-            f"use segslam {packages.get('segslam', 'of that time')}, which wrote it"
+            f"{path}: a log of schema version {brief(run['schema_version'])}, but this version reads {schema.VERSION}; "
+            f"use segslam {brief(packages.get('segslam', 'of that time'))}, which wrote it"
         )
     config = config_from_yaml(metadata[schema.CONFIG_METADATA]["yaml"], f"{path} (settings)")
     options = restored(metadata.get(schema.OPTIONS_METADATA, {}))

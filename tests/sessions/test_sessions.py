@@ -81,7 +81,7 @@ def test_two_days_become_one_frame(days: Days, merged: FinishedRun) -> None:
     assert np.degrees(geometry.angle(geometry.inverse(monday) @ friday)) < 0.5
     distance_m, angle_deg = _errors(whole, merged.reference, monday)
     assert np.median(distance_m) < 0.1
-    assert (distance_m < 0.3).mean() >= 0.95  # a single scan is off by the error of its odometry
+    assert distance_m.max() < 0.3
     assert angle_deg.max() < 1.0
     assert merged.metrics["num_sessions"] == 2
     assert merged.metrics["num_loops_between"] >= 3

@@ -9,6 +9,7 @@ import numpy as np
 
 from segslam import geometry
 from segslam.refinement import LightSurface, Surface
+from segslam.system.kernels import kernel
 from segslam.types import Points, Transform
 
 NUM_POINTS, NUM_SEARCH = 1500, 400
@@ -42,6 +43,7 @@ def nudge(
     if min(len(points), len(target.points)) < LEAST_POINTS:
         return None
     chosen = points[:: max(1, len(points) // num_points)].astype(np.float64)
+    target_points, scale_m = target.points, SCALE_VOXELS * voxel_m
     T_now = T_target_source
     for reach in reaches:
         moved = geometry.apply(T_now, chosen)
@@ -49,12 +51,30 @@ def nudge(
         near = apart_m < reach * voxel_m
         if near.sum() < LEAST_NEAR:
             return None
-        normal, point = target.normals_at(rows[near]), moved[near]
-        residual = np.einsum("ij,ij->i", point - target.points[rows[near]], normal)
-        weight = 1.0 / (1.0 + (residual / (SCALE_VOXELS * voxel_m)) ** 2)
-        jacobian = np.hstack([np.cross(point, normal), normal])
-        hessian = (jacobian * weight[:, None]).T @ jacobian
-        gradient = (jacobian * weight[:, None]).T @ residual
+        rows = rows[near]
+        hessian, gradient = _normal_equations(moved[near], target_points[rows], target.normals_at(rows), scale_m)
         damped = hessian + 1e-3 * np.diag(np.diag(hessian)) + 1e-9 * np.eye(6)
-        T_now = geometry.exp(-np.linalg.solve(damped, gradient)) @ T_now
+        T_now = geometry.exp(-np.linalg.solve(damped, gradient)[:, 0]) @ T_now
     return geometry.nearest_transform(T_now)
+
+
+@kernel("UniTuple(float64[:, ::1], 2)(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64)")
+def _normal_equations(points, planes, normals, scale):
+    """Hessian (6, 6) and gradient (6, 1) of half the weighted squares by the pose, perturbed from the left."""
+    hessian, gradient, row = np.zeros((6, 6)), np.zeros((6, 1)), np.empty(6)
+    for k in range(len(points)):
+        p, n = points[k], normals[k]
+        e = 0.0
+        for i in range(3):
+            e += n[i] * (p[i] - planes[k, i])
+        row[0], row[1], row[2] = p[1] * n[2] - p[2] * n[1], p[2] * n[0] - p[0] * n[2], p[0] * n[1] - p[1] * n[0]
+        row[3], row[4], row[5] = n[0], n[1], n[2]
+        w = 1.0 / (1.0 + (e / scale) ** 2)
+        for i in range(6):
+            gradient[i, 0] += w * e * row[i]
+            for j in range(i, 6):
+                hessian[i, j] += w * row[i] * row[j]
+    for i in range(6):
+        for j in range(i):
+            hessian[i, j] = hessian[j, i]
+    return hessian, gradient

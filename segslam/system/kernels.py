@@ -44,6 +44,7 @@ MODULES = (
     "datasets.numbers",
     "verification.free_space",
     "adjustment.alignment",
+    "odometry.nudge",
     "points",
 )
 """Modules of this package that define kernels, the slowest to compile first."""

@@ -1,0 +1,124 @@
+"""Finished runs of real drives in one table: KISS-ICP alone, before loops, the result; and the picture of the README.
+
+    python -m tools.benchmarks.real NAME=RUN[,RUN,...] ... --out docs/real_drives.json [--picture NAME=FILE.png]
+
+Runs of `segslam map` with default settings, several of one drive separated by commas: medians over them. KISS-ICP alone
+is computed again from the data of the first run.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from segslam import geometry
+from segslam.datasets import open_dataset
+from segslam.evaluation import align_positions, trajectory_metrics
+from segslam.log import read_log
+from segslam.odometry import KissOdometry
+from segslam.run.finished import FinishedRun, read_run
+from segslam.run.folder import LOG
+from segslam.trajectory import Poses, rows_of_same_scan
+from segslam.types import Points
+from tools.benchmarks import common
+
+EXACT = ("num_loops_accepted", "num_loops_false", "num_motions_repaired", "num_motions_broken")
+METRES = ("odometry_ate_m", "ate_m", "height_m", "map_thickness_before_m", "map_thickness_m")
+OTHERS = ("loop_recall", "vertical_correction_deg", "seconds_total", "peak_rss_mb")
+POINTS_EACH, REACH_M, LOW_M, HIGH_M = 150, 25.0, -1.0, 2.5
+"""Of each keyframe in the picture: number of points, their range, and their height above the sensor."""
+
+
+def kiss_alone(run: FinishedRun) -> Poses | None:
+    """(n, 4, 4) poses of KISS-ICP with one thread and the settings of a run; None if its odometry was given."""
+    if run.options.get("odometry"):
+        return None
+    scans = open_dataset(run.options["data"], frames=run.options.get("frames") or None, labels="none")
+    odometry = KissOdometry(run.config.odometry.model_copy(update={"max_num_threads": 1}))
+    return np.stack([odometry.register(scans[row]).T_odom_lidar for row in range(len(scans))])
+
+
+def row(name: str, runs: list[FinishedRun], alone: Poses | None) -> common.Row:
+    """Medians over the runs of a drive; the range of errors beside them."""
+    first, reference = runs[0], runs[0].reference
+    if reference is None:
+        raise SystemExit(f"{name}: the run has no true poses; map a folder with poses.txt")
+    found: dict[str, Any] = {"drive": name, "scans": len(first.result.trajectory), "runs": len(runs)}
+    rows = rows_of_same_scan(first.result.trajectory.scan_index, reference.scan_index)
+    truth = reference.T_world_lidar[rows[:, 1]]
+    found["length_m"] = round(float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()))
+    if alone is not None:
+        found["kiss_icp_ate_m"] = round(trajectory_metrics(alone[rows[:, 0]], truth)["ate_m"], 3)
+    for key in (*METRES, *EXACT, *OTHERS):
+        values = [run.metrics[key] for run in runs if key in run.metrics]
+        if values:
+            found[key] = round(median(values), 4 if key in METRES else 3)
+    for key in ("odometry_ate_m", "ate_m"):
+        found[f"{key}_all"] = sorted(round(run.metrics[key], 3) for run in runs)
+    return found
+
+
+def draw(run: FinishedRun, alone: Poses, file: Path) -> None:
+    """The map by KISS-ICP alone and by the run, seen from above in one scale, with the true path."""
+    from matplotlib.figure import Figure
+
+    assert run.reference is not None
+    rows = rows_of_same_scan(run.result.trajectory.scan_index, run.reference.scan_index)
+    truth = run.reference.T_world_lidar[rows[:, 1], :3, 3]
+    figure = Figure(figsize=(11.8, 6.2), layout="constrained")
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    steps = [step for step in read_log(run.folder / LOG).steps() if step.keyframe is not None]
+    for axes, poses, title in (
+        (left, alone, "KISS-ICP alone"),
+        (right, run.result.trajectory.T_world_lidar, "segslam"),
+    ):
+        T_true_world = align_positions(poses[rows[:, 0], :3, 3], truth)
+        off_m = np.linalg.norm(geometry.apply(T_true_world, poses[rows[:, 0], :3, 3]) - truth, axis=1)
+        clouds = [
+            geometry.apply(T_true_world @ poses[number], _standing(step.keyframe.points, number))
+            for number, step in zip(run.result.keyframe_rows, steps, strict=True)
+            if step.keyframe is not None
+        ]
+        points = np.vstack(clouds)
+        axes.scatter(points[:, 0], points[:, 1], s=0.1, c="#404040", alpha=0.35, linewidths=0, rasterized=True)
+        axes.plot(truth[:, 0], truth[:, 1], color="#0072B2", linewidth=1.0, label="true path")
+        axes.set_title(f"{title}: error {np.sqrt(np.mean(off_m**2)):.2f} m", fontsize=13)
+        axes.set_aspect("equal")
+        axes.tick_params(labelsize=11)
+        axes.set_xlabel("m", fontsize=11)
+    left.legend(loc="lower left", fontsize=11, frameon=False)
+    figure.savefig(file, dpi=150)
+
+
+def _standing(points: Points, seed: int) -> Points:
+    """Some points above the ground and below bridges."""
+    near = (np.linalg.norm(points, axis=1) < REACH_M) & (points[:, 2] > LOW_M) & (points[:, 2] < HIGH_M)
+    chosen = np.random.default_rng(seed).permutation(np.flatnonzero(near))[:POINTS_EACH]
+    return points[chosen].astype(np.float64)
+
+
+def main() -> None:
+    """Write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("drives", nargs="+", metavar="NAME=RUN,...")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--picture", metavar="NAME=FILE.png")
+    options = parser.parse_args()
+    pictured, _, picture = (options.picture or "").partition("=")
+    rows = []
+    for drive in options.drives:
+        name, _, folders = drive.partition("=")
+        runs = [read_run(folder) for folder in folders.split(",")]
+        alone = kiss_alone(runs[0])
+        rows.append(row(name, runs, alone))
+        print(json.dumps(rows[-1]), flush=True)
+        if name == pictured and alone is not None:
+            draw(runs[0], alone, Path(picture))
+    common.write_report(options.out, {"drives": rows})
+
+
+if __name__ == "__main__":
+    main()

@@ -34,7 +34,7 @@ def finish(
     from segslam.run.accuracy import accuracy
     from segslam.run.folder import LOG, room_for, write_metrics
     from segslam.run.report import write_report
-    from segslam.run.run import peak_rss_mb
+    from segslam.system.memory import peak_mb
 
     say("all scans read; final optimisation ...", quiet=quiet)
     result, metrics = run.finish(search_s=search_s, progress=partial(_shown, quiet=quiet))
@@ -46,7 +46,7 @@ def finish(
         if map_files:
             log = read_log(run.folder / LOG)
             metrics |= write_maps(log, map_files, config=log.config.map, quiet=quiet)
-            metrics["peak_rss_mb"] = peak_rss_mb()
+            metrics["peak_rss_mb"] = peak_mb()
             write_metrics(run.folder, metrics)
     finally:
         with room_for(run.folder):

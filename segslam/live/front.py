@@ -22,6 +22,7 @@ from segslam.live.serve import END_S, READY, serve
 from segslam.live.source import Source
 from segslam.live.waiting import Tally
 from segslam.odometry import Tracked
+from segslam.system.memory import note_peak_of
 from segslam.types import SegslamError, Step
 
 CLOUDS_KEPT = 20
@@ -129,6 +130,7 @@ class Front:
                 if isinstance(item, Ended):
                     if item.died:
                         return item
+                    note_peak_of(self._process.pid)
                     self._received.put(item)
                     return None
                 self._take(item)

@@ -11,7 +11,7 @@ import numpy as np
 
 from segslam.config import OdometryConfig
 from segslam.odometry.kiss import KissAligner, KissOdometry
-from segslam.system.memory import keep_freed_memory
+from segslam.system.memory import keep_freed_memory, note_peak_of
 from segslam.types import Points, SegslamError, Transform
 
 MOST_SHARED = 2**18
@@ -77,6 +77,7 @@ class _AlignerApart:
 
     def close(self) -> None:
         """End the process."""
+        note_peak_of(self._process.pid)
         self._pipe.close()
         self._process.join()
 

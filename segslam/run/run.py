@@ -2,7 +2,6 @@
 
 import logging
 import math
-import resource
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -23,6 +22,7 @@ from segslam.log import LogWriter, Mirror, RunLog
 from segslam.log.drawing import CloudOf
 from segslam.run.folder import LOG, UNFINISHED, room_for, write_localised, write_loops, write_poses
 from segslam.slam import Slam, SlamResult, Tracked
+from segslam.system.memory import peak_mb
 from segslam.system.threads import in_other_thread
 from segslam.system.whole_files import write_whole
 from segslam.types import (
@@ -221,7 +221,7 @@ class Run:
             "num_loops_switched_off": len(result.estimate.rejected),
             "seconds_total": seconds,
             "scans_per_second": (len(result.trajectory) - self.num_scans_resumed) / seconds_mapping,
-            "peak_rss_mb": peak_rss_mb(),
+            "peak_rss_mb": peak_mb(),
             **figures,
             **({} if result.from_map_m is None else {"localised_percent": 100.0 * float(result.localised().mean())}),
             "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
@@ -288,12 +288,6 @@ class Run:
 
 def _count(result: SlamResult, *states: MotionState) -> int:
     return sum(motion.state in states for motion in result.motions)
-
-
-def peak_rss_mb() -> float:
-    """Peak memory of this process plus that of the odometry process, which has ended (MB)."""
-    processes = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return sum(resource.getrusage(process).ru_maxrss for process in processes) / 1024
 
 
 def _other_data(log: Path, difference: str) -> SegslamError:

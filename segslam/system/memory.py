@@ -1,7 +1,10 @@
-"""Memory allocation of the C library."""
+"""Memory allocation of the C library, and the peak memory of this process and those it started."""
 
 import ctypes
+import re
+import resource
 import sys
+from pathlib import Path
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 """M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of glibc's malloc.h."""
@@ -23,3 +26,25 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(MMAP_THRESHOLD, MMAP_BYTES)
         mallopt(TRIM_THRESHOLD, KEPT_BYTES)
+
+
+_others_mb = 0.0
+
+
+def note_peak_of(pid: int | None) -> None:
+    """Note the peak memory of another process, before it ends, for `peak_mb` (Linux only)."""
+    global _others_mb
+    try:
+        found = re.search(r"VmHWM:\s*(\d+) kB", Path(f"/proc/{pid}/status").read_text(encoding="ascii"))
+    except OSError:
+        return
+    if found is not None:
+        _others_mb = max(_others_mb, int(found[1]) / 1024)
+
+
+def peak_mb() -> float:
+    """Peak memory of this process plus the largest one noted (MB).
+
+    `getrusage` is of no use for the other: a new process begins with the peak of the one that started it.
+    """
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 + _others_mb

@@ -1,8 +1,9 @@
 """Work in other threads: a pipeline of items, and two calls at the same time."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from threading import get_ident
 from typing import TypeVar
 
 First = TypeVar("First")
@@ -23,10 +24,11 @@ def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, max_
 
     The calling thread produces the items, up to `max_waiting` ahead of the item in work. An exception of an item or of
     `work` is raised in the order of the results. After it, after Ctrl-C, or if the caller stops early, no further item
-    is started.
+    is started, and `items` is closed if it is a generator.
     """
     waiting: deque[Future[Done]] = deque()
     failures: list[BaseException] = []
+    worker: list[int] = []
 
     def unless_failed(item: Item) -> Done:
         if failures:
@@ -37,13 +39,16 @@ def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, max_
             failures.append(error)
             raise
 
-    with ThreadPoolExecutor(1, thread_name_prefix="beside") as thread:
-        try:
-            for item in items:
-                waiting.append(thread.submit(unless_failed, item))
-                while waiting and (len(waiting) > max_waiting or waiting[0].done()):
-                    yield waiting.popleft().result()
-            while waiting:
+    thread = ThreadPoolExecutor(1, thread_name_prefix="beside", initializer=lambda: worker.append(get_ident()))
+    try:
+        for item in items:
+            waiting.append(thread.submit(unless_failed, item))
+            while waiting and (len(waiting) > max_waiting or waiting[0].done()):
                 yield waiting.popleft().result()
-        finally:
-            thread.shutdown(cancel_futures=True)
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        # If the caller forgot this generator, the garbage collector closes it in any thread, perhaps in the worker.
+        thread.shutdown(wait=get_ident() not in worker, cancel_futures=True)
+        if isinstance(items, Generator):
+            items.close()

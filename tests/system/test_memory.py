@@ -3,6 +3,8 @@ import sys
 
 import pytest
 
+from segslam.system.memory import note_peak_of, peak_mb
+
 FAULTS = """
 import resource
 import numpy as np
@@ -29,3 +31,17 @@ def test_arrays_of_a_scans_size_are_made_of_pages_that_are_there() -> None:
     pages = 6 * 3 * 120_000 * 8 // 4096
     assert _faults("keep_freed_memory()") < 3 * pages
     assert _faults("") > 20 * pages, "or the setting is of no use any more"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_the_peak_of_another_process_does_not_contain_that_of_this_one() -> None:
+    program = "import sys; kept = bytearray(40 * 2**20); print(); sys.stdout.flush(); sys.stdin.read()"
+    alone_mb = peak_mb()
+    with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        note_peak_of(other.pid)
+        other.communicate()
+    assert 40.0 < peak_mb() - alone_mb < 80.0
+    note_peak_of(other.pid)  # it has ended
+    assert peak_mb() - alone_mb > 40.0

@@ -1,3 +1,5 @@
+import gc
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -93,6 +95,44 @@ def test_an_early_end_stops_the_work() -> None:
     num_worked = len(worked)
     time.sleep(0.02)
     assert len(worked) == num_worked <= 5
+
+
+def test_a_forgotten_one_may_be_closed_by_its_own_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    problems: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", problems.append)
+    second, forgotten, collected = threading.Event(), threading.Event(), threading.Event()
+    made = []
+
+    def items() -> Iterator[int]:
+        try:
+            for item in range(10):
+                if item == 2:
+                    second.set()
+                yield item
+        finally:
+            made.append("closed")
+
+    def work(item: int) -> int:
+        if item == 0:
+            second.wait(5.0)
+        if item == 1:
+            forgotten.wait(5.0)
+            gc.collect()
+            collected.set()
+        return item
+
+    gc.disable()
+    try:
+        results: list[object] = [in_other_thread(items(), work, max_waiting=2)]
+        next(results[0])  # type: ignore[call-overload]
+        results.append(results)  # a cycle, as an exception and its frames are one
+        del results
+        forgotten.set()
+        assert collected.wait(5.0)
+    finally:
+        gc.enable()
+    assert problems == []
+    assert made == ["closed"]
 
 
 def test_both_are_done_at_the_same_time_and_given_in_their_order() -> None:

@@ -9,10 +9,9 @@ from segslam.cli.checks import check_links
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
 
 if TYPE_CHECKING:
+    from segslam.evaluation import Up
     from segslam.trajectory import PoseFile, Poses
     from segslam.types import IndexPairs
-
-UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
 
 
 def evaluate(
@@ -27,7 +26,7 @@ def evaluate(
     ] = None,
     up: Annotated[
         Literal["z", "-y"] | None,
-        typer.Option(help="Upward axis of the reference frame; default: -y (camera) for KITTI format, z for TUM."),
+        typer.Option(help="Upward axis of the two files: z, or -y for cameras; by default found from the path."),
     ] = None,
     max_difference: Annotated[
         float, typer.Option(help="Largest time difference between a pose and its reference (s).")
@@ -94,28 +93,28 @@ def _score_run(folder: Path, reference_file: Path | None, plot: Path | None, *, 
     if plot is not None:
         trajectory = run.result.trajectory
         rows = rows_of_same_scan(trajectory.scan_index, reference.scan_index)
-        _draw(plot, trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]])
+        _draw(plot, trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]], "z")
     return metrics
 
 
-def _draw(file: Path, estimate: "Poses", reference: "Poses") -> None:
+def _draw(file: Path, estimate: "Poses", reference: "Poses", up: "Up") -> None:
     from segslam.run.report.comparison import check_picture, draw_scored
 
     check_picture(file)
-    draw_scored(file, estimate, reference)
+    draw_scored(file, estimate, reference, up=up)
 
 
 def _score_files(
     estimate_file: Path,
     reference_file: Path,
     format: Literal["kitti", "tum"] | None,
-    up: str | None,
+    up: "Up | None",
     max_difference_s: float,
     plot: Path | None,
     *,
     quiet: bool,
 ) -> dict[str, Any]:
-    from segslam.evaluation import trajectory_metrics
+    from segslam.evaluation import UP, trajectory_metrics
     from segslam.trajectory import read_poses
     from segslam.types import SegslamError
 
@@ -130,18 +129,31 @@ def _score_files(
             "line n + 1 is scan n in both. Score the run folder instead, or use TUM format, which is matched by stamp"
         )
     rows = _matching_rows(estimate, reference, round(max_difference_s * 1e9))
-    direction = up or ("-y" if estimate.stamp_ns is None else "z")
-    figures = trajectory_metrics(estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]], up=UP[direction])
+    matched, truth = estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]]
+    direction, how = (up, "") if up or not len(rows) else _up(truth, camera=estimate.stamp_ns is None)
+    figures = trajectory_metrics(matched, truth, up=UP[direction or "z"])
     if not figures:
         raise SegslamError(
             f"{estimate_file}: only {len(rows)} of its {len(estimate)} poses match one of the {len(reference)} "
             f"poses of {reference_file}; at least three are needed. Check the files, or raise --max-difference"
         )
+    if how:
+        say(f"{reference_file}: upward axis {direction} ({how}); for another: --up", quiet=quiet)
     if plot is not None:
-        _draw(plot, estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]])
+        _draw(plot, matched, truth, direction or "z")
     if not len(rows) == len(estimate) == len(reference):
         say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}", quiet=quiet)
-    return figures | {"num_poses": len(rows)}
+    return figures | {"num_poses": len(rows), "up": direction}
+
+
+def _up(reference: "Poses", *, camera: bool) -> tuple["Up", str]:
+    """The upward axis of the files, and how it is known."""
+    from segslam.evaluation import upward_axis
+
+    found = upward_axis(reference)
+    if found is not None:
+        return found, "the path lies across it"
+    return ("-y", "as in KITTI's files; the path does not show it") if camera else ("z", "the path does not show it")
 
 
 def _matching_rows(estimate: "PoseFile", reference: "PoseFile", max_difference_ns: int) -> "IndexPairs":

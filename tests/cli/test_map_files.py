@@ -69,6 +69,26 @@ def test_export_refuses_with_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("files", "output"),
+    [
+        (["before_after.png", "no/such/map.ply"], "there is no folder"),
+        (["before_after.png", "map.stl"], "unknown kind of map"),
+        (["map.ply", "no/before_after.png"], "there is no folder"),
+        (["map.ply", "map.ply"], "map.ply: given twice"),
+        (["before_after.png", "map.ply", "grid.yaml"], "grid.pgm: exists and is not a regular file"),
+    ],
+)
+def test_an_export_that_fails_writes_none_of_its_files(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], files: list[str], output: str
+) -> None:
+    if "grid.yaml" in files:
+        (tmp_path / "grid.pgm").mkdir()
+    assert run("export", finished, *(tmp_path / name for name in files), "--quiet") == 2
+    assert output in capsys.readouterr().err
+    assert [file for file in tmp_path.iterdir() if file.is_file()] == []
+
+
 def test_an_unfinished_run_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut = make_run(tmp_path / "cut", finished=False).folder
     assert run("export", cut, tmp_path / "map.ply") == 2

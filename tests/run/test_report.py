@@ -9,16 +9,17 @@ from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from helpers.finished_run import make_run
 
-from segslam import cli
+from segslam import cli, geometry
 from segslam.config import Config, load_config
 from segslam.run.accuracy import accuracy
 from segslam.run.finished import FIGURES, read_run
 from segslam.run.folder import write_metrics
 from segslam.run.report import write_report
-from segslam.run.report.figures import draw_loops
+from segslam.run.report.figures import draw_loops, paths_of
 from segslam.run.report.gallery import choose, outcome_text
 from segslam.run.report.page import number, page, settings_not_default
 from segslam.types import SegslamError
@@ -91,6 +92,16 @@ def test_loops_are_counted_by_outcome_and_the_false_one_is_shown(scored: Path) -
     for label in ("accepted (3)", "false (1)", "small clique (5)", "low overlap (1)"):
         assert label in loops
     assert "rejected by the optimiser" not in loops  # the low weight of the false one adds nothing
+
+
+def test_all_plots_are_in_the_frame_of_the_run(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    assert run.reference is not None
+    T_other_world = geometry.transform(geometry.yaw(2.0), [300.0, -80.0, 5.0])
+    moved = replace(run, reference=replace(run.reference, T_world_lidar=T_other_world @ run.reference.T_world_lidar))
+    truth, _, corrected = paths_of(moved)
+    np.testing.assert_array_equal(corrected.poses, run.result.trajectory.T_world_lidar)
+    np.testing.assert_allclose(truth.poses[:, :3, 3], run.reference.T_world_lidar[:, :3, 3], atol=0.05)
 
 
 def test_without_truth_nothing_is_compared_with_it(tmp_path: Path) -> None:

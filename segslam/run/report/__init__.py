@@ -15,7 +15,7 @@ from segslam.run.report.page import Pictures, page
 from segslam.system.whole_files import write_whole
 from segslam.types import Keyframe
 
-__all__ = ["BEFORE_AFTER", "write_before_after", "write_report"]
+__all__ = ["BEFORE_AFTER", "draw_before_after", "write_before_after", "write_report"]
 
 BEFORE_AFTER = "before_after.png"
 
@@ -39,9 +39,14 @@ def write_report(folder: Path) -> Path:
 
 
 def write_before_after(folder: Path, file: Path) -> Path:
-    """Write a PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
+    """Write the picture of `draw_before_after` to a file."""
+    return _write(file, draw_before_after(folder))
+
+
+def draw_before_after(folder: Path) -> bytes:
+    """A PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
     picture, _ = _drawn(read_run(folder))
-    return _write(file, picture)
+    return picture
 
 
 def _write(file: Path, content: bytes) -> Path:

@@ -66,11 +66,25 @@ def compared(run: FinishedRun) -> Compared | None:
     )
 
 
+def paths_of(run: FinishedRun) -> list[Line]:
+    """The paths to draw, in the frame of the run, as all other plots and the map."""
+    true = compared(run)
+    paths = []
+    if true is not None:
+        T_world_truth = align_positions(true.truth[:, :3, 3], true.corrected[:, :3, 3])
+        paths.append(Line("truth", T_world_truth @ true.truth, TRUTH, "-", 4.0))
+    return [
+        *paths,
+        Line("odometry", run.result.odometry.T_world_lidar, ODOMETRY, "--", 1.5),
+        Line("corrected", run.result.trajectory.T_world_lidar, CORRECTED, "-", 1.2),
+    ]
+
+
 def draw_paths(run: FinishedRun) -> str:
     """Ground truth, odometry and corrected trajectory in top view, and their heights against travel."""
     figure = Figure(figsize=(WIDTH_IN, 6.6), layout="constrained")
     above, height = figure.subplots(2, 1, height_ratios=(3, 1))
-    paths = _paths(run)
+    paths = paths_of(run)
     _plot_motions(above, run, paths[-1].poses)
     _plot_from_above(above, paths)
     for line in paths:
@@ -184,22 +198,6 @@ def _plot_attempts(axes: Axes, run: FinishedRun) -> None:
 def _finish_map(axes: Axes, *, num_columns: int) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
     _legend_on_top(axes, num_columns=num_columns)
-
-
-def _paths(run: FinishedRun) -> list[Line]:
-    """The paths to draw, in the frame of the ground truth if there is any."""
-    corrected, odometry = run.result.trajectory.T_world_lidar, run.result.odometry.T_world_lidar
-    true = compared(run)
-    paths = []
-    if true is not None:
-        T_truth_world = align_positions(true.corrected[:, :3, 3], true.truth[:, :3, 3])
-        corrected, odometry = T_truth_world @ corrected, T_truth_world @ odometry
-        paths.append(Line("truth", true.truth, TRUTH, "-", 4.0))
-    return [
-        *paths,
-        Line("odometry", odometry, ODOMETRY, "--", 1.5),
-        Line("corrected", corrected, CORRECTED, "-", 1.2),
-    ]
 
 
 def _rejected_pairs(run: FinishedRun) -> dict[RejectReason, list[tuple[int, int]]]:

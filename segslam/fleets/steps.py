@@ -37,6 +37,7 @@ RUNS, INDEX, PROPOSALS, PAIRS = "runs", "index", "proposals", "pairs"
 KEY = "fleet.key"
 """File in a run folder of a fleet: the key that it was made with."""
 UNFINISHED = ".part"
+ONE_THREAD = "odometry.max_num_threads=1"
 NUM_LOCATORS = 2
 
 
@@ -100,13 +101,16 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
 
 
 def _config(drive: Drive, source: DataSource) -> Config:
-    """The settings of a drive. Raises SegslamError for a wrong setting, and for an unknown preset."""
+    """The settings of a drive: KISS-ICP has one thread, so that poses repeat exactly, unless they say otherwise.
+
+    Raises SegslamError for a wrong setting, and for an unknown preset.
+    """
     if drive.preset != "auto" and drive.preset not in SETTINGS:
         raise SegslamError(f"preset: {drive.preset}: unknown preset; known: auto, {', '.join(SETTINGS)}")
     file = Path(drive.config) if drive.config else None
     scans = open_scans(source, load_config(file, drive.set))
     name = preset_for(extent_m(scans)) if drive.preset == "auto" else cast("Preset", drive.preset)
-    return load_config(file, drive.set, base=preset(name))
+    return load_config(file, drive.set, base=load_config(None, [ONE_THREAD], base=preset(name)))
 
 
 def index_drive(fleet: Path, drive: Mapped) -> int:

@@ -4,7 +4,7 @@ Two located keyframes are consistent if they and the odometry between them, in b
 noise (`segslam.pose_graph.closure_pairs`). A wrong location is consistent with few others.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -58,15 +58,17 @@ def find_session(
     locator: Locator,
     *,
     config: Config,
+    among: Sequence[int] | None = None,
     progress: Progress = no_progress,
 ) -> SessionPose | str:
     """The pose of a session in the earlier session of this `number`, or the reason as text if it is unknown.
 
-    Sparse keyframes are searched together with their neighbours.
+    At most `NUM_QUERIES` keyframes are searched, of all or of those given by `among`; sparse ones together with their
+    neighbours.
     """
     submap = submaps(session, config)
     found: list[tuple[int, int, Alignment]] = []
-    queries = _spread(len(session.travel_m))
+    queries = _spread(range(len(session.travel_m)) if among is None else among)
     num_tried = 0
     for keyframe_id in progress(queries, len(queries), "locate"):
         num_tried += 1
@@ -93,10 +95,10 @@ def find_session(
     return SessionPose(number, T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))
 
 
-def _spread(num_keyframes: int) -> list[int]:
+def _spread(keyframe_ids: Sequence[int]) -> list[int]:
     """Keyframes spread over a session, each far from the previous ones."""
-    evenly = np.unique(np.linspace(0, num_keyframes - 1, NUM_QUERIES).astype(int))
-    return evenly[np.argsort(np.arange(len(evenly)) * GOLDEN % 1.0)].tolist()
+    evenly = np.unique(np.linspace(0, len(keyframe_ids) - 1, NUM_QUERIES).astype(int))
+    return [keyframe_ids[row] for row in evenly[np.argsort(np.arange(len(evenly)) * GOLDEN % 1.0)]]
 
 
 def closure(found: tuple[int, int, Alignment], first_id: int, target_shift: int = 0) -> LoopClosure:

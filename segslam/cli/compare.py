@@ -7,6 +7,7 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
+from segslam.cli.overwriting import OverwriteOption, check_free
 from segslam.errors import SegslamError
 
 COLUMN = 14
@@ -18,6 +19,7 @@ def compare(
     plot: Annotated[
         Path | None, typer.Option(help="Draw the trajectories and their errors to this file: .png, .svg or .pdf.")
     ] = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -28,6 +30,7 @@ def compare(
     for folder in runs:
         check_exists(folder, "give run folders")
     names = _names(runs)
+    check_free([plot] if plot else [], overwrite=overwrite)
     announce(f"compare: reading {len(runs)} runs", quiet=quiet)
     from segslam.run.finished import read_metrics, read_run
     from segslam.run.report.comparison import check_picture, draw_runs

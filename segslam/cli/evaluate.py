@@ -7,6 +7,7 @@ import typer
 
 from segslam.cli.checks import check_links
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
+from segslam.cli.overwriting import OverwriteOption, check_free
 
 if TYPE_CHECKING:
     from segslam.evaluation import Up
@@ -34,6 +35,7 @@ def evaluate(
     plot: Annotated[
         Path | None, typer.Option(help="Draw both trajectories and the error to this file: .png, .svg or .pdf.")
     ] = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -41,6 +43,7 @@ def evaluate(
 
     Example: segslam eval runs/00; or segslam eval --estimate poses_kitti.txt --reference kitti/poses/00.txt
     """
+    check_free([plot] if plot else [], overwrite=overwrite)
     if run is not None or estimate is not None:
         announce(f"eval: reading {run or estimate}", quiet=quiet)
     from segslam.types import SegslamError
@@ -68,7 +71,7 @@ def table(figures: dict[str, Any]) -> str:
 
 def _score_run(folder: Path, reference_file: Path | None, plot: Path | None, *, quiet: bool) -> dict[str, Any]:
     from segslam.run.accuracy import accuracy
-    from segslam.run.finished import ACCURACY, read_run, true_poses
+    from segslam.run.finished import ACCURACY, plain_name, read_run, true_poses
     from segslam.run.folder import folder_of, write_metrics
     from segslam.trajectory import rows_of_same_scan
     from segslam.types import SegslamError
@@ -87,7 +90,7 @@ def _score_run(folder: Path, reference_file: Path | None, plot: Path | None, *, 
         )
     if len(reference) < num_scans:
         say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose", quiet=quiet)
-    metrics = {key: value for key, value in run.metrics.items() if key.removeprefix("odometry_") not in ACCURACY}
+    metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY}
     metrics |= figures
     write_metrics(folder, metrics)
     if plot is not None:

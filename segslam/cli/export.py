@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, print_json, progress, say
+from segslam.cli.overwriting import OverwriteOption, check_free
 
 if TYPE_CHECKING:
     from segslam.config import MapConfig
@@ -29,6 +30,7 @@ def export(
     ],
     config: ConfigOption = None,
     settings: SetOption = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -36,6 +38,7 @@ def export(
 
     Example: segslam export runs/00 map.laz map.png grid.yaml --set map.color=height
     """
+    check_free(files, overwrite=overwrite)
     announce(f"export: reading {run}", quiet=quiet)
     from segslam.config import load_config
     from segslam.log import read_log

@@ -36,7 +36,10 @@ def test_export_draws_the_map_before_and_after_loop_closing(
     assert run("export", finished, tmp_path / "before_after.png") == 0
     assert f"map in {tmp_path / 'before_after.png'}" in capsys.readouterr().err
     assert imread(tmp_path / "before_after.png").shape[1] == 1200
-    assert run("export", finished, tmp_path / "before_after.png", tmp_path / "map.ply", "--json", "--quiet") == 0
+    assert (
+        run("export", finished, tmp_path / "before_after.png", tmp_path / "map.ply", "--json", "--quiet", "--overwrite")
+        == 0
+    )
     assert json.loads(capsys.readouterr().out)["num_map_points"] > 0
 
 

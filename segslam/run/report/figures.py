@@ -18,7 +18,7 @@ from segslam.trajectory import Poses, rows_of_same_scan, travelled_m
 from segslam.types import LoopClosure, MotionState, Rejected, RejectReason, Vector
 
 # Okabe and Ito's colours, distinguishable with any colour vision
-TRUTH, CORRECTED, ODOMETRY = "#B8B8B8", "#0072B2", "#E69F00"
+TRUTH, CORRECTED, ODOMETRY, ALONE = "#B8B8B8", "#0072B2", "#E69F00", "#CC79A7"
 ACCEPTED, OPTIMISED_AWAY, FALSE = "#009E73", "#CC79A7", "#D55E00"
 REJECTED = ("#56B4E9", "#8C564B", "#7F7F7F", "#9467BD", "#BCBD22", "#17BECF", "#1F3A93")
 STYLE: Any = {
@@ -40,6 +40,8 @@ class Compared:
     truth: Poses
     corrected: Poses
     odometry: Poses
+    alone: Poses | None = None
+    """By KISS-ICP alone; None if they are unknown."""
 
 
 class Line(NamedTuple):
@@ -63,6 +65,7 @@ def compared(run: FinishedRun) -> Compared | None:
         run.reference.T_world_lidar[rows[:, 1]],
         run.result.trajectory.T_world_lidar[rows[:, 0]],
         run.result.odometry.T_world_lidar[rows[:, 0]],
+        None if run.result.alone is None else run.result.alone.T_world_lidar[rows[:, 0]],
     )
 
 
@@ -73,6 +76,8 @@ def paths_of(run: FinishedRun) -> list[Line]:
     if true is not None:
         T_world_truth = align_positions(true.truth[:, :3, 3], true.corrected[:, :3, 3])
         paths.append(Line("truth", T_world_truth @ true.truth, TRUTH, "-", 4.0))
+    if run.result.alone is not None:
+        paths.append(Line("KISS-ICP alone", run.result.alone.T_world_lidar, ALONE, ":", 1.5))
     return [
         *paths,
         Line("odometry", run.result.odometry.T_world_lidar, ODOMETRY, "--", 1.5),
@@ -126,10 +131,13 @@ def _plot_times(axes: Axes, time_s: Vector, pairs: list[tuple[int, int]], label:
 
 def draw_errors(poses: Compared) -> str:
     """Position error and height error against the distance travelled, after the alignment of the ATE."""
-    figure = Figure(figsize=(WIDTH_IN, 4.8), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 5.4), layout="constrained")
     whole, height = figure.subplots(2, 1, sharex=True)
     along_m = travelled_m(poses.truth)
-    for name, estimate, color in (("odometry", poses.odometry, ODOMETRY), ("corrected", poses.corrected, CORRECTED)):
+    drives = [("odometry", poses.odometry, ODOMETRY), ("corrected", poses.corrected, CORRECTED)]
+    if poses.alone is not None:
+        drives = [("KISS-ICP alone", poses.alone, ALONE), ("odometry after repairs", *drives[0][1:]), drives[1]]
+    for name, estimate, color in drives:
         aligned = align_positions(estimate[:, :3, 3], poses.truth[:, :3, 3]) @ estimate
         error_m = pose_errors(aligned, poses.truth).translation_m
         label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
@@ -138,7 +146,7 @@ def draw_errors(poses: Compared) -> str:
     whole.set(ylabel="error (m)")
     whole.set_ylim(bottom=0)
     height.set(xlabel="distance travelled (m)", ylabel="height error (m)")
-    _legend_on_top(whole)
+    _legend_on_top(whole, num_columns=1)
     return svg(figure, "errors")
 
 

@@ -12,11 +12,9 @@ from pydantic.fields import FieldInfo
 
 from segslam.calibration import vertical_angle_advice
 from segslam.config import Config, Section, changed_settings
-from segslam.run.finished import FIGURES, FinishedRun
+from segslam.run.finished import COMPARED, FIGURES, FinishedRun
 from segslam.types import Rejected
 
-ODOMETRY = "odometry_"
-"""Prefix of the figures of the odometry without loop closing."""
 FILES = {
     "map.png": "the map in top view",
     "map.ply": "the map as a point cloud",
@@ -25,6 +23,8 @@ FILES = {
     "poses_kitti.txt": "pose of every scan, KITTI format",
     "odometry_tum.txt": "the same before loop closing, TUM format",
     "odometry_kitti.txt": "the same before loop closing, KITTI format",
+    "kiss_icp_tum.txt": "the same by KISS-ICP alone, TUM format",
+    "kiss_icp_kitti.txt": "the same by KISS-ICP alone, KITTI format",
     "loops.csv": "all loop candidates and their outcomes",
     "graph.g2o": "the pose graph",
     "metrics.json": "the figures of this page",
@@ -144,6 +144,9 @@ def _tiles(metrics: dict[str, Any]) -> str:
     tiles = [
         ("ate_m", " m", "error after alignment"),
         ("odometry_ate_m", " m", "error of the odometry, after repairs"),
+        ("kiss_icp_ate_m", " m", "error of KISS-ICP alone"),
+        ("length_m", " m", "length of the drive"),
+        ("duration_s", " s", "duration of the drive"),
         ("num_loops_accepted", "", "loops accepted"),
         ("num_loops_false", "", "false loops"),
         ("scans_per_second", "", "scans per second"),
@@ -173,15 +176,16 @@ def _picture(caption: str, picture: bytes, kind: str) -> str:
 
 
 def _figures(metrics: dict[str, Any]) -> str:
-    """Figures with a description first, in their order, then the others; each beside that of the odometry."""
+    """Figures with a description first, in their order, then the others; each beside those of the odometry."""
     known = [key for key in FIGURES if key in metrics]
     rest = [key for key, value in metrics.items() if key not in FIGURES and isinstance(value, int | float)]
-    of_run = [key for key in known + rest if not key.startswith(ODOMETRY)]
-    rows = [
-        (f"{FIGURES.get(key, '')} <code>{escape(key)}</code>", metrics[key], metrics.get(ODOMETRY + key))
-        for key in of_run
-    ]
-    return _table(("", "run", "odometry, after repairs"), rows)
+    of_run = [key for key in known + rest if not key.startswith(COMPARED)]
+    rows = [(_meaning(key), metrics[key], *(metrics.get(prefix + key) for prefix in COMPARED)) for key in of_run]
+    return _table(("", "run", "odometry, after repairs", "KISS-ICP alone"), rows)
+
+
+def _meaning(key: str) -> str:
+    return f"{FIGURES.get(key, '')} <code>{escape(key)}</code>"
 
 
 def _outcomes(run: FinishedRun) -> str:

@@ -44,7 +44,7 @@ def scores(
     scaled = estimate.copy()
     scaled[:, :3, 3] *= scale
     aligned = aligned_by(scaled, reference, align)
-    figures = trajectory_metrics(aligned, reference, up=up)
+    figures = trajectory_metrics(scaled, reference, up=up)
     errors = pose_errors(aligned, reference)
     if align in ("first", "none"):  # trajectory_metrics aligns; these are the errors without it
         figures["ate_m"] = _rms(errors.translation_m)

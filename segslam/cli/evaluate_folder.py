@@ -21,7 +21,7 @@ def score_folders(
     rows = {name: score(made, true) for name, (made, true) in found.items() if made is not None}
     if not rows:
         raise SegslamError(
-            f"{estimates}: no drive has poses here and in {references}; name the files alike, 00.txt in both, or the "
+            f"{estimates}: no drive has poses here and in {references}; give both files one name, 00.txt, or the "
             "runs 00, 01, ..."
         )
     first, *others = rows.values()

@@ -1,7 +1,7 @@
 """Fleets of simulated drives.
 
     python -m tools.benchmarks.fleet simulate POSES TOWNS [--frames N]
-    python -m tools.benchmarks.fleet growth TOWNS OUT [--numbers 4,8,16,24] [--workers 1]
+    python -m tools.benchmarks.fleet growth TOWNS OUT [--numbers 4,8,16,23] [--workers 1]
     python -m tools.benchmarks.fleet troubles TOWNS OUT [--number 4]
 
 `simulate` writes 24 drives of six towns along KITTI's true poses, and each town in one drive. `growth` joins more and
@@ -38,7 +38,7 @@ def main() -> None:
         kind = kinds.add_parser(name)
         kind.add_argument("towns", type=Path)
         kind.add_argument("out", type=Path)
-    kinds.choices["growth"].add_argument("--numbers", default="4,8,16,24")
+    kinds.choices["growth"].add_argument("--numbers", default="4,8,16,23")
     kinds.choices["growth"].add_argument("--workers", default="1")
     kinds.choices["troubles"].add_argument("--number", type=int, default=4)
     given = options.parse_args()
@@ -55,24 +55,23 @@ def main() -> None:
 
 
 def _growth(given: argparse.Namespace) -> None:
-    """Each number of drives in a folder of its own; then the last drive is added to the others."""
+    """Each number of drives in a folder of its own; then another drive is added to the last."""
     given.out.mkdir(parents=True, exist_ok=True)
     drives, whole = drives_in(given.towns), drives_in(given.towns, whole=True)
     alone = _run(given.out / "whole", whole, given.workers)
     at_once = {name.split("_")[0]: one["ate_m"] for one in alone["components"] for name in one["drives"]}
-    rows, towns = [], list[Row]()
+    rows: list[Row] = []
     for number in map(int, given.numbers.split(",")):
-        ran = _run(given.out / f"of {number}", drives[:number], given.workers)
-        rows.append(_row(f"{number} drives", number, ran))
-        towns = [
-            {"component": ", ".join(one["drives"]), "ATE (m)": one.get("ate_m"), "loops": one["num_loops_between"]}
-            | {"mapped at once (m)": at_once[one["drives"][0].split("_")[0]]}
-            for one in ran["components"]
-        ]
+        folder = given.out / f"of {number}"
+        rows.append(_row(f"{number} drives", number, _run(folder, drives[:number], given.workers)))
         print(markdown("Fleet", rows), flush=True)
-    if len(drives) > 1:
-        _run(given.out / "added", drives[:-1], given.workers)
-        rows.append(_row(f"1 added to {len(drives) - 1}", 1, _run(given.out / "added", drives, given.workers)))
+    ran = _run(folder, drives[: number + 1], given.workers)
+    rows.append(_row(f"1 added to {number}", 1, ran))
+    towns = [
+        {"component": ", ".join(one["drives"]), "ATE (m)": one.get("ate_m"), "loops": one["num_loops_between"]}
+        | {"mapped at once (m)": at_once[one["drives"][0].split("_")[0]]}
+        for one in ran["components"]
+    ]
     print(markdown("Fleet", rows), markdown("Towns", towns), sep="\n")
     write_report(given.out / "growth.json", {"rows": rows, "towns": towns})
 

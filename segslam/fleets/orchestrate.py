@@ -145,36 +145,38 @@ class _Fleet:
                 self._failed(name, outcome.failure)
         return kept
 
-    def _proposed(self, mapped: Sequence[Mapped]) -> dict[tuple[int, int], list[int]]:
-        """Keyframes of a drive that look like places of an earlier one, by the numbers of both."""
+    def _proposed(self, mapped: Sequence[Mapped]) -> dict[tuple[int, int], list[tuple[int, float]]]:
+        """Keyframes of a drive that look most like places of an earlier one, by the numbers of both."""
         tasks = [
             (self._folder, drive, mapped[:number], key_of([one.key for one in mapped[: number + 1]]))
             for number, drive in enumerate(mapped)
         ]
         numbers = {drive.name: number for number, drive in enumerate(mapped)}
-        proposals: dict[tuple[int, int], list[int]] = {}
+        proposals: dict[tuple[int, int], list[tuple[int, float]]] = {}
         for later, outcome in enumerate(self._all("propose", steps.propose, tasks)):
             if outcome.failure is not None:
                 raise WorkFailed(f"{mapped[later].name}: {outcome.failure}; call `segslam fleet` again to go on")
-            proposals |= {(later, numbers[name]): ids for name, ids in outcome.value.items() if len(ids) >= MIN_FOUND}
+            proposals |= {(later, numbers[name]): likely for name, likely in outcome.value.items()}
         return proposals
 
-    def _related(self, mapped: Sequence[Mapped], proposals: Mapping[tuple[int, int], list[int]]) -> Components:
+    def _related(
+        self, mapped: Sequence[Mapped], proposals: Mapping[tuple[int, int], list[tuple[int, float]]]
+    ) -> Components:
         """The most similar pairs of drives are related first, until all are joined or tried."""
-        components, tried = Components(len(mapped)), set[tuple[int, int]]()
-        counts = {pair: len(ids) for pair, ids in proposals.items()}
-        while pairs := components.next_pairs(counts, tried):
+        components = Components(len(mapped))
+        similarity = {pair: sum(score for _, score in likely[:MIN_FOUND]) for pair, likely in proposals.items()}
+        while pairs := components.next_pairs(similarity):
             tasks = []
             for later, earlier in pairs:
-                key = key_of(mapped[later].key, mapped[earlier].key, proposals[later, earlier])
-                tasks.append((self._folder, mapped[later], mapped[earlier], proposals[later, earlier], key))
+                queries = [keyframe_id for keyframe_id, _ in proposals[later, earlier]]
+                key = key_of(mapped[later].key, mapped[earlier].key, queries)
+                tasks.append((self._folder, mapped[later], mapped[earlier], queries, key))
             for pair, outcome in zip(pairs, self._all("relate", steps.relate, tasks), strict=True):
                 if outcome.failure is not None:
                     raise WorkFailed(f"{mapped[pair[0]].name}: {outcome.failure}; call `segslam fleet` again to go on")
                 relation: Relation = outcome.value
                 components.add(*pair, relation)
                 self._say(_line(mapped[pair[0]].name, mapped[pair[1]].name, relation))
-            tried.update(pairs)
         return components
 
     def _joined(self, mapped: Sequence[Mapped], components: Components, same: bool) -> list[dict[str, Any]]:

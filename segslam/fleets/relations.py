@@ -14,6 +14,9 @@ from segslam.sessions.session_pose import SessionPose
 from segslam.types import Alignment, Registration, SegslamError, Transform
 
 Found = tuple[int, int, Alignment]
+MOST_FAILED = 4
+"""Chosen: two drives that so many others each could not be joined to are not tried with each other; the cost of a drive
+then does not grow with the number of drives."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +75,8 @@ class Components:
     def __init__(self, num_drives: int) -> None:
         self._component = list(range(num_drives))
         self._relations: dict[tuple[int, int], Relation] = {}
+        self._tried = set[tuple[int, int]]()
+        self._num_failed = [0] * num_drives
 
     def of(self, drive: int) -> int:
         """The component of a drive: the number of its first drive."""
@@ -86,7 +91,11 @@ class Components:
 
     def add(self, later: int, earlier: int, relation: Relation) -> None:
         """Join two drives, unless they are joined already, or their relation is unknown."""
+        self._tried.add((later, earlier))
         one, other = sorted((self.of(later), self.of(earlier)))
+        if relation.T_earlier_later is None:
+            self._num_failed[later] += 1
+            self._num_failed[earlier] += 1
         if relation.T_earlier_later is None or one == other:
             return
         self._relations[later, earlier] = relation
@@ -114,15 +123,14 @@ class Components:
             return SessionPose(number, geometry.inverse(relation.T_earlier_later), found)
         return None
 
-    def next_pairs(
-        self, proposals: Mapping[tuple[int, int], int], tried: set[tuple[int, int]]
-    ) -> list[tuple[int, int]]:
-        """For each component the pair with another one that has most proposals, of those not tried yet."""
-        best: dict[int, tuple[int, tuple[int, int]]] = {}
-        for pair, count in proposals.items():
+    def next_pairs(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
+        """For each component the most similar pair with another one, of those not tried yet."""
+        best: dict[int, tuple[float, tuple[int, int]]] = {}
+        for pair, value in similarity.items():
             ends = {self.of(drive) for drive in pair}
-            if pair in tried or len(ends) < 2:
+            is_open = min(self._num_failed[drive] for drive in pair) < MOST_FAILED
+            if pair in self._tried or len(ends) < 2 or not is_open:
                 continue
             for component in ends:
-                best[component] = max(best.get(component, (0, (0, 0))), (count, (-pair[0], -pair[1])))
+                best[component] = max(best.get(component, (0.0, (0, 0))), (value, (-pair[0], -pair[1])))
         return sorted({(-negated[0], -negated[1]) for _, negated in best.values()})

@@ -5,7 +5,6 @@ A step writes its result beside the final name and renames it when it is whole. 
 
 import json
 import shutil
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +16,6 @@ import numpy as np
 
 from segslam.config import Config, load_config
 from segslam.datasets import DataSource
-from segslam.far_loops import MIN_SCORE
 from segslam.fleets.drives import Drive
 from segslam.fleets.relations import Relation, read_relation, write_relation
 from segslam.presets import SETTINGS, Preset, extent_m, preset, preset_for
@@ -30,7 +28,7 @@ from segslam.run.map_folder import map_folder, open_scans
 from segslam.semantics.encodings import Encoding
 from segslam.sessions.merge import arranged, write_merged
 from segslam.sessions.recorded import Session, read_session
-from segslam.sessions.session_pose import SessionPose, find_session
+from segslam.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
 from segslam.types import SegslamError, Trajectory
 
 RUNS, INDEX, PROPOSALS, PAIRS = "runs", "index", "proposals", "pairs"
@@ -39,6 +37,8 @@ KEY = "fleet.key"
 UNFINISHED = ".part"
 ONE_THREAD = "odometry.max_num_threads=1"
 NUM_LOCATORS = 2
+Likely = dict[str, list[tuple[int, float]]]
+"""By the name of an earlier drive: keyframes of a drive and their largest similarities to a place there, best first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,28 +122,29 @@ def index_drive(fleet: Path, drive: Mapped) -> int:
     return len(np.load(file, mmap_mode="r"))
 
 
-def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped], key: str) -> dict[str, list[int]]:
-    """For each earlier drive, the keyframes of this one that look like one of its places, by its name."""
+def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped], key: str) -> Likely:
+    """For each earlier drive, the keyframes of this one that look most like one of its places, by its name."""
     file = fleet / PROPOSALS / f"{drive.name}-{key}.json"
     if not file.exists():
         proposed = _proposed(fleet, drive, earlier)
         _replace(file, lambda part: part.write_text(json.dumps(proposed), encoding="utf-8"))
-    found: dict[str, list[int]] = json.loads(file.read_text(encoding="utf-8"))
-    return found
+    found = json.loads(file.read_text(encoding="utf-8"))
+    return {name: [(keyframe_id, score) for keyframe_id, score in likely] for name, likely in found.items()}
 
 
-def _proposed(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> dict[str, list[int]]:
+def _proposed(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
     places, owners = Places(), list[str]()
     for other in earlier:
         for spectrum in np.load(other.signatures(fleet), mmap_mode="r"):
             places.add(len(owners), PlaceSignature(np.asarray(spectrum)))
             owners.append(other.name)
-    proposed: dict[str, list[int]] = {}
+    likely: dict[str, dict[int, float]] = {}
     for keyframe_id, spectrum in enumerate(np.load(drive.signatures(fleet), mmap_mode="r")):
-        similar = places.shortlist(PlaceSignature(np.asarray(spectrum)))
-        for name in Counter(owners[one.place_id] for one in similar if one.score >= MIN_SCORE):
-            proposed.setdefault(name, []).append(keyframe_id)
-    return proposed
+        for similar in places.shortlist(PlaceSignature(np.asarray(spectrum))):
+            likely.setdefault(owners[similar.place_id], {}).setdefault(keyframe_id, similar.score)  # best first
+    return {
+        name: sorted(scores.items(), key=lambda one: -one[1])[:NUM_ENOUGH] for name, scores in sorted(likely.items())
+    }
 
 
 def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], key: str) -> Relation:
@@ -152,7 +153,7 @@ def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], 
     if not file.exists():
         session, known = (read_session(one.folder(fleet)) for one in (later, earlier))
         config = known.run.config
-        found = find_session(session, known, 0, _locator(fleet, earlier), config=config, among=queries)
+        found = find_session(session, known, 0, _locator(fleet, earlier), config=config, likely=queries)
         relation = Relation(None, (), found) if isinstance(found, str) else Relation(found.T_earlier_world, found.found)
         _replace(file, lambda part: write_relation(part, relation))
     return read_relation(file)

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
+from uuid import uuid4
 
 from segslam.system.cluster import cluster
 from segslam.types import SegslamError
@@ -88,7 +89,8 @@ class _On:
         """Raises SegslamError if the scheduler is lost."""
         from distributed import KilledWorker, as_completed
 
-        futures = [self._client.submit(attempted, function, *task, pure=False) for task in tasks]
+        name, submit = function.__name__, self._client.submit  # the dashboard groups tasks by name
+        futures = [submit(attempted, function, *task, key=f"{name}-{uuid4().hex}") for task in tasks]
         numbers = {future.key: number for number, future in enumerate(futures)}
         for future in as_completed(futures):
             if future.status in ("cancelled", "lost"):

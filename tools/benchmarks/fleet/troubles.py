@@ -76,7 +76,7 @@ class _Trial:
             statuses = [subprocess.run(_command(self._listed, self._folder, "--scheduler", self._address)).returncode]
         states = json.loads((self._folder / "fleet.json").read_text())["drives"]
         print({name: one.get("reason", one["state"]) for name, one in states.items()})
-        before = self._finished()
+        before = {name: time_ns for name, time_ns in self._finished().items() if "component_" not in name}
         return [*statuses, self._call()], before
 
     def _damaged(self) -> tuple[list[int], dict[str, int]]:

@@ -113,7 +113,7 @@ def _length(metrics: dict[str, Any]) -> list[str]:
 def _ends(metrics: dict[str, Any], folder: Path) -> list[str]:
     """Lines about the results, and the command that comes next."""
     where = shlex.quote(str(folder))
-    follows = f"segslam export {where} {shlex.quote(str(folder / 'map.laz'))}"
+    follows = f"segslam export {where} {shlex.quote(str(folder / 'map.ply'))}"
     if "ate_m" not in metrics:
         follows = f"segslam eval {where} --reference POSES.txt"
     return [

@@ -20,7 +20,8 @@ from segslam.config import config_to_yaml
 from segslam.datasets import Dataset
 from segslam.log import LogWriter, Mirror, RunLog
 from segslam.log.drawing import CloudOf
-from segslam.run.folder import LOG, UNFINISHED, room_for, write_localised, write_loops, write_poses
+from segslam.pose_graph import PoseGraph
+from segslam.run.folder import ADJUSTED_GRAPH, LOG, UNFINISHED, room_for, write_localised, write_loops, write_poses
 from segslam.slam import Slam, SlamResult, Tracked
 from segslam.system.memory import peak_mb
 from segslam.system.threads import in_other_thread
@@ -207,6 +208,8 @@ class Run:
                 write_localised(self.folder, result.trajectory, result.from_map_m, result.localised())
             write_poses(self.folder, "odometry", result.odometry, self._T_camera_lidar)
             self._slam.graph.write_g2o(self.folder / "graph.g2o")
+            if isinstance(self._slam.graph, PoseGraph):
+                self._slam.graph.write_adjusted_g2o(self.folder / ADJUSTED_GRAPH)
             write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
         closures = [attempt for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
         return result, {

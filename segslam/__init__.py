@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from segslam.config import Config, load_config
     from segslam.datasets import open_dataset
+    from segslam.fleets import fleet
     from segslam.registration import register
     from segslam.retrieval import Places
     from segslam.run.finished import read_run
@@ -36,6 +37,7 @@ __all__ = [
     "Scan",
     "SegslamError",
     "Slam",
+    "fleet",
     "keep_freed_memory",
     "load_config",
     "localise",
@@ -58,6 +60,7 @@ _HOMES = {
     "Scan": "types",
     "SegslamError": "errors",
     "Slam": "slam",
+    "fleet": "fleets",
     "keep_freed_memory": "system.memory",
     "load_config": "config",
     "locate": "run.locator",

@@ -200,3 +200,26 @@ def test_the_page_of_thresholds_gives_each_setting_with_its_default(section: str
         named = " ".join(row for row in rows if re.search(rf"[`.]{name}`", row))
         shown = {f"{number:g}", f"{100 * number:g} %"}
         assert any(re.search(rf"(?<![\d.]){re.escape(text)}(?![\d.]*\d)", named) for text in shown), (name, number)
+
+
+def test_the_errors_of_real_drives_are_those_that_the_benchmark_wrote() -> None:
+    drives = json.loads((ROOT / "docs" / "real_drives.json").read_text())["drives"]
+    table = (ROOT / "docs" / "benchmarks.md").read_text().split("## Whole drives, real")[1].split("\n\n")[2]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+    assert len(rows) == len(drives)
+    for row, drive in zip(rows, drives, strict=True):
+        kiss, before, after = (drive.get(key) for key in ("kiss_icp_ate_m", "odometry_ate_m", "ate_m"))
+        assert row[0].startswith(drive["drive"])
+        assert row[1:6] == [
+            *(str(drive["scans"]), f"{kiss:.2f}" if kiss else ""),
+            *(f"{before:.2f}", f"{after:.2f}", str(drive["num_motions_repaired"])),
+        ]
+    readme = (ROOT / "README.md").read_text()
+    whole = drives[0]
+    for value in (f"error {whole['kiss_icp_ate_m']:.2f} m", f"error is {whole['ate_m']:.2f} m"):
+        assert value in readme
+    for drive in (
+        drive for drive in drives if drive["drive"] in ("KITTI 00 whole", "NCLT whole", "HKU 1", "courtyard")
+    ):
+        errors = ", ".join(f"{drive[key]:.2f}" for key in ("kiss_icp_ate_m", "odometry_ate_m", "ate_m"))
+        assert errors in readme, drive["drive"]

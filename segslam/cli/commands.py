@@ -10,6 +10,7 @@ from segslam.cli import (
     doctor,
     evaluate,
     export,
+    fleet,
     label,
     live,
     localise,
@@ -45,6 +46,7 @@ def add_all(app: typer.Typer) -> None:
     app.command("locate")(locate.locate)
     app.command("map")(map.map_command)
     app.command("merge")(merge.merge)
+    app.command("fleet")(fleet.fleet)
     app.command("optimize")(optimize.optimize)
     app.command("refine")(refine.refine)
     app.command("register", cls=register.LabelsCommand)(register.register)

@@ -15,7 +15,6 @@ from segslam.cli.console import announce, how_to_go_on, print_json, print_out, p
 from segslam.cli.ending import finish
 from segslam.cli.export import map_summary, write_maps
 from segslam.cli.foxglove import serve_foxglove
-from segslam.cli.given_odometry import given_odometry
 from segslam.cli.in_map import pipeline
 from segslam.cli.run_options import DataArgument, DryRunOption, OutputOptions, RunOptions
 from segslam.cli.shared_options import with_options
@@ -76,6 +75,7 @@ def map_data(
     settings = output.load_config(base=recorded.config if recorded else None)
     announce(f"map: opening {data}" if in_map is None else f"localise: reading the map of {in_map}", quiet=quiet)
     slam_of = pipeline(in_map)
+    from segslam.run.given_odometry import given_odometry
     from segslam.run.map_folder import open_scans, resume_options
 
     map_names, map_files = output.maps(folder)

@@ -13,7 +13,8 @@ from segslam.experiments.job import Job
 from segslam.experiments.rows import Row, RowFile, read_rows
 from segslam.experiments.summary import grouped
 from segslam.experiments.trials import Trial
-from segslam.experiments.workers import LOST_WORKER, cluster, run_here, run_on
+from segslam.experiments.workers import LOST_WORKER, run_here, run_on
+from segslam.system.cluster import cluster
 from segslam.system.whole_files import write_whole
 from segslam.types import SegslamError
 

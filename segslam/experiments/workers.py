@@ -1,9 +1,7 @@
 """Runs trials in this process or on the workers of a Dask cluster; yields rows as they are finished."""
 
-import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from functools import lru_cache, partial
 from itertools import islice
 from typing import Any
@@ -11,14 +9,11 @@ from typing import Any
 from segslam.experiments.job import Job, failed_row, register_trial, shared_scan
 from segslam.experiments.rows import Row
 from segslam.experiments.trials import ScanVariant, Trial
-from segslam.system.extras import how_to_install
-from segslam.types import SegslamError
 
 NUM_SCANS_KEPT = 128
 """Chosen: scans kept in one process, up to 15 MB each with all methods; consecutive pairs of a drive reuse scans."""
 PAIRS_AHEAD = 8
 """Pairs submitted per worker: enough that no worker idles, few enough that their scans fit in memory."""
-CONNECT_S = 5
 LOST_WORKER = "worker_lost"
 """Reject reason of a row whose pair terminated every worker that tried it."""
 
@@ -28,32 +23,6 @@ def run_here(job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]]:
     prepared = lru_cache(NUM_SCANS_KEPT)(partial(shared_scan, job))
     for trial in trials:
         yield register_trial(job, trial, prepared(trial.source), prepared(trial.target))
-
-
-@contextmanager
-def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
-    """A Dask client for the scheduler at an address, or for local worker processes.
-
-    Raises SegslamError if Dask is not installed or the scheduler does not answer.
-    """
-    try:
-        from distributed import Client, LocalCluster  # optional package: extra `cluster`
-    except ImportError as error:
-        raise SegslamError(f"--workers and --scheduler need Dask: {how_to_install('cluster')}") from error
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # its info level reports each connection
-    if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout=CONNECT_S)
-        except (OSError, ValueError) as error:
-            raise SegslamError(f"--scheduler {scheduler}: no answer ({error}); start `dask scheduler`") from error
-        with client:
-            yield client
-        return
-    with (
-        LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as local,
-        Client(local) as client,
-    ):
-        yield client
 
 
 def run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]]:

@@ -85,9 +85,10 @@ class Locator:
         )
         for keyframe in keyframes:
             self.submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
+        self.signatures = [self._signature(keyframe) for keyframe in keyframes]
         self.places = Places()
-        for keyframe in keyframes:
-            self.places.add(keyframe.id, self._signature(keyframe))
+        for keyframe, signature in zip(keyframes, self.signatures, strict=True):
+            self.places.add(keyframe.id, signature)
 
     @classmethod
     def from_run(cls, folder: str | Path) -> "Locator":

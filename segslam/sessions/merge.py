@@ -131,8 +131,15 @@ def plan(
         taken.append(session)
         session_poses.append(found)
         waiting.remove(session)
-    shifts = _shifts(taken, session_poses)
-    return Merged(tuple(taken), tuple(session_poses), shifts, _reference(taken, shifts, same_reference))
+    return arranged(taken, session_poses, same_reference=same_reference)
+
+
+def arranged(
+    sessions: Sequence[Session], session_poses: Sequence[SessionPose | None], *, same_reference: bool = False
+) -> Merged:
+    """Sessions with known poses, each in one that comes before it; the first has none."""
+    shifts = _shifts(sessions, session_poses)
+    return Merged(tuple(sessions), tuple(session_poses), shifts, _reference(sessions, shifts, same_reference))
 
 
 def merge(
@@ -149,21 +156,28 @@ def merge(
     the true poses of all runs are in one frame. `on_step` is called with each Step. Raises SegslamError, naming the
     run, if one did not finish, is damaged, is given twice or was not found in any other.
     """
-    from segslam.run.report import write_report
-
     sessions = read_sessions([Path(run) for run in runs])
     config = config or sessions[0].run.config
     merged = plan(sessions, config=config, same_reference=same_reference)
-    with run_of(merged, new_folder(Path(out)), config) as run:
+    return write_merged(merged, new_folder(Path(out)), config, on_step=on_step)
+
+
+def write_merged(
+    merged: Merged, folder: Path, config: Config, *, on_step: Callable[[Step], object] = lambda step: None
+) -> FinishedRun:
+    """The merged run, in an empty folder."""
+    from segslam.run.report import write_report
+
+    with run_of(merged, folder, config) as run:
         for step in run.take(merged.steps()):
             on_step(step)
         result, metrics = run.finish()
     metrics |= merged.figures(result)
     if merged.reference is not None:
         metrics |= accuracy(result, merged.reference)
-    write_metrics(run.folder, metrics)
-    write_report(run.folder)
-    return read_run(run.folder)
+    write_metrics(folder, metrics)
+    write_report(folder)
+    return read_run(folder)
 
 
 def run_of(merged: Merged, folder: Path, config: Config) -> Run:

@@ -4,7 +4,8 @@ Two located keyframes are consistent if they and the odometry between them, in b
 noise (`segslam.pose_graph.closure_pairs`). A wrong location is consistent with few others.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -58,17 +59,22 @@ def find_session(
     locator: Locator,
     *,
     config: Config,
+    likely: Sequence[int] | None = None,
     progress: Progress = no_progress,
 ) -> SessionPose | str:
     """The pose of a session in the earlier session of this `number`, or the reason as text if it is unknown.
 
-    Sparse keyframes are searched together with their neighbours.
+    At most `NUM_QUERIES` keyframes, spread over the session, are searched; sparse ones together with their neighbours.
+    `likely`: these keyframes are searched instead, in this order, and those before and after each that is found.
     """
     submap = submaps(session, config)
     found: list[tuple[int, int, Alignment]] = []
-    queries = _spread(len(session.travel_m))
+    count = len(session.travel_m)
+    queries = (
+        _spread(count) if likely is None else _with_neighbours(likely, count, lambda: found[-1][0] if found else None)
+    )
     num_tried = 0
-    for keyframe_id in progress(queries, len(queries), "locate"):
+    for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
         num_tried += 1
         place = locator.locate(*submap(keyframe_id))
         if not isinstance(place, Rejected):
@@ -93,10 +99,28 @@ def find_session(
     return SessionPose(number, T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))
 
 
-def _spread(num_keyframes: int) -> list[int]:
-    """Keyframes spread over a session, each far from the previous ones."""
-    evenly = np.unique(np.linspace(0, num_keyframes - 1, NUM_QUERIES).astype(int))
-    return evenly[np.argsort(np.arange(len(evenly)) * GOLDEN % 1.0)].tolist()
+def _spread(count: int) -> list[int]:
+    """Keyframes spread over a session of so many, each far from the previous ones."""
+    evenly = np.unique(np.linspace(0, count - 1, NUM_QUERIES).astype(int))
+    keyframe_ids: list[int] = evenly[np.argsort(np.arange(len(evenly)) * GOLDEN % 1.0)].tolist()
+    return keyframe_ids
+
+
+def _with_neighbours(likely: Sequence[int], count: int, last_found: Callable[[], int | None]) -> Iterator[int]:
+    """Likely keyframes of a session of so many, each once; after one that was found, first the next and the one before.
+
+    Where sessions share a place, they do so for some metres; at the end of one and the beginning of the other that may
+    be a few keyframes only.
+    """
+    queue, searched = deque(likely), set[int]()
+    while queue:
+        keyframe_id = queue.popleft()
+        if keyframe_id in searched or not 0 <= keyframe_id < count:
+            continue
+        searched.add(keyframe_id)
+        yield keyframe_id
+        if last_found() == keyframe_id:
+            queue.extendleft((keyframe_id - 1, keyframe_id + 1))
 
 
 def closure(found: tuple[int, int, Alignment], first_id: int, target_shift: int = 0) -> LoopClosure:

@@ -102,7 +102,7 @@ def test_a_given_odometry_is_cropped_by_the_ranges_of_the_preset(
         ranges_m.append(config.max_range_m)
         raise SegslamError("far enough")
 
-    monkeypatch.setattr("segslam.cli.map.given_odometry", given)
+    monkeypatch.setattr("segslam.run.given_odometry.given_odometry", given)
     words = ("--odometry", "poses.txt", "--preset", "indoor")
     assert run("map", kitti, "--out", tmp_path / "run", *words) == 2
     assert ranges_m == [40.0]

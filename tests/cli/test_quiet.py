@@ -66,6 +66,7 @@ def _places(out: Path) -> Path:
 COMMANDS: dict[str, Callable[[Path, Path, Path], Words]] = {
     "map": lambda data, _, out: [data, "--out", out, "--map"],
     "refine": lambda _, finished, out: [finished, "--out", out],
+    "fleet": lambda data, _, out: [data, "--out", out, "--workers", 1],
     "label": lambda data, _, out: [
         *(data, "--out", out, "--labels", "true_labels", "--truth", "true_labels", "--frames", "0:2")
     ],

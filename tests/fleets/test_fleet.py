@@ -1,0 +1,179 @@
+"""A fleet of two days in one place, a stranger and a damaged recording: joined, gone on with, and on a cluster."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.commands import run
+from helpers.recorded_drive import TOPIC, clouds, write_mcap
+from helpers.sessions import write_day
+from helpers.terminal import in_terminal
+
+import segslam.fleets.orchestrate
+from segslam.fleets import Drive, FleetResult, fleet, read_drives, workers
+from segslam.fleets.orchestrate import FILE
+from segslam.run.finished import read_run
+from segslam.sessions import session_pose
+from segslam.trajectory import read_poses
+from segslam.types import SegslamError
+
+pytestmark = pytest.mark.usefixtures("short_runs")
+SETTINGS = ("adjustment.max_minutes=0",)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Monday, a stranger, a damaged one, and friday."""
+    root = tmp_path_factory.mktemp("recordings")
+    monday = write_day(root / "monday", day=0, first=0, num_scans=22)
+    friday = write_day(root / "friday", day=1, first=6, num_scans=22)
+    damaged = root / "damaged.mcap"
+    damaged.write_bytes(b"no recording")
+    return [monday, write_mcap(root / "stranger.mcap", clouds(8)), damaged, friday]
+
+
+def _drives(recordings: list[Path]) -> list[Drive]:
+    """From a list in YAML."""
+    file = recordings[0].parent / "drives.yaml"
+    entries = [{"data": path.name, "topic": TOPIC if path.suffix else ""} for path in recordings]
+    file.write_text(json.dumps(entries))
+    return read_drives(file)
+
+
+@pytest.fixture(scope="module")
+def joined(recordings: list[Path], tmp_path_factory: pytest.TempPathFactory) -> FleetResult:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session_pose, "NUM_ENOUGH", 5)
+        out = tmp_path_factory.mktemp("fleets") / "city é"
+        return fleet(_drives(recordings), out, same_reference=True, settings=SETTINGS)
+
+
+def test_drives_that_share_places_are_in_one_frame_and_the_others_alone(joined: FleetResult) -> None:
+    values = json.loads((joined.folder / FILE).read_text())
+    assert {name: one["state"] for name, one in values["drives"].items()} == {
+        "monday": "mapped",
+        "stranger": "mapped",
+        "damaged": "failed",
+        "friday": "mapped",
+    }
+    assert [one["drives"] for one in values["components"]] == [["monday", "friday"], ["stranger"]]
+    assert values["drives"]["friday"]["component"] == 0
+    assert values["drives"]["damaged"]["component"] is None
+    assert "damaged.mcap" in values["drives"]["damaged"]["reason"]
+    assert values["num_loops_between"] >= 3
+    assert values["components"][0]["ate_m"] < 0.15
+    assert set(values["seconds"]) == {"map", "index", "propose", "relate", "join"}
+    assert "damaged.mcap" in (joined.folder / "report.html").read_text()
+
+
+def test_a_component_is_a_run_with_the_poses_of_each_drive(joined: FleetResult) -> None:
+    component = read_run(joined.folder / "component_0")
+    friday = read_run(joined.folder / "runs" / "friday")
+    own = read_poses(component.folder / "drives" / "friday_tum.txt")
+    assert own.stamp_ns is not None
+    np.testing.assert_allclose(own.stamp_ns, friday.result.trajectory.stamp_ns, atol=1000)
+    last = component.result.trajectory.T_world_lidar[-len(own) :]
+    np.testing.assert_allclose(own.T_a_b, last, atol=1e-5)
+    alone = read_run(joined.folder / "component_1")
+    assert alone.dataset == read_run(joined.folder / "runs" / "stranger").dataset
+
+
+def _made(folder: Path) -> dict[str, int]:
+    """All files but those that each call writes, with their times."""
+    files = (file for file in folder.rglob("*") if file.is_file())
+    return {str(file): file.stat().st_mtime_ns for file in files if file.name not in (FILE, "report.html")}
+
+
+def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
+    joined: FleetResult, recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_pose, "NUM_ENOUGH", 5)
+    folder = tmp_path / "again"
+    shutil.copytree(joined.folder, folder)
+    (folder / "runs" / ".friday.0123.part").mkdir()
+    before = _made(folder)
+    tried = []
+    map_folder = segslam.fleets.steps.map_folder
+
+    def mapped(data: Path, *arguments: Any, **options: Any) -> Any:
+        tried.append(data.name)
+        return map_folder(data, *arguments, **options)
+
+    monkeypatch.setattr("segslam.fleets.steps.map_folder", mapped)
+    again = fleet(_drives(recordings), folder, same_reference=True, settings=SETTINGS)
+    assert again.drives == joined.drives
+    assert _made(folder) == before
+    assert tried == [], "the damaged drive fails before it is mapped"
+    assert not (folder / "runs" / ".friday.0123.part").exists()
+    (recordings[2].parent / "damaged.mcap").rename(recordings[2].parent / "kept")
+    try:
+        write_mcap(recordings[2], clouds(8))
+        whole = fleet(_drives(recordings), folder, same_reference=True, settings=SETTINGS)
+    finally:
+        (recordings[2].parent / "kept").replace(recordings[2])
+    assert whole.drives["damaged"]["state"] == "mapped"
+    assert tried == ["damaged.mcap"]
+
+
+@pytest.mark.slow
+def test_two_processes_write_the_same_poses(
+    joined: FleetResult, recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    one, two = (
+        fleet(_drives(recordings), tmp_path / str(number), num_workers=number, settings=SETTINGS) for number in (1, 2)
+    )
+    assert one.drives == two.drives
+    for name in ("poses_tum.txt", "loops.csv", "graph.g2o"):
+        first, second = ((result.folder / "component_0" / name).read_bytes() for result in (one, two))
+        if name == "loops.csv":  # which has times
+            first, second = (
+                b"\n".join(line.rsplit(b",", 4)[0] for line in text.splitlines()) for text in (first, second)
+            )
+        assert first == second, name
+
+
+class _Client:
+    """Workers that answer with a version, and see the folder or not."""
+
+    def __init__(self, found: Any, sees: bool = True) -> None:
+        self._answers = [{"tcp://a": found}, {"tcp://a": sees}]
+
+    def run(self, *_: Any, **__: Any) -> Any:
+        return self._answers.pop(0)
+
+
+@pytest.mark.parametrize(
+    ("client", "message"),
+    [
+        (_Client("0.0.1"), r"worker tcp://a: has segslam 0\.0\.1, this is .*; install the same version"),
+        (_Client(ModuleNotFoundError("segslam")), "cannot import segslam"),
+        (_Client(segslam.__version__, sees=False), "does not see .*; give a folder that all workers share"),
+    ],
+)
+def test_a_worker_that_cannot_take_part_is_refused(client: _Client, message: str, tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match=message):
+        workers._check(client, tmp_path, "tcp://b")
+
+
+def test_nothing_mapped_is_an_error_with_the_first_reason(
+    recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("fleet", recordings[2], "--out", tmp_path / "none", "-q") == 2
+    assert "no drive could be mapped; damaged: " in capsys.readouterr().err
+    assert run("fleet", tmp_path / "nothing.yaml", "--out", tmp_path / "none") == 2
+    assert run("fleet", recordings[0], "--out", tmp_path / "x", "--scheduler", "tcp://x:1", "--workers", "2") == 2
+    assert "--workers: " in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_shows_steps_and_components_in_a_terminal(recordings: list[Path], tmp_path: Path) -> None:
+    drives = [str(recordings[0]), str(recordings[3])]
+    settings = ("--set", SETTINGS[0])
+    status, output = in_terminal("-m", "segslam", "fleet", *drives, "--out", str(tmp_path / "city"), *settings)
+    assert status == 0, output
+    assert "friday is joined to monday by" in output
+    assert "component 0: monday, friday" in output

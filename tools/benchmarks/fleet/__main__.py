@@ -1,0 +1,106 @@
+"""Fleets of simulated drives.
+
+    python -m tools.benchmarks.fleet simulate POSES TOWNS [--frames N]
+    python -m tools.benchmarks.fleet growth TOWNS OUT [--numbers 4,8,16,23] [--workers 1]
+    python -m tools.benchmarks.fleet troubles TOWNS OUT [--number 4]
+
+`simulate` writes 24 drives of six towns along KITTI's true poses, and each town in one drive. `growth` joins more and
+more of them, prints ATE beside that of the town mapped at once, CPU and wall time and peak memory of the largest
+process, and then adds one drive. `troubles` kills a worker in each step, the scheduler, and fills a disk; the result
+must have the same bytes as without trouble, and nothing finished may be done twice.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from tools.benchmarks.common import Row, markdown, parser, write_report
+from tools.benchmarks.fleet.towns import NUM_FRAMES, drives_in, write_list, write_towns
+from tools.benchmarks.fleet.troubles import troubles
+
+COMMAND = (sys.executable, "-m", "segslam", "fleet")
+
+
+def main() -> None:
+    """Run one of the benchmarks."""
+    options = parser(__doc__, "fleet")
+    kinds = options.add_subparsers(dest="kind", required=True)
+    simulate = kinds.add_parser("simulate")
+    simulate.add_argument("poses", type=Path)
+    simulate.add_argument("towns", type=Path)
+    simulate.add_argument("--frames", type=int, default=NUM_FRAMES)
+    for name in ("growth", "troubles"):
+        kind = kinds.add_parser(name)
+        kind.add_argument("towns", type=Path)
+        kind.add_argument("out", type=Path)
+    kinds.choices["growth"].add_argument("--numbers", default="4,8,16,23")
+    kinds.choices["growth"].add_argument("--workers", default="1")
+    kinds.choices["troubles"].add_argument("--number", type=int, default=4)
+    given = options.parse_args()
+    if given.kind == "simulate":
+        for name in write_towns(given.towns, given.poses, num_frames=given.frames):
+            print(name, flush=True)
+    elif given.kind == "growth":
+        _growth(given)
+    else:
+        given.out.mkdir(parents=True, exist_ok=True)
+        rows = troubles(given.out, drives_in(given.towns)[: given.number])
+        print(markdown("Fleet: troubles", rows))
+        write_report(given.out / "troubles.json", {"rows": rows})
+
+
+def _growth(given: argparse.Namespace) -> None:
+    """Each number of drives in a folder of its own; then another drive is added to the last."""
+    given.out.mkdir(parents=True, exist_ok=True)
+    drives, whole = drives_in(given.towns), drives_in(given.towns, whole=True)
+    alone = _run(given.out / "whole", whole, given.workers)
+    at_once = {name.split("_")[0]: one["ate_m"] for one in alone["components"] for name in one["drives"]}
+    rows: list[Row] = []
+    for number in map(int, given.numbers.split(",")):
+        folder = given.out / f"of {number}"
+        rows.append(_row(f"{number} drives", number, _run(folder, drives[:number], given.workers)))
+        print(markdown("Fleet", rows), flush=True)
+    ran = _run(folder, drives[: number + 1], given.workers)
+    rows.append(_row(f"1 added to {number}", 1, ran))
+    towns = [
+        {"component": ", ".join(one["drives"]), "ATE (m)": one.get("ate_m"), "loops": one["num_loops_between"]}
+        | {"mapped at once (m)": at_once[one["drives"][0].split("_")[0]]}
+        for one in ran["components"]
+    ]
+    print(markdown("Fleet", rows), markdown("Towns", towns), sep="\n")
+    write_report(given.out / "growth.json", {"rows": rows, "towns": towns})
+
+
+def _run(folder: Path, drives: list[Path], workers: str) -> dict[str, Any]:
+    """`fleet.json` of a call, and what it cost."""
+    listed = write_list(folder.with_suffix(".yaml"), drives)
+    arguments = [*COMMAND, str(listed), "--out", str(folder), "--same-reference", "--workers", workers, "-q"]
+    started = perf_counter()
+    _, status, used = os.wait4(subprocess.Popen(arguments).pid, 0)
+    if status:
+        raise SystemExit(f"{' '.join(arguments)} failed")
+    result: dict[str, Any] = json.loads((folder / "fleet.json").read_text())
+    cost = {"wall_s": perf_counter() - started, "cpu_s": used.ru_utime + used.ru_stime, "peak_mb": used.ru_maxrss / 1e3}
+    return result | cost | {"bytes": sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())}
+
+
+def _row(name: str, number: int, ran: dict[str, Any]) -> Row:
+    steps = {f"{step} (s)": round(seconds, 1) for step, seconds in ran["seconds"].items()}
+    return {
+        "fleet": name,
+        "components": len(ran["components"]),
+        "loops between": ran["num_loops_between"],
+        "CPU a drive (s)": round(ran["cpu_s"] / number, 1),
+        "wall a drive (s)": round(ran["wall_s"] / number, 1),
+        "largest process (MB)": round(ran["peak_mb"]),
+        "disk a drive (MB)": round(ran["bytes"] / 1e6 / number, 1),
+    } | steps
+
+
+if __name__ == "__main__":
+    main()

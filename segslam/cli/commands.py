@@ -11,6 +11,7 @@ from segslam.cli import (
     evaluate,
     export,
     fleet,
+    georeference,
     label,
     live,
     localise,
@@ -47,6 +48,7 @@ def add_all(app: typer.Typer) -> None:
     app.command("map")(map.map_command)
     app.command("merge")(merge.merge)
     app.command("fleet")(fleet.fleet)
+    app.command("georeference")(georeference.georeference)
     app.command("optimize")(optimize.optimize)
     app.command("refine")(refine.refine)
     app.command("register", cls=register.LabelsCommand)(register.register)

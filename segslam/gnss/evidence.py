@@ -12,8 +12,9 @@ The difference r of the fixes to the placed drive is Gaussian with the covarianc
     w       standard deviation of its errors from fix to fix
 
 The three unknowns are those of the largest likelihood; placement, clock and lever arm are then the most likely ones
-(generalised least squares: errors that last for minutes do not pass for a lever arm). The two kinds of error are distinct: the drift of a drive grows
-with the travel, is small between places joined by loops, and is smooth; the errors of a receiver depend on time alone.
+(generalised least squares: errors that last for minutes do not pass for a lever arm). The two kinds of error are
+distinct: the drift of a drive grows with the travel, is small between places joined by loops, and is smooth; the errors
+of a receiver depend on time alone.
 A standard deviation claimed by the receiver is not used: it is often wrong by a factor of ten.
 """
 
@@ -108,7 +109,7 @@ class DriveCovariance:
         return made
 
     def of(self, keys: np.ndarray, points: Points, axes: Sequence[int]) -> np.ndarray:
-        """(n d, n d) covariance of `points` (n, 3) in the frames of poses `keys`, along d axes; all of an axis first."""
+        """(n d, n d) covariance of `points` (n, 3) in the frames of poses `keys`, along d axes, one after the other."""
         R = self._T[keys, :3, :3]
         x, y, z = points.T
         zero = np.zeros_like(x)

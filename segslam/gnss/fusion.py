@@ -1,9 +1,11 @@
 """Joint solution of a finished graph and the fixes, with a weight that the fixes themselves justify.
 
-The noise of drive and receiver is that of the largest likelihood (`evidence`). With it, the fixes of a receiver with slow
-errors hardly bend a consistent map. But a map may also have systematic errors that its graph does not claim, and then a
-good receiver is right. So blocks of fixes are held out: the drive keeps its shape unless bending it by the others, or
-following them closely, predicts the held-out fixes far better.
+The noise of drive and receiver is that of the largest likelihood (`evidence`). With it, the fixes of a receiver with
+slow errors hardly bend a consistent map. But a map may also have systematic errors that its graph does not claim, and
+then a good receiver is right. So blocks of fixes are held out, and of three stiffnesses (the drive keeps its shape, is
+bent by this noise, follows the fixes closely) the stiffest is used whose cost of held-out fixes is within a standard
+error of the least one: the one-standard-error rule (Hastie, Tibshirani and Friedman, "The Elements of Statistical
+Learning", 2nd edition, section 7.10).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,10 +24,6 @@ from segslam.types import Indices, Points, Vector
 NUM_BLOCKS, NUM_FOLDS = 6, 3
 """Chosen: blocks of fixes in a row and groups in which they are held out; a block is longer than the errors of most
 receivers are correlated."""
-FAR_BETTER = 0.6
-"""Chosen: the drive is bent, or follows the fixes closely, if the cost of those held out falls below this share. It does
-where the map is warped (KITTI 00: 0.53 horizontally, 0.05 in height), not where the receiver's errors are slow (NCLT: 0.8
-and more)."""
 RIGID_M = 1000.0
 """Standard deviation of fixes that do not bend the drive."""
 LEAST_FUSED = 24
@@ -186,12 +184,13 @@ def _level_only(sigma: Vector) -> Vector:
 def _best(
     problem: _Problem, candidates: Sequence[Vector], blocks: Indices, reference: Points, of: Measure
 ) -> tuple[Vector, Costs]:
-    """The stiffest of three candidates, rigid, soft and close, unless a closer one is far better."""
-    rigid, soft, close = (_cost(_held_out(problem, one, blocks), reference, of) for one in candidates)
-    chosen = candidates[0]
-    if min(soft, close) < FAR_BETTER * rigid:
-        chosen = candidates[2] if close < FAR_BETTER * soft else candidates[1]
-    return chosen, (rigid, soft, close)
+    """The stiffest of three candidates, rigid, soft and close, whose cost is within a standard error of the least."""
+    costs = np.array([_costs(_held_out(problem, one, blocks), reference, blocks, of) for one in candidates])
+    means = costs.mean(axis=1)
+    more = costs - costs[means.argmin()]
+    is_as_good = more.mean(axis=1) <= more.std(axis=1, ddof=1) / np.sqrt(NUM_BLOCKS)
+    rigid, soft, close = means.tolist()
+    return candidates[int(is_as_good.argmax())], (rigid, soft, close)
 
 
 def _held_out(problem: _Problem, sigma: Vector, blocks: np.ndarray) -> Points:
@@ -258,8 +257,10 @@ def _up(residual: Points) -> tuple[Vector, float]:
     return residual[:, 2], axis_sigma(known)
 
 
-def _cost(residual: Points, reference: Points, of: Measure) -> float:
-    """Mean cost of residuals, in units of those about the placed drive; far ones count little more."""
+def _costs(residual: Points, reference: Points, blocks: Indices, of: Measure) -> Vector:
+    """(b,) mean cost in each block, in units of residuals about the placed drive; far ones count little more."""
     (values, _), (_, sigma) = of(residual), of(reference)
-    return float(np.nanmean(np.log1p(values**2 / sigma**2)))
-
+    costs = np.log1p(values**2 / sigma**2)
+    known = np.isfinite(costs)
+    counts = np.bincount(blocks[known], minlength=NUM_BLOCKS)
+    return np.bincount(blocks[known], costs[known], minlength=NUM_BLOCKS) / np.maximum(counts, 1)

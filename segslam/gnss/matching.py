@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.gnss.fixes import OUTSIDE, Fixes, origin_of
 from segslam.gnss.geodesy import Geodetic, Origin, enu_from_geodetic
 from segslam.trajectory import Poses, travelled_m
-from segslam.types import Indices, Mask, Points, SegslamError, Trajectory, Vector
+from segslam.types import Indices, Mask, Points, SegslamError, Vector
 
 LONGEST_GAP_S = 2.0
 """Chosen: a fix between two scans farther apart than this, or so long before the first scan, has no pose."""
@@ -144,7 +143,9 @@ def has_pose(drive: Drive, stamp_ns: Indices) -> Mask:
 def outside_reasons(prepared: Prepared, drive: Drive, offset_s: float) -> list[str]:
     """The reason of each fix that is not matched; empty for the matched ones."""
     inside = has_pose(drive, prepared.fixes.stamp_ns + round(1e9 * offset_s))
-    return [reason or ("" if within else OUTSIDE) for reason, within in zip(prepared.fixes.reasons, inside, strict=True)]
+    return [
+        reason or ("" if within else OUTSIDE) for reason, within in zip(prepared.fixes.reasons, inside, strict=True)
+    ]
 
 
 def interpolated(drive: Drive, scan_s: Vector, time_s: Vector) -> Poses:
@@ -177,7 +178,7 @@ def _elsewhere(fixes: Fixes, drive: Drive, offset_s: float) -> str:
     first, last = (1e-9 * (fixes.stamp_ns[fixes.usable][row]) + offset_s for row in (0, -1))
     begin, end = 1e-9 * drive.stamp_ns[0], 1e-9 * drive.stamp_ns[-1]
     return (
-        f"{fixes.source}: its fixes are from {first:.1f} to {last:.1f} s, the scans from {begin:.1f} to {end:.1f} s: no "
-        f"fix is within the drive. If both are of one drive, give the difference of the clocks: --gnss-offset "
+        f"{fixes.source}: its fixes are from {first:.1f} to {last:.1f} s, the scans from {begin:.1f} to {end:.1f} s: "
+        f"no fix is within the drive. If both are of one drive, give the difference of the clocks: --gnss-offset "
         f"{begin - first + offset_s:.1f} lets them begin together"
     )

@@ -5,6 +5,7 @@ Absolute errors are residuals after the best rigid alignment, without scale.
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool
@@ -21,6 +22,13 @@ Z_UP = (0.0, 0.0, 1.0)
 """Upward axis of LiDAR frames."""
 CAMERA_UP = (0.0, -1.0, 0.0)
 """Upward axis of KITTI's camera frames (x right, y down, z ahead)."""
+Up = Literal["z", "-y"]
+UP: dict[Up, tuple[float, float, float]] = {"z": Z_UP, "-y": CAMERA_UP}
+"""Upward axes that pose files have, by name."""
+FLAT = (
+    3.0  # chosen: a path lies in a plane if it is this much wider than high; all 20 real drives looked at are 5 times
+)
+ALONG = 0.8  # chosen: smallest component of a direction along its axis; 0.96 or more in these drives
 MIN_POSES = 3  # fewer poses are always aligned without error
 LINE_TOLERANCE = 1e-6  # smallest extent across a line, relative to that along it; above rounding
 LINE_TURN_DEG = 5.0  # chosen: are_deg is omitted if the rotation about the line of positions is less certain than this
@@ -111,6 +119,24 @@ def align_positions(source: Points, target: Points) -> Transform:
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     rotation = geometry.nearest_rotation((target - target_mean).T @ (source - source_mean))  # Eq. (38), (40), (43)
     return geometry.transform(rotation, target_mean - rotation @ source_mean)  # Eq. (41)
+
+
+def upward_axis(poses: Poses) -> Up | None:
+    """The upward axis of the frame of a drive; None if the drive does not show it.
+
+    It is the normal of the plane in which the positions lie. Of a straight drive, the direction of travel shows it:
+    cameras look along z, so their y points down. Both hold for vehicles, and for persons who walk on a floor.
+    """
+    positions = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    _, (_, width, height), axes = np.linalg.svd(positions, full_matrices=False)
+    if width > FLAT * height:
+        return "z" if abs(axes[2, 2]) > ALONG else "-y" if abs(axes[2, 1]) > ALONG else None
+    starts_level = geometry.angle(poses[0]) < math.acos(ALONG)
+    motions_m = np.abs((np.linalg.inv(poses[:-1]) @ poses[1:])[:, :3, 3]).sum(axis=0)
+    ahead = motions_m / max(motions_m.sum(), np.finfo(float).tiny)
+    if not starts_level or ahead.max() < ALONG:
+        return None
+    return "-y" if ahead[2] == ahead.max() else "z"
 
 
 def pose_errors(estimate: Poses, reference: Poses) -> PoseErrors:

@@ -49,10 +49,13 @@ class FarLoops:
         prepared: Callable[[int], PreparedScan],
         floor: Callable[[int], gates.NoiseFloor],
         confirmation: Confirmation,
+        forbidden: frozenset[tuple[int, int]] = frozenset(),
     ) -> None:
+        """`forbidden`: pairs (newer, older) of keyframes that are never tried."""
         self._config, self._graph = config, graph
         self._prepared, self._floor = prepared, floor
         self._confirmation = confirmation
+        self._forbidden = forbidden
         self._places = Places()
         self._signatures: dict[int, PlaceSignature] = {}
         self._rejected_m = -math.inf
@@ -97,13 +100,18 @@ class FarLoops:
             np.searchsorted(travel_m, travel_m[keyframe_id] - self._config.proximity.min_travel_m, side="right")
         )
         listed = self._places.shortlist(signature, most=NUM_LISTED, below_id=min(num_old, keyframe_id))
-        candidates = [self._candidate_at(keyframe_id, one.place_id) for one in listed if one.score >= MIN_SCORE]
+        candidates = [
+            self.candidate(keyframe_id, one.place_id)
+            for one in listed
+            if one.score >= MIN_SCORE and (keyframe_id, one.place_id) not in self._forbidden
+        ]
         return next(
             (one for one in candidates if NEAR_M <= one.distance_m <= one.search_radius_m + NEAR_M),
             None,
         )
 
-    def _candidate_at(self, keyframe_id: int, target_id: int) -> LoopCandidate:
+    def candidate(self, keyframe_id: int, target_id: int) -> LoopCandidate:
+        """A loop between these two, within the largest drift."""
         T_world = self._graph.T_world_keyframes
         T_target_source = geometry.inverse(T_world[target_id]) @ T_world[keyframe_id]
         chain_m = float(self._graph.travel_m[keyframe_id] - self._graph.travel_m[target_id])

@@ -9,9 +9,11 @@ from segslam.config import Config
 from segslam.confirmation import Confirmation
 from segslam.far_loops import FarLoops
 from segslam.keyframes import Clouds
+from segslam.loop_edits import LoopEdits
 from segslam.pose_graph import Graph
 from segslam.proximity import BREAK_TRAVEL_M, ProximityDetector
 from segslam.registration import Labeller, PreparedScan, Stopwatch, register_near, register_prepared
+from segslam.registration.trial import Gate, anywhere
 from segslam.retrieval import PlaceSignature, signature_of
 from segslam.submaps import Submaps
 from segslam.system.threads import at_once
@@ -19,6 +21,7 @@ from segslam.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Re
 from segslam.verification.noise_floor import NeighbourNoise
 from segslam.verification.prior import far_from_prior
 
+NO_EDITS = LoopEdits()
 NUM_PREPARED = 64
 """Number of prepared keyframes in memory, about 2 MB each; preparing another takes about 40 ms."""
 ROUNDS = 3
@@ -31,8 +34,16 @@ LEAST_AGAIN = 40
 class LoopCloser:
     """Proposes loops from the poses of the graph, and adds the verified ones to the graph."""
 
-    def __init__(self, config: Config, graph: Graph, clouds: Callable[[], Clouds], labeller: Labeller) -> None:
+    def __init__(
+        self,
+        config: Config,
+        graph: Graph,
+        clouds: Callable[[], Clouds],
+        labeller: Labeller,
+        edits: LoopEdits = NO_EDITS,
+    ) -> None:
         """`clouds` provides the points of keyframes; `labeller` computes geometric labels of gathered clouds."""
+        self._edits = edits
         self._config = config
         self._graph = graph
         self._detector = ProximityDetector(config.proximity)
@@ -45,8 +56,8 @@ class LoopCloser:
             config=config,
         )
         self._confirmation = Confirmation(graph, lambda number: self.submaps.T_odom[number])
-        self._far = FarLoops(config, graph, self._prepared, self._floor.at, self._confirmation)
-        self._tried: set[tuple[int, int]] = set()
+        self._far = FarLoops(config, graph, self._prepared, self._floor.at, self._confirmation, edits.forbidden)
+        self._tried: set[tuple[int, int]] = set(edits.forbidden)
         self._unsearched: set[int] = set()
         """Keyframes for which no loop was searched when they were added, because the machine was too slow."""
 
@@ -80,8 +91,9 @@ class LoopCloser:
             candidates = self._detector.candidates(
                 keyframe_id, self._graph.T_world_keyframes, self._graph.travel_m, below=below
             )
-        new = [c for c in candidates if (c.source_id, c.target_id) not in self._tried]
-        near = self._tried_in_turn(new, watch, is_known=below is not None)
+        by_hand = [self._far.candidate(keyframe_id, target_id) for target_id in self._edits.targets(keyframe_id)]
+        new = [c for c in (*by_hand, *candidates) if (c.source_id, c.target_id) not in self._tried]
+        near = self._tried_in_turn(_once_each(new), watch, is_known=below is not None)
         is_first_time = below is None and keyframe_id in self._unsearched
         self._unsearched.discard(keyframe_id)
         return (*near, *self._far_loops(keyframe_id, watch)) if is_first_time and not _has_closure(near) else near
@@ -143,6 +155,7 @@ class LoopCloser:
             )
         floor = self._floor.at(candidate.source_id)
         outcome: Alignment | Rejected | None = None
+        is_by_hand = (candidate.source_id, candidate.target_id) in self._edits.added
         if is_known:
             prior = candidate.T_target_source_prior
             outcome = register_near(source, target, prior, config=self._config, floor=floor, watch=own)
@@ -151,12 +164,7 @@ class LoopCloser:
                 source,
                 target,
                 config=self._config,
-                gate=partial(
-                    far_from_prior,
-                    candidate=candidate,
-                    R_world_target=self._graph.T_world_keyframes[candidate.target_id][:3, :3],
-                    config=self._config,
-                ),
+                gate=anywhere if is_by_hand else self._near_prior(candidate),
                 floor=floor,
                 watch=own,
             )
@@ -165,9 +173,18 @@ class LoopCloser:
         if isinstance(outcome, Rejected):
             return (LoopAttempt(candidate, outcome, own.seconds),)
         closure = LoopClosure.of(candidate.source_id, candidate.target_id, outcome)
-        if candidate.chain_m >= BREAK_TRAVEL_M and not is_known:
+        if candidate.chain_m >= BREAK_TRAVEL_M and not is_known and not is_by_hand:
             return self._confirmation.attempts(candidate, closure, own.seconds)
         return (LoopAttempt(candidate, closure, own.seconds),)
+
+    def _near_prior(self, candidate: LoopCandidate) -> Gate:
+        R_world_target = self._graph.T_world_keyframes[candidate.target_id][:3, :3]
+        return partial(far_from_prior, candidate=candidate, R_world_target=R_world_target, config=self._config)
+
+
+def _once_each(candidates: list[LoopCandidate]) -> list[LoopCandidate]:
+    """The first candidate of each pair."""
+    return list({(one.source_id, one.target_id): one for one in reversed(candidates)}.values())[::-1]
 
 
 def _has_closure(attempts: tuple[LoopAttempt, ...]) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from segslam.config import Config, load_config
 from segslam.datasets import Dataset
 from segslam.points import voxel_first, within_range
-from segslam.types import BadScan
+from segslam.types import BadScan, Points
 
 Preset = Literal["driving", "campus", "indoor"]
 SETTINGS = MappingProxyType[Preset, tuple[str, ...]](
@@ -59,11 +59,16 @@ def extent_m(scans: Dataset) -> float | None:
     last = min(len(scans), SEQUENTIAL_SCANS) if scans.is_sequential else len(scans)
     for row in np.unique(np.linspace(0, last - 1, NUM_SCANS).astype(int)).tolist():
         try:
-            points = scans[row].points
-            points = points[within_range(points, 0.0, FARTHEST_M)]
+            median_m = extent_of(scans[row].points)
         except BadScan:
             continue  # reported when the scan is mapped
-        distance_m = np.linalg.norm(points[voxel_first(points, VOXEL_M), :2], axis=1)
-        if len(distance_m) > 0:
-            medians_m.append(float(np.median(distance_m)))
+        if median_m is not None:
+            medians_m.append(median_m)
     return float(np.median(medians_m)) if medians_m else None
+
+
+def extent_of(points: Points) -> float | None:
+    """Median horizontal distance (m) of the surfaces of one scan in the LiDAR frame; None without usable points."""
+    near = points[within_range(points, 0.0, FARTHEST_M)]
+    distance_m = np.linalg.norm(near[voxel_first(near, VOXEL_M), :2], axis=1)
+    return float(np.median(distance_m)) if len(distance_m) > 0 else None

@@ -14,7 +14,8 @@ import numpy as np
 from segslam.adjustment import Adjusted, Progress, adjust, no_progress
 from segslam.config import Config
 from segslam.keyframes import Clouds, CloudStore, downsample_keyframe
-from segslam.loops import ROUNDS, LoopCloser
+from segslam.loop_edits import LoopEdits
+from segslam.loops import NO_EDITS, ROUNDS, LoopCloser
 from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
 from segslam.odometry import Tracked as Tracked
 from segslam.pose_graph import Graph, PoseGraph
@@ -47,9 +48,17 @@ class Slam:
     """
 
     def __init__(
-        self, config: Config | None = None, *, odometry: Odometry | None = None, labeller: Labeller | None = None
+        self,
+        config: Config | None = None,
+        *,
+        odometry: Odometry | None = None,
+        labeller: Labeller | None = None,
+        edits: LoopEdits = NO_EDITS,
     ) -> None:
-        """`odometry` replaces KISS-ICP; `labeller` replaces the geometric labels of scans without labels."""
+        """`odometry` replaces KISS-ICP; `labeller` replaces the geometric labels of scans without labels.
+
+        `edits` forbids loops between keyframes, or has them tried.
+        """
         self.config = config or Config()
         by_shape = partial(shape_labels, config=self.config)
         self._tracker = Tracker(self.config, odometry=odometry)
@@ -57,7 +66,7 @@ class Slam:
         self._labels_by_shape = labeller is None
         self.graph = self._new_graph()
         self._clouds: Clouds = CloudStore(self.config.keyframes.resolution_m)
-        self._loops = LoopCloser(self.config, self.graph, lambda: self._clouds, by_shape)
+        self._loops = LoopCloser(self.config, self.graph, lambda: self._clouds, by_shape, edits)
         self._steps: list[tuple[int, int, Transform]] = []
         self._motions: list[Motion] = []
         self._since_keyframe: list[Motion] = []
@@ -174,7 +183,13 @@ class Slam:
             tuple(self._motions),
             len(late),
             adjusted=adjusted,
+            alone=self._alone(odometry),
         )
+
+    def _alone(self, odometry: Trajectory) -> Trajectory | None:
+        """The poses by KISS-ICP alone; None if they were not kept, as after `resume`."""
+        poses = self._tracker.alone()[: len(odometry)]  # tracking may be ahead when a run is stopped
+        return replace(odometry, T_world_lidar=np.stack(poses)) if len(poses) == len(odometry) else None
 
     def _adjust(self, estimate: GraphEstimate, progress: Progress) -> Adjusted | None:
         """The adjustment of the whole map; None if it is off, or for a graph in the frame of an existing map."""

@@ -1,5 +1,6 @@
 """The result of a run, its export to files and plain values, its errors, and a plot."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from segslam.types import (
     LoopClosure,
     Mask,
     Motion,
+    Rejected,
     SegslamError,
     Trajectory,
     Transform,
@@ -48,7 +50,8 @@ class SlamResult(Record):
     from_map_m: Vector | None = None
     """For a drive localised in an existing map: travel from each scan to the nearest keyframe placed in the map,
     infinite across a break. None without such a map."""
-
+    alone: Trajectory | None = None
+    """The poses by KISS-ICP alone, without repairs by the check; None if they are unknown."""
     adjusted: Adjusted | None = None
     """The adjustment of the whole map, which led to `estimate`; None if there was none, or if the run was read from
     files."""
@@ -146,3 +149,14 @@ class SlamResult(Record):
         if reference.shape != own.T_world_lidar.shape:
             raise SegslamError(f"reference: an array of shape {reference.shape} for {len(own)} scans; give (n, 4, 4)")
         return own.T_world_lidar, reference
+
+
+def outcome_text(attempt: LoopAttempt, closure_weights: Mapping[tuple[int, int], float]) -> str:
+    """The outcome of a loop candidate in one line; the weights are those of the last estimate."""
+    outcome = attempt.outcome
+    if isinstance(outcome, Rejected):
+        reason = outcome.reason.value.replace("_", " ")
+        return f"rejected, {reason}" + (f" ({outcome.detail})" if outcome.detail else "")
+    weight = closure_weights[outcome.source_id, outcome.target_id]
+    found = outcome.alignment
+    return f"accepted, overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m, weight {weight:.2f}"

@@ -40,13 +40,16 @@ class PoseFile:
         return len(self.T_a_b)
 
 
-def read_poses(path: Path, *, format: PoseFormat | None = None) -> PoseFile:
+def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: bool = False) -> PoseFile:
     """The poses of a KITTI or TUM file with exact rotations; by default the format is detected from the columns.
 
-    Empty lines, and text after a #, are ignored. Raises SegslamError, naming the file and line, for another number of
-    columns, numbers that are not finite, and matrices or quaternions that are not rotations.
+    Empty lines, text after a #, and with `skips_names` a first line of column names, are ignored. Raises SegslamError,
+    naming the file and line, for another number of columns, numbers that are not finite, and matrices or quaternions
+    that are not rotations.
     """
     lines = _number_lines(path)
+    if skips_names and len(lines) > 1 and not re.match(r"[-+.\d]", lines[0][1][0]):
+        lines = lines[1:]
     chosen = format or _format_of(path, *lines[0])
     rows = np.array([_numbers(path, number, fields, chosen) for number, fields in lines])
     poses = _poses_from_matrices(rows) if chosen == "kitti" else _poses_from_quaternions(rows)

@@ -21,6 +21,7 @@ from segslam.evaluation import (
     revisits,
     segment_errors,
     trajectory_metrics,
+    upward_axis,
 )
 from segslam.trajectory import read_poses
 
@@ -277,3 +278,28 @@ def test_no_rotation_error_is_given_where_the_turn_about_a_line_is_not_known() -
     estimate[:, 1, 3] *= 100
     estimate[:, 1, 3] = truth[:, 1, 3] + 0.006 * rng.normal(size=50)
     assert trajectory_metrics(estimate, truth)["are_deg"] < 0.1
+
+
+@pytest.mark.data
+def test_the_upward_axis_of_real_drives_is_found(data_dir: Path) -> None:
+    files = {"-y": [*(data_dir / "kitti" / "poses").glob("*.txt"), *(data_dir / "trajectories").glob("*.txt")]}
+    files["z"] = [file for file in data_dir.glob("*/poses.txt") if file.parent.name != "kitti"]
+    assert len(files["-y"]) > 10
+    assert len(files["z"]) > 3
+    for up, named in files.items():
+        assert {file.name: upward_axis(read_poses(file).T_a_b) for file in named} == dict.fromkeys(
+            (file.name for file in named), up
+        )
+
+
+def test_a_path_that_does_not_show_its_upward_axis_has_none() -> None:
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(60, 3))
+    assert upward_axis(poses) is None
+    straight = np.tile(np.eye(4), (60, 1, 1))
+    straight[:, 2, 3] = np.arange(60.0)
+    assert upward_axis(straight) == "-y"  # a camera that looks ahead
+    assert upward_axis(straight[:, [2, 0, 1, 3]][:, :, [2, 0, 1, 3]]) == "z"
+    turned = geometry.transform(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.zeros(3)) @ straight
+    assert upward_axis(turned) is None  # the frame is not that of the first pose

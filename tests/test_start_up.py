@@ -81,7 +81,7 @@ def test_every_long_command_prints_a_message_before_it_imports_large_libraries(t
         ["eval", folder],
         ["eval", "--estimate", file, "--reference", file],
         ["report", folder],
-        ["view", folder, "--save", file],
+        ["view", folder, "--save", f"{folder}/run.rrd"],
         ["export", folder, f"{folder}/map.ply"],
         ["register", file, file],
         ["simulate", folder],

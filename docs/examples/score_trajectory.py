@@ -6,13 +6,14 @@ python docs/examples/score_trajectory.py poses_kitti.txt kitti/poses/00.txt
 import sys
 from pathlib import Path
 
-from segslam.evaluation import trajectory_metrics
+from segslam.evaluation import UP, trajectory_metrics, upward_axis
 from segslam.trajectory import read_poses
 
 if len(sys.argv) != 3:
     sys.exit(__doc__)
 
 estimate, reference = (read_poses(Path(file), format="kitti") for file in sys.argv[1:])
-figures = trajectory_metrics(estimate.T_a_b, reference.T_a_b, up=(0.0, -1.0, 0.0))  # the camera's y points down
+up = UP[upward_axis(reference.T_a_b) or "-y"]  # -y: in the files of KITTI the camera's y points down
+figures = trajectory_metrics(estimate.T_a_b, reference.T_a_b, up=up)
 for name, value in figures.items():
     print(f"{name:30} {value:.4f}")

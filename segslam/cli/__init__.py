@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from segslam.cli.groups import GroupedCommands
 from segslam.cli.warn import FirstOfEachKind
 from segslam.errors import SegslamError, reason
 from segslam.system.interrupts import EXIT_STATUS, ctrl_c_in_order, stop_line
@@ -18,6 +19,7 @@ BAD_INPUT = 2
 
 app = typer.Typer(
     name="segslam",
+    cls=GroupedCommands,
     help="LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs.",
     no_args_is_help=True,
     rich_markup_mode=None,  # rich doubles the time until help is shown

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from segslam.cli.compiling import compile_kernels
+from segslam.cli.completion import METHODS
 from segslam.cli.console import (
     ConfigOption,
     DatasetOption,
@@ -63,7 +64,11 @@ class Options:
     sequence: SequenceOption = "00"
     method: Annotated[
         list[str] | None,
-        typer.Option("--method", help=f"Method, may be repeated; default: all of {', '.join(METHOD_NAMES)}."),
+        typer.Option(
+            "--method",
+            autocompletion=METHODS,
+            help=f"Method, may be repeated; default: all of {', '.join(METHOD_NAMES)}.",
+        ),
     ] = None
     dataset: DatasetOption = None
     labels: LabelsOption = "auto"

@@ -7,6 +7,8 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
+from segslam.cli.overwriting import OverwriteOption, check_free
+from segslam.cli.tables import CsvOption, LatexOption, write_tables
 from segslam.errors import SegslamError
 
 COLUMN = 14
@@ -18,6 +20,9 @@ def compare(
     plot: Annotated[
         Path | None, typer.Option(help="Draw the trajectories and their errors to this file: .png, .svg or .pdf.")
     ] = None,
+    csv: CsvOption = None,
+    latex: LatexOption = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -28,6 +33,7 @@ def compare(
     for folder in runs:
         check_exists(folder, "give run folders")
     names = _names(runs)
+    check_free([file for file in (plot, csv, latex) if file], overwrite=overwrite)
     announce(f"compare: reading {len(runs)} runs", quiet=quiet)
     from segslam.run.finished import read_metrics, read_run
     from segslam.run.report.comparison import check_picture, draw_runs
@@ -36,6 +42,7 @@ def compare(
         check_picture(plot)
         draw_runs(plot, {name: read_run(folder) for name, folder in zip(names, runs, strict=True)})
     figures = {name: read_metrics(folder) for name, folder in zip(names, runs, strict=True)}
+    write_tables(figures, csv_file=csv, latex_file=latex)
     if json:
         print_json({"runs": figures, "plot": None if plot is None else str(plot)})
         return

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
+from segslam.cli import completion
 from segslam.cli.warn import FirstOfEachKind
 from segslam.errors import WorkFailed, reason
 
@@ -43,7 +44,12 @@ ConfigOption = Annotated[
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Change one setting: section.key=value; may be repeated."),
+    typer.Option(
+        "--set",
+        metavar="SECTION.KEY=VALUE",
+        autocompletion=completion.settings,
+        help="Change one setting: section.key=value; may be repeated.",
+    ),
 ]
 RefineMinutesOption = Annotated[
     float | None,
@@ -56,14 +62,22 @@ RefineMinutesOption = Annotated[
 ]
 DatasetOption = Annotated[
     str | None,
-    typer.Option("--dataset", help="Kind of data: kitti, or a reader of kiss-icp; detected by default."),
+    typer.Option(
+        "--dataset",
+        autocompletion=completion.datasets,
+        help="Kind of data: kitti, or a reader of kiss-icp; detected by default.",
+    ),
 ]
 SequenceOption = Annotated[str, typer.Option("--sequence", help="Sequence of the data set.")]
-FramesOption = Annotated[str | None, typer.Option("--frames", help="Use scans A to B by number, B excluded: A:B.")]
+FramesOption = Annotated[
+    str | None,
+    typer.Option("--frames", metavar="A:B[:STEP]", help="Use scans A to B by number, B excluded; every STEP-th."),
+]
 LabelsOption = Annotated[
     str,
     typer.Option(
         "--labels",
+        autocompletion=completion.labels_or_files,
         help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder.",
     ),
 ]

@@ -7,8 +7,9 @@ import typer
 
 from segslam.cli.console import JsonOption, QuietOption, announce, progress, say
 from segslam.cli.map import map_scans
+from segslam.cli.overwriting import OverwriteOption, make_room
 from segslam.errors import WorkFailed
-from segslam.system.interrupts import when_stopped
+from segslam.system.interrupts import same_command_with, when_stopped
 
 SEQUENCE = "00"
 SEED = 33
@@ -23,6 +24,7 @@ scans have the same distortion, so they still match."""
 
 def demo(
     out: Annotated[Path, typer.Option(help="New folder for the data and the run.")] = Path("segslam-demo"),
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -36,9 +38,11 @@ def demo(
     from segslam.datasets import open_dataset
     from segslam.run.folder import new_folder
     from segslam.run.report import BEFORE_AFTER, write_before_after
+    from segslam.simulation.files import SETTINGS_FILE
 
+    make_room(out, overwrite=overwrite, made_by=(f"data/sequences/{SEQUENCE}/{SETTINGS_FILE}",))
     data = new_folder(out) / "data"
-    begin_again = f"to start again, remove {out}"
+    begin_again = f"to start again: {same_command_with('--overwrite')}"
     when_stopped(begin_again)
     sensor = simulation.SensorConfig(name=SENSOR, axis_wander_sigma_deg=AXIS_WANDER_DEG, axis_wander_s=AXIS_WANDER_S)
     drive = simulation.example_drive(scale=SCALE)

@@ -1,6 +1,7 @@
 """End of a mapped or replayed run: results, report, figures."""
 
 import math
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,10 +25,12 @@ def finish(
     quiet: bool,
     more: Callable[["SlamResult"], Mapping[str, Any]] = lambda result: {},
     search_s: float = math.inf,
+    stopped: bool = False,
 ) -> dict[str, Any]:
     """Finish a run: write its results, and the map if files are given; show and return its figures.
 
     `more` adds figures computed from the result. `search_s` limits the last search for loops, as in `Slam.finish`.
+    `stopped`: Ctrl-C ended the run, before the last scan if there is one.
     """
     from segslam.calibration import vertical_angle_advice
     from segslam.log import read_log
@@ -36,7 +39,8 @@ def finish(
     from segslam.run.report import write_report
     from segslam.system.memory import peak_mb
 
-    say("all scans read; final optimisation ...", quiet=quiet)
+    read = "Ctrl-C: stopped" if stopped else "all scans read"
+    say(f"{read}; final optimisation ...", quiet=quiet)
     result, metrics = run.finish(search_s=search_s, progress=partial(_shown, quiet=quiet))
     if reference is not None:
         metrics |= accuracy(result, reference)
@@ -84,8 +88,39 @@ def _adjustment(metrics: dict[str, Any]) -> str:
     return line
 
 
-def _after_repairs(metrics: dict[str, Any]) -> str:
-    return "after repairs" if metrics.get("num_motions_repaired") else "only"
+def _errors(metrics: dict[str, Any]) -> list[str]:
+    """Lines about the error by stage: KISS-ICP alone, after repairs of its motions, with loops."""
+    if "ate_m" not in metrics:
+        return []
+    repaired = "after repairs" if metrics.get("num_motions_repaired") else "only"
+    false = f"; false loops: {metrics['num_loops_false']}" if "num_loops_false" in metrics else ""
+    odometry = f"odometry {repaired}: {metrics['odometry_ate_m']:.3f} m"
+    line = f"error after alignment: {metrics['ate_m']:.3f} m, {odometry}{false}"
+    alone = metrics.get("kiss_icp_ate_m")
+    return [line] if alone is None else [line, f"the same error of KISS-ICP alone: {alone:.3f} m"]
+
+
+def _length(metrics: dict[str, Any]) -> list[str]:
+    """A line about the length and duration of the drive."""
+    if "length_m" not in metrics or "duration_s" not in metrics:
+        return []
+    length_m = metrics["length_m"]
+    length = f"{length_m:.0f} m" if length_m < 10_000 else f"{length_m / 1000:.1f} km"
+    seconds = round(metrics["duration_s"])
+    return [f"drive: {length} in " + (f"{seconds} s" if seconds < 600 else f"{seconds // 60} min {seconds % 60} s")]
+
+
+def _ends(metrics: dict[str, Any], folder: Path) -> list[str]:
+    """Lines about the results, and the command that comes next."""
+    where = shlex.quote(str(folder))
+    follows = f"segslam export {where} {shlex.quote(str(folder / 'map.laz'))}"
+    if "ate_m" not in metrics:
+        follows = f"segslam eval {where} --reference POSES.txt"
+    return [
+        f"results in {folder}",
+        f"report: {folder / 'report.html'} (open it in a browser)",
+        f"next: {follows}; all commands: segslam --help",
+    ]
 
 
 def summary(metrics: dict[str, Any], folder: Path) -> str:
@@ -94,7 +129,8 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         f"{_counted(metrics['num_scans'], 'scan')} in {metrics['seconds_total']:.1f} s "
         f"({metrics['scans_per_second']:.1f}/s), "
         f"{_counted(metrics['num_keyframes'], 'keyframe')}, {_counted(metrics['num_loops_accepted'], 'loop')} of "
-        f"{_counted(metrics['num_candidates'], 'candidate')}"
+        f"{_counted(metrics['num_candidates'], 'candidate')}",
+        *_length(metrics),
     ]
     if skipped := metrics["num_scans_skipped"]:
         lines.append(f"{skipped} scan{'s' * (skipped != 1)} skipped (unreadable or empty); see the warning above")
@@ -111,12 +147,7 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         )
     if "adjustment_moved_m" in metrics:
         lines.append(_adjustment(metrics))
-    if "ate_m" in metrics:
-        lines.append(
-            f"error after alignment: {metrics['ate_m']:.3f} m, "
-            f"odometry {_after_repairs(metrics)}: {metrics['odometry_ate_m']:.3f} m"
-            + (f"; false loops: {metrics['num_loops_false']}" if "num_loops_false" in metrics else "")
-        )
+    lines += _errors(metrics)
     if "localised_percent" in metrics:
         lines.append(f"localised in the old map: {metrics['localised_percent']:.1f} % of the scans; see localised.csv")
     if "num_loops_between" in metrics:
@@ -131,4 +162,4 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         lines.append(
             f"against the logged run: {metrics['num_loops_won']} loops more, {metrics['num_loops_lost']} fewer{before}"
         )
-    return "\n".join([*lines, f"results in {folder}"])
+    return "\n".join([*lines, *_ends(metrics, folder)])

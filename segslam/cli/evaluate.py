@@ -1,61 +1,98 @@
 """`segslam eval`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
 from segslam.cli.checks import check_links
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
+from segslam.cli.evaluate_folder import score_folders
+from segslam.cli.overwriting import OverwriteOption, check_free
+from segslam.cli.tables import CsvOption, LatexOption, as_text, write_tables
 
 if TYPE_CHECKING:
+    from segslam.evaluation import Up
+    from segslam.scores import Align
     from segslam.trajectory import PoseFile, Poses
     from segslam.types import IndexPairs
-
-UP = {"z": (0.0, 0.0, 1.0), "-y": (0.0, -1.0, 0.0)}
 
 
 def evaluate(
     run: Annotated[
         Path | None, typer.Argument(help="Run folder; its metrics.json is updated with the new figures.")
     ] = None,
-    reference: Annotated[Path | None, typer.Option(help="Ground-truth poses, KITTI or TUM format.")] = None,
-    estimate: Annotated[Path | None, typer.Option(help="Estimated poses, instead of a run folder.")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="Ground-truth poses, KITTI or TUM format; a folder if --estimate is one.")
+    ] = None,
+    estimate: Annotated[
+        Path | None, typer.Option(help="Estimated poses, or a folder with poses NAME.txt of several drives.")
+    ] = None,
     format: Annotated[
         Literal["kitti", "tum"] | None,
         typer.Option(help="Format of both files; detected from the number of columns by default."),
     ] = None,
     up: Annotated[
         Literal["z", "-y"] | None,
-        typer.Option(help="Upward axis of the reference frame; default: -y (camera) for KITTI format, z for TUM."),
+        typer.Option(help="Upward axis of the two files: z, or -y for cameras; by default found from the path."),
     ] = None,
     max_difference: Annotated[
         float, typer.Option(help="Largest time difference between a pose and its reference (s).")
     ] = 0.01,
+    align: Annotated[
+        Literal["se3", "sim3", "first", "none"],
+        typer.Option(help="Alignment: rigid (se3), with scale (sim3), of the first pose (first), or none."),
+    ] = "se3",
+    rpe_distance: Annotated[
+        float | None,
+        typer.Option(min=0.01, metavar="METRES", help="Also measure the error of the motion over this distance."),
+    ] = None,
+    csv: CsvOption = None,
+    latex: LatexOption = None,
     plot: Annotated[
         Path | None, typer.Option(help="Draw both trajectories and the error to this file: .png, .svg or .pdf.")
     ] = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Measure the error of a run, or of a trajectory, against ground truth.
 
-    Example: segslam eval runs/00; or segslam eval --estimate poses_kitti.txt --reference kitti/poses/00.txt
+    Two folders are compared drive by drive: all of KITTI 00 to 10 in one command. metrics.json of a run keeps the
+    figures of --align se3.
+
+    Example: segslam eval runs/00; or segslam eval --estimate poses_kitti.txt --reference kitti/poses/00.txt; or
+    segslam eval --estimate runs --reference kitti/poses --csv kitti.csv
     """
+    check_free([file for file in (plot, csv, latex) if file], overwrite=overwrite)
     if run is not None or estimate is not None:
         announce(f"eval: reading {run or estimate}", quiet=quiet)
     from segslam.types import SegslamError
 
+    how = _How(align, rpe_distance)
     if run is not None and estimate is None:
-        figures = _score_run(run, reference, plot, quiet=quiet)
+        figures = _score_run(run, reference, plot, how, quiet=quiet)
+        rows = {run.resolve().name: figures}
     elif run is None and estimate is not None and reference is not None:
-        figures = _score_files(estimate, reference, format, up, max_difference, plot, quiet=quiet)
+
+        def score(made: Path, true: Path) -> dict[str, Any]:
+            return _score_files(made, true, format, up, max_difference, plot, how, quiet=quiet)
+
+        if estimate.is_dir():
+            if plot is not None:
+                raise SegslamError("--plot: draws one drive; give two files")
+            rows = score_folders(estimate, reference, score)
+            figures = {"drives": rows}
+        else:
+            figures = score(estimate, reference)
+            rows = {estimate.stem: figures}
     else:
         raise SegslamError("give either a run folder, or two files with --estimate and --reference")
+    write_tables(rows, csv_file=csv, latex_file=latex)
     if json:
         print_json(figures)
     elif not quiet:
-        print_out(table(figures))
+        print_out(as_text(rows) if "drives" in figures else table(figures))
     if plot is not None and not json:
         say(f"figure written to {plot}", quiet=quiet)
 
@@ -63,14 +100,26 @@ def evaluate(
 def table(figures: dict[str, Any]) -> str:
     """The figures with their meaning, one per line."""
     from segslam.run.finished import FIGURES
+    from segslam.scores import MEANINGS
 
-    return "\n".join(f"{figures[key]:10.4g}  {meaning}" for key, meaning in FIGURES.items() if key in figures)
+    meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
+    return "\n".join(f"{figures[key]:10.4g}  {meaning}" for key, meaning in meanings.items() if key in figures)
 
 
-def _score_run(folder: Path, reference_file: Path | None, plot: Path | None, *, quiet: bool) -> dict[str, Any]:
+class _How(NamedTuple):
+    """Alignment, and the distance of the relative error."""
+
+    align: "Align"
+    rpe_distance_m: float | None
+
+
+def _score_run(
+    folder: Path, reference_file: Path | None, plot: Path | None, how: _How, *, quiet: bool
+) -> dict[str, Any]:
     from segslam.run.accuracy import accuracy
-    from segslam.run.finished import ACCURACY, read_run, true_poses
+    from segslam.run.finished import ACCURACY, plain_name, read_run, true_poses
     from segslam.run.folder import folder_of, write_metrics
+    from segslam.scores import scores
     from segslam.trajectory import rows_of_same_scan
     from segslam.types import SegslamError
 
@@ -88,34 +137,39 @@ def _score_run(folder: Path, reference_file: Path | None, plot: Path | None, *, 
         )
     if len(reference) < num_scans:
         say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose", quiet=quiet)
-    metrics = {key: value for key, value in run.metrics.items() if key.removeprefix("odometry_") not in ACCURACY}
+    metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY}
     metrics |= figures
-    write_metrics(folder, metrics)
+    trajectory = run.result.trajectory
+    rows = rows_of_same_scan(trajectory.scan_index, reference.scan_index)
+    matched, truth = trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]]
+    if how.align == "se3":
+        write_metrics(folder, metrics)
     if plot is not None:
-        trajectory = run.result.trajectory
-        rows = rows_of_same_scan(trajectory.scan_index, reference.scan_index)
-        _draw(plot, trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]])
-    return metrics
+        _draw(plot, matched, truth, "z")
+    more = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance_m)
+    return more | metrics if how.align == "se3" else metrics | more
 
 
-def _draw(file: Path, estimate: "Poses", reference: "Poses") -> None:
+def _draw(file: Path, estimate: "Poses", reference: "Poses", up: "Up") -> None:
     from segslam.run.report.comparison import check_picture, draw_scored
 
     check_picture(file)
-    draw_scored(file, estimate, reference)
+    draw_scored(file, estimate, reference, up=up)
 
 
 def _score_files(
     estimate_file: Path,
     reference_file: Path,
     format: Literal["kitti", "tum"] | None,
-    up: str | None,
+    up: "Up | None",
     max_difference_s: float,
     plot: Path | None,
+    how: _How,
     *,
     quiet: bool,
 ) -> dict[str, Any]:
-    from segslam.evaluation import trajectory_metrics
+    from segslam.evaluation import UP
+    from segslam.scores import scores
     from segslam.trajectory import read_poses
     from segslam.types import SegslamError
 
@@ -130,18 +184,31 @@ def _score_files(
             "line n + 1 is scan n in both. Score the run folder instead, or use TUM format, which is matched by stamp"
         )
     rows = _matching_rows(estimate, reference, round(max_difference_s * 1e9))
-    direction = up or ("-y" if estimate.stamp_ns is None else "z")
-    figures = trajectory_metrics(estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]], up=UP[direction])
+    matched, truth = estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]]
+    direction, why = (up, "") if up or not len(rows) else _up(truth, camera=estimate.stamp_ns is None)
+    figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance_m, up=UP[direction or "z"])
     if not figures:
         raise SegslamError(
             f"{estimate_file}: only {len(rows)} of its {len(estimate)} poses match one of the {len(reference)} "
             f"poses of {reference_file}; at least three are needed. Check the files, or raise --max-difference"
         )
+    if why:
+        say(f"{reference_file}: upward axis {direction} ({why}); for another: --up", quiet=quiet)
     if plot is not None:
-        _draw(plot, estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]])
+        _draw(plot, matched, truth, direction or "z")
     if not len(rows) == len(estimate) == len(reference):
         say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}", quiet=quiet)
-    return figures | {"num_poses": len(rows)}
+    return figures | {"num_poses": len(rows), "up": direction}
+
+
+def _up(reference: "Poses", *, camera: bool) -> tuple["Up", str]:
+    """The upward axis of the files, and how it is known."""
+    from segslam.evaluation import upward_axis
+
+    found = upward_axis(reference)
+    if found is not None:
+        return found, "the path lies across it"
+    return ("-y", "as in KITTI's files; the path does not show it") if camera else ("z", "the path does not show it")
 
 
 def _matching_rows(estimate: "PoseFile", reference: "PoseFile", max_difference_ns: int) -> "IndexPairs":

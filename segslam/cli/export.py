@@ -1,6 +1,7 @@
 """`segslam export`, and the map files of other commands."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, print_json, progress, say
+from segslam.cli.overwriting import OverwriteOption, check_free
 
 if TYPE_CHECKING:
     from segslam.config import MapConfig
@@ -28,6 +30,7 @@ def export(
     ],
     config: ConfigOption = None,
     settings: SetOption = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -35,6 +38,7 @@ def export(
 
     Example: segslam export runs/00 map.laz map.png grid.yaml --set map.color=height
     """
+    check_free(files, overwrite=overwrite)
     announce(f"export: reading {run}", quiet=quiet)
     from segslam.config import load_config
     from segslam.log import read_log
@@ -49,27 +53,29 @@ def export(
 
 
 def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", quiet: bool) -> dict[str, Any]:
-    """Write the map of a finished run to each of the files. Returns figures of the map.
+    """Write the map of a finished run to each of the files, or to none. Returns figures of the map.
 
     Raises SegslamError if the run did not finish or a name has an unknown extension, WorkFailed if the disk is full.
     """
     from time import perf_counter
 
-    from segslam.map import write_map
-    from segslam.run.report import BEFORE_AFTER, write_before_after
-    from segslam.system.whole_files import cannot_write
+    from segslam.map import check_files, write_map
+    from segslam.run.report import BEFORE_AFTER, draw_before_after
+    from segslam.system.whole_files import cannot_write, whole_file
 
     started = perf_counter()
     of_map = [file for file in files if file.name != BEFORE_AFTER]
-    for file in files:
-        if file not in of_map:
-            write_before_after(log.path.parent, file)
-    if not of_map:
-        return {"map_seconds": perf_counter() - started}
-    try:
-        made = write_map(_placed(log, quiet=quiet), of_map, config=config, show=partial(_shown, quiet=quiet))
-    except OSError as error:
-        raise cannot_write(of_map[0], error) from error
+    check_files(of_map)
+    with ExitStack() as complete:  # moves each file to its name at the end, after a failure none
+        for file in files:
+            if file not in of_map:
+                complete.enter_context(whole_file(file)).write_bytes(draw_before_after(log.path.parent))
+        if not of_map:
+            return {"map_seconds": perf_counter() - started}
+        try:
+            made = write_map(_placed(log, quiet=quiet), of_map, config=config, show=partial(_shown, quiet=quiet))
+        except OSError as error:
+            raise cannot_write(of_map[0], error) from error
     return {
         "num_map_points": made.num_points,
         "num_map_moving_points": made.num_moving_points,

@@ -21,6 +21,7 @@ from segslam.cli.console import (
     print_json,
     progress,
 )
+from segslam.cli.overwriting import OverwriteOption
 
 if TYPE_CHECKING:
     from segslam.config import Config
@@ -60,6 +61,7 @@ def label(
     pictures: Annotated[int, typer.Option(min=0, help="Number of scans to draw, spread evenly over the drive.")] = 1,
     config: ConfigOption = None,
     settings: SetOption = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -89,7 +91,7 @@ def label(
 
     scans = opened(labels, encoding)
     true_scans = _open_truth(truth, truth_encoding, opened) if truth else None
-    folder = new_folder(out)
+    folder = out if overwrite and out.is_dir() else new_folder(out)
     tally = Tally(scans, folder, write_as=write_as, num_pictures=pictures)
     found = _labelled(scans, true_scans, settings_now)
     for one in progress(found, total=len(scans), title="label", quiet=quiet):

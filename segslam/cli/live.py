@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,7 +17,9 @@ from segslam.cli.console import announce, how_to_go_on, say
 from segslam.cli.ending import finish
 from segslam.cli.foxglove import serve_foxglove
 from segslam.cli.live_status import LiveFigures, Status, too_slow
-from segslam.cli.run_options import OutputOptions
+from segslam.cli.overwriting import check_free, make_room
+from segslam.cli.preset import live_config
+from segslam.cli.run_options import OutputOptions, PresetOption
 from segslam.cli.shared_options import with_options
 from segslam.cli.view import check_display, close_scene, open_scene
 from segslam.errors import SegslamError, WorkFailed
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
     from segslam.live import Front, LiveMap, Source
     from segslam.live.live_map import Show
     from segslam.live.ros import MappingPublisher
-    from segslam.presets import Preset
     from segslam.registration import Labeller
     from segslam.run.foxglove_server import FoxgloveServer
     from segslam.run.run import Run
@@ -60,7 +61,7 @@ def live(
         float | None, typer.Option(min=0.1, metavar="SECONDS", help="End after this time without a new scan.")
     ] = None,
     labels: Annotated[str, typer.Option("--labels", help="Labels: geometric (auto is the same) or none.")] = "auto",
-    preset: Annotated[str, typer.Option(help="Settings for an environment: driving, campus or indoor.")] = "driving",
+    preset: PresetOption = "auto",
     options: OutputOptions,
 ) -> None:
     """Map scans while they arrive. Ctrl-C or SIGTERM finishes the run.
@@ -71,20 +72,15 @@ def live(
     if options.view:
         check_display()
     _check_source(folder, topic, out)
-    settings = options.load_config()
+    options.load_config()  # reports a wrong setting before the scans are looked at
     if labels not in ("auto", "geometric", "none"):
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
     announce("live: starting", quiet=quiet)
-    if preset != "driving":
-        from segslam.presets import SETTINGS
-        from segslam.presets import preset as settings_of
-
-        if preset not in SETTINGS:
-            raise SegslamError(f"--preset {preset}: unknown preset; known: {', '.join(SETTINGS)}")
-        settings = options.load_config(base=settings_of(cast("Preset", preset)))
+    settings = options.load_config(base=live_config(preset, folder, topic, quiet=quiet))
     from segslam.run.folder import new_folder
 
     map_names, map_files = options.maps(out)
+    check_free([file for file in map_files if out not in file.parents], overwrite=options.overwrite)
     angle_deg = settings.sensor.vertical_angle_deg or 0.0
     sensor = settings.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
     settings = settings.model_copy(update={"sensor": sensor})
@@ -92,6 +88,7 @@ def live(
     scene = open_scene(None, view_every=settings.log.view_every) if options.view else None
     with ExitStack() as stack:
         server = serve_foxglove(options.foxglove, stack, quiet=quiet)
+        make_room(out, overwrite=options.overwrite, inputs=[folder] if folder else [])
         out = new_folder(out)
         compile_kernels(quiet=quiet)
         recorded = {
@@ -152,7 +149,13 @@ def map_live(
         run = stack.enter_context(Run(folder, slam, dataset=source.name, options=options, mirror=mirror))
         publisher = _publisher(source, run, stack)
         front = stack.enter_context(Front(source, settings, tell=tell, idle_s=idle_s))
-        stack.enter_context(stopped_by_signals(front.stop))
+        stops: list[bool] = []
+
+        def stop() -> None:
+            stops.append(True)
+            front.stop()
+
+        stack.enter_context(stopped_by_signals(stop))
         front.wait_until_ready()
         tell(f"{source.name}: waiting for scans; Ctrl-C ends the run")
         shows = _shows(server, publisher)
@@ -168,7 +171,16 @@ def map_live(
             file.parent.mkdir(parents=True, exist_ok=True)
 
         more = figures.metrics(ended, num_restarts=front.num_restarts)
-        finish(run, None, map_files=map_files, json=json, quiet=quiet, more=lambda _: more, search_s=FINAL_SEARCH_S)
+        finish(
+            run,
+            None,
+            map_files=map_files,
+            json=json,
+            quiet=quiet,
+            more=lambda _: more,
+            search_s=FINAL_SEARCH_S,
+            stopped=bool(stops),
+        )
         if advice := too_slow(more, settings.odometry.voxel_size_m):
             say(advice, quiet=quiet)
     return ended.why if ended.failed else ""

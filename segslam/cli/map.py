@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,8 @@ from segslam.cli.ending import finish
 from segslam.cli.export import map_summary, write_maps
 from segslam.cli.foxglove import serve_foxglove
 from segslam.cli.in_map import pipeline
+from segslam.cli.overwriting import check_free, make_room
+from segslam.cli.preset import check_preset, preset_config
 from segslam.cli.run_options import DataArgument, DryRunOption, OutputOptions, RunOptions
 from segslam.cli.shared_options import with_options
 from segslam.cli.view import check_display, close_scene, open_scene
@@ -27,7 +29,6 @@ if TYPE_CHECKING:
     from segslam.datasets import Dataset
     from segslam.log import Mirror, RunLog
     from segslam.odometry import Odometry
-    from segslam.presets import Preset
     from segslam.run.map_folder import SlamOf
     from segslam.run.run import Run
     from segslam.types import BadScan, Step
@@ -69,6 +70,8 @@ def map_data(
     quiet = output.quiet
     if output.view:
         check_display()
+    if options.resume and output.overwrite:
+        raise SegslamError("--overwrite: a resumed run is continued, not replaced; give --resume or --overwrite")
     check_exists(data, "give the folder with sequences/ or with the scans")
     recorded = log_to_resume(folder) if options.resume and not dry_run else None
     check_preset(options.preset, resumes=recorded is not None)
@@ -79,6 +82,7 @@ def map_data(
     from segslam.run.map_folder import open_scans, resume_options
 
     map_names, map_files = output.maps(folder)
+    check_free([file for file in map_files if folder not in file.parents], overwrite=output.overwrite or options.resume)
     scans = open_scans(options.source(data), settings)
     if settings.map.color == "intensity":
         check_intensities(scans)
@@ -96,6 +100,9 @@ def map_data(
         if is_finished(recorded, scans):
             _complete(recorded, map_files, config=settings.map, json=output.json, quiet=quiet)
             raise typer.Exit(0)
+    else:
+        inputs = [path for path in (data, in_map, options.odometry) if path is not None]
+        make_room(folder, overwrite=output.overwrite, inputs=inputs)
     scene = open_scene(None, view_every=settings.log.view_every) if output.view else None
     with ExitStack() as stack:
         server = serve_foxglove(output.foxglove, stack, quiet=quiet)
@@ -116,31 +123,6 @@ def map_data(
         )
     if scene:
         close_scene(scene, None)
-
-
-def check_preset(name: str, *, resumes: bool) -> None:
-    """Raises SegslamError for an unknown preset, and for any preset if a run is resumed."""
-    if name == "auto":
-        return
-    from segslam.presets import SETTINGS
-
-    if name not in SETTINGS:
-        raise SegslamError(f"--preset {name}: unknown preset; known: auto, {', '.join(SETTINGS)}")
-    if resumes:
-        raise SegslamError(f"--preset {name}: a resumed run keeps its settings; omit the option")
-
-
-def preset_config(name: str, scans: "Dataset", *, quiet: bool) -> "Config":
-    """The settings of a preset; with `auto`, of the preset that fits the scans, with a message."""
-    from segslam.presets import extent_m, preset, preset_for
-
-    if name != "auto":
-        return preset(cast("Preset", name))
-    extent = extent_m(scans)
-    chosen = preset_for(extent)
-    if chosen != "driving":
-        say(f"surfaces are near (median range {extent:.0f} m): using --preset {chosen}", quiet=quiet)
-    return preset(chosen)
 
 
 def _show_dry_run(scans: "Dataset", settings: "Config", *, json: bool, quiet: bool) -> None:
@@ -204,7 +186,7 @@ def map_scans(
     for file in map_files:
         file.parent.mkdir(parents=True, exist_ok=True)
     when_stopped(f"the log in {folder} is kept; {go_on}")
-    apart = OdometryApart(settings.odometry) if odometry is None else None
+    apart = OdometryApart(settings.odometry, keeps_alone=True) if odometry is None else None
     with (
         how_to_go_on(f"{go_on} when there is space"),
         apart or nullcontext(),
@@ -228,7 +210,15 @@ def map_scans(
             when_stopped("no scan was mapped, nothing was written")
             raise typer.Exit(EXIT_STATUS)
         resumed = {} if recorded is None else {"num_scans_resumed": run.num_scans_resumed}
-        metrics = finish(run, scans.reference, map_files=map_files, json=json, quiet=quiet, more=lambda _: resumed)
+        metrics = finish(
+            run,
+            scans.reference,
+            map_files=map_files,
+            json=json,
+            quiet=quiet,
+            more=lambda _: resumed,
+            stopped=interrupted,
+        )
     if interrupted:
         when_stopped(f"{metrics['num_scans']} of {len(scans)} scans are mapped; {go_on}")
         raise typer.Exit(EXIT_STATUS)

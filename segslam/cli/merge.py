@@ -23,6 +23,7 @@ from segslam.cli.console import (
 )
 from segslam.cli.ending import finish
 from segslam.cli.export import WITH_MAP
+from segslam.cli.overwriting import OverwriteOption, make_room
 from segslam.cli.run_options import WithMapOption
 from segslam.system.interrupts import EXIT_STATUS, when_stopped
 
@@ -40,6 +41,7 @@ def merge(
     with_map: WithMapOption = False,
     config: ConfigOption = None,
     settings: SetOption = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -56,7 +58,8 @@ def merge(
     from segslam.config import load_config
     from segslam.run.folder import check_new, new_folder
 
-    check_new(out)
+    if not overwrite:
+        check_new(out)
     settings = with_minutes(settings, refine_minutes)
     load_config(config, settings)  # reports a wrong setting before the logs are read
     announce(f"merge: reading {len(runs)} runs", quiet=quiet)
@@ -68,6 +71,7 @@ def merge(
     settings_now = load_config(config, settings, base=sessions[0].run.config)
     merged = plan(sessions, config=settings_now, same_reference=same_reference, progress=partial(_shown, quiet=quiet))
     say(merged.summary(), quiet=quiet)
+    make_room(out, overwrite=overwrite, inputs=runs)
     folder = new_folder(out)
     when_stopped(f"the log in {folder} is kept, without results")
     with run_of(merged, folder, settings_now) as run:

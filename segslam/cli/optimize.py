@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, say
+from segslam.cli.overwriting import OverwriteOption, check_free
 from segslam.errors import SegslamError
 from segslam.system.whole_files import check_target, whole_file
 
@@ -25,7 +26,8 @@ def optimize(
             "geman-mcclure: robust kernel; none: keep all (least squares)."
         ),
     ] = "consistent",
-    force: Annotated[bool, typer.Option("--force", help="Replace the file --out if it exists.")] = False,
+    overwrite: OverwriteOption = False,
+    force: Annotated[bool, typer.Option("--force", hidden=True, help="The same as --overwrite.")] = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -36,8 +38,7 @@ def optimize(
     Example: segslam optimize parking-garage.g2o --out optimum.g2o
     """
     check_target(out)
-    if out.exists() and not force:
-        raise SegslamError(f"--out {out}: exists; give another file, or replace it with --force")
+    check_free([out], overwrite=overwrite or force)
     announce(f"optimize: reading {graph}", quiet=quiet)
     from segslam.pose_graph import Unsolvable, optimize_graph, read_g2o, write_g2o
 

@@ -22,6 +22,7 @@ from segslam.cli.console import (
 )
 from segslam.cli.ending import finish
 from segslam.cli.export import WITH_MAP
+from segslam.cli.overwriting import OverwriteOption, make_room
 from segslam.cli.replay import check_settings
 from segslam.cli.run_options import WithMapOption
 from segslam.errors import SegslamError
@@ -39,6 +40,7 @@ def refine(
     with_map: WithMapOption = False,
     config: ConfigOption = None,
     settings: SetOption = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -53,7 +55,7 @@ def refine(
     load_config(config, settings)  # reports a wrong setting before the log is read
     announce(f"refine: reading {run}", quiet=quiet)
     from segslam.log import read_log
-    from segslam.run.folder import log_of, new_folder
+    from segslam.run.folder import copy_alone, log_of, new_folder
     from segslam.run.run import Run
     from segslam.slam import Slam
 
@@ -66,6 +68,7 @@ def refine(
         raise SegslamError("adjustment.max_minutes=0: nothing to do; give a limit with --refine-minutes")
     reference = recorded.reference()
     compile_kernels(quiet=quiet)
+    make_room(out, overwrite=overwrite, inputs=[run])
     folder = new_folder(out)
     when_stopped(f"the log in {folder} is kept, without results")
     with Run(
@@ -83,6 +86,7 @@ def refine(
             interrupted = False
         if interrupted:
             raise typer.Exit(EXIT_STATUS)
+        copy_alone(recorded.path.parent, folder)
         files = [folder / name for name in WITH_MAP] if with_map else []
         finish(made, reference, map_files=files, json=json, quiet=quiet, search_s=0.0)
 

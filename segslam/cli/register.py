@@ -8,6 +8,7 @@ from typer.core import TyperCommand
 
 from segslam.cli.checks import check_exists
 from segslam.cli.compiling import compile_kernels
+from segslam.cli.completion import METHODS, labels_or_files, one_of
 from segslam.cli.console import (
     ConfigOption,
     EncodingOption,
@@ -50,15 +51,21 @@ def _is_word(label_source: str) -> bool:
 def register(
     source: Annotated[Path, typer.Argument(help="Scan to align: .bin, .npy, .ply or .pcd.")],
     target: Annotated[Path, typer.Argument(help="Fixed scan.")],
-    dataset: Annotated[str | None, typer.Option(help="kitti: apply KITTI's correction of the vertical angles.")] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(autocompletion=one_of("kitti"), help="kitti: apply KITTI's correction of the vertical angles."),
+    ] = None,
     labels: Annotated[
         list[str] | None,
         typer.Option(
-            help="Labels: two .label files (source, target), geometric (default), network:MODEL.onnx, or none."
+            autocompletion=labels_or_files,
+            help="Labels: two .label files (source, target), geometric (default), network:MODEL.onnx, or none.",
         ),
     ] = None,
     encoding: EncodingOption = None,
-    method: Annotated[str, typer.Option(help=f"Method: {', '.join(METHOD_NAMES)}.")] = "segregator-c2f",
+    method: Annotated[
+        str, typer.Option(autocompletion=METHODS, help=f"Method: {', '.join(METHOD_NAMES)}.")
+    ] = "segregator-c2f",
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="Refine the coarse pose with GICP (method segregator-c2f).")
     ] = True,

@@ -1,5 +1,6 @@
 """`segslam replay`."""
 
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from itertools import tee
 from pathlib import Path
@@ -22,14 +23,18 @@ from segslam.cli.console import (
 from segslam.cli.ending import finish
 from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
 from segslam.cli.in_map import pipeline
+from segslam.cli.overwriting import OverwriteOption, make_room
+from segslam.loop_edits import LoopEdits
 from segslam.system.interrupts import EXIT_STATUS, when_stopped
 
 if TYPE_CHECKING:
     from segslam.config import Config
     from segslam.log import RunLog
     from segslam.run.run import Run
+    from segslam.slam_result import SlamResult
     from segslam.types import Step, Trajectory
 
+NO_EDITS = LoopEdits()
 BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "keyframes", "geometric")
 """Sections of the settings that a replay cannot change, because the log contains their results."""
 
@@ -41,6 +46,7 @@ def replay(
     settings: SetOption = None,
     refine_minutes: RefineMinutesOption = None,
     foxglove: FoxgloveOption = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -48,14 +54,42 @@ def replay(
 
     Example: segslam replay runs/00/log.mcap --out runs/00-strict --set verify.min_overlap=0.6
     """
+    replay_log(
+        log,
+        out,
+        config=config,
+        settings=with_minutes(settings, refine_minutes),
+        foxglove=foxglove,
+        overwrite=overwrite,
+        json=json,
+        quiet=quiet,
+    )
+
+
+def replay_log(
+    log: Path,
+    out: Path,
+    *,
+    config: Path | None,
+    settings: list[str],
+    foxglove: str | None = None,
+    edits: LoopEdits = NO_EDITS,
+    after: "Callable[[SlamResult], Mapping[str, Any]]" = lambda result: {},
+    overwrite: bool,
+    json: bool,
+    quiet: bool,
+) -> None:
+    """Repeat a run from its log into a new folder; `edits` follow those of the run.
+
+    `after` returns further figures, from the result. Raises typer.Exit(130) if Ctrl-C ended it early.
+    """
     from segslam.config import load_config
 
     check_exists(log, "give a run folder, or its log.mcap")
-    settings = with_minutes(settings, refine_minutes)
     load_config(config, settings)  # reports a wrong setting before the log is read
     announce(f"replay: reading {log}", quiet=quiet)
     from segslam.log import read_log
-    from segslam.run.folder import log_of, new_folder
+    from segslam.run.folder import copy_alone, log_of, new_folder
     from segslam.run.run import Run
     from segslam.slam import Slam
 
@@ -65,28 +99,34 @@ def replay(
     reference = recorded.reference()
     in_map = recorded.options.get("in_map")
     slam_of = pipeline(Path(in_map) if in_map else None)
+    in_all = LoopEdits.from_json(recorded.options.get("edits", "")).and_then(edits)
+    options = {"in_map": in_map} if in_map else {"edits": in_all.to_json()} if in_all != LoopEdits() else {}
     compile_kernels(quiet=quiet)
     with ExitStack() as stack:
         server = serve_foxglove(foxglove, stack, quiet=quiet)
+        make_room(out, overwrite=overwrite, inputs=[log])
         folder = new_folder(out)
         when_stopped(f"the log in {folder} is kept, without results")
         run = stack.enter_context(
             Run(
                 folder,
-                (slam_of or Slam)(settings_now),
+                slam_of(settings_now) if slam_of else Slam(settings_now, edits=in_all),
                 dataset=recorded.run.get("dataset", ""),
                 T_camera_lidar=recorded.T_camera_lidar,
                 reference=reference,
-                options={"in_map": in_map} if in_map else {},
+                options=options,
                 mirror=server.send if server else None,
             )
         )
+        copy_alone(recorded.path.parent, folder)
         changes, interrupted = _repeat(run, recorded, quiet=quiet)
         if interrupted and run.num_steps == 0:
             when_stopped("nothing was written")
             raise typer.Exit(EXIT_STATUS)
         more = changes | _recorded_accuracy(recorded, reference)
-        finish(run, reference, json=json, quiet=quiet, more=lambda _: more)
+        finish(
+            run, reference, json=json, quiet=quiet, more=lambda result: {**more, **after(result)}, stopped=interrupted
+        )
     if interrupted:
         when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps were replayed; results in {folder}")
         raise typer.Exit(EXIT_STATUS)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from segslam.cli.completion import presets
 from segslam.cli.console import (
     ConfigOption,
     DatasetOption,
@@ -21,6 +22,7 @@ from segslam.cli.console import (
 )
 from segslam.cli.export import WITH_MAP
 from segslam.cli.foxglove import FoxgloveOption
+from segslam.cli.overwriting import OverwriteOption
 from segslam.system.whole_files import check_target
 
 if TYPE_CHECKING:
@@ -37,7 +39,11 @@ OdometryOption = Annotated[
 ]
 PresetOption = Annotated[
     str,
-    typer.Option("--preset", help="Settings for an environment: driving, campus or indoor; auto: by DATA."),
+    typer.Option(
+        "--preset",
+        autocompletion=presets,
+        help="Settings for an environment: driving, campus or indoor; auto: by the scans.",
+    ),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in --out.")]
 DryRunOption = Annotated[
@@ -66,6 +72,7 @@ class OutputOptions:
     map_file: MapFileOption = None
     view: ViewOption = False
     foxglove: FoxgloveOption = None
+    overwrite: OverwriteOption = False
     json: JsonOption = False
     quiet: QuietOption = False
 

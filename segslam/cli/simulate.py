@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from segslam.cli.completion import SENSORS, one_of, simulation_settings
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
 from segslam.errors import WorkFailed
 from segslam.system.interrupts import EXIT_STATUS, interrupts_wait, same_command_with, when_stopped
@@ -21,7 +22,9 @@ def simulate(
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; default: the whole drive.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same scans.")] = 0,
-    sensor: Annotated[str, typer.Option(help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16.")] = "hdl64",
+    sensor: Annotated[
+        str, typer.Option(autocompletion=one_of(*SENSORS), help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16.")
+    ] = "hdl64",
     lane: Annotated[
         float, typer.Option(min=-4, max=4, help="Offset to the left of the path (m); negative: to the right.")
     ] = 0.0,
@@ -31,6 +34,7 @@ def simulate(
         typer.Option(
             "--set",
             metavar="SECTION.KEY=VALUE",
+            autocompletion=simulation_settings,
             help="Change a setting of the world or the sensor, for example world.cars=3.",
         ),
     ] = None,

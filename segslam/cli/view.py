@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
+from segslam.cli.overwriting import OverwriteOption, check_free
 from segslam.errors import SegslamError, WorkFailed
 from segslam.system.extras import how_to_install
 
@@ -21,6 +22,7 @@ def view(
     save: Annotated[
         Path | None, typer.Option(help="Write a .rrd file for Rerun instead of opening the viewer.")
     ] = None,
+    overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -30,6 +32,7 @@ def view(
     """
     if save is None:
         check_display()
+    check_free([save] if save else [], overwrite=overwrite)
     announce(f"view: reading {run}", quiet=quiet)
     from segslam.log import read_log
     from segslam.run.folder import log_of

@@ -46,8 +46,9 @@ def open_dataset(
     """Open a folder or recording; its scans are read when they are accessed.
 
     `dataset`: kind of data (`kitti`, or a name of one of kiss_icp's readers), by default detected. `labels`: `auto`,
-    `none`, `geometric`, `network:MODEL.onnx` or a folder. `frames`: numbers of the scans as `A:B`, B excluded. `topic`:
-    point cloud topic of a recording with several. Scans have `intensities` only if requested and known.
+    `none`, `geometric`, `network:MODEL.onnx` or a folder. `frames`: numbers of the scans as `A:B` or `A:B:STEP`, B
+    excluded. `topic`: point cloud topic of a recording with several. Scans have `intensities` only if requested and
+    known.
     `vertical_angle_deg`: correction added to the elevation of all points; by default 0.205 degrees for data in KITTI's
     layout, whose points are too low by this angle, and 0 for other data. Raises SegslamError, naming the file and the
     remedy.

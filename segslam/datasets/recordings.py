@@ -166,9 +166,7 @@ def open_recording(
 
     Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan.
     """
-    from kiss_icp.datasets import available_dataloaders
-
-    kinds = sorted({"kitti", *available_dataloaders()})
+    kinds = known_kinds()
     if kind is not None and kind not in kinds:
         raise SegslamError(f"--dataset {kind}: no such kind of data; known: {', '.join(kinds)}")
     kind = kind or _kind_of(data)
@@ -255,3 +253,10 @@ def _whole_stamps(times_file: Path, num_scans: int) -> Indices | None:
 
 def _reason(error: BaseException) -> str:
     return brief(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__, 300)
+
+
+def known_kinds() -> list[str]:
+    """Names for `dataset`: kitti, and those of kiss_icp's readers."""
+    from kiss_icp.datasets import available_dataloaders
+
+    return sorted({"kitti", *available_dataloaders()})

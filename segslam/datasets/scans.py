@@ -154,19 +154,23 @@ def check_num_poses(file: Path, num_poses: int, num_recorded: int) -> None:
 def selected_rows(scan_index: Indices, frames: str | None, source: Path) -> Indices:
     """Rows of the scans with numbers in `A:B` (A included, B excluded; either may be omitted); all rows for None.
 
-    Raises SegslamError for another form, and if no scan is selected.
+    Of `A:B:STEP`, the numbers A, A + STEP, ... are selected. Raises SegslamError for another form, and if no scan is
+    selected.
     """
     if frames is None:
         return np.arange(len(scan_index))
-    first, colon, last = frames.partition(":")
-    if not colon or not all(text.strip().isdecimal() for text in (first, last) if text):
-        raise SegslamError(f"--frames {frames}: write A:B, scans A to B - 1, for example 0:100")
+    first, last, step = (*frames.split(":"), "", "")[:3]
+    if frames.count(":") not in (1, 2) or not all(text.strip().isdecimal() for text in (first, last, step) if text):
+        raise SegslamError(f"--frames {frames}: write A:B, scans A to B - 1, or A:B:STEP, for example 0:100 or ::2")
+    if step and int(step) == 0:
+        raise SegslamError(f"--frames {frames}: STEP must be at least 1")
     start, stop = min(int(first or 0), NO_LIMIT), min(int(last or NO_LIMIT), NO_LIMIT)
     if start >= stop:
         raise SegslamError(f"--frames {frames}: selects no scan, B must be greater than A")
     if last and stop > scan_index[-1] + 1 and start <= scan_index[-1]:
         logger.warning("--frames %s: the last scan of %s is %d", frames, source, scan_index[-1])
-    rows = np.flatnonzero((scan_index >= start) & (scan_index < stop))
+    is_inside = (scan_index >= start) & (scan_index < stop)
+    rows = np.flatnonzero(is_inside & ((scan_index - start) % min(int(step or 1), NO_LIMIT) == 0))
     if len(rows) == 0:
         raise SegslamError(f"--frames {frames}: {source} has no such scan, only {scan_index[0]} to {scan_index[-1]}")
     return rows

@@ -7,6 +7,7 @@ and one tile, whatever the length of the drive.
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,7 +22,7 @@ from segslam.system.interrupts import removed_when_stopped
 from segslam.system.whole_files import check_target, whole_file
 from segslam.types import Keyframe, SegslamError, Transform
 
-__all__ = ["MapSummary", "check_names", "write_map"]
+__all__ = ["MapSummary", "check_files", "check_names", "write_map"]
 
 KINDS: dict[str, type[MapFile]] = {
     ".ply": PlyCloud,
@@ -56,6 +57,15 @@ def check_names(files: Sequence[Path]) -> None:
             check_las(file)
 
 
+def check_files(files: Sequence[Path]) -> None:
+    """Raises SegslamError as `check_names`, for a file that cannot be written, or for one that is given twice."""
+    check_names(files)
+    for file in files:
+        check_target(file)
+        if files.count(file) > 1:
+            raise SegslamError(f"{file}: given twice; give each file once")
+
+
 def _unseen(parts: Iterator[Part], _: int) -> Iterator[Part]:
     return parts
 
@@ -74,9 +84,7 @@ def write_map(
     show progress. Raises SegslamError for another extension, a missing folder, or if no keyframe has a point; raises
     OSError if the disk is full.
     """
-    check_names(files)
-    for file in files:
-        check_target(file)
+    check_files(files)
     with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name, removed_when_stopped(Path(name)):
         scratch = Path(name)
         store = MapStore(scratch, config)
@@ -109,9 +117,10 @@ def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scra
         num_points += len(part.points)
         for writer in writers:
             writer.add(part)
-    for file, folder, writer in zip(files, folders, writers, strict=True):
+    for writer in writers:
         writer.close()
-        for made in folder.iterdir():  # a grid is two files
-            with whole_file(file.parent / made.name) as unfinished:
-                shutil.move(made, unfinished)
+    with ExitStack() as complete:
+        for file, folder in zip(files, folders, strict=True):
+            for made in folder.iterdir():  # a grid is two files
+                shutil.move(made, complete.enter_context(whole_file(file.parent / made.name)))
     return num_points

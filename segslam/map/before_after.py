@@ -26,6 +26,7 @@ DETAIL_M = 30.0
 """Chosen: smallest half width of the detail."""
 TRUSTED = 0.5
 """Closures with at least this weight are kept by the optimiser."""
+NO_LOOP = "after: adjusted as a whole; no loop was found"
 BEFORE, AFTER, BACKGROUND = "#E69F00", "#56B4E9", "#10141a"
 
 
@@ -59,9 +60,10 @@ class BeforeAfter:
         rows = [panels for panels in (self._whole, self._detail) if panels]
         heights = [panels[0].height_per_width for panels in rows]
         layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
-        figure = Figure(figsize=(12.0, 6.0 * sum(heights) + 0.3), facecolor=BACKGROUND, layout=layout)
+        figure = Figure(figsize=(12.0, 6.0 * sum(heights) + 0.5), facecolor=BACKGROUND, layout=layout)
         grid = figure.subplots(len(rows), 2, squeeze=False, height_ratios=heights)
-        titles = ("before: odometry only", f"after: corrected by {len(self._loops)} loops")
+        num = len(self._loops)
+        titles = ("before: odometry only", f"after: corrected by {num} loop{'s' * (num != 1)}" if num else NO_LOOP)
         for row, panels in zip(grid, rows, strict=True):
             brightest = max(panel.brightest() for panel in panels)
             for axes, panel, poses, color in zip(row, panels, self._maps, (BEFORE, AFTER), strict=True):

@@ -2,7 +2,8 @@
 
 import multiprocessing
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from typing import Any
@@ -26,9 +27,10 @@ class OdometryApart(KissOdometry):
     that uses this class needs `if __name__ == "__main__":`.
     """
 
-    def __init__(self, config: OdometryConfig) -> None:
+    def __init__(self, config: OdometryConfig, *, keeps_alone: bool = False) -> None:
+        """`keeps_alone` as for `KissOdometry`; the other process aligns these scans while this one continues."""
         self._apart = _AlignerApart(config)
-        super().__init__(config, self._apart)
+        super().__init__(config, self._apart, keeps_alone=keeps_alone)
 
     def __enter__(self) -> "OdometryApart":
         return self
@@ -45,6 +47,9 @@ class _AlignerApart:
     """A `KissAligner` in another process, which handles one request at a time."""
 
     def __init__(self, config: OdometryConfig) -> None:
+        self._alone: list[Transform] = []
+        self._is_waiting = False
+        """True while an answer to `align_alone` has not been received."""
         context = multiprocessing.get_context("spawn")  # a fork would copy locks held by other threads
         self._pipe, theirs = context.Pipe()
         shared = _room_for_points(context)
@@ -55,11 +60,7 @@ class _AlignerApart:
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
         """T_odom_lidar of the next sweep, `gap` intervals after the previous one."""
-        sent: Points | int = points
-        if len(points) <= len(self._shared):
-            self._shared[: len(points)] = points
-            sent = len(points)
-        return self._exchange((sent, gap))
+        return self._exchange((self._shared_or_sent(points), gap))
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
@@ -67,16 +68,48 @@ class _AlignerApart:
         """As `Odometry.follow`."""
         self._exchange((list(scans), T_odom_lidar, T_before_lidar))
 
+    def align_alone(self, points: Points, gap: float = 1.0) -> None:
+        """As `Aligner.align_alone`; the other process works while this one continues."""
+        request = (self._shared_or_sent(points), gap, None, None)
+        with self._reported():
+            self._pipe.send(request)
+        self._is_waiting = True
+
+    def alone(self) -> list[Transform]:
+        """As `Aligner.alone`, also after `close`."""
+        if self._is_waiting:
+            self._is_waiting = False
+            with self._reported():
+                self._alone.append(self._pipe.recv())
+        return self._alone
+
+    def _shared_or_sent(self, points: Points) -> Points | int:
+        """The number of the points, which are then in the shared memory, or the points if they are too many."""
+        self.alone()  # the shared memory is in use until then
+        if len(points) > len(self._shared):
+            return points
+        self._shared[: len(points)] = points
+        return len(points)
+
     def _exchange(self, request: tuple[Any, ...]) -> Transform:
-        try:
+        self.alone()
+        with self._reported():
             self._pipe.send(request)
             answer: Transform = self._pipe.recv()
+        return answer
+
+    @contextmanager
+    def _reported(self) -> Iterator[None]:
+        """Context manager that raises SegslamError if the process has ended."""
+        try:
+            yield
         except (EOFError, OSError) as error:
             raise self._ended() from error
-        return answer
 
     def close(self) -> None:
         """End the process."""
+        with suppress(SegslamError):  # the process has ended already
+            self.alone()
         note_peak_of(self._process.pid)
         self._pipe.close()
         self._process.join()
@@ -105,8 +138,8 @@ def _as_points(shared: Any) -> Points:
 def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
     """Answer requests with a pose until the other side closes the pipe.
 
-    Two values are the points and the gap of a sweep to align, three the arguments of `follow`. Points are sent
-    themselves or, if they are in the shared memory, as their number.
+    Two values are the points and the gap of a sweep to align, four those of one to `align_alone`, three the arguments
+    of `follow`. Points are sent themselves or, if they are in the shared memory, as their number.
     """
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and then closes the pipe
@@ -119,7 +152,12 @@ def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
                 aligner.follow(*request)
                 pipe.send(request[1])
                 continue
-            sent, gap = request
-            pipe.send(aligner.align(shared_points[:sent] if isinstance(sent, int) else sent, gap))
+            sent, gap = request[:2]
+            points = shared_points[:sent] if isinstance(sent, int) else sent
+            if len(request) == 4:
+                aligner.align_alone(points, gap)
+                pipe.send(aligner.alone().pop())
+            else:
+                pipe.send(aligner.align(points, gap))
     except (EOFError, OSError):
         return

@@ -1,6 +1,7 @@
 """KISS-ICP (Vizzo et al., RA-L 2023), using the package of its authors."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -11,7 +12,7 @@ from kiss_icp.kiss_icp import KissICP
 from segslam import geometry
 from segslam.config import OdometryConfig
 from segslam.odometry.sweep import OdometryResult, deskew_scan
-from segslam.types import Points, Scan, Transform
+from segslam.types import BadScan, Points, Scan, Transform
 
 
 @runtime_checkable
@@ -28,13 +29,22 @@ class Aligner(Protocol):
         """As `Odometry.follow`."""
         ...
 
+    def align_alone(self, points: Points, gap: float = 1.0) -> None:
+        """Align a sweep as well with KISS-ICP as it was before the first `follow`; `alone` returns the pose."""
+        ...
+
+    def alone(self) -> list[Transform]:
+        """The pose of each sweep passed to `align_alone`."""
+        ...
+
 
 class KissAligner:
     """KISS-ICP's aligner. Its threads sum in any order: poses repeat to 1e-9 m, with one thread exactly."""
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
-        self._kiss = KissICP(_kiss_config(config))
+        self._kiss = self._first = KissICP(_kiss_config(config))
+        self._alone: list[Transform] = []
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
@@ -52,11 +62,22 @@ class KissAligner:
         KISS-ICP predicts with the last motion; here it is scaled to `gap` intervals, and back to one interval
         afterwards.
         """
-        kiss = self._kiss
-        kiss.last_delta = geometry.scaled(kiss.last_delta, gap)
-        kiss.register_frame(points, np.empty(0))
-        kiss.last_delta = geometry.scaled(kiss.last_delta, 1 / gap)
-        return np.array(kiss.last_pose)
+        return _registered(self._kiss, points, gap)
+
+    def align_alone(self, points: Points, gap: float = 1.0) -> None:
+        """As `Aligner.align_alone`."""
+        self._alone.append(_registered(self._first, points, gap))
+
+    def alone(self) -> list[Transform]:
+        """As `Aligner.alone`."""
+        return self._alone
+
+
+def _registered(kiss: KissICP, points: Points, gap: float) -> Transform:
+    kiss.last_delta = geometry.scaled(kiss.last_delta, gap)
+    kiss.register_frame(points, np.empty(0))
+    kiss.last_delta = geometry.scaled(kiss.last_delta, 1 / gap)
+    return np.array(kiss.last_pose)
 
 
 class KissOdometry:
@@ -64,9 +85,13 @@ class KissOdometry:
 
     is_from_scans = True
 
-    def __init__(self, config: OdometryConfig, aligner: Aligner | None = None) -> None:
+    def __init__(self, config: OdometryConfig, aligner: Aligner | None = None, *, keeps_alone: bool = False) -> None:
+        """`keeps_alone`: keep the poses of `alone`, for which each scan is aligned twice after the first `follow`."""
         self._config = config
         self._aligner = aligner or KissAligner(config)
+        self._keeps_alone, self._has_followed = keeps_alone, False
+        self._before_following: list[Transform] = []
+        self._last_gap = 1.0
         self._T_odom_last = self._T_last_lidar = np.eye(4)
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
@@ -76,6 +101,8 @@ class KissOdometry:
         """
         points, labels, intensities = deskew_scan(scan, self._T_last_lidar, self._config)
         T_odom_lidar = self._aligner.align(points, gap)
+        if self._keeps_alone:
+            self._register_alone(scan, points, T_odom_lidar, gap)
         self._now_at(T_odom_lidar)
         self._T_last_lidar = geometry.scaled(self._T_last_lidar, 1 / gap)
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
@@ -89,8 +116,25 @@ class KissOdometry:
         last: Scan | None = None,
     ) -> None:
         """Continue from another pose of the last scan, with a local map of these scans alone."""
+        self._has_followed = True
         self._aligner.follow(scans, T_odom_lidar, T_before_lidar)
         self._T_odom_last, self._T_last_lidar = T_odom_lidar, T_before_lidar
+
+    def alone(self) -> Sequence[Transform]:
+        """The pose of each scan by KISS-ICP alone, without corrections by `follow`; empty if they are not kept."""
+        return [*self._before_following, *self._aligner.alone()]
+
+    def _register_alone(self, scan: Scan, points: Points, T_odom_lidar: Transform, gap: float) -> None:
+        """Keep the pose by KISS-ICP alone; `points` and the pose are those of the scan here."""
+        if not self._has_followed:
+            self._before_following.append(T_odom_lidar)
+        else:
+            before, last = [np.eye(4), np.eye(4), *self.alone()][-2:]
+            T_last_lidar = geometry.scaled(_since(before, last), 1 / self._last_gap)
+            with suppress(BadScan):
+                points = deskew_scan(scan, T_last_lidar, self._config)[0]
+            self._aligner.align_alone(points, gap)
+        self._last_gap = gap
 
     def _now_at(self, T_odom_lidar: Transform) -> None:
         self._T_last_lidar = _since(self._T_odom_last, T_odom_lidar)

@@ -1,6 +1,6 @@
 """Front end of the pipeline: odometry, its check, and selection of keyframes. It uses no graph and no log."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -39,9 +39,8 @@ class Tracker:
     def __init__(self, config: Config, *, odometry: Odometry | None = None) -> None:
         """`odometry` replaces KISS-ICP."""
         self._config = config
-        self._odometry = CheckedOdometry(
-            odometry or KissOdometry(config.odometry), config, recover=partial(register, config=config)
-        )
+        self._inner = odometry or KissOdometry(config.odometry)
+        self._odometry = CheckedOdometry(self._inner, config, recover=partial(register, config=config))
         self._selector = KeyframeSelector(config.keyframes)
         self._num_tracked = 0
         self._last_stamp_ns: int | None = None
@@ -66,6 +65,10 @@ class Tracker:
         is_keyframe = self._selector.update(T_odom_lidar, break_m=BREAK_TRAVEL_M * motion.is_break)
         kept = registered if is_keyframe else None
         return Tracked(index, scan.stamp_ns, kept, T_odom_lidar, self._selector.travel_m, motion, watch)
+
+    def alone(self) -> Sequence[Transform]:
+        """The pose of each tracked scan by KISS-ICP alone; empty if it was not kept, or for another odometry."""
+        return self._inner.alone() if isinstance(self._inner, KissOdometry) else ()
 
     def note(self, recorded: Step) -> None:
         """Note a recorded step; after `resume`, `track` continues from it."""

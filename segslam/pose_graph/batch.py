@@ -1,7 +1,9 @@
 """Optimisation of a whole pose graph from a file."""
 
 import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from time import perf_counter
 from typing import Literal
 
@@ -10,8 +12,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from segslam.pose_graph import gnc, noise
-from segslam.pose_graph.batch_search import FileProblem, least_squares, plausible, select
-from segslam.pose_graph.edges import factor_graph, joined, poses_by_id, squared_errors
+from segslam.pose_graph.batch_search import IMPLAUSIBLE, FileProblem, least_squares, plausible, select
+from segslam.pose_graph.edges import Edge, factor_graph, joined, poses_by_id, squared_errors
 from segslam.pose_graph.g2o import G2oGraph, parts
 from segslam.pose_graph.levenberg_marquardt import Search, search
 from segslam.types import SegslamError, Vector
@@ -62,9 +64,10 @@ class Optimized:
 def optimize_graph(graph: G2oGraph, *, robust: Robust = "consistent", inlier_probability: float = 0.99) -> Optimized:
     """The optimum of a graph near the file's poses or, where those are a bad guess, near chordal poses.
 
-    Edges between consecutive ids count as odometry and are always kept. All others are closures: kept (`none`), under a
-    robust kernel, or kept or rejected by graduated non-convexity (`gnc`) or starting from a pairwise-consistent set
-    (`consistent`). The bound of inliers is a chi-square that all of them are below with `inlier_probability`.
+    Edges between consecutive ids count as odometry and are always kept, unless several between the same two contradict
+    each other: then they are closures, too. All others are closures: kept (`none`), under a robust kernel, or kept or
+    rejected by graduated non-convexity (`gnc`) or starting from a pairwise-consistent set (`consistent`). The bound of
+    inliers is a chi-square that all of them are below with `inlier_probability`.
     If odometry alone does not connect the graph, `gnc` raises SegslamError, and `consistent` falls back to `cauchy`.
     """
     problem = FileProblem.of(graph, inlier_probability)
@@ -144,8 +147,28 @@ def _described(
         outliers=tuple((edge.a, edge.b) for edge, out in zip(problem.closures, is_outlier, strict=True) if out),
         chi2_per_dof=chi2 / redundancy if redundancy > 0 else None,
         chi2_quantiles=(median, p95, most),
-        doubts=tuple(_warnings(found, chi2, redundancy, float(fitted.mean()) if len(fitted) else 1.0)),
+        doubts=(
+            *_warnings(found, chi2, redundancy, float(fitted.mean()) if len(fitted) else 1.0),
+            *_poor_edges([*problem.odometry, *compress(problem.closures, fitted)], spread),
+            *(
+                f"the edges between {a} and {b} contradict each other, and no closure shows which is correct"
+                for a, b in problem.undecided(fitted.astype(float))
+            ),
+        ),
     )
+
+
+def _poor_edges(edges: Sequence[Edge], chi2: Vector) -> Iterator[str]:
+    """The kept edge that fits worst, if its chi-square is improbable for the largest of so many."""
+    if len(chi2) == 0:
+        return
+    worst = int(np.argmax(chi2))
+    if len(chi2) * chdtrc(noise.DEGREES_OF_FREEDOM, chi2[worst]) < IMPLAUSIBLE:
+        edge = edges[worst]
+        yield (
+            f"the edge from {edge.a} to {edge.b} is kept with a chi-square of {chi2[worst]:.6g}, far above the "
+            f"{noise.DEGREES_OF_FREEDOM} that its information claims"
+        )
 
 
 def _warnings(found: Search, chi2: float, redundancy: int, share: float) -> list[str]:

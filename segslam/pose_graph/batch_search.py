@@ -7,9 +7,9 @@ import gtsam
 import numpy as np
 from scipy.special import chdtrc
 
-from segslam import geometry
 from segslam.pose_graph import noise
-from segslam.pose_graph.closure_pairs import adjoints, consistent_pairs, ends_m, largest_consistent, neighbours
+from segslam.pose_graph.closure_pairs import consistent_pairs, ends_m, largest_consistent, neighbours
+from segslam.pose_graph.contradictions import contradicting, turned, unknown_motion
 from segslam.pose_graph.edges import Edge
 from segslam.pose_graph.g2o import G2oGraph
 from segslam.pose_graph.gnc import Solution, TruncatedProblem, better, settle, solve
@@ -39,29 +39,46 @@ class FileProblem:
     num_vertices: int
     first_id: int
     odometry: list[Edge]
-    """Edges between consecutive ids."""
+    """Edges between consecutive ids; where several contradict each other, one without information."""
     closures: list[Edge]
+    """All other edges, and those between consecutive ids that contradict each other."""
+    contradicting: list[list[Edge]]
+    """Edges between the same neighbours that contradict each other."""
     inlier_bound: float
     """Chi-square that all closures, if all are inliers, are below with the given probability."""
 
     @classmethod
     def of(cls, graph: G2oGraph, inlier_probability: float) -> "FileProblem":
         """The edges of a graph."""
-        odometry = [edge for edge in graph.edges if abs(edge.a - edge.b) == 1]
-        closures = [edge for edge in graph.edges if abs(edge.a - edge.b) != 1]
+        groups = contradicting([edge for edge in graph.edges if abs(edge.a - edge.b) == 1])
+        moved = {id(edge) for edges in groups for edge in edges}
+        odometry = [edge for edge in graph.edges if abs(edge.a - edge.b) == 1 and id(edge) not in moved]
+        odometry += [unknown_motion(edges) for edges in groups]
+        closures = [edge for edge in graph.edges if abs(edge.a - edge.b) != 1 or id(edge) in moved]
         each = 1.0 - (1.0 - inlier_probability) / max(1, len(closures))
         first_id = min(graph.T_world_vertex)
-        return cls(len(graph.T_world_vertex), first_id, odometry, closures, noise.inlier_bound(each))
+        return cls(len(graph.T_world_vertex), first_id, odometry, closures, groups, noise.inlier_bound(each))
 
     def redundancy(self, weights: Vector) -> int:
         """Degrees of freedom of the edges beyond those of the poses, without the closures of weight 0."""
-        num_edges = len(self.odometry) + int((weights > 0.0).sum())
+        num_edges = len(self.odometry) - len(self.contradicting) + int((weights > 0.0).sum())
         return noise.DEGREES_OF_FREEDOM * (num_edges - self.num_vertices + 1)
+
+    def undecided(self, weights: Vector) -> list[tuple[int, int]]:
+        """The neighbours whose contradicting edges no kept closure (of weight above 0) across them decides."""
+        moved = {id(edge) for edges in self.contradicting for edge in edges}
+        across = [
+            (min(edge.a, edge.b), max(edge.a, edge.b))
+            for edge, weight in zip(self.closures, weights, strict=True)
+            if weight > 0.0 and id(edge) not in moved
+        ]
+        pairs = [sorted((edges[0].a, edges[0].b)) for edges in self.contradicting]
+        return [(a, b) for a, b in pairs if not any(first <= a and b <= last for first, last in across)]
 
     def chain(self) -> tuple[list[Edge], list[Edge]]:
         """One motion from each vertex to the next, and the closures, with vertices numbered from 0."""
         motions = {min(edge.a, edge.b): edge for edge in reversed(self.odometry)}  # the first of several stays
-        forwards = [edge if edge.a < edge.b else _turned(edge) for _, edge in sorted(motions.items())]
+        forwards = [edge if edge.a < edge.b else turned(edge) for _, edge in sorted(motions.items())]
         return _renumbered(forwards, self.first_id), _renumbered(self.closures, self.first_id)
 
 
@@ -134,12 +151,6 @@ def _generous(truncated: TruncatedProblem, solution: Solution) -> Solution:
         return solution
     found = search(truncated.weighted(wider.astype(float)), solution.search.values)
     return better(solution, settle(truncated, found.values, solution.search.iterations + found.iterations))
-
-
-def _turned(edge: Edge) -> Edge:
-    """The same measurement from the other vertex."""
-    turn = adjoints(geometry.inverse(edge.T_a_b)[None])[0]  # of information: the inverse transposed of covariances'
-    return Edge(edge.b, edge.a, geometry.inverse(edge.T_a_b), turn.T @ edge.information @ turn)
 
 
 def _renumbered(edges: list[Edge], first: int) -> list[Edge]:

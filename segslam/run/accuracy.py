@@ -3,20 +3,27 @@
 import numpy as np
 
 from segslam.evaluation import loop_metrics, trajectory_metrics
+from segslam.run.folder import ALONE
 from segslam.slam import SlamResult
 from segslam.trajectory import Poses, rows_of_same_scan
 from segslam.types import IndexPairs, LoopClosure, Trajectory
 
 
 def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
-    """The figures of `metrics.json` that need ground truth; figures of the odometry start with `odometry_`.
+    """The figures of `metrics.json` that need ground truth.
 
-    A drive localised in a map has no figures of loops, because loops within it are not searched.
+    Those of the odometry after repairs start with `odometry_`, those of KISS-ICP alone, if known, with `kiss_icp_`. A
+    drive localised in a map has no figures of loops, because loops within it are not searched.
     """
     corrected = trajectory_accuracy(result.trajectory, reference)
-    odometry = trajectory_accuracy(result.odometry, reference)
+    others = {"odometry_": result.odometry} | ({} if result.alone is None else {f"{ALONE}_": result.alone})
+    compared = {
+        prefix + name: value
+        for prefix, trajectory in others.items()
+        for name, value in trajectory_accuracy(trajectory, reference).items()
+    }
     loops = {} if result.from_map_m is not None else _loop_accuracy(result, reference)
-    return corrected | {f"odometry_{name}": value for name, value in odometry.items()} | loops
+    return corrected | compared | loops
 
 
 def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[str, float]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from segslam.config import Config
 from segslam.log import RunLog, read_log
-from segslam.run.folder import LOG, read_localised
+from segslam.run.folder import ALONE, LOG, read_alone, read_localised
 from segslam.slam import SlamResult
 from segslam.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
@@ -22,6 +22,7 @@ STAMP_TOLERANCE_NS = 10_000_000
 FIGURES = {
     "ate_m": "absolute trajectory error after alignment, rms (m)",
     "odometry_ate_m": "the same error of the odometry, after repairs by the check (m)",
+    "kiss_icp_ate_m": "the same error of KISS-ICP alone, without repairs and loops (m)",
     "are_deg": "absolute rotation error after alignment, rms (degrees)",
     "height_m": "height error after alignment, rms (m)",
     "rpe_m": "error of the motion from pose to pose, rms (m)",
@@ -29,6 +30,8 @@ FIGURES = {
     "kitti_translation_percent": "KITTI's translation error over 100 to 800 m (%)",
     "kitti_rotation_deg_per_100m": "KITTI's rotation error over 100 to 800 m (degrees per 100 m)",
     "num_poses": "poses scored",
+    "length_m": "length of the drive (m)",
+    "duration_s": "duration of the drive (s)",
     "num_scans": "scans mapped",
     "num_scans_skipped": "scans skipped (unreadable or empty)",
     "num_keyframes": "keyframes",
@@ -52,12 +55,18 @@ FIGURES = {
     "map_thickness_m": "thickness of surfaces in the map: median standard deviation about local planes (m)",
     "num_submap_pairs": "pairs of submaps registered for the adjustment",
     "adjustment_moved_m": "distance by which the adjustment moved keyframes, rms (m)",
+    "num_map_points": "points of the map",
+    "num_map_moving_points": "points removed from the map by class, as moving",
+    "num_map_voxels_seen_through": "voxels removed from the map, because other scans see through them",
+    "map_seconds": "time to write the map (s)",
     "seconds_total": "total time (s)",
     "scans_per_second": "scans per second",
     "peak_rss_mb": "peak memory (MB)",
 }
 """Meaning of the figures of `metrics.json`, the most important first."""
 
+COMPARED = ("odometry_", f"{ALONE}_")
+"""Prefixes of the figures of the odometry after repairs, and of KISS-ICP alone."""
 ACCURACY = frozenset(
     (
         *("ate_m", "are_deg", "height_m", "rpe_m", "rpe_deg", "kitti_translation_percent"),
@@ -93,7 +102,11 @@ def read_run(folder: str | Path) -> FinishedRun:
         folder=folder,
         dataset=log.run.get("dataset", ""),
         config=log.config,
-        result=replace(result, from_map_m=read_localised(folder, len(result.trajectory))),
+        result=replace(
+            result,
+            from_map_m=read_localised(folder, len(result.trajectory)),
+            alone=read_alone(folder, result.odometry),
+        ),
         reference=log.reference(),
         T_camera_lidar=log.T_camera_lidar,
         metrics=read_metrics(folder),
@@ -110,6 +123,11 @@ def read_metrics(folder: Path) -> dict[str, Any]:
         raise SegslamError(f"{file}: cannot read the figures of the run ({error}); replay its log.mcap") from error
 
 
+def plain_name(key: str) -> str:
+    """The name of a figure without the prefix of the trajectory that it measures."""
+    return next((key.removeprefix(prefix) for prefix in COMPARED if key.startswith(prefix)), key)
+
+
 def _checked_metrics(values: Any) -> dict[str, Any]:
     """The figures, without those that are null. Raises ValueError if a figure that is shown is no number."""
     if not isinstance(values, dict):
@@ -118,7 +136,7 @@ def _checked_metrics(values: Any) -> dict[str, Any]:
     times = known.get("stage_ms", {})
     if not isinstance(times, dict) or not all(isinstance(one, dict) for one in times.values()):
         raise ValueError("stage_ms is not a JSON object of objects")
-    shown = {key: value for key, value in known.items() if key.removeprefix("odometry_") in FIGURES}
+    shown = {key: value for key, value in known.items() if plain_name(key) in FIGURES}
     shown |= {f"stage_ms.{stage}.{name}": one.get(name) for stage, one in times.items() for name in ("median", "p95")}
     for key, value in shown.items():
         if isinstance(value, bool) or not isinstance(value, int | float):

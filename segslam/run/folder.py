@@ -4,6 +4,7 @@ import csv
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from segslam.errors import reason
 from segslam.system.whole_files import whole_file, write_whole
-from segslam.trajectory import camera_from_lidar, write_kitti, write_tum
+from segslam.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
 from segslam.types import LoopAttempt, LoopClosure, Mask, SegslamError, Trajectory, Transform, Vector, WorkFailed
 
 POSE_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
@@ -19,6 +20,8 @@ STAGES = ("prepare", "match", "refine", "verify")
 LOG = "log.mcap"
 ADJUSTED_GRAPH = "adjusted.g2o"
 """All edges of the last estimate, with the information with which they act."""
+ALONE = "kiss_icp"
+"""Start of the names of the files with the poses by KISS-ICP alone."""
 UNFINISHED = ".part"
 """Suffix of a file that replaces another when it is complete."""
 
@@ -47,7 +50,7 @@ def check_new(folder: Path) -> None:
     """Raises SegslamError if the new folder of a run is not empty."""
     try:
         if folder.exists() and any(folder.iterdir()):
-            raise SegslamError(f"{folder}: not empty; give another folder with --out, or remove it")
+            raise SegslamError(f"{folder}: not empty; give another folder with --out, or replace a run: --overwrite")
     except OSError as error:
         raise SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out") from error
 
@@ -68,6 +71,38 @@ def write_poses(
         poses = camera_from_lidar(poses, T_camera_lidar)
     with whole_file(folder / f"{name}_kitti.txt") as part:
         write_kitti(part, poses)
+
+
+def write_alone(folder: Path, alone: Trajectory, T_camera_lidar: Transform | None) -> None:
+    """The files of KISS-ICP alone, as `write_poses`."""
+    write_poses(folder, ALONE, alone, T_camera_lidar)
+
+
+def remove_alone(folder: Path) -> None:
+    """Remove the files of KISS-ICP alone, whose state is lost when a run is resumed."""
+    for name in (f"{ALONE}_tum.txt", f"{ALONE}_kitti.txt"):
+        (folder / name).unlink(missing_ok=True)
+
+
+def copy_alone(source: Path, target: Path) -> None:
+    """Copy the files of KISS-ICP alone to another run of the same scans, if the first has them."""
+    for name in (f"{ALONE}_tum.txt", f"{ALONE}_kitti.txt"):
+        if (source / name).is_file():
+            write_whole(target / name, (source / name).read_bytes())
+
+
+def read_alone(folder: Path, scans: Trajectory) -> Trajectory | None:
+    """The poses of all scans by KISS-ICP alone; None if the folder does not contain them.
+
+    Raises SegslamError if the file is not one of these scans.
+    """
+    file = folder / f"{ALONE}_tum.txt"
+    if not file.is_file():
+        return None
+    poses = read_poses(file, format="tum")
+    if poses.stamp_ns is None or not np.array_equal(poses.stamp_ns, scans.stamp_ns):
+        raise SegslamError(f"{file}: not of the scans of this run; remove the file")
+    return replace(scans, T_world_lidar=poses.T_a_b)
 
 
 def write_localised(folder: Path, trajectory: Trajectory, from_map_m: Vector, localised: Mask) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from segslam.config import Config
 from segslam.datasets import Dataset, DataSource
+from segslam.odometry import KissOdometry
 from segslam.presets import extent_m, preset, preset_for
 from segslam.run.accuracy import accuracy
 from segslam.run.finished import FinishedRun, read_run
@@ -69,7 +70,11 @@ def map_folder(
     not_resumed = [name for name, value in own.items() if value is not None]
     with Run(
         folder,
-        slam_of(config, odometry=odometry, labeller=labeller_of(scans)),
+        slam_of(
+            config,
+            odometry=odometry or KissOdometry(config.odometry, keeps_alone=True),
+            labeller=labeller_of(scans),
+        ),
         dataset=scans.name,
         T_camera_lidar=scans.T_camera_lidar,
         reference=scans.reference,

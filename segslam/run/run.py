@@ -21,11 +21,23 @@ from segslam.datasets import Dataset
 from segslam.log import LogWriter, Mirror, RunLog
 from segslam.log.drawing import CloudOf
 from segslam.pose_graph import PoseGraph
-from segslam.run.folder import ADJUSTED_GRAPH, LOG, UNFINISHED, room_for, write_localised, write_loops, write_poses
+from segslam.run.folder import (
+    ADJUSTED_GRAPH,
+    LOG,
+    UNFINISHED,
+    read_alone,
+    remove_alone,
+    room_for,
+    write_alone,
+    write_localised,
+    write_loops,
+    write_poses,
+)
 from segslam.slam import Slam, SlamResult, Tracked
 from segslam.system.memory import peak_mb
 from segslam.system.threads import in_other_thread
 from segslam.system.whole_files import write_whole
+from segslam.trajectory import travelled_m
 from segslam.types import (
     BadScan,
     LoopClosure,
@@ -142,6 +154,7 @@ class Run:
 
         self._slam.resume(scan_of)
         self._log.move(recorded.path)
+        remove_alone(self.folder)
         self.num_scans_resumed = len(taken)
         self._started_mapping = perf_counter()
         self._next_row = taken[-1][0] + 1 if taken else 0
@@ -198,6 +211,8 @@ class Run:
         else:
             figures = result.adjusted.record.figures()
             self._note_ms("adjust", result.adjusted.record.seconds)
+        if result.alone is None:
+            result = replace(result, alone=read_alone(self.folder, result.odometry))  # a replay has a copy
         late = result.attempts[len(result.attempts) - result.num_late_attempts :]
         self._log.write_result(result.estimate, result.trajectory, late, result.adjusted)
         self._log.close()
@@ -207,6 +222,8 @@ class Run:
             if result.from_map_m is not None:
                 write_localised(self.folder, result.trajectory, result.from_map_m, result.localised())
             write_poses(self.folder, "odometry", result.odometry, self._T_camera_lidar)
+            if result.alone is not None:
+                write_alone(self.folder, result.alone, self._T_camera_lidar)
             self._slam.graph.write_g2o(self.folder / "graph.g2o")
             if isinstance(self._slam.graph, PoseGraph):
                 self._slam.graph.write_adjusted_g2o(self.folder / ADJUSTED_GRAPH)
@@ -215,6 +232,8 @@ class Run:
         return result, {
             "num_scans": len(result.trajectory),
             "num_scans_skipped": self.num_scans_skipped,
+            "length_m": float(travelled_m(result.trajectory.T_world_lidar)[-1]),
+            "duration_s": float(np.ptp(result.trajectory.stamp_ns)) / 1e9,
             "num_keyframes": len(result.keyframe_rows),
             "num_motions_repaired": _count(result, MotionState.REPAIRED, MotionState.REJOINED),
             "num_motions_broken": _count(result, MotionState.BROKEN),

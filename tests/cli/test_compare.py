@@ -1,6 +1,7 @@
 """`segslam compare`, `eval --plot` and `doctor` as typed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,9 @@ from helpers.finished_run import make_run
 from matplotlib.image import imread
 
 from segslam.cli import doctor
+from segslam.run.finished import read_run
 from segslam.run.folder import write_metrics
+from segslam.run.report.comparison import by_data, draw_runs
 from segslam.trajectory import write_kitti
 
 
@@ -58,6 +61,23 @@ def test_runs_that_cannot_be_compared_are_reported_in_one_line(
     message = capsys.readouterr().err.strip()
     assert expected in message
     assert len(message.splitlines()) == 1
+
+
+def test_runs_of_different_data_are_not_compared_with_the_truth_of_each_other(runs: list[Path], tmp_path: Path) -> None:
+    one, two = (read_run(folder) for folder in runs)
+    assert by_data({"one": one, "two": two}) == [["one", "two"]]
+    assert one.reference is not None
+    turned = replace(one.reference, T_world_lidar=one.reference.T_world_lidar * [[[2.0], [2.0], [1.0], [1.0]]])
+    other = replace(two, dataset="another", reference=turned)
+    assert by_data({"one": one, "other": other, "two": two}) == [["one", "two"], ["other"]]
+    assert by_data({"two": two, "other": replace(two, dataset="another")}) == [["two"], ["other"]]
+    later = replace(one.result.trajectory, stamp_ns=one.result.trajectory.stamp_ns + 1)
+    shifted = replace(one, result=replace(one.result, trajectory=later))
+    assert by_data({"one": one, "shifted": shifted}) == [["one"], ["shifted"]]
+    draw_runs(tmp_path / "both.svg", {"one": one, "other": other})
+    drawn = (tmp_path / "both.svg").read_text()
+    assert drawn.count("ground truth") == 2
+    assert ">another<" in drawn
 
 
 def test_eval_draws_a_run_and_a_trajectory(runs: list[Path], tmp_path: Path) -> None:

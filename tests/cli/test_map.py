@@ -10,7 +10,7 @@ from helpers.drives import round_drive, write_kitti_sequence
 from segslam.config import OdometryConfig
 from segslam.errors import SegslamError
 from segslam.log import read_log
-from segslam.trajectory import read_poses, write_kitti
+from segslam.trajectory import read_poses, travelled_m, write_kitti
 
 RUN_FILES = {
     "config.yaml",
@@ -49,6 +49,28 @@ def test_map_writes_a_whole_run_and_skips_the_bad_scan(
     assert len(list(read_log(out / "log.mcap").steps())) == 9
     assert {"ate_m", "odometry_ate_m", "rpe_m", "stage_ms", "peak_rss_mb"} <= set(metrics)
     assert metrics["num_motions_broken"] == 0, "a missing scan breaks nothing"
+    truth = round_drive()[1].T_world_lidar[[0, 1, 2, 3, 5, 6, 7, 8, 9]]
+    assert metrics["length_m"] == pytest.approx(travelled_m(truth)[-1], rel=0.05)
+    assert metrics["duration_s"] == pytest.approx(2.7)
+
+
+def test_the_end_of_map_leads_on(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Length and duration, the error by stage, the report, the next command; also of a replay."""
+    out = tmp_path / "my run"
+    assert run("map", kitti, "--out", out) == 0
+    shown = capsys.readouterr().err
+    metrics = json.loads((out / "metrics.json").read_text())
+    for text in (
+        f"drive: {metrics['length_m']:.0f} m in 3 s",
+        f"error after alignment: {metrics['ate_m']:.3f} m, odometry",
+        f"the same error of KISS-ICP alone: {metrics['kiss_icp_ate_m']:.3f} m",
+        f"report: {out / 'report.html'}",
+        f"next: segslam export '{out}' ",
+    ):
+        assert text in shown
+    assert len(read_poses(out / "kiss_icp_tum.txt")) == metrics["num_scans"]
+    assert run("replay", out, "--out", tmp_path / "again", "--json", "--quiet") == 0
+    assert json.loads(capsys.readouterr().out)["kiss_icp_ate_m"] == pytest.approx(metrics["kiss_icp_ate_m"])
 
 
 def test_a_run_folder_is_never_overwritten(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -36,7 +36,10 @@ def test_export_draws_the_map_before_and_after_loop_closing(
     assert run("export", finished, tmp_path / "before_after.png") == 0
     assert f"map in {tmp_path / 'before_after.png'}" in capsys.readouterr().err
     assert imread(tmp_path / "before_after.png").shape[1] == 1200
-    assert run("export", finished, tmp_path / "before_after.png", tmp_path / "map.ply", "--json", "--quiet") == 0
+    assert (
+        run("export", finished, tmp_path / "before_after.png", tmp_path / "map.ply", "--json", "--quiet", "--overwrite")
+        == 0
+    )
     assert json.loads(capsys.readouterr().out)["num_map_points"] > 0
 
 
@@ -67,6 +70,26 @@ def test_export_refuses_with_one_line(
     assert message.startswith("segslam: ")
     assert output in message
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("files", "output"),
+    [
+        (["before_after.png", "no/such/map.ply"], "there is no folder"),
+        (["before_after.png", "map.stl"], "unknown kind of map"),
+        (["map.ply", "no/before_after.png"], "there is no folder"),
+        (["map.ply", "map.ply"], "map.ply: given twice"),
+        (["before_after.png", "map.ply", "grid.yaml"], "grid.pgm: exists and is not a regular file"),
+    ],
+)
+def test_an_export_that_fails_writes_none_of_its_files(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], files: list[str], output: str
+) -> None:
+    if "grid.yaml" in files:
+        (tmp_path / "grid.pgm").mkdir()
+    assert run("export", finished, *(tmp_path / name for name in files), "--quiet") == 2
+    assert output in capsys.readouterr().err
+    assert [file for file in tmp_path.iterdir() if file.is_file()] == []
 
 
 def test_an_unfinished_run_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

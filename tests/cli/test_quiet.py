@@ -70,6 +70,9 @@ COMMANDS: dict[str, Callable[[Path, Path, Path], Words]] = {
     "label": lambda data, _, out: [
         *(data, "--out", out, "--labels", "true_labels", "--truth", "true_labels", "--frames", "0:2")
     ],
+    "convert": lambda data, _, out: [data / "poses" / "00.txt", out],
+    "info": lambda _, finished, __: [finished],
+    "edit": lambda _, finished, out: [finished, "--forbid", "2:0", "--out", out],
     "eval": lambda _, finished, __: [finished],
     "replay": lambda _, finished, out: [finished / "log.mcap", "--out", out],
     "register": lambda data, _, __: [*((data / f"sequences/00/velodyne/{i:06d}.bin") for i in (3, 0)), "--no-refine"],
@@ -96,6 +99,7 @@ COMMANDS: dict[str, Callable[[Path, Path, Path], Words]] = {
 OF_MAPPED: dict[str, Callable[[Path, Path, Path], Words]] = {
     "locate": lambda data, mapped, _: [mapped, data / "sequences/00/velodyne/000003.bin", "--dataset", "kitti"],
     "localise": lambda data, mapped, out: [mapped, data, "--out", out],
+    "fleet": lambda data, _, out: [data, "--workers", 1, "--out", out],
     "resume": lambda _, mapped, __: [mapped],
 }
 """The same, given a run of the data."""

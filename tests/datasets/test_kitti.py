@@ -67,7 +67,17 @@ def test_poses_return_to_the_cameras_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "numbers"), [("0:2", [0, 1]), ("1:12", [1, 4]), (":5", [0, 1, 4]), ("4:", [4, 12]), (":", [0, 1, 4, 12])]
+    ("frames", "numbers"),
+    [
+        ("0:2", [0, 1]),
+        ("1:12", [1, 4]),
+        (":5", [0, 1, 4]),
+        ("4:", [4, 12]),
+        (":", [0, 1, 4, 12]),
+        ("0:12:2", [0, 4]),
+        ("1::3", [1, 4]),
+        ("::1", [0, 1, 4, 12]),
+    ],
 )
 def test_frames_select_by_number_without_the_last(tmp_path: Path, frames: str, numbers: list[int]) -> None:
     _write_sequence(tmp_path, [0, 1, 4, 12])
@@ -82,7 +92,9 @@ def test_frames_select_by_number_without_the_last(tmp_path: Path, frames: str, n
     [
         ("5", "A:B"),
         ("a:b", "A:B"),
-        ("1:2:3", "A:B"),
+        ("1:2:3:4", "A:B"),
+        ("0:9:0", "STEP must be"),
+        ("2:4:9", "no such scan"),
         ("20:30", r"no such scan, only 0 to 12"),
         ("4:4", "selects no scan"),
     ],

@@ -1,6 +1,7 @@
 import multiprocessing
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,6 +87,26 @@ def test_a_process_of_its_own_changes_nothing() -> None:
         np.testing.assert_allclose(mine.T_odom_lidar, theirs.T_odom_lidar, atol=1e-9)
         np.testing.assert_allclose(mine.points, theirs.points, atol=1e-5)  # float32
         np.testing.assert_array_equal(mine.labels, theirs.labels)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_the_poses_of_kiss_icp_alone_are_kept_while_the_odometry_follows_others(apart: bool) -> None:
+    scans = _street(8)
+    plain = KissOdometry(ONE_THREAD)
+    expected = [plain.register(scan).T_odom_lidar for scan in scans]
+    with OdometryApart(ONE_THREAD, keeps_alone=True) if apart else nullcontext() as other:
+        odometry = other or KissOdometry(ONE_THREAD, keeps_alone=True)
+        found = []
+        for number, scan in enumerate(scans):
+            found.append(odometry.register(scan))
+            if number == 3:
+                T_moved = geometry.transform(np.eye(3), [0.5, 0.1, 0.0]) @ found[-1].T_odom_lidar
+                odometry.follow([(T_moved, found[-1].points)], T_moved, np.eye(4))
+        if not apart:
+            np.testing.assert_allclose(odometry.alone(), expected, atol=1e-9)
+    np.testing.assert_allclose(odometry.alone(), expected, atol=1e-9)
+    assert geometry.distance(geometry.inverse(found[-1].T_odom_lidar) @ expected[-1]) > 0.1
+    assert len(plain.alone()) == 0, "not kept unless wanted"
 
 
 def test_a_sweep_too_large_for_the_shared_memory_is_aligned_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:

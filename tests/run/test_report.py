@@ -9,16 +9,17 @@ from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from helpers.finished_run import make_run
 
-from segslam import cli
+from segslam import cli, geometry
 from segslam.config import Config, load_config
 from segslam.run.accuracy import accuracy
 from segslam.run.finished import FIGURES, read_run
-from segslam.run.folder import write_metrics
+from segslam.run.folder import write_alone, write_metrics
 from segslam.run.report import write_report
-from segslam.run.report.figures import draw_loops
+from segslam.run.report.figures import draw_loops, paths_of
 from segslam.run.report.gallery import choose, outcome_text
 from segslam.run.report.page import number, page, settings_not_default
 from segslam.types import SegslamError
@@ -36,7 +37,8 @@ class _Tags(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.loads += [value or "" for name, value in attrs if name in ("src", "href")]
-        assert tag not in ("script", "link", "iframe")
+        assert tag not in ("link", "iframe")
+        assert tag != "script" or "src" not in dict(attrs)
         if tag not in VOID:
             self.open.append(tag)
 
@@ -91,6 +93,43 @@ def test_loops_are_counted_by_outcome_and_the_false_one_is_shown(scored: Path) -
     for label in ("accepted (3)", "false (1)", "small clique (5)", "low overlap (1)"):
         assert label in loops
     assert "rejected by the optimiser" not in loops  # the low weight of the false one adds nothing
+
+
+def test_all_plots_are_in_the_frame_of_the_run(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    assert run.reference is not None
+    T_other_world = geometry.transform(geometry.yaw(2.0), [300.0, -80.0, 5.0])
+    moved = replace(run, reference=replace(run.reference, T_world_lidar=T_other_world @ run.reference.T_world_lidar))
+    truth, _, corrected = paths_of(moved)
+    np.testing.assert_array_equal(corrected.poses, run.result.trajectory.T_world_lidar)
+    np.testing.assert_allclose(truth.poses[:, :3, 3], run.reference.T_world_lidar[:, :3, 3], atol=0.05)
+
+
+def test_kiss_icp_alone_is_drawn_and_scored_beside_the_repaired_odometry(tmp_path: Path) -> None:
+    made = make_run(tmp_path / "run")
+    off = made.result.odometry.T_world_lidar.copy()
+    off[60:, 1, 3] += 8.0
+    write_alone(made.folder, replace(made.result.odometry, T_world_lidar=off), None)
+    run = read_run(made.folder)
+    assert run.reference is not None
+    figures = accuracy(run.result, run.reference)
+    assert figures["kiss_icp_ate_m"] > 2 * figures["odometry_ate_m"]
+    write_metrics(made.folder, run.metrics | figures)
+    html = write_report(made.folder).read_text()
+    plots = _plots(html)
+    assert "KISS-ICP alone" in plots["Trajectory, top view and height"]
+    errors = plots["Error along the drive, after alignment"]
+    assert f"KISS-ICP alone, rms {figures['kiss_icp_ate_m']:.2f} m" in errors
+    assert "odometry after repairs, rms" in errors
+    assert number(figures["kiss_icp_ate_m"]) in html
+
+
+def test_poses_of_kiss_icp_alone_of_other_scans_are_refused(tmp_path: Path) -> None:
+    made = make_run(tmp_path / "run")
+    later = replace(made.result.odometry, stamp_ns=made.result.odometry.stamp_ns + 1)
+    write_alone(made.folder, later, None)
+    with pytest.raises(SegslamError, match=r"kiss_icp_tum\.txt: not of the scans of this run; remove the file"):
+        read_run(made.folder)
 
 
 def test_without_truth_nothing_is_compared_with_it(tmp_path: Path) -> None:

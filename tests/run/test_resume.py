@@ -86,7 +86,8 @@ def _assert_as_whole(whole: Path, resumed: Path) -> None:
     metrics, metrics_again = (json.loads((folder / "metrics.json").read_text()) for folder in (whole, resumed))
     assert metrics_again["num_scans"] == metrics["num_scans"]
     assert metrics_again["num_scans_skipped"] == metrics["num_scans_skipped"] == 1
-    assert {file.name for file in resumed.iterdir()} == {file.name for file in whole.iterdir()}
+    alone = {"kiss_icp_tum.txt", "kiss_icp_kitti.txt"}  # the state of KISS-ICP alone is lost
+    assert {file.name for file in resumed.iterdir()} - alone == {file.name for file in whole.iterdir()} - alone
     with (resumed / "log.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert sum(1 for _ in reader.iter_messages()) == reader.get_summary().statistics.message_count

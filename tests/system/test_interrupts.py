@@ -160,7 +160,11 @@ def _has_begun(file: Path) -> bool:
 @pytest.mark.parametrize(
     ("command", "begun", "kept"),
     [
-        (("demo", "--out", "FOLDER/demo"), "demo/data/sequences/00/velodyne/000001.bin", "to start again, remove"),
+        (
+            ("demo", "--out", "FOLDER/demo"),
+            "demo/data/sequences/00/velodyne/000001.bin",
+            "to start again: segslam demo",
+        ),
         (
             (
                 "bench",

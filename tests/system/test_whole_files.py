@@ -81,10 +81,10 @@ def test_only_regular_files_are_replaced(
     assert Path("/dev/null").is_char_device()
 
 
-def test_optimize_replaces_a_file_only_with_force(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_optimize_replaces_a_file_only_if_wanted(graph: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = graph.read_bytes()
     assert run("optimize", graph, "--out", graph, "--quiet") == 2
-    assert "--force" in one_line(capsys)
+    assert "--overwrite" in one_line(capsys)
     assert graph.read_bytes() == before
     assert run("optimize", graph, "--out", graph, "--force", "--quiet") == 0
     assert graph.read_bytes() != before

@@ -1,6 +1,6 @@
 """The report of a run: one HTML page with map, plots, figures and settings, without network access."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from itertools import islice
 from pathlib import Path
 
@@ -10,12 +10,12 @@ from segslam.log import read_log
 from segslam.map.before_after import BeforeAfter
 from segslam.run.finished import FinishedRun, read_run
 from segslam.run.folder import LOG
-from segslam.run.report import figures, gallery
+from segslam.run.report import figures, gallery, interactive
 from segslam.run.report.page import Pictures, page
 from segslam.system.whole_files import write_whole
-from segslam.types import Keyframe
+from segslam.types import Keyframe, LoopAttempt
 
-__all__ = ["BEFORE_AFTER", "write_before_after", "write_report"]
+__all__ = ["BEFORE_AFTER", "draw_before_after", "write_before_after", "write_report"]
 
 BEFORE_AFTER = "before_after.png"
 
@@ -39,9 +39,14 @@ def write_report(folder: Path) -> Path:
 
 
 def write_before_after(folder: Path, file: Path) -> Path:
-    """Write a PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
+    """Write the picture of `draw_before_after` to a file."""
+    return _write(file, draw_before_after(folder))
+
+
+def draw_before_after(folder: Path) -> bytes:
+    """A PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
     picture, _ = _drawn(read_run(folder))
-    return _write(file, picture)
+    return picture
 
 
 def _write(file: Path, content: bytes) -> Path:
@@ -66,15 +71,20 @@ def _plots(run: FinishedRun) -> dict[str, str]:
 
 def _pictures(run: FinishedRun) -> Pictures:
     """Pictures that need the clouds of the log: the map before and after, and pairs of keyframes."""
-    chosen = gallery.choose(run.result.attempts)
-    wanted = {number for a in chosen for number in (a.candidate.source_id, a.candidate.target_id)}
-    before_after, kept = _drawn(run, wanted)
+    chosen, shown = gallery.choose(run.result.attempts), interactive.with_clouds(run)
+    before_after, kept = _drawn(run, _keyframes_of([*chosen, *shown]))
+    of_view = {number: kept[number] for number in sorted(_keyframes_of(shown)) if number in kept}
     map_file = run.folder / "map.png"
     return Pictures(
         before_after=before_after,
         map=map_file.read_bytes() if map_file.is_file() else None,
         loops=gallery.draw(run, chosen, kept),
+        top_view=interactive.top_view(run, of_view),
     )
+
+
+def _keyframes_of(attempts: Iterable[LoopAttempt]) -> set[int]:
+    return {number for one in attempts for number in (one.candidate.source_id, one.candidate.target_id)}
 
 
 def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:

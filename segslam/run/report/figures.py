@@ -18,7 +18,7 @@ from segslam.trajectory import Poses, rows_of_same_scan, travelled_m
 from segslam.types import LoopClosure, MotionState, Rejected, RejectReason, Vector
 
 # Okabe and Ito's colours, distinguishable with any colour vision
-TRUTH, CORRECTED, ODOMETRY = "#B8B8B8", "#0072B2", "#E69F00"
+TRUTH, CORRECTED, ODOMETRY, ALONE = "#B8B8B8", "#0072B2", "#E69F00", "#CC79A7"
 ACCEPTED, OPTIMISED_AWAY, FALSE = "#009E73", "#CC79A7", "#D55E00"
 REJECTED = ("#56B4E9", "#8C564B", "#7F7F7F", "#9467BD", "#BCBD22", "#17BECF", "#1F3A93")
 STYLE: Any = {
@@ -40,6 +40,8 @@ class Compared:
     truth: Poses
     corrected: Poses
     odometry: Poses
+    alone: Poses | None = None
+    """By KISS-ICP alone; None if they are unknown."""
 
 
 class Line(NamedTuple):
@@ -63,14 +65,31 @@ def compared(run: FinishedRun) -> Compared | None:
         run.reference.T_world_lidar[rows[:, 1]],
         run.result.trajectory.T_world_lidar[rows[:, 0]],
         run.result.odometry.T_world_lidar[rows[:, 0]],
+        None if run.result.alone is None else run.result.alone.T_world_lidar[rows[:, 0]],
     )
+
+
+def paths_of(run: FinishedRun) -> list[Line]:
+    """The paths to draw, in the frame of the run, as all other plots and the map."""
+    true = compared(run)
+    paths = []
+    if true is not None:
+        T_world_truth = align_positions(true.truth[:, :3, 3], true.corrected[:, :3, 3])
+        paths.append(Line("truth", T_world_truth @ true.truth, TRUTH, "-", 4.0))
+    if run.result.alone is not None:
+        paths.append(Line("KISS-ICP alone", run.result.alone.T_world_lidar, ALONE, ":", 1.5))
+    return [
+        *paths,
+        Line("odometry", run.result.odometry.T_world_lidar, ODOMETRY, "--", 1.5),
+        Line("corrected", run.result.trajectory.T_world_lidar, CORRECTED, "-", 1.2),
+    ]
 
 
 def draw_paths(run: FinishedRun) -> str:
     """Ground truth, odometry and corrected trajectory in top view, and their heights against travel."""
     figure = Figure(figsize=(WIDTH_IN, 6.6), layout="constrained")
     above, height = figure.subplots(2, 1, height_ratios=(3, 1))
-    paths = _paths(run)
+    paths = paths_of(run)
     _plot_motions(above, run, paths[-1].poses)
     _plot_from_above(above, paths)
     for line in paths:
@@ -112,10 +131,13 @@ def _plot_times(axes: Axes, time_s: Vector, pairs: list[tuple[int, int]], label:
 
 def draw_errors(poses: Compared) -> str:
     """Position error and height error against the distance travelled, after the alignment of the ATE."""
-    figure = Figure(figsize=(WIDTH_IN, 4.8), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, 5.4), layout="constrained")
     whole, height = figure.subplots(2, 1, sharex=True)
     along_m = travelled_m(poses.truth)
-    for name, estimate, color in (("odometry", poses.odometry, ODOMETRY), ("corrected", poses.corrected, CORRECTED)):
+    drives = [("odometry", poses.odometry, ODOMETRY), ("corrected", poses.corrected, CORRECTED)]
+    if poses.alone is not None:
+        drives = [("KISS-ICP alone", poses.alone, ALONE), ("odometry after repairs", *drives[0][1:]), drives[1]]
+    for name, estimate, color in drives:
         aligned = align_positions(estimate[:, :3, 3], poses.truth[:, :3, 3]) @ estimate
         error_m = pose_errors(aligned, poses.truth).translation_m
         label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
@@ -124,7 +146,7 @@ def draw_errors(poses: Compared) -> str:
     whole.set(ylabel="error (m)")
     whole.set_ylim(bottom=0)
     height.set(xlabel="distance travelled (m)", ylabel="height error (m)")
-    _legend_on_top(whole)
+    _legend_on_top(whole, num_columns=1)
     return svg(figure, "errors")
 
 
@@ -184,22 +206,6 @@ def _plot_attempts(axes: Axes, run: FinishedRun) -> None:
 def _finish_map(axes: Axes, *, num_columns: int) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
     _legend_on_top(axes, num_columns=num_columns)
-
-
-def _paths(run: FinishedRun) -> list[Line]:
-    """The paths to draw, in the frame of the ground truth if there is any."""
-    corrected, odometry = run.result.trajectory.T_world_lidar, run.result.odometry.T_world_lidar
-    true = compared(run)
-    paths = []
-    if true is not None:
-        T_truth_world = align_positions(true.corrected[:, :3, 3], true.truth[:, :3, 3])
-        corrected, odometry = T_truth_world @ corrected, T_truth_world @ odometry
-        paths.append(Line("truth", true.truth, TRUTH, "-", 4.0))
-    return [
-        *paths,
-        Line("odometry", odometry, ODOMETRY, "--", 1.5),
-        Line("corrected", corrected, CORRECTED, "-", 1.2),
-    ]
 
 
 def _rejected_pairs(run: FinishedRun) -> dict[RejectReason, list[tuple[int, int]]]:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from segslam import geometry
+from segslam import geometry, slam_result
 from segslam.run.finished import FinishedRun
 from segslam.run.report.pairs import draw_pair
 from segslam.types import GROUND_LABELS, Keyframe, LoopAttempt, LoopClosure, Points, Rejected, RejectReason
@@ -41,13 +41,7 @@ def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int
 
 def outcome_text(run: FinishedRun, attempt: LoopAttempt) -> str:
     """The outcome of a candidate in one line."""
-    outcome = attempt.outcome
-    if isinstance(outcome, Rejected):
-        reason = outcome.reason.value.replace("_", " ")
-        return f"rejected, {reason}" + (f" ({outcome.detail})" if outcome.detail else "")
-    weight = run.result.estimate.closure_weights[outcome.source_id, outcome.target_id]
-    found = outcome.alignment
-    return f"accepted, overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m, weight {weight:.2f}"
+    return slam_result.outcome_text(attempt, run.result.estimate.closure_weights)
 
 
 def _apart(attempts: list[LoopAttempt]) -> list[LoopAttempt]:

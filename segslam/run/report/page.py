@@ -12,11 +12,9 @@ from pydantic.fields import FieldInfo
 
 from segslam.calibration import vertical_angle_advice
 from segslam.config import Config, Section, changed_settings
-from segslam.run.finished import FIGURES, FinishedRun
+from segslam.run.finished import COMPARED, FIGURES, FinishedRun
 from segslam.types import Rejected
 
-ODOMETRY = "odometry_"
-"""Prefix of the figures of the odometry without loop closing."""
 FILES = {
     "map.png": "the map in top view",
     "map.ply": "the map as a point cloud",
@@ -25,12 +23,15 @@ FILES = {
     "poses_kitti.txt": "pose of every scan, KITTI format",
     "odometry_tum.txt": "the same before loop closing, TUM format",
     "odometry_kitti.txt": "the same before loop closing, KITTI format",
+    "kiss_icp_tum.txt": "the same by KISS-ICP alone, TUM format",
+    "kiss_icp_kitti.txt": "the same by KISS-ICP alone, KITTI format",
     "loops.csv": "all loop candidates and their outcomes",
     "graph.g2o": "the pose graph",
     "metrics.json": "the figures of this page",
     "config.yaml": "the settings",
     "log.mcap": "complete log, for Foxglove and segslam replay",
 }
+ODOMETRIES = ("odometry, after repairs", "KISS-ICP alone")
 CONDITIONS = {
     "started": "started (UTC)",
     "command": "command",
@@ -51,9 +52,12 @@ section { margin-bottom: 1rem; break-inside: avoid; min-width: 0; overflow-x: au
 .tiles b { display: block; font-size: 1.4rem; } img { width: 100%; height: auto; display: block; }
 table { border-collapse: collapse; width: 100%; font-size: .92rem; }
 td, th { text-align: left; padding: .2rem .6rem .2rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-figure { margin: 0; min-width: 0; } .gallery { display: grid; gap: 1rem;
+#pair { display: flex; flex-wrap: wrap; gap: 1rem; } #pair h3 { flex-basis: 100%; margin: .5rem 0 0; font-size: 1rem; }
+#pair h4 { margin: 0; text-align: center; }
+.panel { flex: 1 1 18rem; min-width: 0; } figure { margin: 0; min-width: 0; } .gallery { display: grid; gap: 1rem;
   grid-template-columns: repeat(auto-fit, minmax(min(34rem, 100%), 1fr)); } p { margin: .2rem 0 .6rem; }
 td.number, th + th { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+th + th { white-space: normal; width: 5.5rem; }
 tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: anywhere; }
 details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child { white-space: nowrap; }
 @media (max-width: 40rem) { body, section { padding: .5rem; } td code { display: block; }
@@ -67,7 +71,7 @@ details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """PNGs."""
+    """PNGs, and the interactive view."""
 
     before_after: bytes | None = None
     """The map by odometry alone beside the corrected map."""
@@ -75,6 +79,8 @@ class Pictures:
     """Top view of the map, if the run has one."""
     loops: Mapping[str, bytes] = field(default_factory=dict)
     """Pairs of scans, by caption."""
+    top_view: str = ""
+    """HTML of the interactive top view."""
 
 
 def page(
@@ -89,7 +95,8 @@ def page(
     name = run.folder.resolve().name
     title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
     maps = {"Map by odometry, and corrected": pictures.before_after, "Map in top view": pictures.map}
-    top = "".join(png_section(caption, png) for caption, png in maps.items() if png is not None)
+    top = section("Top view", pictures.top_view) if pictures.top_view else ""
+    top += "".join(png_section(caption, png) for caption, png in maps.items() if png is not None)
     sections = [plot_section(caption, svg) for caption, svg in plots.items()]
     sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
     sections += [section("Files", _files(run)), section("Conditions", _conditions(run, about))]
@@ -144,6 +151,9 @@ def _tiles(metrics: dict[str, Any]) -> str:
     tiles = [
         ("ate_m", " m", "error after alignment"),
         ("odometry_ate_m", " m", "error of the odometry, after repairs"),
+        ("kiss_icp_ate_m", " m", "error of KISS-ICP alone"),
+        ("length_m", " m", "length of the drive"),
+        ("duration_s", " s", "duration of the drive"),
         ("num_loops_accepted", "", "loops accepted"),
         ("num_loops_false", "", "false loops"),
         ("scans_per_second", "", "scans per second"),
@@ -173,15 +183,17 @@ def _picture(caption: str, picture: bytes, kind: str) -> str:
 
 
 def _figures(metrics: dict[str, Any]) -> str:
-    """Figures with a description first, in their order, then the others; each beside that of the odometry."""
+    """Figures with a description first, in their order, then the others; each beside those of the odometry."""
     known = [key for key in FIGURES if key in metrics]
     rest = [key for key, value in metrics.items() if key not in FIGURES and isinstance(value, int | float)]
-    of_run = [key for key in known + rest if not key.startswith(ODOMETRY)]
-    rows = [
-        (f"{FIGURES.get(key, '')} <code>{escape(key)}</code>", metrics[key], metrics.get(ODOMETRY + key))
-        for key in of_run
-    ]
-    return _table(("", "run", "odometry, after repairs"), rows)
+    of_run = [key for key in known + rest if not key.startswith(COMPARED)]
+    titles = {prefix: title for prefix, title in zip(COMPARED, ODOMETRIES, strict=True) if prefix + "ate_m" in metrics}
+    rows = [(_meaning(key), metrics[key], *(metrics.get(prefix + key) for prefix in titles)) for key in of_run]
+    return _table(("", "run", *titles.values()), rows)
+
+
+def _meaning(key: str) -> str:
+    return f"{FIGURES.get(key, '')} <code>{escape(key)}</code>"
 
 
 def _outcomes(run: FinishedRun) -> str:

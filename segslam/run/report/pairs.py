@@ -15,7 +15,7 @@ VIEW_M = 50.0
 
 def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform], title: str) -> bytes:
     """The two scans as a PNG, a panel for each of `poses`: a name and T_target_source."""
-    figure = Figure(figsize=(5.5 * len(poses), 6.2), layout="compressed")
+    figure = Figure(figsize=(3.6 * len(poses), 4.4), layout="compressed")
     figure.suptitle(title, fontsize=11)
     panels = figure.subplots(1, len(poses), squeeze=False)[0]
     for axes, (name, T_target_source) in zip(panels, poses.items(), strict=True):
@@ -27,5 +27,5 @@ def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform],
             axes.plot(near[:, 0], near[:, 1], ",", color=color, label=label, rasterized=True)
         axes.set(title=name, xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), aspect="equal", xlabel="x (m)")
     image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=90)
+    figure.savefig(image, format="png", dpi=140)
     return image.getvalue()

@@ -1,0 +1,79 @@
+"""Completion of values in the shell; the modules that know them are imported when a value is completed."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+from segslam.experiments.method_settings import METHOD_NAMES
+
+LABELS = ("auto", "none", "geometric", "network:")
+SENSORS = ("hdl64", "os1-64", "vlp16")
+
+
+def _starting(words: Iterable[str], incomplete: str) -> list[str]:
+    return [word for word in words if word.startswith(incomplete)]
+
+
+def one_of(*words: str) -> Callable[[str], list[str]]:
+    """A completion among fixed words."""
+
+    def complete(incomplete: str) -> list[str]:
+        return _starting(words, incomplete)
+
+    return complete
+
+
+def labels_or_files(incomplete: str) -> list[str]:
+    """Sources of labels, and the paths that begin so: a completion of its own replaces the shell's file names."""
+    parent = Path(incomplete).expanduser()
+    parent = parent if incomplete.endswith("/") else parent.parent
+    try:
+        paths = [f"{path}/" if path.is_dir() else str(path) for path in parent.iterdir()]
+    except OSError:
+        paths = []
+    return _starting([*LABELS, *sorted(paths)], incomplete)
+
+
+def presets(incomplete: str) -> list[str]:
+    """Names of the presets."""
+    from segslam.presets import SETTINGS
+
+    return _starting(["auto", *SETTINGS], incomplete)
+
+
+def datasets(incomplete: str) -> list[str]:
+    """Kinds of data."""
+    from segslam.datasets.recordings import known_kinds
+
+    return _starting(known_kinds(), incomplete)
+
+
+def settings(incomplete: str) -> list[str]:
+    """Keys `section.key=`; after the equals sign the values, if the setting has a fixed list of them."""
+    from segslam.config import Config
+
+    return _settings(Config, incomplete)
+
+
+def simulation_settings(incomplete: str) -> list[str]:
+    """As `settings`, of the simulation."""
+    from segslam.simulation import SimulationConfig
+
+    return _settings(SimulationConfig, incomplete)
+
+
+def _settings(config: Any, incomplete: str) -> list[str]:
+    fields = {
+        f"{section}.{key}=": field.annotation
+        for section, of_section in config.model_fields.items()
+        for key, field in of_section.annotation.model_fields.items()
+    }
+    key, equals, _ = incomplete.partition("=")
+    if not equals:
+        return _starting(fields, incomplete)
+    hint = fields.get(f"{key}=")
+    values = ("true", "false") if hint is bool else get_args(hint) if get_origin(hint) is Literal else ()
+    return _starting([f"{key}={value}" for value in values], incomplete)
+
+
+METHODS = one_of(*METHOD_NAMES)

@@ -1,0 +1,96 @@
+"""`segslam edit`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from segslam.cli.checks import check_exists
+from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, say
+from segslam.cli.overwriting import OverwriteOption
+from segslam.cli.replay import replay_log
+from segslam.errors import SegslamError
+from segslam.loop_edits import LoopEdits, Pair, pairs_of
+
+if TYPE_CHECKING:
+    from segslam.slam_result import SlamResult
+
+
+def edit(
+    run: Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, finished or not.")],
+    out: Annotated[Path, typer.Option(help="New folder for the run.")],
+    forbid: Annotated[
+        list[str] | None,
+        typer.Option(metavar="I:J", help="Never close a loop between these two keyframes; may be repeated."),
+    ] = None,
+    add: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="I:J", help="Register these two keyframes, wherever the drift has put them; may be repeated."
+        ),
+    ] = None,
+    config: ConfigOption = None,
+    settings: SetOption = None,
+    overwrite: OverwriteOption = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Forbid or add loops by hand, and repeat the run with them. Keyframes have the ids of loops.csv and the report.
+
+    An added loop is registered without initial guess; its pose must pass all checks but the comparison with the drift.
+    Later replays and edits keep these edits.
+
+    Example: segslam edit runs/00 --forbid 120:15 --add 300:40 --out runs/00-edited
+    """
+    check_exists(run, "give a run folder, or its log.mcap")
+    edits = LoopEdits(pairs_of(forbid or (), "--forbid"), pairs_of(add or (), "--add"))
+    if edits == LoopEdits():
+        raise SegslamError("nothing to edit: give --forbid I:J or --add I:J")
+    announce(f"edit: reading {run}", quiet=quiet)
+    _check_keyframes(run, edits)
+
+    def after(result: "SlamResult") -> Mapping[str, Any]:
+        outcomes = _outcomes(result)
+        for pair in sorted(edits.added):
+            said = outcomes.get(pair, "not tried, because the run ended before")
+            say(f"added {pair[0]}:{pair[1]}: {said}", quiet=quiet)
+        return {}
+
+    replay_log(
+        run,
+        out,
+        config=config,
+        settings=settings or [],
+        edits=edits,
+        after=after,
+        overwrite=overwrite,
+        json=json,
+        quiet=quiet,
+    )
+
+
+def _check_keyframes(run: Path, edits: LoopEdits) -> None:
+    """Raises SegslamError for a keyframe that the run does not have, and for a run localised in a map."""
+    from segslam.log import read_log
+    from segslam.run.folder import log_of
+
+    recorded = read_log(log_of(run))
+    if recorded.options.get("in_map"):
+        raise SegslamError(f"{run}: localised in the map of another run, without loops of its own; edit that run")
+    num = len(recorded.keyframes())
+    for newer, older in sorted(edits.forbidden | edits.added):
+        if newer >= num:
+            raise SegslamError(f"{newer}:{older}: {run} has keyframes 0 to {num - 1}; the report shows their ids")
+
+
+def _outcomes(result: "SlamResult") -> dict[Pair, str]:
+    """The outcome of each pair that was tried."""
+    from segslam.slam_result import outcome_text
+
+    return {
+        (attempt.candidate.source_id, attempt.candidate.target_id): outcome_text(
+            attempt, result.estimate.closure_weights
+        )
+        for attempt in result.attempts
+    }

@@ -1,0 +1,55 @@
+"""Choice of the settings for an environment."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from segslam.cli.console import say
+from segslam.errors import SegslamError
+
+if TYPE_CHECKING:
+    from segslam.config import Config
+    from segslam.datasets import Dataset
+    from segslam.presets import Preset
+
+
+def check_preset(name: str, *, resumes: bool) -> None:
+    """Raises SegslamError for an unknown preset, and for any preset if a run is resumed."""
+    if name == "auto":
+        return
+    from segslam.presets import SETTINGS
+
+    if name not in SETTINGS:
+        raise SegslamError(f"--preset {name}: unknown preset; known: auto, {', '.join(SETTINGS)}")
+    if resumes:
+        raise SegslamError(f"--preset {name}: a resumed run keeps its settings; omit the option")
+
+
+def preset_config(name: str, scans: "Dataset", *, quiet: bool) -> "Config":
+    """The settings of a preset; with `auto`, of the preset that fits the scans, with a message."""
+    from segslam.presets import extent_m, preset
+
+    return preset(cast("Preset", name)) if name != "auto" else _fitting(extent_m(scans), quiet=quiet)
+
+
+def live_config(name: str, folder: Path | None, topic: str | None, *, quiet: bool) -> "Config":
+    """As `preset_config`; `auto` looks at the scans already in the folder, or at the first cloud of the topic."""
+    check_preset(name, resumes=False)
+    from segslam.presets import preset
+
+    if name != "auto":
+        return preset(cast("Preset", name))
+    from segslam.live.look import extent_in_folder, extent_of_topic
+
+    extent = extent_in_folder(folder) if folder is not None else extent_of_topic(topic or "")
+    if extent is None:
+        say("no scan yet: using --preset driving; others: campus, indoor", quiet=quiet)
+    return _fitting(extent, quiet=quiet)
+
+
+def _fitting(extent_m: float | None, *, quiet: bool) -> "Config":
+    from segslam.presets import preset, preset_for
+
+    chosen = preset_for(extent_m)
+    if chosen != "driving":
+        say(f"surfaces are near (median range {extent_m:.0f} m): using --preset {chosen}", quiet=quiet)
+    return preset(chosen)

@@ -1,0 +1,89 @@
+"""Tables of figures, a row a run or drive: on the terminal, as CSV and as LaTeX."""
+
+import csv
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from segslam.system.whole_files import write_whole
+
+CsvOption = Annotated[Path | None, typer.Option("--csv", help="Write the table to this file, a row for each.")]
+LatexOption = Annotated[
+    Path | None, typer.Option("--latex", help="Write the table to this file as a LaTeX tabular, a row for each.")
+]
+SHORT = {
+    "ate_m": "ATE rms (m)",
+    "ate_mean_m": "mean (m)",
+    "ate_median_m": "median (m)",
+    "ate_max_m": "max (m)",
+    "odometry_ate_m": "odometry (m)",
+    "kiss_icp_ate_m": "KISS-ICP (m)",
+    "rpe_over_distance_percent": "RPE (%)",
+    "kitti_translation_percent": "KITTI t (%)",
+    "kitti_rotation_deg_per_100m": "KITTI r (deg/100 m)",
+    "num_loops_accepted": "loops",
+    "num_poses": "poses",
+}
+"""Columns of a table for people: figures that at least one row has."""
+Rows = Mapping[str, Mapping[str, Any]]
+"""Name -> figures."""
+
+
+def write_tables(rows: Rows, *, csv_file: Path | None, latex_file: Path | None) -> None:
+    """Write the files that are given: CSV has all numbers in full, LaTeX the columns for people."""
+    if csv_file is not None:
+        write_whole(csv_file, as_csv(rows))
+    if latex_file is not None:
+        write_whole(latex_file, as_latex(rows))
+
+
+def as_csv(rows: Rows) -> str:
+    """A line of column names (`name`, then keys as in metrics.json), then a line for each row; unknown ones empty."""
+    keys = list(dict.fromkeys(key for row in rows.values() for key, value in row.items() if _is_number(value)))
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["name", *keys])
+    writer.writerows([name, *(row.get(key, "") for key in keys)] for name, row in rows.items())
+    return stream.getvalue()
+
+
+def as_latex(rows: Rows) -> str:
+    """A tabular with the columns of `SHORT`, of package booktabs."""
+    columns = _columns(rows)
+    head = " & ".join(["", *(_escaped(SHORT[key]) for key in columns)])
+    lines = [" & ".join([_escaped(name), *(_cell(row.get(key)) for key in columns)]) for name, row in rows.items()]
+    body = " \\\\\n".join(lines)
+    begin = f"\\begin{{tabular}}{{l{'r' * len(columns)}}}"
+    parts = [begin, "\\toprule", f"{head} \\\\", "\\midrule", f"{body} \\\\", "\\bottomrule", "\\end{tabular}"]
+    return "\n".join([*parts, ""])
+
+
+def as_text(rows: Rows) -> str:
+    """The columns of `SHORT`, aligned."""
+    columns = _columns(rows)
+    width = max(map(len, rows), default=4)
+    widths = [max(len(SHORT[key]), 8) for key in columns]
+    lines = [" " * width + "".join(f"  {SHORT[key]:>{w}}" for key, w in zip(columns, widths, strict=True))]
+    for name, row in rows.items():
+        cells = (f"  {_cell(row.get(key)):>{w}}" for key, w in zip(columns, widths, strict=True))
+        lines.append(f"{name:<{width}}" + "".join(cells))
+    return "\n".join(lines)
+
+
+def _columns(rows: Rows) -> list[str]:
+    return [key for key in SHORT if any(_is_number(row.get(key)) for row in rows.values())]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _cell(value: Any) -> str:
+    return "-" if not _is_number(value) else f"{value}" if isinstance(value, int) else f"{value:.3f}"
+
+
+def _escaped(text: str) -> str:
+    return "".join(f"\\{letter}" if letter in "&%$#_{}" else letter for letter in text)

@@ -1,0 +1,85 @@
+"""One rule for all commands: what exists is replaced only with `--overwrite`."""
+
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from helpers.commands import run
+from helpers.drives import write_kitti_sequence
+from helpers.finished_run import make_run
+
+from segslam.cli.overwriting import make_room
+from segslam.errors import SegslamError
+from segslam.log import read_log
+from segslam.log.output import Output
+
+GRAPH = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
+VERTEX_SE3:QUAT 1 1 0 0 0 0 0 1
+EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = make_run(tmp_path_factory.mktemp("made") / "run").folder
+    (folder / "graph.g2o").write_text(GRAPH)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["export", "RUN", "FILE.png"],
+        ["eval", "RUN", "--plot", "FILE.png"],
+        ["compare", "RUN", "OTHER", "--plot", "FILE.png"],
+        ["view", "RUN", "--save", "FILE.rrd"],
+        ["optimize", "RUN/graph.g2o", "--out", "FILE.g2o"],
+    ],
+)
+def test_a_file_is_replaced_only_if_wanted(
+    command: list[str], made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if command[0] == "view":
+        pytest.importorskip("rerun")
+    other = make_run(tmp_path / "other").folder if "OTHER" in command else made
+    stem = str(tmp_path / "there")
+    given = [part.replace("RUN", str(made)).replace("OTHER", str(other)).replace("FILE", stem) for part in command]
+    file = Path(next(part for part in given if part.startswith(stem)))
+    file.write_bytes(b"mine")
+    assert run(*given, "--quiet") == 2
+    assert f"{file}: exists; give another name, or replace it with --overwrite" in capsys.readouterr().err
+    assert file.read_bytes() == b"mine"
+    assert run(*given, "--overwrite", "--quiet") == 0
+    assert file.read_bytes() != b"mine"
+
+
+def test_map_replaces_a_run_only_if_wanted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, out = tmp_path / "data", tmp_path / "run"
+    write_kitti_sequence(data, num_scans=3)
+    assert run("map", data, "--out", out, "--quiet") == 0
+    (out / "notes.txt").touch()
+    assert run("map", data, "--out", out, "--frames", "0:2", "--quiet") == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert (out / "notes.txt").exists()
+    assert run("map", data, "--out", out, "--frames", "0:2", "--overwrite", "--quiet") == 0
+    assert read_log(out / "log.mcap").num_steps() == 2
+    assert not (out / "notes.txt").exists()
+    assert run("map", data, "--out", out, "--overwrite", "--resume", "--quiet") == 2
+
+
+def test_only_a_finished_run_that_is_no_input_is_removed(made: Path, tmp_path: Path) -> None:
+    other = tmp_path / "photos"
+    other.mkdir()
+    (other / "me.jpg").touch()
+    with pytest.raises(SegslamError, match="does not remove it"):
+        make_room(other, overwrite=True)
+    with pytest.raises(SegslamError, match="contains the input"):
+        make_room(made, overwrite=True, inputs=[made / "log.mcap"])
+    make_room(made, overwrite=False)
+    make_room(tmp_path / "new", overwrite=True)
+    run_folder = tmp_path / "now"
+    run_folder.mkdir()
+    with closing(Output(run_folder / "log.mcap")), pytest.raises(SegslamError, match="in progress"):
+        make_room(run_folder, overwrite=True)
+    assert (other / "me.jpg").exists()
+    assert (made / "log.mcap").exists()

@@ -96,8 +96,8 @@ def _start(prepared: Prepared, drive: Drive, matched: Matched) -> Transform:
     chosen = chosen[np.argsort(np.abs(np.log(np.maximum(lengths[0], 1e-6) / np.maximum(lengths[1], 1e-6)))[chosen])]
     if lengths[0][chosen[0]] < LEAST_SPAN_M:
         raise SegslamError(
-            f"{prepared.fixes.source}: the sensor moved by less than {LEAST_SPAN_M:g} m between the fixes, so they show "
-            "no heading; use fixes of a longer part of the drive"
+            f"{prepared.fixes.source}: the sensor moved by less than {LEAST_SPAN_M:g} m between the fixes, so they "
+            "show no heading; use fixes of a longer part of the drive"
         )
     best = (np.inf, 0.0, np.zeros(2))
     for row in chosen[:NUM_GUESSES]:

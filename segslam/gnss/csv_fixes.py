@@ -63,16 +63,24 @@ def _cells(line: str) -> list[str]:
 
 
 def _places_by_name(file: Path, number: int, names: Sequence[str]) -> dict[str, int]:
-    cleaned = [re.sub(r"[^a-z0-9_]", "", re.sub(r"[\[(].*", "", name.lower().strip()).strip().replace(" ", "_")) for name in names]
+    cleaned = [
+        re.sub(r"[^a-z0-9_]", "", re.sub(r"[\[(].*", "", name.lower().strip()).strip().replace(" ", "_"))
+        for name in names
+    ]
     places = {
-        column: cleaned.index(alias) for column, aliases in COLUMNS.items() for alias in reversed(aliases) if alias in cleaned
+        column: cleaned.index(alias)
+        for column, aliases in COLUMNS.items()
+        for alias in reversed(aliases)
+        if alias in cleaned
     }
     missing = [name for name in NEEDED if name not in places]
     if "time" not in places and "time_ns" not in places:
         missing.insert(0, "time")
     if missing:
         known = ", ".join(brief(name, 20) for name in names[:12])
-        raise bad_line(file, number, f"no column {' or '.join(missing)} among {known}", "name the columns as in docs/gnss.md")
+        raise bad_line(
+            file, number, f"no column {' or '.join(missing)} among {known}", "name the columns as in docs/gnss.md"
+        )
     return places
 
 

@@ -84,7 +84,9 @@ def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fi
     fixes = Fixes(str(source), stamp_ns, places, sigma_m, tuple(reasons), note)
     if not fixes.usable.any():
         counts = ", ".join(f"{reasons.count(one)} {one}" for one in sorted(set(reasons)))
-        raise SegslamError(f"{source}: none of its {len(rows)} fixes can be used ({counts}); give another file or topic")
+        raise SegslamError(
+            f"{source}: none of its {len(rows)} fixes can be used ({counts}); give another file or topic"
+        )
     return fixes
 
 
@@ -100,7 +102,9 @@ def origin_of(fixes: Fixes, usable: Mask) -> Origin:
 
 def sigma_or(fixes: Fixes, default_m: float) -> Vector:
     """(n,) claimed horizontal standard deviation of each fix (m), root of the mean square of both axes."""
-    sigma = np.sqrt(np.nanmean(np.where(np.isfinite(fixes.sigma_m[:, :2]), fixes.sigma_m[:, :2], default_m) ** 2, axis=1))
+    sigma = np.sqrt(
+        np.nanmean(np.where(np.isfinite(fixes.sigma_m[:, :2]), fixes.sigma_m[:, :2], default_m) ** 2, axis=1)
+    )
     return sigma
 
 

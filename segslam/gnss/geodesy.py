@@ -22,6 +22,8 @@ SEMI_MAJOR_M = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY2 = FLATTENING * (2.0 - FLATTENING)
 SEMI_MINOR_M = SEMI_MAJOR_M * (1.0 - FLATTENING)
+WGS84_3D = 4979
+"""EPSG code of latitude, longitude and ellipsoidal height."""
 BOWRING_STEPS = 3
 """Chosen: one step is exact to 1e-9 degrees on the ground, three also at the heights of satellites."""
 

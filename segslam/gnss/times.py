@@ -1,9 +1,9 @@
 """Times of receivers: calendar dates, weeks of GPS, leap seconds."""
 
 from bisect import bisect_right
-from datetime import datetime, timedelta, timezone
+from datetime import UTC, datetime, timedelta
 
-GPS_EPOCH = datetime(1980, 1, 6, tzinfo=timezone.utc)
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 SECONDS_PER_WEEK = 604_800
 LEAPS = [
     *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01"),
@@ -11,13 +11,13 @@ LEAPS = [
     *("2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
 ]
 """Days (UTC) that begin after a leap second since GPS began (IERS Bulletin C)."""
-_LEAP_TIMES = [datetime.fromisoformat(day).replace(tzinfo=timezone.utc) for day in LEAPS]
+_LEAP_TIMES = [datetime.fromisoformat(day).replace(tzinfo=UTC) for day in LEAPS]
 
 
 def stamp_of(moment: datetime) -> int:
     """Nanoseconds since 1970 of a moment; one without a time zone is in UTC."""
-    aware = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
-    since = aware - datetime(1970, 1, 1, tzinfo=timezone.utc)
+    aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    since = aware - datetime(1970, 1, 1, tzinfo=UTC)
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
 from segslam.gnss import georeference as georeference_drive
+from segslam.gnss.reading import read_fixes
 from segslam.pose_graph import read_g2o
 from segslam.run.finished import FinishedRun, read_run
 from segslam.run.folder import ADJUSTED_GRAPH, room_for
@@ -44,14 +45,8 @@ def georeference(
     to the times of the fixes. Raises SegslamError if the run or the fixes cannot be read, or if the fixes do not
     determine a placement.
     """
-    from segslam.gnss.csv_fixes import read_csv
-    from segslam.gnss.fixes import make_fixes
-    from segslam.gnss.text import text_lines
-
     finished = read_run(run)
-    if not isinstance(fixes, Fixes):
-        file = Path(fixes)
-        fixes = make_fixes(file, read_csv(file, text_lines(file)))
+    known = fixes if isinstance(fixes, Fixes) else read_fixes(fixes)
     scans = finished.result.trajectory
     drive = Drive(scans.stamp_ns, scans.T_world_lidar, finished.result.keyframe_rows)
     graph = finished.folder / ADJUSTED_GRAPH
@@ -59,7 +54,7 @@ def georeference(
         raise SegslamError(
             f"{graph}: missing, the run was made by an earlier version; `segslam replay` it into a new folder first"
         )
-    placed = georeference_drive(read_g2o(graph).edges, drive, fixes, use=Use(use), offset_s=offset_s)
+    placed = georeference_drive(read_g2o(graph).edges, drive, known, use=Use(use), offset_s=offset_s)
     _write(finished, placed, Use(use), offset_s)
     return placed
 
@@ -150,3 +145,29 @@ def _write_fixes(folder: Path, placed: Georeference) -> None:
                 f"{value:.4f}" if np.isfinite(value) else "" for value in (placed.fixes.places[row, 2], *measured)
             )
             writer.writerow((int(placed.fixes.stamp_ns[row]), *degrees, *others, int(not reason), reason))
+
+
+def summary(placed: Georeference) -> str:
+    """What the fixes say, and what they were used for."""
+    east, north, _ = placed.position_sigma_m
+    lines = [
+        f"{placed.num_kept} of {len(placed.fixes)} fixes kept; single fixes are off by {placed.fix_sigma_m[0]:.2f} m, "
+        "a standard deviation",
+        f"map placed: heading known to {placed.heading_sigma_deg:.2f} degrees, position to {east:.2f} m east and "
+        f"{north:.2f} m north",
+    ]
+    axes = [name for name, is_bent in zip(("horizontally", "in height"), placed.is_bent, strict=True) if is_bent]
+    lines.append(f"trajectory bent {' and '.join(axes)} by the fixes" if axes else "trajectory kept its shape")
+    if placed.measured_offset_s:
+        lines.append(
+            f"clock of the receiver: {placed.measured_offset_s:+.3f} s added to its times, "
+            f"known to {placed.offset_sigma_s:.3f} s"
+        )
+    if placed.arm_m.any():
+        lines.append(
+            f"antenna {placed.arm_m[0]:+.2f} m ahead and {placed.arm_m[1]:+.2f} m to the left of the LiDAR, "
+            f"known to {max(placed.arm_sigma_m):.2f} m"
+        )
+    if placed.fixes.note:
+        lines.append(placed.fixes.note)
+    return "\n".join(lines)

@@ -7,11 +7,11 @@ Prints for each alteration the error of the run without fixes and with them, aft
 true positions as UrbanNav has them, whose differences are added to the fixes.
 """
 
-import argparse
 import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -56,9 +56,7 @@ def _alterations(residuals: list[Path] | None) -> dict[str, Alteration]:
         "a jump of 50 m that stays for 5 minutes": _jump,
         "clock 0.5 s off": lambda fixes: fixes.shifted(CLOCK_S),
     }
-    made |= {
-        f"third {third + 1} removed": lambda fixes, third=third: _without_third(fixes, third) for third in range(3)
-    }
+    made |= {f"third {third + 1} removed": partial(_without_third, third=third) for third in range(3)}
     if residuals:
         made["real residuals of a receiver in a city added"] = lambda fixes: _with_residuals(fixes, *residuals)
     return made

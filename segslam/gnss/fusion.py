@@ -16,7 +16,7 @@ import numpy as np
 from segslam.gnss.alignment import PRIOR, Placement, linearised, moved, refined
 from segslam.gnss.evidence import DriveCovariance, Estimate, Noise, estimated
 from segslam.gnss.matching import Drive, Matched, Prepared
-from segslam.gnss.statistics import axis_noise, axis_sigma, horizontal_noise, horizontal_sigma, weight
+from segslam.gnss.statistics import Weights, axis_noise, axis_sigma, horizontal_noise, horizontal_sigma, weight
 from segslam.pose_graph import Edge, PositionedGraph
 from segslam.trajectory import Poses
 from segslam.types import Indices, Points, Vector
@@ -67,7 +67,7 @@ class Fused:
     """The drive in the local frame after the joint solution."""
 
     T_enu_keyframe: Poses
-    weights: Points
+    weights: Weights
     """(n, 2) robust weight of each fix, horizontally and vertically; 0 for an unknown height."""
     precisions: Points
     """(n, 3) inverse variances with which the fixes acted (1 / m^2)."""
@@ -205,7 +205,7 @@ def _held_out(problem: _Problem, sigma: Vector, blocks: np.ndarray) -> Points:
     return residual
 
 
-def _solved(problem: _Problem, sigma: Vector) -> tuple[Poses, Points, Points]:
+def _solved(problem: _Problem, sigma: Vector) -> tuple[Poses, Weights, Points]:
     """Poses, weights (n, 2) and precisions (n, 3) by iteratively reweighted least squares.
 
     It starts from the largest chain of consistent fixes; later rounds weight all fixes by their residuals.
@@ -222,13 +222,13 @@ def _solved(problem: _Problem, sigma: Vector) -> tuple[Poses, Points, Points]:
     return T, weights, precisions
 
 
-def _scales(residual: Points, weights: Points) -> Vector:
+def _scales(residual: Points, weights: Weights) -> Vector:
     used, used_up = weights[:, 0] >= KEPT_WEIGHT, weights[:, 1] >= KEPT_WEIGHT
     level = horizontal_sigma(residual[used] if used.any() else residual)
     return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
 
 
-def robust_weights(residual: Points, sigma: Vector, time_s: Vector) -> Points:
+def robust_weights(residual: Points, sigma: Vector, time_s: Vector) -> Weights:
     """(n, 2) weights horizontally and vertically; a fix in a run of wrong ones has the weight of the run."""
     level = np.hypot(*residual[:, :2].T) / sigma[0]
     up = np.abs(residual[:, 2]) / sigma[2]

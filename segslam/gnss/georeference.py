@@ -11,6 +11,7 @@ from segslam.gnss.fixes import Fixes
 from segslam.gnss.fusion import KEPT_WEIGHT, RIGID_M, Constants, calibrate, fuse, robust_weights
 from segslam.gnss.geodesy import Origin
 from segslam.gnss.matching import Drive, outside_reasons, prepare
+from segslam.gnss.statistics import Weights
 from segslam.pose_graph import Edge
 from segslam.trajectory import Poses
 from segslam.types import Points, Transform, Vector
@@ -58,7 +59,7 @@ class Georeference:
     """(n, 3) positions of the fixes; NaN where unknown."""
     residual_m: Points
     """(n, 3) measured less estimated positions of the antenna; NaN for fixes outside the drive."""
-    weights: Points
+    weights: Weights
     """(n, 2) robust weights, horizontally and in height; 0 for fixes outside the drive."""
 
     @property

@@ -1,9 +1,12 @@
 """Robust statistics of residuals: their scale, and for how many fixes in a row they are similar."""
 
 import numpy as np
+from jaxtyping import Float
 
 from segslam.types import Vector
 
+Weights = Float[np.ndarray, "_ 2"]
+"""Robust weights of fixes, horizontally and in height."""
 MEDIAN_OF_NORM2 = 1.1774
 """Median of the length of a vector of two independent standard normal variables."""
 MEDIAN_OF_ABS = 0.6745

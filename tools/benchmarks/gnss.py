@@ -1,10 +1,10 @@
 """Finished runs of real drives, georeferenced by real fixes and by fixes made worse.
 
-    python -m tools.benchmarks.gnss RUN FIXES.csv --out FILE.json [--truth-origin LAT,LON,HEIGHT] [--residuals POS TRUTH]
+    python -m tools.benchmarks.gnss RUN FIXES --out FILE.json [--truth-origin LAT,LON,HEIGHT] [--residuals POS TRUTH]
 
 Prints for each alteration the error of the run without fixes and with them, after the best rigid motion, and, with
-`--truth-origin` (of the local frame of the true poses), horizontally without any. `--residuals`: a file of RTKLIB and the
-true positions as UrbanNav has them, whose differences are added to the fixes.
+`--truth-origin` (of the local frame of the true poses), horizontally without any. `--residuals`: a file of RTKLIB and
+the true positions as UrbanNav has them, whose differences are added to the fixes.
 """
 
 import shutil

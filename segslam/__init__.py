@@ -15,9 +15,13 @@ if TYPE_CHECKING:
     from segslam.fleets import fleet
     from segslam.registration import register
     from segslam.retrieval import Places
+    from segslam.run.evaluate import evaluate
+    from segslam.run.export import export
     from segslam.run.finished import read_run
     from segslam.run.locator import Located, Locator, locate
     from segslam.run.map_folder import map_folder
+    from segslam.run.replay import replay
+    from segslam.run.report import write_report as report
     from segslam.sessions.localise import localise
     from segslam.sessions.merge import merge
     from segslam.slam import Slam
@@ -37,6 +41,8 @@ __all__ = [
     "Scan",
     "SegslamError",
     "Slam",
+    "evaluate",
+    "export",
     "fleet",
     "keep_freed_memory",
     "load_config",
@@ -47,6 +53,8 @@ __all__ = [
     "open_dataset",
     "read_run",
     "register",
+    "replay",
+    "report",
 ]
 
 _HOMES = {
@@ -60,6 +68,8 @@ _HOMES = {
     "Scan": "types",
     "SegslamError": "errors",
     "Slam": "slam",
+    "evaluate": "run.evaluate",
+    "export": "run.export",
     "fleet": "fleets",
     "keep_freed_memory": "system.memory",
     "load_config": "config",
@@ -70,13 +80,18 @@ _HOMES = {
     "open_dataset": "datasets",
     "read_run": "run.finished",
     "register": "registration",
+    "replay": "run.replay",
+    "report": "run.report",
 }
+
+_NAMES = {"report": "write_report"}
+"""Names that differ in their modules."""
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first access; `segslam --help` needs none of them."""
     if name in _HOMES:
-        return getattr(import_module(f"segslam.{_HOMES[name]}"), name)
+        return getattr(import_module(f"segslam.{_HOMES[name]}"), _NAMES.get(name, name))
     if name == "__version__":
         from importlib.metadata import version
 

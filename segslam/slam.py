@@ -74,6 +74,11 @@ class Slam:
         self._attempts: list[LoopAttempt] = []
         self._is_finished = False
 
+    def __repr__(self) -> str:
+        loops = sum(isinstance(attempt.outcome, LoopClosure) for attempt in self._attempts)
+        state = "finished" if self._is_finished else "running"
+        return f"Slam({len(self._steps)} scans, {len(self._keyframe_rows)} keyframes, {loops} loops, {state})"
+
     def _new_graph(self) -> Graph:
         return PoseGraph(self.config.graph)
 

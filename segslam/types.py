@@ -291,7 +291,7 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Alignment(Record):
-    """A refined and verified registration; `fine.T_target_source` is the pose."""
+    """A refined and verified registration."""
 
     coarse: Registration
     fine: Registration
@@ -303,6 +303,11 @@ class Alignment(Record):
     """Share of the points in space that the other scan observed empty."""
     observability: float = 1.0
     """Smallest divided by largest variance of the translation, 0 to 1: small along a corridor."""
+
+    @property
+    def T_target_source(self) -> Transform:  # noqa: N802  (a transform)
+        """The pose of the source in the target: `p_target = T_target_source @ p_source`, (4, 4)."""
+        return self.fine.T_target_source
 
     @property
     def ok(self) -> bool:

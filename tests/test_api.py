@@ -13,7 +13,7 @@ from helpers.finished_run import MadeRun, make_run
 
 import segslam
 from segslam.run.finished import FinishedRun
-from segslam.trajectory import read_poses
+from segslam.trajectory import read_poses, write_tum
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,8 @@ def test_two_scans_are_registered_as_they_come_from_files() -> None:
     found = segslam.register(source, target.astype(np.float32).tolist())
     assert found.ok
     expected = np.linalg.inv(truth.T_world_lidar[2]) @ truth.T_world_lidar[53]
-    np.testing.assert_allclose(found.fine.T_target_source[:3, 3], expected[:3, 3], atol=0.3)
+    np.testing.assert_allclose(found.T_target_source[:3, 3], expected[:3, 3], atol=0.3)
+    assert found.T_target_source is found.fine.T_target_source
     with pytest.raises(segslam.SegslamError, match="shape"):
         segslam.register(source[:, :2], target)
 
@@ -114,3 +115,54 @@ def test_a_folder_without_usable_scans_is_an_error(tmp_path: Path) -> None:
         file.write_bytes(b"")
     with pytest.raises(segslam.SegslamError, match="none of its 2 scans"):
         segslam.map_folder(tmp_path / "kitti", tmp_path / "run")
+
+
+def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun, tmp_path: Path) -> None:
+    run = segslam.read_run(made.folder)
+    figures = segslam.evaluate(run)
+    assert figures["ate_m"] == pytest.approx(made.result.errors(made.truth)["ate_m"])
+    made.result.to_tum(tmp_path / "tum.txt")
+    write_tum(tmp_path / "true.txt", made.truth.stamp_ns, made.truth.T_world_lidar)
+    for estimate, reference in (
+        (run.result.trajectory, made.truth),
+        (run.result.trajectory.T_world_lidar, made.truth.T_world_lidar),
+        (tmp_path / "tum.txt", str(tmp_path / "true.txt")),
+        (run.result.trajectory.T_world_lidar, tmp_path / "true.txt"),
+    ):
+        assert segslam.evaluate(estimate, reference)["ate_m"] == pytest.approx(figures["ate_m"], rel=1e-4)
+    with pytest.raises(segslam.SegslamError, match="one for each"):
+        segslam.evaluate(run.result.trajectory.T_world_lidar[:-1], made.truth.T_world_lidar)
+    with pytest.raises(segslam.SegslamError, match="no ground truth"):
+        segslam.evaluate(run.result.trajectory)
+    assert segslam.report(str(made.folder)) == made.folder / "report.html"
+    assert segslam.export(made.folder, [tmp_path / "map.ply"])["num_map_points"] > 0
+    assert (tmp_path / "map.ply").is_file()
+
+
+def test_a_run_is_replayed_with_other_settings(tmp_path: Path) -> None:
+    write_kitti_sequence(tmp_path / "kitti", num_scans=5)
+    first = segslam.map_folder(tmp_path / "kitti", tmp_path / "run")
+    again = segslam.replay(first.folder, tmp_path / "again", settings=["verify.min_overlap=0.45"])
+    assert again.config.verify.min_overlap == 0.45
+    assert len(again.result.trajectory) == 5
+    assert again.metrics["kiss_icp_ate_m"] == pytest.approx(first.metrics["kiss_icp_ate_m"])
+    with pytest.raises(segslam.SegslamError, match="a replay uses the keyframes"):
+        segslam.replay(first.folder, tmp_path / "no", settings=["odometry.voxel_size_m=0.7"])
+    assert not (tmp_path / "no").exists()
+
+
+def test_representations_are_short_and_say_what_matters(made: MadeRun, tmp_path: Path) -> None:
+    assert repr(segslam.Config()) == "Config()"
+    changed = segslam.load_config(None, ["verify.min_overlap=0.45", "graph.final=gnc"])
+    assert set(repr(changed)[7:-1].split(", ")) == {"verify.min_overlap=0.45", "graph.final='gnc'"}
+    slam = segslam.Slam()
+    slam.process(round_drive()[0][0])
+    assert repr(slam) == "Slam(1 scans, 1 keyframes, 0 loops, running)"
+    write_kitti_sequence(tmp_path / "kitti", num_scans=3)
+    scans = segslam.open_dataset(tmp_path / "kitti")
+    assert repr(scans) == f"KittiSequence({scans.name!r}, 3 scans)"
+    run = segslam.read_run(made.folder)
+    assert repr(run).startswith(f"FinishedRun('{made.folder}', 120 scans")
+    html = run._repr_html_()
+    assert "<svg" in html
+    assert "scans mapped" in html

@@ -106,6 +106,22 @@ def test_the_notebook_maps_and_registers_simulated_scans(tmp_path: Path, monkeyp
     assert names["off_m"] < 0.3
 
 
+def test_the_site_lists_the_commands_in_the_groups_and_order_of_the_help() -> None:
+    page = runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))["commands_page"]()
+    shown = re.findall(r"^## segslam ([\w-]+)", page, re.MULTILINE)
+    named = [name for group in commands.GROUPS.values() for name in group]
+    assert [name for name in shown if name != "bench"] == named
+    assert re.findall(r"^\*\*([^*]+)\*\*$", page, re.MULTILINE) == list(commands.GROUPS)
+
+
+def test_the_container_has_the_libraries_of_the_install_page_and_copies_what_the_build_needs() -> None:
+    container = (ROOT / "Dockerfile").read_text()
+    [wanted] = re.findall(r"apt-get install (.*) python3-venv", (ROOT / "docs" / "install.md").read_text())
+    assert wanted in container
+    for copied in re.findall(r"^COPY (.*) /src", container, re.MULTILINE)[0].split():
+        assert (ROOT / copied).is_file()
+
+
 def test_the_site_has_a_page_for_every_command_and_public_name() -> None:
     pages = runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))
     page = pages["commands_page"]()

@@ -10,6 +10,7 @@ import segslam
 from segslam import cli
 from segslam.cli import commands
 
+BENCH_GROUP = "Paper"
 RECORDS = "segslam.types"
 CONFIG = """All settings, by section, frozen: `segslam.Config()` has the defaults,
 `segslam.load_config(path, overrides)` changes some of them. [Every setting](options.md) has a page of its own."""
@@ -25,7 +26,12 @@ def commands_page() -> str:
     """Every command with its arguments and options."""
     commands.add_all(cli.app)
     parts = ["# Commands\n\nGenerated from the program; `segslam COMMAND --help` shows the same.\n"]
-    for name, command in sorted(_leaves(get_command(cli.app))):
+    group = ""
+    for name, command in _leaves(get_command(cli.app)):
+        title = getattr(command, "rich_help_panel", None) or BENCH_GROUP
+        if title != group:
+            group = title
+            parts.append(f"**{group}**\n")
         about, _, example = inspect.cleandoc(command.help or "").partition("Example:")
         parts.append(f"## segslam {name}\n\n{about.strip()}\n")
         if example:

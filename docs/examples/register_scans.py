@@ -19,4 +19,4 @@ if isinstance(found, Rejected):
     print(f"no pose: {found.reason} ({found.detail})")
 else:
     print(f"overlap {found.overlap:.2f}, pose of the source in the target:")
-    print(found.fine.T_target_source.round(3))
+    print(found.T_target_source.round(3))

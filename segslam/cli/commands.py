@@ -30,6 +30,7 @@ from segslam.cli import (
     report,
     resume,
     simulate,
+    sweep,
     view,
     warm_up,
 )
@@ -58,6 +59,7 @@ GROUPS: dict[str, dict[str, tuple[Any, str]]] = {
     },
     "Evaluate": {
         "eval": (evaluate.evaluate, "Measure the error against ground truth."),
+        "sweep": (sweep.sweep, "Replay a grid of settings, and table the results."),
         "convert": (convert.convert, "Convert trajectories: KITTI, TUM, CSV, frames."),
         "compare": (compare.compare, "Compare runs in one table and one figure."),
     },

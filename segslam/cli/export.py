@@ -1,7 +1,6 @@
 """`segslam export`, and the map files of other commands."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,8 +13,6 @@ from segslam.cli.overwriting import OverwriteOption, check_free
 if TYPE_CHECKING:
     from segslam.config import MapConfig
     from segslam.log import RunLog
-    from segslam.run.georeferenced import Globe
-    from segslam.types import Indices, Keyframe, Transform
 
 WITH_MAP = ("map.ply", "map.png")
 """Files that `--map` writes into the run folder."""
@@ -57,44 +54,10 @@ def export(
 
 
 def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", quiet: bool) -> dict[str, Any]:
-    """Write the map of a finished run to each of the files, or to none. Returns figures of the map.
+    """As `segslam.run.export.write_maps`, with progress bars."""
+    from segslam.run.export import write_maps as write
 
-    Raises SegslamError if the run did not finish or a name has an unknown extension, WorkFailed if the disk is full.
-    """
-    from time import perf_counter
-
-    from segslam.map import check_files, write_map
-    from segslam.run.georeferenced import read_globe
-    from segslam.run.report import BEFORE_AFTER, draw_before_after
-    from segslam.run.tracks import is_track, track
-    from segslam.system.whole_files import cannot_write, whole_file
-
-    started = perf_counter()
-    folder = log.path.parent
-    globe = read_globe(folder)
-    origin = None if globe is None else globe.origin
-    of_map = [file for file in files if file.name != BEFORE_AFTER and not is_track(file)]
-    check_files(of_map, origin=origin)
-    with ExitStack() as complete:  # moves each file to its name at the end, after a failure none
-        for file in files:
-            if file.name == BEFORE_AFTER:
-                complete.enter_context(whole_file(file)).write_bytes(draw_before_after(folder))
-            elif is_track(file):
-                content = track(file, globe, _stamps(log), name=folder.resolve().name)
-                complete.enter_context(whole_file(file)).write_bytes(content)
-        if not of_map:
-            return {"map_seconds": perf_counter() - started}
-        try:
-            placed = _placed(log, globe, quiet=quiet)
-            made = write_map(placed, of_map, config=config, origin=origin, show=partial(_shown, quiet=quiet))
-        except OSError as error:
-            raise cannot_write(of_map[0], error) from error
-    return {
-        "num_map_points": made.num_points,
-        "num_map_moving_points": made.num_moving_points,
-        "num_map_voxels_seen_through": made.num_voxels_seen_through,
-        "map_seconds": perf_counter() - started,
-    }
+    return write(log, files, config=config, show=partial(_shown, quiet=quiet))
 
 
 def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
@@ -110,45 +73,5 @@ def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
     )
 
 
-def _stamps(log: "RunLog") -> "Indices":
-    """(n,) times of the scans of a finished run (ns)."""
-    from segslam.types import SegslamError
-
-    result = log.result()
-    if result is None:
-        raise SegslamError(f"{log.path}: the run did not finish; replay it, or resume it")
-    return result[1].stamp_ns
-
-
-def _placed(log: "RunLog", globe: "Globe | None", *, quiet: bool) -> "Iterator[tuple[Keyframe, Transform]]":
-    """Each keyframe, its points corrected as in the adjustment of the run, with its final T_world_keyframe.
-
-    The world of a georeferenced run is its local frame.
-    """
-    from dataclasses import replace
-
-    from segslam.geometry import raise_beams
-    from segslam.types import SegslamError
-
-    result = log.result()
-    if result is None:
-        raise SegslamError(
-            f"{log.path}: the run did not finish; run `segslam replay` on its log, or resume it with --resume"
-        )
-    estimate, _ = result
-    adjustment = log.adjustment()
-    raised_deg = 0.0 if adjustment is None else adjustment.correction_deg
-    num_gathered = 0
-    for row, step in enumerate(progress(log.steps(), total=log.num_steps(), title="gather", quiet=quiet)):
-        if step.keyframe is not None:
-            num_gathered += 1
-            points = raise_beams(step.keyframe.points, raised_deg)
-            T_world_keyframe = estimate.T_world_keyframe[step.keyframe.id] if globe is None else globe.T_enu_lidar[row]
-            yield replace(step.keyframe, points=points), T_world_keyframe
-    if num_gathered < len(estimate.T_world_keyframe):
-        readable = f"only {num_gathered} of its {len(estimate.T_world_keyframe)} keyframes are readable"
-        raise SegslamError(f"{log.path}: damaged, {readable}; the map is not written. Map the data again, or replay it")
-
-
-def _shown(parts: "Iterator[Any]", total: int, *, quiet: bool) -> "Iterator[Any]":
-    return progress(parts, total=total, title="clean", quiet=quiet)
+def _shown(items: "Iterable[Any]", total: int, title: str, *, quiet: bool) -> "Iterator[Any]":
+    return progress(items, total=total, title=title, quiet=quiet)

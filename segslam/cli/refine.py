@@ -23,7 +23,6 @@ from segslam.cli.console import (
 from segslam.cli.ending import finish
 from segslam.cli.export import WITH_MAP
 from segslam.cli.overwriting import OverwriteOption, make_room
-from segslam.cli.replay import check_settings
 from segslam.cli.run_options import WithMapOption
 from segslam.errors import SegslamError
 from segslam.system.interrupts import EXIT_STATUS, when_stopped
@@ -56,6 +55,7 @@ def refine(
     announce(f"refine: reading {run}", quiet=quiet)
     from segslam.log import read_log
     from segslam.run.folder import copy_alone, log_of, new_folder
+    from segslam.run.replay import check_settings
     from segslam.run.run import Run
     from segslam.slam import Slam
 

@@ -28,15 +28,12 @@ from segslam.loop_edits import LoopEdits
 from segslam.system.interrupts import EXIT_STATUS, when_stopped
 
 if TYPE_CHECKING:
-    from segslam.config import Config
     from segslam.log import RunLog
     from segslam.run.run import Run
     from segslam.slam_result import SlamResult
     from segslam.types import Step, Trajectory
 
 NO_EDITS = LoopEdits()
-BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "keyframes", "geometric")
-"""Sections of the settings that a replay cannot change, because the log contains their results."""
 
 
 def replay(
@@ -90,6 +87,7 @@ def replay_log(
     announce(f"replay: reading {log}", quiet=quiet)
     from segslam.log import read_log
     from segslam.run.folder import copy_alone, log_of, new_folder
+    from segslam.run.replay import check_settings
     from segslam.run.run import Run
     from segslam.slam import Slam
 
@@ -130,19 +128,6 @@ def replay_log(
     if interrupted:
         when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps were replayed; results in {folder}")
         raise typer.Exit(EXIT_STATUS)
-
-
-def check_settings(settings_now: "Config", recorded: "RunLog") -> None:
-    """Raises SegslamError for a change that would have no effect."""
-    from segslam.config import changed_settings
-    from segslam.types import SegslamError
-
-    for key, before, _ in changed_settings(recorded.config, settings_now):
-        if key.partition(".")[0] in BEFORE_THE_KEYFRAMES:
-            raise SegslamError(
-                f"{key}: a replay uses the keyframes of {recorded.path}, which were made with {before}; "
-                "keep this value, or map the data again"
-            )
 
 
 def _repeat(run: "Run", recorded: "RunLog", *, quiet: bool) -> tuple[dict[str, Any], bool]:

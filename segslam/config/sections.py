@@ -631,7 +631,19 @@ class MapConfig(Section):
 
 
 class Config(Section):
-    """All sections."""
+    """All sections; the representation shows the settings that differ from the defaults."""
+
+    def __repr__(self) -> str:
+        default = Config()
+        changed = (
+            f"{name}.{key}={value!r}"
+            for name, section in self
+            for key, value in section
+            if value != getattr(getattr(default, name), key)
+        )
+        return f"Config({', '.join(changed)})"
+
+    __str__ = __repr__
 
     sensor: SensorCalibrationConfig = SensorCalibrationConfig()
     odometry: OdometryConfig = OdometryConfig()

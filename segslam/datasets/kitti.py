@@ -55,6 +55,9 @@ class KittiSequence:
         """Name of each scan's file, without extension."""
         return tuple(file.stem for file in self.scan_files)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
+
     def __len__(self) -> int:
         return len(self.scan_files)
 

@@ -74,6 +74,9 @@ class Recording:
         self.labels: LabelSource = open_labels(labels, beside=beside, scan_names=self.names, encoding=encoding)
         self.reference = self._reference(beside / "poses.txt" if kind == "generic" else None)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
+
     def __len__(self) -> int:
         return len(self.scan_index)
 

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -20,6 +21,7 @@ PROTOBUF_TOPICS: dict[str, Any] = {
     schema.TRAJECTORY: PosesInFrame,
     schema.TRAJECTORY_BEFORE: PosesInFrame,
     schema.GROUND_TRUTH: PosesInFrame,
+    schema.LOG: Log,
     schema.ACCEPTED: SceneUpdate,
     schema.REJECTED: SceneUpdate,
     schema.GRAPH: SceneUpdate,

@@ -9,6 +9,7 @@ from google.protobuf.message import Message
 from segslam import geometry
 from segslam.config import LogConfig
 from segslam.log import foxglove, schema
+from segslam.log.messages import messages_of
 from segslam.log.records import codec
 from segslam.points import voxel_first, within_range
 from segslam.types import (
@@ -84,12 +85,14 @@ class Drawing:
             foxglove.frame_transform(step.T_odom_lidar, parent=schema.ODOM, child=schema.LIDAR, stamp_ns=step.stamp_ns),
         )
         if step.keyframe is not None:
-            yield from self._keyframe(step.keyframe)
+            yield from self._keyframe(step.keyframe, corrected=step.estimate is None or not path)
         if step.estimate is not None:
             yield from self.draw_estimate(step.estimate, stamp_ns=step.stamp_ns, path=path)
         else:
             yield self._odom_in_world(step.stamp_ns)
         yield from self._attempts(step.attempts, step.stamp_ns)
+        for message in messages_of(step):
+            yield schema.LOG, message
 
     def draw_estimate(self, estimate: GraphEstimate, *, stamp_ns: int, path: bool = True) -> Iterator[Topical]:
         """Pose of odom in world and, if `path`, the corrected path and the closures."""
@@ -122,7 +125,8 @@ class Drawing:
             self._T_world_odom, parent=schema.WORLD, child=schema.ODOM, stamp_ns=stamp_ns
         )
 
-    def _keyframe(self, keyframe: Keyframe) -> Iterator[Topical]:
+    def _keyframe(self, keyframe: Keyframe, *, corrected: bool) -> Iterator[Topical]:
+        """Its points, and now and then the paths: by odometry and, with `corrected`, in world as far as it is known."""
         self._T_odom_keyframe[keyframe.id] = keyframe.T_odom_keyframe
         stamp_ns, some = keyframe.stamp_ns, slice(None, None, self._config.view_every)
         points = np.round(keyframe.points[some] / VIEW_GRID_M) * VIEW_GRID_M
@@ -134,6 +138,9 @@ class Drawing:
             self._num_on_path = len(self._T_odom_keyframe)
             path = foxglove.poses_in_frame(self._T_odom_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
             yield schema.ODOMETRY, path
+            if corrected:
+                poses = [self._in_world(number) for number in self._T_odom_keyframe]
+                yield schema.TRAJECTORY, foxglove.poses_in_frame(poses, frame=schema.WORLD, stamp_ns=stamp_ns)
 
     def _attempts(self, attempts: tuple[LoopAttempt, ...], stamp_ns: int) -> Iterator[Topical]:
         for topic, wanted in ((schema.ACCEPTED, False), (schema.REJECTED, True)):
@@ -171,9 +178,12 @@ class Drawing:
 
     def _position(self, keyframe_id: int) -> Vector:
         """Position in world, by the last estimate and the odometry since."""
+        return self._in_world(keyframe_id)[:3, 3]
+
+    def _in_world(self, keyframe_id: int) -> Transform:
         if keyframe_id in self._T_world_keyframe:
-            return self._T_world_keyframe[keyframe_id][:3, 3]
-        return (self._T_world_odom @ self._T_odom_keyframe[keyframe_id])[:3, 3]
+            return self._T_world_keyframe[keyframe_id]
+        return self._T_world_odom @ self._T_odom_keyframe[keyframe_id]
 
 
 def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, *, view_every: int) -> tuple[Points, Labels]:

@@ -42,7 +42,7 @@ def frame_transform(T_parent_child: Transform, *, parent: str, child: str, stamp
     """Message with the pose of frame `child` in frame `parent`."""
     pose = _pose(T_parent_child)
     return FrameTransform(
-        timestamp=_timestamp(stamp_ns),
+        timestamp=timestamp(stamp_ns),
         parent_frame_id=parent,
         child_frame_id=child,
         translation=pose.position,
@@ -56,7 +56,7 @@ def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) ->
     rows["xyz"], rows["label"] = points, labels
     rows["rgba"][:, :3], rows["rgba"][:, 3] = of_classes(labels), 255
     return PointCloud(
-        timestamp=_timestamp(stamp_ns),
+        timestamp=timestamp(stamp_ns),
         frame_id=frame,
         pose=_IDENTITY,
         point_stride=_POINT.itemsize,
@@ -68,7 +68,7 @@ def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) ->
 def poses_in_frame(T_frame_each: Iterable[Transform], *, frame: str, stamp_ns: int) -> PosesInFrame:
     """Message with a path; `transforms` recovers its poses to float64 precision."""
     stack = np.array(list(T_frame_each)).reshape(-1, 4, 4)
-    return PosesInFrame(timestamp=_timestamp(stamp_ns), frame_id=frame, poses=_poses(stack))
+    return PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=frame, poses=_poses(stack))
 
 
 def transforms(poses: PosesInFrame) -> list[Transform]:
@@ -98,7 +98,7 @@ def entity(
 ) -> SceneEntity:
     """Lines that remain until an entity of the same identity replaces them; a click shows the metadata."""
     return SceneEntity(
-        timestamp=_timestamp(stamp_ns),
+        timestamp=timestamp(stamp_ns),
         frame_id=frame,
         id=identity,
         metadata=[KeyValuePair(key=key, value=value) for key, value in metadata.items()],
@@ -129,7 +129,8 @@ def _pose(T_frame_body: Transform) -> Pose:
     return Pose(position=Vector3(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 
-def _timestamp(stamp_ns: int) -> Timestamp:
+def timestamp(stamp_ns: int) -> Timestamp:
+    """Message with a time."""
     seconds, nanos = divmod(stamp_ns, 1_000_000_000)
     return Timestamp(seconds=seconds, nanos=nanos)
 

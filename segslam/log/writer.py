@@ -18,6 +18,7 @@ from segslam.log.channels import channels
 from segslam.log.cloud import KeyframePoints, keyframe_points, points_and_labels
 from segslam.log.container import messages_within
 from segslam.log.drawing import Drawing, Topical, ground_truth
+from segslam.log.messages import warning
 from segslam.log.origin import metadata
 from segslam.log.output import Output
 from segslam.log.records import codec
@@ -101,6 +102,10 @@ class LogWriter:
         written = self._write(self._step_messages(step), stamp_ns=step.stamp_ns)
         if step.keyframe is not None:
             self._steps_of_keyframes[step.keyframe.id] = written
+
+    def warn(self, text: str) -> None:
+        """Add a warning to `/log`, at the time of the last step."""
+        self._write(_serialised([(schema.LOG, warning(text, stamp_ns=self._stamp_ns))]), stamp_ns=self._stamp_ns)
 
     def keep(self, keyframe: Keyframe) -> None:
         """Keep the newest keyframe in memory until its step is written: `Clouds` of segslam.keyframes."""

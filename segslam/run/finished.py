@@ -76,7 +76,7 @@ ACCURACY = frozenset(
 """Figures that need a reference; another reference replaces all of them."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FinishedRun:
     """The content of a run folder."""
 
@@ -89,6 +89,16 @@ class FinishedRun:
     metrics: dict[str, Any]
     options: Mapping[str, str]
     """Command-line options of the run other than settings, such as `frames`; empty for a replay."""
+
+    def __repr__(self) -> str:
+        scans, error = len(self.result.trajectory), self.metrics.get("ate_m")
+        return f"FinishedRun({str(self.folder)!r}, {scans} scans{'' if error is None else f', error {error:.3f} m'})"
+
+    def _repr_html_(self) -> str:
+        """The trajectory and the figures, for notebooks."""
+        from segslam.run.report.summary import as_html
+
+        return as_html(self)
 
 
 def read_run(folder: str | Path) -> FinishedRun:

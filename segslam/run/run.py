@@ -296,6 +296,7 @@ class Run:
     def _report(self, bad: BadScan) -> None:
         if self.num_steps:
             logger.warning("%s; skipped", bad)
+            self._log.warn(f"{bad}; skipped")
         else:
             self._unreported.append(bad)
 

@@ -93,7 +93,7 @@ def test_the_poses_of_all_estimates_stay_in_proportion_to_the_keyframes(
     read = list(read_log(write_log(tmp_path / "log.mcap", steps)).steps())
     logged = [len(step.estimate.T_world_keyframe) for step in read if step.estimate is not None]
     assert 0.8 * 8 * 130 < sum(logged) <= 8 * 130 < sum(len(s.estimate.T_world_keyframe) for s in steps if s.estimate)
-    assert len(decoded(tmp_path / "log.mcap", schema.TRAJECTORY)) == len(logged)
+    assert len(logged) <= len(decoded(tmp_path / "log.mcap", schema.TRAJECTORY)) < len(logged) + 80
     for step, again in zip(steps, read, strict=True):
         assert_same(step if again.estimate is not None else replace(step, estimate=None), again)
 

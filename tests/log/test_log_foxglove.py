@@ -189,7 +189,8 @@ def test_the_layout_draws_all_that_the_log_has_to_draw(whole: Path) -> None:
     frames = {schema.WORLD, schema.ODOM, schema.LIDAR}
     topics = {channel.topic for channel in channels if channel.message_encoding == "protobuf"}
     panel = LAYOUT["configById"]["3D!segslam"]
-    assert set(panel["topics"]) == topics - {schema.TRANSFORMS, schema.KEYFRAME}
+    assert set(panel["topics"]) == topics - {schema.TRANSFORMS, schema.KEYFRAME, schema.LOG}
+    assert LAYOUT["configById"]["RosOut!log"]["topicToRender"] == schema.LOG
     assert {name.removeprefix("frame:") for name in panel["transforms"]} == frames
     assert panel["followTf"] in frames
 

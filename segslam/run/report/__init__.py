@@ -23,11 +23,12 @@ MOST_KEYFRAMES = 500
 """Chosen: in longer drives, every second keyframe is drawn, or every third, and so on; each takes about 10 ms."""
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: str | Path) -> Path:
     """Write `report.html` into a run folder, from the files there; returns its path.
 
     Raises SegslamError if the folder contains no finished run, or cannot be written.
     """
+    folder = Path(folder)
     run = read_run(folder)
     log = read_log(folder / LOG)
     with matplotlib.rc_context(figures.STYLE):

@@ -16,7 +16,7 @@ from segslam.run.finished import FinishedRun
 from segslam.run.report.figures import paths_of
 from segslam.slam_result import outcome_text
 from segslam.trajectory import Poses, rows_of_same_scan
-from segslam.types import GROUND_LABELS, Keyframe, LoopAttempt, LoopClosure, Points, Transform
+from segslam.types import GROUND_LABELS, REJECTED_WEIGHT, Keyframe, LoopAttempt, LoopClosure, Points, Transform
 
 MOST_SCANS = 3000
 """Chosen: of longer drives, every second scan is drawn, or every third, and so on; a browser pans these smoothly."""
@@ -27,8 +27,6 @@ NEAR_M = 50.0
 """Chosen: points drawn of each cloud, and their largest distance."""
 STEP_M = 0.1
 """Resolution of the coordinates of clouds, in whole numbers of 16 bits."""
-TRUSTED = 0.5
-"""Closures with a smaller weight are rejected by the optimiser, as in the picture of the map before and after."""
 
 
 def with_clouds(run: FinishedRun) -> list[LoopAttempt]:
@@ -101,7 +99,7 @@ def _loop(run: FinishedRun, attempt: LoopAttempt, ids: set[int]) -> dict[str, An
     T_world, T_odom = estimate.T_world_keyframe, run.result.odometry.T_world_lidar[rows]
     kind = "rejected"
     if isinstance(attempt.outcome, LoopClosure):
-        kind = "accepted" if estimate.closure_weights[pair] >= TRUSTED else "rejected by the optimiser"
+        kind = "accepted" if estimate.closure_weights[pair] >= REJECTED_WEIGHT else "rejected by the optimiser"
     loop: dict[str, Any] = {
         "name": f"{source_id} to {target_id}",
         "kind": kind,

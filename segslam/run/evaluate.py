@@ -1,0 +1,67 @@
+"""Errors of runs, trajectories and pose files against ground truth."""
+
+from pathlib import Path
+
+import numpy as np
+
+from segslam.evaluation import Z_UP
+from segslam.run.finished import FinishedRun
+from segslam.scores import Align, scores
+from segslam.trajectory import PoseFile, Poses, read_poses, rows_of_same_scan, rows_of_same_stamp
+from segslam.types import IndexPairs, SegslamError, Trajectory
+
+STAMP_TOLERANCE_NS = 10_000_000
+Given = FinishedRun | Trajectory | Poses | str | Path
+"""A run, a trajectory, poses (n, 4, 4), or a pose file in KITTI or TUM format."""
+
+
+def evaluate(
+    estimate: Given,
+    reference: Given | None = None,
+    *,
+    align: Align = "se3",
+    rpe_distance_m: float | None = None,
+    up: tuple[float, float, float] = Z_UP,
+) -> dict[str, float]:
+    """The error figures of `segslam eval`: `ate_m` (rms, m), its mean, median and maximum, KITTI's errors and others.
+
+    Poses of runs and trajectories are matched by scan number, those of TUM files by stamp (within 10 ms), all others
+    row by row. `reference` may be omitted for a run with ground truth. `align`, `rpe_distance_m` as for `--align` and
+    `--rpe-distance`; `up`: upward axis of the reference. Raises SegslamError if fewer than three poses match.
+    """
+    if reference is None:
+        reference = estimate.reference if isinstance(estimate, FinishedRun) else None
+        if reference is None:
+            raise SegslamError("evaluate: no ground truth; give `reference`")
+    made, true = _known(estimate), _known(reference)
+    rows = _rows(made, true)
+    figures = scores(
+        _poses(made)[rows[:, 0]], _poses(true)[rows[:, 1]], align=align, rpe_distance_m=rpe_distance_m, up=up
+    )
+    if not figures:
+        raise SegslamError(f"evaluate: only {len(rows)} poses match the reference; at least three are needed")
+    return figures
+
+
+def _known(given: Given) -> Trajectory | PoseFile:
+    if isinstance(given, FinishedRun):
+        return given.result.trajectory
+    if isinstance(given, Trajectory):
+        return given
+    if isinstance(given, str | Path):
+        return read_poses(Path(given))
+    return PoseFile(np.asarray(given, dtype=np.float64), None)
+
+
+def _poses(known: Trajectory | PoseFile) -> Poses:
+    return known.T_world_lidar if isinstance(known, Trajectory) else known.T_a_b
+
+
+def _rows(made: Trajectory | PoseFile, true: Trajectory | PoseFile) -> IndexPairs:
+    if isinstance(made, Trajectory) and isinstance(true, Trajectory):
+        return rows_of_same_scan(made.scan_index, true.scan_index)
+    if made.stamp_ns is not None and true.stamp_ns is not None:
+        return rows_of_same_stamp(made.stamp_ns, true.stamp_ns, max_difference_ns=STAMP_TOLERANCE_NS)
+    if len(made) != len(true):
+        raise SegslamError(f"evaluate: {len(made)} poses for {len(true)} true ones; without stamps give one for each")
+    return np.column_stack([np.arange(len(made)), np.arange(len(made))])

@@ -1,0 +1,47 @@
+"""A grid of settings by replay."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from helpers.commands import run
+
+from segslam.cli.sweep import grid_of
+from segslam.errors import SegslamError
+from segslam.run.finished import read_run
+
+pytestmark = pytest.mark.usefixtures("short_runs")
+
+
+def test_all_combinations_are_made() -> None:
+    assert grid_of(["a.b=1,2", "c.d=x"]) == {"a.b=1 c.d=x": ["a.b=1", "c.d=x"], "a.b=2 c.d=x": ["a.b=2", "c.d=x"]}
+    with pytest.raises(SegslamError, match="give values"):
+        grid_of(["a.b"])
+
+
+def test_a_sweep_replays_each_value_once_and_tables_it(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "sweep"
+    given = ["sweep", log, "--set", "verify.min_overlap=0.2,0.95", "--out", out, "--csv", tmp_path / "t.csv"]
+    assert run(*given, "--json", "--quiet") == 0
+    rows = json.loads(capsys.readouterr().out)["runs"]
+    loose, strict = rows["verify.min_overlap=0.2"], rows["verify.min_overlap=0.95"]
+    assert loose["num_loops_accepted"] > strict["num_loops_accepted"]
+    assert read_run(out / "verify.min_overlap=0.95").config.verify.min_overlap == 0.95
+    names = [row["name"] for row in csv.DictReader((tmp_path / "t.csv").read_text().splitlines())]
+    assert names == list(rows)
+    before = (out / "verify.min_overlap=0.2" / "log.mcap").stat().st_mtime_ns
+    assert run(*given, "--overwrite") == 0
+    assert (out / "verify.min_overlap=0.2" / "log.mcap").stat().st_mtime_ns == before
+    assert "verify.min_overlap=0.95" in capsys.readouterr().out
+
+
+def test_a_wrong_setting_is_reported_before_anything_is_replayed(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for setting, message in (("verify.nothing=1,2", "unknown key"), ("keyframes.voxel_m=0.3,0.4", "a replay uses")):
+        assert run("sweep", log, "--set", setting, "--out", tmp_path / "no", "-q") == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()

@@ -1,0 +1,34 @@
+"""A wheel built from the sources, installed into a bare environment, works there."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def _run(*words: object, folder: Path) -> str:
+    done = subprocess.run([str(word) for word in words], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_a_wheel_in_a_bare_environment_maps_a_simulated_drive(tmp_path: Path) -> None:
+    """All dependencies come from the package registry; nothing of the sources is visible."""
+    _run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path, ROOT, folder=tmp_path)
+    (wheel,) = tmp_path.glob("segslam-*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    assert {"segslam/py.typed", "segslam/run/report/interactive.js"} <= names
+    assert not any(name.startswith(("tests/", "tools/", "docs/")) for name in names)
+    _run(sys.executable, "-m", "venv", "bare", folder=tmp_path)
+    scripts = tmp_path / "bare" / "bin"
+    _run(scripts / "pip", "install", "-q", wheel, folder=tmp_path)
+    segslam = scripts / "segslam"
+    assert _run(segslam, "--version", folder=tmp_path).startswith("segslam ")
+    _run(segslam, "simulate", "streets", "--sensor", "vlp16", "--frames", "5", "-q", folder=tmp_path)
+    _run(segslam, "map", "streets", "--out", "run", "-q", folder=tmp_path)
+    assert (tmp_path / "run" / "report.html").stat().st_size > 1_000_000

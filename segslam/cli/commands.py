@@ -15,6 +15,7 @@ from segslam.cli import (
     evaluate,
     export,
     fleet,
+    georeference,
     info,
     label,
     live,
@@ -48,6 +49,7 @@ GROUPS: dict[str, dict[str, tuple[Any, str]]] = {
         "locate": (locate.locate, "Find the poses of single scans in a map."),
         "localise": (localise.localise, "Localise a drive in the map of an earlier run."),
         "merge": (merge.merge, "Merge runs that share places into one run."),
+        "georeference": (georeference.georeference, "Place a run on the globe by position fixes."),
         "export": (export.export, "Write the map: cloud, top view, occupancy grid."),
     },
     "Look": {

@@ -26,11 +26,13 @@ def finish(
     more: Callable[["SlamResult"], Mapping[str, Any]] = lambda result: {},
     search_s: float = math.inf,
     stopped: bool = False,
+    place: Callable[[Path], str] | None = None,
 ) -> dict[str, Any]:
     """Finish a run: write its results, and the map if files are given; show and return its figures.
 
     `more` adds figures computed from the result. `search_s` limits the last search for loops, as in `Slam.finish`.
-    `stopped`: Ctrl-C ended the run, before the last scan if there is one.
+    `stopped`: Ctrl-C ended the run, before the last scan if there is one. `place` georeferences the run before its maps
+    are written, and returns what it found.
     """
     from segslam.calibration import vertical_angle_advice
     from segslam.log import read_log
@@ -47,6 +49,7 @@ def finish(
     metrics |= more(result)
     write_metrics(run.folder, metrics)
     try:
+        placed = place(run.folder) if place is not None else ""
         if map_files:
             log = read_log(run.folder / LOG)
             metrics |= write_maps(log, map_files, config=log.config.map, quiet=quiet)
@@ -61,6 +64,8 @@ def finish(
         say(summary(metrics, run.folder), quiet=quiet)
         if advice := vertical_angle_advice(metrics, run.config.sensor):
             say(advice, quiet=quiet)
+        if placed:
+            say(placed, quiet=quiet)
         if map_files:
             say(map_summary(metrics, map_files), quiet=quiet)
     return metrics

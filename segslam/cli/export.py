@@ -23,7 +23,8 @@ def export(
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="Files to write: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid), or before_after.png."
+            help="Files to write: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid), or before_after.png; of "
+            "a georeferenced run also .tif (GeoTIFF), .geojson .kml .gpx (trajectory), map_projector_info.yaml."
         ),
     ],
     config: ConfigOption = None,
@@ -33,6 +34,8 @@ def export(
     quiet: QuietOption = False,
 ) -> None:
     """Write the map of a finished run: a point cloud, a top view, an occupancy grid for map_server.
+
+    After `segslam georeference` maps are in the local frame (east, north, up), .las, .laz and .tif in UTM.
 
     Example: segslam export runs/00 map.laz map.png grid.yaml --set map.color=height
     """

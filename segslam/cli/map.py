@@ -15,6 +15,7 @@ from segslam.cli.console import announce, how_to_go_on, print_json, print_out, p
 from segslam.cli.ending import finish
 from segslam.cli.export import map_summary, write_maps
 from segslam.cli.foxglove import serve_foxglove
+from segslam.cli.gnss_options import GnssOptions
 from segslam.cli.in_map import pipeline
 from segslam.cli.overwriting import check_free, make_room
 from segslam.cli.preset import check_preset, preset_config
@@ -33,8 +34,9 @@ if TYPE_CHECKING:
     from segslam.run.run import Run
     from segslam.types import BadScan, Step
 
-FREE_OPTIONS = ("data", "dataset", "sequence", "map_files")
+FREE_OPTIONS = ("data", "dataset", "sequence", "map_files", "gnss", "gnss_use", "gnss_offset")
 """Options in the log that may be others when the run is resumed, as long as the data is the same."""
+NO_GNSS = GnssOptions()
 
 
 @with_options
@@ -46,6 +48,7 @@ def map_command(
     ] = None,
     options: RunOptions,
     output: OutputOptions,
+    gnss: GnssOptions,
     dry_run: DryRunOption = False,
 ) -> None:
     """Map scans: write the corrected trajectory, the loops, a log, a report and, with ground truth, the error.
@@ -54,7 +57,7 @@ def map_command(
     """
     if out is None and not dry_run:
         raise SegslamError("--out: give a new folder for the run, as in --out runs/00 (to look first: --dry-run)")
-    map_data(data, out or Path(), options, output, dry_run=dry_run)
+    map_data(data, out or Path(), options, output, gnss, dry_run=dry_run)
 
 
 def map_data(
@@ -62,6 +65,7 @@ def map_data(
     folder: Path,
     options: RunOptions,
     output: OutputOptions,
+    gnss: GnssOptions = NO_GNSS,
     *,
     dry_run: bool = False,
     in_map: Path | None = None,
@@ -87,6 +91,8 @@ def map_data(
     if settings.map.color == "intensity":
         check_intensities(scans)
     choices = resume_options(options.source(data), odometry=options.odometry, map_files=map_names)
+    place = gnss.placing(data)
+    choices |= gnss.recorded()
     choices |= {"in_map": str(in_map.expanduser().resolve())} if in_map else {}
     if recorded is None:
         settings = output.load_config(base=preset_config(options.preset, scans, quiet=quiet))
@@ -117,6 +123,7 @@ def map_data(
             watch=scene.add if scene else _nobody,
             go_on=f"continue with: segslam resume {shlex.quote(str(folder))}",
             slam_of=slam_of,
+            place=place,
             mirror=server.send if server else None,
             json=output.json,
             quiet=quiet,
@@ -164,6 +171,7 @@ def map_scans(
     watch: "Callable[[Step | BadScan], None]" = _nobody,
     mirror: "Mirror | None" = None,
     slam_of: "SlamOf | None" = None,
+    place: Callable[[Path], str] | None = None,
     go_on: str,
     json: bool,
     quiet: bool,
@@ -171,7 +179,8 @@ def map_scans(
     """Map a data set into a new folder, or resume the run `recorded`, and show the figures.
 
     The run keeps the vertical angle with which the data set was opened.
-    `watch` is called with each step, `mirror` with each message of the log; `slam_of` creates the pipeline. Raises
+    `watch` is called with each step, `mirror` with each message of the log; `slam_of` creates the pipeline, `place`
+    georeferences the run. Raises
     typer.Exit(130) if Ctrl-C ended the run early; `go_on`, the command that continues it, is then printed.
     """
     from segslam.odometry import OdometryApart
@@ -218,6 +227,7 @@ def map_scans(
             quiet=quiet,
             more=lambda _: resumed,
             stopped=interrupted,
+            place=place,
         )
     if interrupted:
         when_stopped(f"{metrics['num_scans']} of {len(scans)} scans are mapped; {go_on}")

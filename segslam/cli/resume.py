@@ -8,6 +8,7 @@ import typer
 
 from segslam.cli.checks import check_exists, log_to_resume
 from segslam.cli.console import JsonOption, QuietOption, announce, say
+from segslam.cli.gnss_options import GnssOptions
 from segslam.cli.map import map_data
 from segslam.cli.run_options import OutputOptions, RunOptions, ViewOption
 from segslam.errors import SegslamError
@@ -57,7 +58,7 @@ def resume(
     map_files = _map_files(chosen.get("map_files", "[]"), run, recorded.path, quiet=quiet)
     output = OutputOptions(map_file=map_files, view=view, json=json, quiet=quiet)
     in_map = Path(chosen["in_map"]) if chosen.get("in_map") else None
-    map_data(Path(chosen["data"]), run, options, output, in_map=in_map)
+    map_data(Path(chosen["data"]), run, options, output, GnssOptions.of(chosen), in_map=in_map)
 
 
 def _encoding(name: str, log: Path) -> Any:

@@ -8,15 +8,17 @@ and one tile, whatever the length of the drive.
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from segslam.config import MapConfig
+from segslam.gnss.geodesy import Origin
 from segslam.map.clouds import LasCloud, PcdCloud, PlyCloud, check_las
 from segslam.map.grid import Grid
 from segslam.map.part import Extent, MapFile, Part
 from segslam.map.picture import Picture
+from segslam.map.projected import GeoTiff, check_projected
 from segslam.map.store import MapStore
 from segslam.system.interrupts import removed_when_stopped
 from segslam.system.whole_files import check_target, whole_file
@@ -31,6 +33,8 @@ KINDS: dict[str, type[MapFile]] = {
     ".laz": LasCloud,
     ".png": Picture,
     ".yaml": Grid,
+    ".tif": GeoTiff,
+    ".tiff": GeoTiff,
 }
 """Writers by file extension."""
 
@@ -48,18 +52,20 @@ class MapSummary:
     """Number of voxels removed because other keyframes saw through them."""
 
 
-def check_names(files: Sequence[Path]) -> None:
-    """Raises SegslamError for a file with an unknown extension, or one that needs a missing package."""
+def check_names(files: Sequence[Path], *, origin: Origin | None = None) -> None:
+    """Raises SegslamError for a file with an unknown extension, or one that needs a missing package or the origin."""
     for file in files:
         if file.suffix.lower() not in KINDS:
             raise SegslamError(f"{file}: unknown kind of map; its name must end in {', '.join(KINDS)}")
         if KINDS[file.suffix.lower()] is LasCloud:
-            check_las(file)
+            check_las(file, is_projected=origin is not None)
+        if KINDS[file.suffix.lower()] is GeoTiff:
+            check_projected(file, origin)
 
 
-def check_files(files: Sequence[Path]) -> None:
+def check_files(files: Sequence[Path], *, origin: Origin | None = None) -> None:
     """Raises SegslamError as `check_names`, for a file that cannot be written, or for one that is given twice."""
-    check_names(files)
+    check_names(files, origin=origin)
     for file in files:
         check_target(file)
         if files.count(file) > 1:
@@ -75,16 +81,18 @@ def write_map(
     files: Sequence[Path],
     *,
     config: MapConfig,
+    origin: Origin | None = None,
     show: Callable[[Iterator[Part], int], Iterator[Part]] = _unseen,
 ) -> MapSummary:
     """Make the map of the keyframes, each with its T_world_keyframe, and write it to one or more files.
 
     The extension selects the format: .ply, .pcd, .las, .laz: point cloud; .png: top view; .yaml, with a .pgm beside it:
-    occupancy grid. Files are written atomically. `show` receives the parts while they are written, and their number, to
-    show progress. Raises SegslamError for another extension, a missing folder, or if no keyframe has a point; raises
-    OSError if the disk is full.
+    occupancy grid; .tif: the top view as GeoTIFF. With the `origin` of the world frame (east, north, up) on the globe,
+    .las and .laz are in UTM. Files are written atomically. `show` receives the parts while they are written, and their
+    number, to show progress. Raises SegslamError for another extension, a missing folder, or if no keyframe has a
+    point; raises OSError if the disk is full.
     """
-    check_files(files)
+    check_files(files, origin=origin)
     with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name, removed_when_stopped(Path(name)):
         scratch = Path(name)
         store = MapStore(scratch, config)
@@ -94,7 +102,7 @@ def write_map(
         if extent is None:
             raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
         parts = show(store.parts(), store.num_tiles)
-        num_points = _write(parts, extent, files, scratch=scratch / "files", config=config)
+        num_points = _write(parts, replace(extent, origin=origin), files, scratch=scratch / "files", config=config)
     return MapSummary(
         num_keyframes=store.num_keyframes,
         num_points=num_points,

@@ -1,15 +1,17 @@
 """Point cloud files written piece by piece: PLY, PCD, LAS and LAZ."""
 
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from segslam.config import MapConfig
+from segslam.gnss.geodesy import Origin
 from segslam.map.part import Extent, Part
 from segslam.system.extras import how_to_install
-from segslam.types import Label, SegslamError
+from segslam.types import Label, Points, SegslamError
 
 PLY_ROW = [("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")]
 PCD_ROW = [("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")]
@@ -101,7 +103,8 @@ class PcdCloud:
 class LasCloud:
     """LAS 1.4, point format 7, in millimetres, with colours and ASPRS classes; compressed if the name ends in .laz.
 
-    `user_data` holds the label (SemanticKITTI learning id). Intensities are scaled to 16 bits, as LAS requires.
+    With the origin of the world frame on the globe, coordinates are UTM, with ellipsoidal heights. `user_data` holds
+    the label (SemanticKITTI learning id). Intensities are scaled to 16 bits, as LAS requires.
     """
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
@@ -111,13 +114,16 @@ class LasCloud:
         header = laspy.LasHeader(version="1.4", point_format=7)
         header.scales = np.full(3, LAS_SCALE_M)
         self._intensity_step = None if extent.brightest is None else (extent.brightest or 1.0) / 65535
+        self._projected: Callable[[Points], Points] = np.asarray
+        if extent.origin is not None:
+            self._projected = _utm(extent.origin, header)
         self._writer = laspy.open(file, mode="w", header=header)
         self._class_of_label = np.array([ASPRS_OF_LABEL.get(label, 1) for label in Label], np.uint8)
 
     def add(self, part: Part) -> None:
         """Append the points of a part."""
         record = self._laspy.ScaleAwarePointRecord.zeros(len(part.points), header=self._writer.header)
-        record.x, record.y, record.z = part.points.astype(np.float64).T
+        record.x, record.y, record.z = self._projected(part.points.astype(np.float64)).T
         record.red, record.green, record.blue = 257 * part.colors.astype(np.uint16).T  # 255 to 65535
         record.classification, record.user_data = self._class_of_label[part.labels], part.labels
         if self._intensity_step is not None:
@@ -129,11 +135,25 @@ class LasCloud:
         self._writer.close()
 
 
-def check_las(file: Path) -> None:
-    """Raises SegslamError if the packages for LAS and LAZ are missing."""
+def _utm(origin: Origin, header: Any) -> Callable[[Points], Points]:
+    """UTM coordinates of points, whose zone and offsets are written into the header of a LAS file."""
+    from pyproj import CRS
+
+    from segslam.map.projected import Utm
+
+    utm = Utm(origin)
+    header.offsets = np.floor(utm(np.zeros((1, 3)))[0])
+    header.add_crs(CRS.from_epsg(utm.epsg))
+    return utm
+
+
+def check_las(file: Path, *, is_projected: bool) -> None:
+    """Raises SegslamError if the packages for LAS and LAZ, and those for coordinate systems, are missing."""
     missing = [name for name in ("laspy", "lazrs") if find_spec(name) is None]
     if missing:
         raise SegslamError(f"{file}: LAS and LAZ need extra packages: {how_to_install('las')}; .ply and .pcd do not")
+    if is_projected and find_spec("pyproj") is None:
+        raise SegslamError(f"{file}: a coordinate system needs extra packages: {how_to_install('geo')}; .ply does not")
 
 
 def _begin(file: Path) -> BinaryIO:

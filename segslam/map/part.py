@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from segslam.config import MapConfig
+from segslam.gnss.geodesy import Origin
 from segslam.map.free_ranges import FreeRanges
 from segslam.map.tiles import Tile
 from segslam.semantics.class_colors import Colors
@@ -30,6 +31,8 @@ class Extent:
     """Both ends of the colour scale, for heights or intensities."""
     free_ranges: FreeRanges
     """Free space observed by the keyframes."""
+    origin: Origin | None = None
+    """Place of the world frame (east, north, up) on the globe, if it is known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -51,14 +51,19 @@ class Picture:
 
     def close(self) -> None:
         """Write the image."""
-        rows, columns = self._seen()
-        colors, height_m = closed(self._image[rows, columns], self._height_m[rows, columns])
-        image = shaded(colors, height_m, SHADED_M * self._pixels / TILE_M)
+        image, window, _ = self._finished()
         from segslam.map.from_above import drawn_map  # importing matplotlib takes long
 
         titles = {"class": "class", "height": "height (m)", "intensity": "intensity"}
-        window, path_m = self._window(rows, columns), self._extent.path_m
+        path_m = self._extent.path_m
         self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=titles[self._color], marks=self._marks()))
+
+    def _finished(self) -> tuple[np.ndarray, Window, float]:
+        """The shaded image (rows, columns, 3), its window, and the median height of its pixels (m)."""
+        rows, columns = self._seen()
+        colors, height_m = closed(self._image[rows, columns], self._height_m[rows, columns])
+        image = shaded(colors, height_m, SHADED_M * self._pixels / TILE_M)
+        return image, self._window(rows, columns), float(np.nanmedian(height_m))
 
     def _seen(self) -> tuple[slice, slice]:
         """Rows and columns of the image that have points, with a margin."""

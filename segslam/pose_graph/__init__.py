@@ -5,6 +5,7 @@ from segslam.pose_graph.edges import Edge
 from segslam.pose_graph.g2o import G2oGraph, read_g2o, write_g2o
 from segslam.pose_graph.graph import PoseGraph
 from segslam.pose_graph.levenberg_marquardt import Unsolvable
+from segslam.pose_graph.position_fixes import PositionedGraph
 from segslam.pose_graph.protocol import Graph
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "Graph",
     "Optimized",
     "PoseGraph",
+    "PositionedGraph",
     "Robust",
     "Unsolvable",
     "optimize_graph",

@@ -33,6 +33,9 @@ LEAST, MOST = np.array([0.05, 0.4]), 20.0
 """Bounds of the factors, least of odometry and of measurements. Chosen on NCLT with an odometry as good as its map: the
 measurements share scans, so they contradict each other less than they err."""
 
+LEAST_WEIGHT = 1e-6
+"""Keeps the information of an outlier positive definite, as a g2o file requires."""
+
 
 def solve_adjusted(
     prior: gtsam.NonlinearFactorGraph,
@@ -74,6 +77,28 @@ def solve_adjusted(
         if np.abs(factors / before - 1.0).max() < SETTLED:
             break
     return found, (float(before[0]), float(before[1]))
+
+
+def weighted_edges(
+    odometry: Sequence[Edge],
+    closures: Sequence[Edge],
+    measured: Sequence[Edge],
+    factors: tuple[float, float],
+    values: gtsam.Values,
+    kernel: Kernel | None,
+) -> list[Edge]:
+    """All edges with the information that they have at the optimum `values`: with the factors of noise of
+    `solve_adjusted`, and the weights of the robust kernel."""
+    moving = [edge if is_break(edge) else _scaled([edge], factors[0])[0] for edge in odometry]
+    robust = [*closures, *_scaled(measured, factors[1])]
+    if kernel is None or not robust:
+        return [*moving, *robust]
+    errors = np.sqrt(squared_errors(factor_graph(robust), values))
+    weights = [max(kernel.weight(float(error)), LEAST_WEIGHT) for error in errors]
+    return [
+        *moving,
+        *(replace(edge, information=w * edge.information) for edge, w in zip(robust, weights, strict=True)),
+    ]
 
 
 def _scaled(edges: Sequence[Edge], factor: float) -> list[Edge]:

@@ -16,7 +16,7 @@ import numpy as np
 from segslam import geometry
 from segslam.config import GraphConfig
 from segslam.pose_graph import noise
-from segslam.pose_graph.adjusted import solve_adjusted
+from segslam.pose_graph.adjusted import solve_adjusted, weighted_edges
 from segslam.pose_graph.breaks import is_break, relinked
 from segslam.pose_graph.closure_pairs import consistent_pairs, largest_consistent
 from segslam.pose_graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors, values_of
@@ -70,6 +70,9 @@ class PoseGraph:
         self._num_closures_in_estimate = 0
         self._weights: list[float] = []
         """Weights of the closures in the last estimate."""
+        self._measured: list[Edge] = []
+        """The relative poses of the last adjustment."""
+        self._noise_factors = (1.0, 1.0)
         self._T_odom_last = np.eye(4)
         self._travel_m = Rows(np.empty(0))
         self._time_s = Rows(np.empty(0))
@@ -227,6 +230,7 @@ class PoseGraph:
             self._prior(), self._kept_odometry(), kept, measured, self._values, self._kernel
         )
         self._take(found.values)
+        self._measured, self._noise_factors = list(measured), factors
         return self._estimate(found.error, self._weights), factors
 
     def _solve_final(self) -> MotionSolution:
@@ -268,6 +272,17 @@ class PoseGraph:
         """Poses, odometry and closures (without robust kernel) as g2o text."""
         poses = dict(enumerate(self.T_world_keyframes))
         write_g2o(path, G2oGraph(poses, self._kept_odometry() + self._closures))
+
+    def write_adjusted_g2o(self, path: Path) -> None:
+        """Poses and all edges of the last estimate, those of the adjustment included, as g2o text.
+
+        The information is that with which an edge acts: rejected closures are omitted, robust weights are applied.
+        """
+        kept = [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
+        edges = weighted_edges(
+            self._kept_odometry(), kept, self._measured, self._noise_factors, self._values, self._kernel
+        )
+        write_g2o(path, G2oGraph(dict(enumerate(self.T_world_keyframes)), edges))
 
     def _edge(self, closure: LoopClosure) -> Edge:
         for keyframe_id in (closure.target_id, closure.source_id):

@@ -13,14 +13,17 @@ from segslam.geometry import raise_beams
 from segslam.log import RunLog, read_log
 from segslam.map import check_files, write_map
 from segslam.run.folder import log_of
+from segslam.run.georeferenced import Globe, read_globe
+from segslam.run.tracks import is_track, track
 from segslam.system.whole_files import cannot_write, whole_file
-from segslam.types import Keyframe, SegslamError, Transform
+from segslam.types import GraphEstimate, Keyframe, SegslamError, Trajectory, Transform
 
 
 def export(run: str | Path, files: Sequence[str | Path], *, settings: Sequence[str] = ()) -> dict[str, Any]:
     """Write the map of a finished run, like `segslam export`; existing files are replaced. Returns figures of the map.
 
-    `files`: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid) or before_after.png; all are written, or none.
+    `files`: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid) or before_after.png, and of a georeferenced run
+    .tif, .geojson, .kml, .gpx and map_projector_info.yaml; all are written, or none.
     `settings`: changes such as `"map.color=height"`. Raises SegslamError, naming the file and the remedy.
     """
     log = read_log(log_of(Path(run)))
@@ -40,17 +43,27 @@ def write_maps(
     from segslam.run.report import BEFORE_AFTER, draw_before_after
 
     started = perf_counter()
-    of_map = [file for file in files if file.name != BEFORE_AFTER]
-    check_files(of_map)
+    folder = log.path.parent
+    globe = read_globe(folder)
+    origin = None if globe is None else globe.origin
+    of_map = [file for file in files if file.name != BEFORE_AFTER and not is_track(file)]
+    check_files(of_map, origin=origin)
     with ExitStack() as complete:  # moves each file to its name at the end, after a failure none
         for file in files:
-            if file not in of_map:
-                complete.enter_context(whole_file(file)).write_bytes(draw_before_after(log.path.parent))
+            if file.name == BEFORE_AFTER:
+                complete.enter_context(whole_file(file)).write_bytes(draw_before_after(folder))
+            elif is_track(file):
+                content = track(file, globe, _finished(log)[1].stamp_ns, name=folder.resolve().name)
+                complete.enter_context(whole_file(file)).write_bytes(content)
         if not of_map:
             return {"map_seconds": perf_counter() - started}
         try:
             made = write_map(
-                _placed(log, show), of_map, config=config, show=lambda parts, total: show(parts, total, "clean")
+                _placed(log, globe, show),
+                of_map,
+                config=config,
+                origin=origin,
+                show=lambda parts, total: show(parts, total, "clean"),
             )
         except OSError as error:
             raise cannot_write(of_map[0], error) from error
@@ -62,22 +75,30 @@ def write_maps(
     }
 
 
-def _placed(log: RunLog, show: Progress) -> Iterator[tuple[Keyframe, Transform]]:
-    """Each keyframe, its points corrected as in the adjustment of the run, with its final T_world_keyframe."""
+def _finished(log: RunLog) -> tuple[GraphEstimate, Trajectory]:
     result = log.result()
     if result is None:
         raise SegslamError(
             f"{log.path}: the run did not finish; run `segslam replay` on its log, or resume it with --resume"
         )
-    estimate, _ = result
+    return result
+
+
+def _placed(log: RunLog, globe: Globe | None, show: Progress) -> Iterator[tuple[Keyframe, Transform]]:
+    """Each keyframe, its points corrected as in the adjustment of the run, with its final T_world_keyframe.
+
+    The world of a georeferenced run is its local frame.
+    """
+    estimate, _ = _finished(log)
     adjustment = log.adjustment()
     raised_deg = 0.0 if adjustment is None else adjustment.correction_deg
     num_gathered = 0
-    for step in show(log.steps(), log.num_steps(), "gather"):
+    for row, step in enumerate(show(log.steps(), log.num_steps(), "gather")):
         if step.keyframe is not None:
             num_gathered += 1
             points = raise_beams(step.keyframe.points, raised_deg)
-            yield replace(step.keyframe, points=points), estimate.T_world_keyframe[step.keyframe.id]
+            T_world_keyframe = estimate.T_world_keyframe[step.keyframe.id] if globe is None else globe.T_enu_lidar[row]
+            yield replace(step.keyframe, points=points), T_world_keyframe
     if num_gathered < len(estimate.T_world_keyframe):
         readable = f"only {num_gathered} of its {len(estimate.T_world_keyframe)} keyframes are readable"
         raise SegslamError(f"{log.path}: damaged, {readable}; the map is not written. Map the data again, or replay it")

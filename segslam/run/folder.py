@@ -18,6 +18,8 @@ from segslam.types import LoopAttempt, LoopClosure, Mask, SegslamError, Trajecto
 POSE_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
 STAGES = ("prepare", "match", "refine", "verify")
 LOG = "log.mcap"
+ADJUSTED_GRAPH = "adjusted.g2o"
+"""All edges of the last estimate, with the information with which they act."""
 ALONE = "kiss_icp"
 """Start of the names of the files with the poses by KISS-ICP alone."""
 UNFINISHED = ".part"

@@ -20,7 +20,9 @@ from segslam.config import config_to_yaml
 from segslam.datasets import Dataset
 from segslam.log import LogWriter, Mirror, RunLog
 from segslam.log.drawing import CloudOf
+from segslam.pose_graph import PoseGraph
 from segslam.run.folder import (
+    ADJUSTED_GRAPH,
     LOG,
     UNFINISHED,
     read_alone,
@@ -223,6 +225,8 @@ class Run:
             if result.alone is not None:
                 write_alone(self.folder, result.alone, self._T_camera_lidar)
             self._slam.graph.write_g2o(self.folder / "graph.g2o")
+            if isinstance(self._slam.graph, PoseGraph):
+                self._slam.graph.write_adjusted_g2o(self.folder / ADJUSTED_GRAPH)
             write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
         closures = [attempt for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
         return result, {

@@ -1,0 +1,182 @@
+"""Placement of a finished trajectory in the frame of its fixes.
+
+The start has four degrees of freedom, heading and position, over the whole drive: a fix measures no heading, and a
+single error must not decide. The refinement adds a small tilt.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from segslam import geometry
+from segslam.gnss.chain import longest_chain
+from segslam.gnss.matching import Drive, Matched, Prepared
+from segslam.gnss.statistics import axis_sigma, correlated, horizontal_noise, horizontal_sigma, weight
+from segslam.types import Mask, Points, SegslamError, Transform, Vector
+
+NUM_GUESSES = 400
+"""Chosen: pairs of fixes that propose a heading; half of the fixes may be wrong, and 100 good pairs are left."""
+LEAST_FIXES = 4
+"""Three parameters of the plane, and one fix more."""
+LEAST_SPAN_M = 1.0
+"""Chosen: fixes within this show no heading."""
+MOST_HEADING_DEG = 5.0
+"""Chosen: a placement is refused if the standard deviation of its heading is larger."""
+ROUNDS = 12
+"""Chosen: iterations of the refinement; it settles in about six."""
+PRIOR_TILT_DEG, PRIOR_OFFSET_S, PRIOR_ARM_M = 2.0, 1.0, 1.0
+"""Chosen: standard deviations, before the fixes, of the tilt of the map, the offset of the clocks, and each component
+of the lever arm."""
+PRIOR = np.array([*2 * [np.radians(PRIOR_TILT_DEG)], 0.1, 10.0, 10.0, 10.0, PRIOR_OFFSET_S, PRIOR_ARM_M, PRIOR_ARM_M])
+"""The same of all constants of `linearised`; of heading and position, more than the start is off by."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """Pose of the map in the local frame, with the two constants of the receiver."""
+
+    T_enu_map: Transform
+    arm_m: Vector
+    """(3,) position of the antenna in the LiDAR frame (m); 0 where it is not significant."""
+    chain: Mask
+    """(n,) fixes of the largest chain that is consistent with the drive."""
+    sigma_m: Vector
+    """(3,) standard deviation of single fixes about the placed drive: east, north, up."""
+    correlated: float
+    """How many fixes in a row count as one."""
+    heading_sigma_deg: float
+
+
+def place(prepared: Prepared, drive: Drive, *, offset_s: float = 0.0) -> tuple[Matched, Placement]:
+    """Place the drive in the frame of its fixes, `offset_s` added to their times; returns the matched fixes, too.
+
+    Raises SegslamError with the reason if the fixes do not determine a placement.
+    """
+    matched = prepared.matched(drive, offset_s)
+    _check_span(prepared, matched)
+    placement = refined(drive, matched, _start(prepared, drive, matched), np.zeros(3))
+    if placement.heading_sigma_deg > MOST_HEADING_DEG:
+        raise SegslamError(
+            f"{prepared.fixes.source}: the fixes determine the heading of the map to {placement.heading_sigma_deg:.1f} "
+            f"degrees only ({_span_m(matched.enu_m):.0f} m of drive, errors of {placement.sigma_m[0]:.1f} m): a map is "
+            f"placed if it is known to {MOST_HEADING_DEG:.0f}; use fixes of a longer part of the drive"
+        )
+    return matched, placement
+
+
+def _check_span(prepared: Prepared, matched: Matched) -> None:
+    source, span_m = prepared.fixes.source, _span_m(matched.enu_m)
+    if len(matched) < LEAST_FIXES:
+        raise SegslamError(
+            f"{source}: {len(matched)} usable fixes are within the drive; at least {LEAST_FIXES} are needed to place "
+            "the map, spread over the drive"
+        )
+    if span_m < LEAST_SPAN_M:
+        raise SegslamError(
+            f"{source}: all fixes are within {span_m:.2f} m, so they show no heading; use fixes of a longer part of "
+            "the drive"
+        )
+
+
+def _span_m(positions: Points) -> float:
+    """Diagonal of the box around positions, horizontally."""
+    return float(np.hypot(*np.ptp(positions[:, :2], axis=0)))
+
+
+def _start(prepared: Prepared, drive: Drive, matched: Matched) -> Transform:
+    """Heading and position by the pairs of fixes whose heading suits most fixes (least sum of square roots)."""
+    estimated = matched.positions(drive.T_map_keyframe, np.zeros(3))
+    measured = matched.enu_m
+    rng = np.random.default_rng(0)
+    pairs = rng.integers(0, len(matched), (20 * NUM_GUESSES, 2))
+    vectors = [(points[pairs[:, 1]] - points[pairs[:, 0]])[:, :2] for points in (estimated, measured)]
+    lengths = [np.hypot(*vector.T) for vector in vectors]
+    far = np.argsort(-np.minimum(*lengths), kind="stable")
+    chosen = far[: len(far) // 2]  # of the longer half, those of about equal length
+    chosen = chosen[np.argsort(np.abs(np.log(np.maximum(lengths[0], 1e-6) / np.maximum(lengths[1], 1e-6)))[chosen])]
+    if lengths[0][chosen[0]] < LEAST_SPAN_M:
+        raise SegslamError(
+            f"{prepared.fixes.source}: the sensor moved by less than {LEAST_SPAN_M:g} m between the fixes, so they "
+            "show no heading; use fixes of a longer part of the drive"
+        )
+    best = (np.inf, 0.0, np.zeros(2))
+    for row in chosen[:NUM_GUESSES]:
+        (x, y), (east, north) = vectors[0][row], vectors[1][row]
+        heading = np.arctan2(north, east) - np.arctan2(y, x)
+        difference = measured[:, :2] - estimated[:, :2] @ geometry.yaw(heading)[:2, :2].T
+        shift = np.median(difference, axis=0)
+        cost = float(np.sum(np.sqrt(np.hypot(*(difference - shift).T))))
+        if cost < best[0]:
+            best = cost, float(heading), shift
+    rotation = geometry.yaw(best[1])
+    up = measured[:, 2] - estimated[:, 2]
+    known = np.isfinite(up)
+    return geometry.transform(rotation, [*best[2], float(np.median(up[known])) if known.any() else 0.0])
+
+
+def refined(drive: Drive, matched: Matched, start: Transform, arm_m: Vector) -> Placement:
+    """The placement near `start` by iteratively reweighted least squares on the largest chain of consistent fixes.
+
+    `arm_m` (3,): position of the antenna in the LiDAR frame.
+    """
+    T_enu_map = start
+    for _ in range(ROUNDS):
+        residual, columns = linearised(drive, matched, T_enu_map, arm_m)
+        chain = longest_chain(residual, matched.travel_m, sigma_m=horizontal_noise(residual))
+        sigma = _sigmas(residual, chain)
+        many = correlated(residual[chain][:, :2])
+        precision = _precision(residual, sigma, chain) / many
+        prior, six = PRIOR[:6] ** -2.0, columns[:, :, :6]
+        system = np.einsum("nij,ni,nik->jk", six, precision, six) + np.diag(prior)
+        right = np.einsum("nij,ni,ni->j", six, precision, np.nan_to_num(residual)) - prior * _tilt(T_enu_map)
+        covariance = np.linalg.inv(system)
+        T_enu_map = moved(T_enu_map, covariance @ right)
+    heading_deg = float(np.degrees(np.sqrt(covariance[2, 2])))
+    return Placement(T_enu_map, arm_m, chain, sigma, many, heading_deg)
+
+
+def linearised(drive: Drive, matched: Matched, T_enu_map: Transform, arm_m: Vector) -> tuple[Points, np.ndarray]:
+    """(n, 3) residuals, and (n, 3, 9) derivatives of the positions by the constants.
+
+    The constants are a rotation about the first keyframe (rad) and a shift (m) of the map in the local frame, seconds
+    added to the times of the fixes, and the first two components of the lever arm (m).
+    """
+    T_enu_keyframe = T_enu_map @ drive.T_map_keyframe
+    R_enu_keyframe = T_enu_keyframe[matched.keyframe, :3, :3]
+    estimated = matched.positions(T_enu_keyframe, arm_m)
+    x, y, z = (estimated - T_enu_map[:3, 3]).T
+    zero = np.zeros_like(x)
+    rotation = np.stack([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
+    shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
+    velocity = np.einsum("nij,nj->ni", R_enu_keyframe, matched.velocity)
+    arm = (R_enu_keyframe @ matched.T_keyframe_lidar[:, :3, :3])[:, :, :2]
+    columns = np.concatenate([rotation, shift, velocity[:, :, None], arm], axis=2)
+    columns[~np.isfinite(matched.enu_m)] = 0.0
+    return matched.enu_m - estimated, columns
+
+
+def moved(T_enu_map: Transform, step: Vector) -> Transform:
+    """The placement after a rotation about the origin of the map (rad), and a shift (m): the six values of `step`."""
+    turn = geometry.exp(geometry.tangent(rotation_rad=step[:3], translation_m=0.0))
+    rotation = geometry.nearest_rotation(turn[:3, :3] @ T_enu_map[:3, :3])
+    return geometry.transform(rotation, T_enu_map[:3, 3] + step[3:6])
+
+
+def _tilt(T_enu_map: Transform) -> Vector:
+    """(6,) rotation of the map from level; heading and position have no prior value."""
+    up = T_enu_map[:3, 2]
+    return np.array([-up[1], up[0], 0.0, 0.0, 0.0, 0.0])
+
+
+def _sigmas(residual: Points, chain: Mask) -> Vector:
+    level = horizontal_sigma(residual[chain])
+    up = residual[chain, 2]
+    up = up[np.isfinite(up)]
+    return np.array([level, level, axis_sigma(up) if len(up) else np.inf])
+
+
+def _precision(residual: Points, sigma: Vector, chain: Mask) -> Points:
+    """(n, 3) inverse variances with robust weights, horizontally and vertically apart."""
+    level = weight(np.sum(residual[:, :2] ** 2, axis=1) / sigma[0] ** 2) * chain
+    up = np.where(np.isfinite(residual[:, 2]), weight(np.nan_to_num(residual[:, 2]) ** 2 / sigma[2] ** 2), 0.0) * chain
+    return np.column_stack([level, level, up]) / sigma**2

@@ -1,0 +1,145 @@
+"""Fixes from a CSV file: time, latitude, longitude, height, standard deviations.
+
+With a header the columns may be in any order and have one of several common names; without one they are in the order
+above. Separators are commas, semicolons, tabs or blanks; text after # is ignored.
+"""
+
+import re
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from segslam.errors import brief
+from segslam.gnss.fixes import Row
+from segslam.gnss.text import bad_line, check_degrees, number_in
+from segslam.gnss.times import stamp_of
+from segslam.trajectory import nanoseconds
+from segslam.types import SegslamError
+
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "time": ("time", "t", "seconds", "timestamp", "stamp", "stamp_s", "time_s", "sec", "utc", "unix_time"),
+    "time_ns": ("time_ns", "stamp_ns", "timestamp_ns", "nanoseconds"),
+    "latitude": ("latitude", "latitude_deg", "lat", "lat_deg"),
+    "longitude": ("longitude", "longitude_deg", "lon", "lon_deg", "lng", "long"),
+    "height": ("height", "height_m", "altitude", "altitude_m", "alt", "alt_m", "h", "ellipsoidal_height", "ele"),
+    "sigma_east": ("sigma_east", "sigma_east_m", "sd_east", "sde", "std_lon", "sigma_e", "sigma_x"),
+    "sigma_north": ("sigma_north", "sigma_north_m", "sd_north", "sdn", "std_lat", "sigma_n", "sigma_y"),
+    "sigma_up": ("sigma_up", "sigma_up_m", "sd_up", "sdu", "std_alt", "sigma_u", "sigma_z", "vertical_accuracy"),
+    "sigma": ("sigma", "sigma_m", "accuracy", "horizontal_accuracy", "hacc", "std", "sd"),
+    "status": ("status", "fix", "quality", "valid"),
+}
+ORDER = ("time", "latitude", "longitude", "height", "sigma_east", "sigma_north", "sigma_up")
+"""Columns of a file without header."""
+NEEDED = ("latitude", "longitude")
+LATEST_S = 4e9
+"""Times above this are not seconds since 1970 (the year 2096) but milli-, micro- or nanoseconds."""
+
+
+def read_csv(file: Path, lines: Sequence[str]) -> list[Row]:
+    """The fixes of a CSV file. Raises SegslamError, naming file and line, for anything else."""
+    content = [(number, line.split("#")[0]) for number, line in enumerate(lines, 1)]
+    content = [(number, line) for number, line in content if line.strip()]
+    if not content:
+        raise SegslamError(f"{file}: contains no line with a fix; give another file")
+    first = _cells(content[0][1])
+    if any(re.search(r"[A-Za-z]{2}", cell) and cell.lower() not in ("nan", "null") for cell in first[1:]):
+        places = _places_by_name(file, content[0][0], first)
+        content = content[1:]
+    else:
+        if len(first) < 3:
+            what = f"{len(first)} columns"
+            raise bad_line(file, content[0][0], what, "give at least time, latitude, longitude")
+        places = {name: place for place, name in enumerate(ORDER) if place < len(first)}
+    return [_row(file, number, _cells(line), places) for number, line in content]
+
+
+def _cells(line: str) -> list[str]:
+    for separator in (",", ";", "\t"):
+        if separator in line:
+            return [cell.strip().strip('"') for cell in line.split(separator)]
+    return line.split()
+
+
+def _places_by_name(file: Path, number: int, names: Sequence[str]) -> dict[str, int]:
+    cleaned = [
+        re.sub(r"[^a-z0-9_]", "", re.sub(r"[\[(].*", "", name.lower().strip()).strip().replace(" ", "_"))
+        for name in names
+    ]
+    places = {
+        column: cleaned.index(alias)
+        for column, aliases in COLUMNS.items()
+        for alias in reversed(aliases)
+        if alias in cleaned
+    }
+    missing = [name for name in NEEDED if name not in places]
+    if "time" not in places and "time_ns" not in places:
+        missing.insert(0, "time")
+    if missing:
+        known = ", ".join(brief(name, 20) for name in names[:12])
+        raise bad_line(
+            file, number, f"no column {' or '.join(missing)} among {known}", "name the columns as in docs/gnss.md"
+        )
+    return places
+
+
+def _row(file: Path, number: int, cells: Sequence[str], places: dict[str, int]) -> Row:
+    needed = max(places[name] for name in (*NEEDED, *[one for one in ("time", "time_ns") if one in places]))
+    if len(cells) <= needed:
+        raise bad_line(file, number, f"{len(cells)} columns; at least {needed + 1} are needed")
+
+    def value(name: str) -> float:
+        place = places.get(name)
+        return np.nan if place is None or place >= len(cells) else number_in(file, number, cells[place], name)
+
+    latitude, longitude = value("latitude"), value("longitude")
+    check_degrees(file, number, latitude, longitude)
+    both = value("sigma")
+    east, north, up = (value(f"sigma_{axis}") for axis in ("east", "north", "up"))
+    if "time_ns" in places:
+        stamp_ns = _stamp(file, number, cells[places["time_ns"]], 1)
+    else:
+        stamp_ns = _stamp(file, number, cells[places["time"]], None)
+    return Row(
+        stamp_ns,
+        latitude,
+        longitude,
+        value("height"),
+        (both if np.isnan(east) else east, both if np.isnan(north) else north, up),
+        has_fix=_has_fix(cells[places["status"]]) if "status" in places and places["status"] < len(cells) else True,
+    )
+
+
+def _stamp(file: Path, number: int, text: str, unit_ns: int | None) -> int:
+    """Time in ns of a number, in the unit that its size shows, or of a date in ISO 8601."""
+    text = text.strip()
+    try:
+        if re.match(r"\d{4}-\d\d-\d\d", text):
+            return stamp_of(datetime.fromisoformat(text.replace("Z", "+00:00")))
+        if unit_ns is not None:
+            return int(text)
+        seconds = nanoseconds(text)
+    except (ValueError, OverflowError) as error:
+        size = text.lstrip("-+").split(".")[0]
+        if size.isdigit() and 13 <= len(size) <= 19:
+            return int(size) * 10 ** (19 - max(len(size), 13) // 3 * 3 - 0) if len(size) < 19 else int(size)
+        what = f"time {brief(text, 40)} is neither a number of seconds nor a date as 2026-01-31T12:00:00Z"
+        raise bad_line(file, number, what) from error
+    for power in (3, 6, 9):
+        if abs(seconds) > LATEST_S * 1e9 * 10 ** (power - 3):
+            scaled = seconds // 10**power
+            if abs(scaled) <= LATEST_S * 1e9:
+                return scaled
+    return seconds
+
+
+def _has_fix(text: str) -> bool:
+    """Status of NavSatFix (-1: none) or quality (0: none), as number or word."""
+    text = text.strip().lower()
+    if text in ("", "true", "yes", "fix", "float", "single", "rtk", "a"):
+        return True
+    try:
+        return float(text) > 0.0 if text != "0" else False
+    except ValueError:
+        return text not in ("false", "no", "none", "nofix", "no_fix", "v", "invalid")

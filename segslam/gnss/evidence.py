@@ -1,0 +1,179 @@
+"""How much of the difference between fixes and drive is the drift of the drive, and how much is the receiver's error.
+
+The difference r of the fixes to the placed drive is Gaussian with the covariance
+
+    C = s^2 P + q^2 K(tau) + w^2 I + A S A',    K(tau)_ij = exp(-|t_i - t_j| / tau)
+
+    symbol  meaning
+    P       covariance of the positions of the drive from its graph, the first pose held
+    A, S    derivatives of the positions by placement, clock and lever arm; their covariance before the fixes
+    s       factor on the noise of the drive, if its graph claims too little
+    q, tau  standard deviation and time constant of the slow errors of the receiver (multipath, atmosphere)
+    w       standard deviation of its errors from fix to fix
+
+The three unknowns are those of the largest likelihood; placement, clock and lever arm are then the most likely ones
+(generalised least squares: errors that last for minutes do not pass for a lever arm). The two kinds of error are
+distinct: the drift of a drive grows with the travel, is small between places joined by loops, and is smooth; the errors
+of a receiver depend on time alone.
+A standard deviation claimed by the receiver is not used: it is often wrong by a factor of ten.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import splu
+
+from segslam import geometry
+from segslam.gnss.matching import Matched
+from segslam.pose_graph import Edge
+from segslam.trajectory import Poses
+from segslam.types import Information, Points, Transform, Vector
+
+MOST_FIXES = 150
+"""Chosen: fixes compared, spread over the drive; the result differs little from 100 on."""
+HELD = geometry.tangent(rotation_rad=1e-4, translation_m=1e-2)
+"""Standard deviations that hold the first pose, since the placement is among the unknowns of A."""
+DRIFT_FACTORS = np.array([1.0, 2.0, 4.0, 8.0])
+TIME_CONSTANTS_S = np.array([1.0, 5.0, 20.0, 60.0, 200.0, 600.0])
+RECEIVER_FACTORS = 2.0 ** np.arange(-5.0, 1.5)
+"""Grids of s, tau, and of q relative to the standard deviation of all differences."""
+PRIOR_DRIFT_FACTOR = 3.0
+"""Chosen: the noise of the graph is estimated on the drive, so s is within this factor at one standard deviation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """The noise of drive and receiver along one axis, or two."""
+
+    drift_factor: float
+    """s"""
+    sigma_m: float
+    """q"""
+    time_constant_s: float
+    """tau"""
+    white_m: float
+    """w"""
+
+    def effective_sigma_m(self, interval_s: float) -> float:
+        """Standard deviation of fixes every `interval_s`, if they are treated as independent, relative to the graph.
+
+        The mean of many fixes then has the variance that it has with slow errors. The noise of the graph stays as it
+        is, so that of the fixes is divided by the factor of the drift.
+        """
+        many = max(1.0, 2.0 * self.time_constant_s / max(interval_s, 1e-3))
+        return math.sqrt(many * self.sigma_m**2 + self.white_m**2) / self.drift_factor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The noise of largest likelihood, and the constants with it."""
+
+    noise: Noise
+    constants: Vector
+    """(c,) the most likely constants, as differences to those with which the residuals were computed."""
+    sigma: Vector
+    """(c,) their standard deviations."""
+
+
+class DriveCovariance:
+    """Covariances of positions of a drive, from the edges of its graph at its optimum."""
+
+    def __init__(self, edges: Sequence[Edge], T: Poses) -> None:
+        """`T` (k, 4, 4): the optimum of the edges, in any frame."""
+        self._T = T
+        rows, columns, blocks = [0], [0], [np.diag(HELD**-2.0)]
+        for edge in edges:
+            minus = -adjoint(geometry.inverse(T[edge.b]) @ T[edge.a])  # derivative by a; that by b is the identity
+            pairs = ((edge.a, edge.a, minus.T @ edge.information @ minus), (edge.b, edge.b, edge.information))
+            cross = minus.T @ edge.information
+            for row, column, block in (*pairs, (edge.a, edge.b, cross), (edge.b, edge.a, cross.T)):
+                rows.append(row)
+                columns.append(column)
+                blocks.append(block)
+        inner = np.arange(6)
+        at_row = 6 * np.array(rows)[:, None, None] + inner[:, None]
+        at_column = 6 * np.array(columns)[:, None, None] + inner
+        values = np.array(blocks)
+        shape = (6 * len(T), 6 * len(T))
+        where = [np.broadcast_to(place, values.shape).ravel() for place in (at_row, at_column)]
+        self._solver = splu(coo_array((values.ravel(), where), shape=shape).tocsc())
+
+    def placed(self, T_enu_map: Transform) -> "DriveCovariance":
+        """The same drive in the local frame."""
+        made = object.__new__(DriveCovariance)
+        made._solver, made._T = self._solver, T_enu_map @ self._T
+        return made
+
+    def of(self, keys: np.ndarray, points: Points, axes: Sequence[int]) -> np.ndarray:
+        """(n d, n d) covariance of `points` (n, 3) in the frames of poses `keys`, along d axes, one after the other."""
+        R = self._T[keys, :3, :3]
+        x, y, z = points.T
+        zero = np.zeros_like(x)
+        cross = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+        jacobian = np.concatenate([-R @ cross, R], axis=2)  # (n, 3, 6)
+        n = len(keys)
+        dense = np.zeros((len(axes) * n, self._solver.shape[0]))
+        for block, axis in enumerate(axes):
+            for row, key in enumerate(keys):
+                dense[block * n + row, 6 * key : 6 * key + 6] = jacobian[row, axis]
+        covariance = dense @ self._solver.solve(np.ascontiguousarray(dense.T))
+        return (covariance + covariance.T) / 2
+
+
+def adjoint(T_a_b: Transform) -> Information:
+    """(6, 6) matrix that turns a tangent of frame b into one of frame a."""
+    rotation, (x, y, z) = T_a_b[:3, :3], T_a_b[:3, 3].tolist()
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.block([[rotation, np.zeros((3, 3))], [cross @ rotation, rotation]])
+
+
+def estimated(
+    drive: DriveCovariance,
+    matched: Matched,
+    residual: Points,
+    columns: np.ndarray,
+    prior: Vector,
+    *,
+    axes: Sequence[int],
+    white_m: float,
+) -> Estimate:
+    """The noise of largest likelihood for residuals (n, 3) without outliers, along some of their axes.
+
+    `columns` (n, 3, c): derivatives of the positions by the constants, whose standard deviations before the fixes are
+    `prior` (c,). The points on the LiDAR are compared: its distance to the antenna changes nothing here.
+    """
+    chosen = np.unique(np.linspace(0, len(matched) - 1, min(MOST_FIXES, len(matched))).round().astype(int))
+    some = matched.some(chosen)
+    P = drive.of(some.keyframe, some.points(np.zeros(3)), axes)
+    r = residual[chosen][:, list(axes)].T.ravel()
+    A = columns[chosen][:, list(axes)].transpose(1, 0, 2).reshape(len(r), -1)
+    fixed = (A * prior**2) @ A.T + white_m**2 * np.eye(len(r))
+    scale = max(float(np.sqrt(np.mean(r**2))), white_m)
+    apart_s = np.abs(some.time_s[:, None] - some.time_s)
+    best, best_noise = -np.inf, Noise(1.0, scale, 1.0, white_m)
+    for tau in TIME_CONSTANTS_S:
+        K = np.kron(np.eye(len(axes)), np.exp(-apart_s / tau))
+        for s in DRIFT_FACTORS:
+            prior_s = -0.5 * (math.log(s) / math.log(PRIOR_DRIFT_FACTOR)) ** 2
+            for q in scale * RECEIVER_FACTORS:
+                likelihood = prior_s + _log_likelihood(s**2 * P + q**2 * K + fixed, r)
+                if likelihood > best:
+                    best, best_noise = likelihood, Noise(float(s), float(q), float(tau), white_m)
+    s, q, tau = best_noise.drift_factor, best_noise.sigma_m, best_noise.time_constant_s
+    factor = cho_factor(s**2 * P + q**2 * np.kron(np.eye(len(axes)), np.exp(-apart_s / tau)) + fixed, lower=True)
+    gain = (prior**2)[:, None] * A.T
+    covariance = np.diag(prior**2) - gain @ cho_solve(factor, gain.T)
+    return Estimate(best_noise, gain @ cho_solve(factor, r), np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def _log_likelihood(covariance: np.ndarray, residual: Vector) -> float:
+    """Logarithm of the Gaussian density, without its constant."""
+    try:
+        factor = cho_factor(covariance, lower=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        return -math.inf
+    return float(-0.5 * residual @ cho_solve(factor, residual, check_finite=False) - np.log(np.diag(factor[0])).sum())

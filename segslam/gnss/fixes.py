@@ -1,0 +1,118 @@
+"""Position fixes of a receiver, as all readers return them, and the checks that do not need a trajectory."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from segslam.gnss.geodesy import Geodetic, Origin
+from segslam.types import Indices, Mask, Points, SegslamError, Vector
+
+KEPT = ""
+NO_FIX, NOT_FINITE, DUPLICATE, OUTSIDE = "no_fix", "not_finite", "duplicate", "outside_run"
+"""Reasons for which a fix is not used, whatever the trajectory is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixes:
+    """Position fixes in the order of time, a row for each.
+
+    `sigma_m` (n, 3) are the standard deviations to the east, north and up (m) that the receiver claims; NaN if unknown.
+    """
+
+    source: str
+    """Name of the file or topic, for messages."""
+    stamp_ns: Indices
+    """(n,) times (ns) in the clock of the receiver, with UTC as epoch where the format has a date."""
+    places: Geodetic
+    """(n, 3) latitude and longitude (degrees), height above the ellipsoid (m); NaN for a height that is unknown."""
+    sigma_m: Points
+    reasons: tuple[str, ...]
+    """(n,) empty for a usable fix, else the reason for which the reader found it unusable."""
+    note: str = ""
+    """Remark of the reader for the user, for example about the geoid."""
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    @property
+    def usable(self) -> Mask:
+        """(n,) True for fixes without a reason against them."""
+        return np.array([reason == KEPT for reason in self.reasons], dtype=bool)
+
+    def shifted(self, seconds: float) -> "Fixes":
+        """The fixes with `seconds` added to their times."""
+        return replace(self, stamp_ns=self.stamp_ns + round(1e9 * seconds))
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One fix as a reader finds it."""
+
+    stamp_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float = np.nan
+    sigma_m: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    has_fix: bool = True
+
+
+def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fixes:
+    """The fixes of the rows of a file, sorted by time, each with the reason why it cannot be used, if there is one.
+
+    A fix with the time or the position of the one before is a duplicate: some receivers repeat the last one while
+    they have none. Raises SegslamError if there is no usable fix, with the number of each reason.
+    """
+    if not rows:
+        raise SegslamError(f"{source}: contains no position fix; give another file or topic")
+    ordered = sorted(rows, key=lambda row: row.stamp_ns)
+    places = np.array([(row.latitude_deg, row.longitude_deg, row.height_m) for row in ordered], dtype=np.float64)
+    sigma_m = np.array([row.sigma_m for row in ordered], dtype=np.float64)
+    sigma_m = np.where(np.isfinite(sigma_m) & (sigma_m > 0.0), sigma_m, np.nan)
+    stamp_ns = np.array([row.stamp_ns for row in ordered], dtype=np.int64)
+    reasons: list[str] = []
+    last: tuple[int, tuple[float, ...]] | None = None
+    for number, row in enumerate(ordered):
+        reason = _reason(row)
+        place = tuple(places[number].tolist())
+        if not reason and last is not None and (row.stamp_ns == last[0] or place == last[1]):
+            reason = DUPLICATE
+        if not reason:
+            last = row.stamp_ns, place
+        reasons.append(reason)
+    fixes = Fixes(str(source), stamp_ns, places, sigma_m, tuple(reasons), note)
+    if not fixes.usable.any():
+        counts = ", ".join(f"{reasons.count(one)} {one}" for one in sorted(set(reasons)))
+        raise SegslamError(
+            f"{source}: none of its {len(rows)} fixes can be used ({counts}); give another file or topic"
+        )
+    return fixes
+
+
+def origin_of(fixes: Fixes, usable: Mask) -> Origin:
+    """The first usable fix as origin of the local frame; its height is 0 where no height is known."""
+    latitude, longitude, height_m = fixes.places[np.flatnonzero(usable)[0]]
+    known = fixes.places[usable, 2]
+    known = known[np.isfinite(known)]
+    if not np.isfinite(height_m):
+        height_m = known[0] if len(known) else 0.0
+    return Origin(float(latitude), float(longitude), float(height_m))
+
+
+def sigma_or(fixes: Fixes, default_m: float) -> Vector:
+    """(n,) claimed horizontal standard deviation of each fix (m), root of the mean square of both axes."""
+    sigma = np.sqrt(
+        np.nanmean(np.where(np.isfinite(fixes.sigma_m[:, :2]), fixes.sigma_m[:, :2], default_m) ** 2, axis=1)
+    )
+    return sigma
+
+
+def _reason(row: Row) -> str:
+    if not row.has_fix:
+        return NO_FIX
+    if not (np.isfinite(row.latitude_deg) and np.isfinite(row.longitude_deg)):
+        return NOT_FINITE
+    if row.latitude_deg == 0.0 and row.longitude_deg == 0.0:
+        return NO_FIX  # off the coast of Africa: the default of many receivers
+    return KEPT

@@ -1,0 +1,266 @@
+"""Joint solution of a finished graph and the fixes, with a weight that the fixes themselves justify.
+
+The noise of drive and receiver is that of the largest likelihood (`evidence`). With it, the fixes of a receiver with
+slow errors hardly bend a consistent map. But a map may also have systematic errors that its graph does not claim, and
+then a good receiver is right. So blocks of fixes are held out, and of three stiffnesses (the drive keeps its shape, is
+bent by this noise, follows the fixes closely) the stiffest is used whose cost of held-out fixes is within a standard
+error of the least one: the one-standard-error rule (Hastie, Tibshirani and Friedman, "The Elements of Statistical
+Learning", 2nd edition, section 7.10).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from segslam.gnss.alignment import PRIOR, Placement, linearised, moved, refined
+from segslam.gnss.evidence import DriveCovariance, Estimate, Noise, estimated
+from segslam.gnss.matching import Drive, Matched, Prepared
+from segslam.gnss.statistics import Weights, axis_noise, axis_sigma, horizontal_noise, horizontal_sigma, weight
+from segslam.pose_graph import Edge, PositionedGraph
+from segslam.trajectory import Poses
+from segslam.types import Indices, Points, Vector
+
+NUM_BLOCKS, NUM_FOLDS = 6, 3
+"""Chosen: blocks of fixes in a row and groups in which they are held out; a block is longer than the errors of most
+receivers are correlated."""
+RIGID_M = 1000.0
+"""Standard deviation of fixes that do not bend the drive."""
+LEAST_FUSED = 24
+"""Chosen: with fewer fixes, four a block, the drive keeps its shape."""
+ROUNDS = 4
+"""Chosen: iterations of weights and poses; they settle in three."""
+RUN_S = 15.0
+"""Chosen: the weight of a fix is at most that of the median residual within this time before and after it."""
+KEPT_WEIGHT = 0.25
+"""A fix is kept if its weight is that of a residual within three standard deviations, or more."""
+SIGNIFICANT = 4.0
+"""Chosen: the clock and the lever arm are corrected beyond this many standard deviations."""
+CONSTANT_ROUNDS = 3
+"""Chosen: repetitions of placement and constants; the third changes the lever arm by less than its noise."""
+
+
+Costs = tuple[float, float, float]
+Measure = Callable[[Points], tuple[Vector, float]]
+"""Residuals along an axis, or their lengths, and their robust standard deviation."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Constants:
+    """Placement of the drive with the clock and the lever arm of the receiver."""
+
+    matched: Matched
+    placement: Placement
+    offset_s: float
+    """Seconds added to the times of the fixes: those given, and those measured."""
+    measured_offset_s: float
+    """The measured part; 0 if it is not significant."""
+    offset_sigma_s: float
+    arm_sigma_m: Vector
+    """(2,)"""
+    level: Estimate
+    covariance: DriveCovariance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fused:
+    """The drive in the local frame after the joint solution."""
+
+    T_enu_keyframe: Poses
+    weights: Weights
+    """(n, 2) robust weight of each fix, horizontally and vertically; 0 for an unknown height."""
+    precisions: Points
+    """(n, 3) inverse variances with which the fixes acted (1 / m^2)."""
+    sigma_m: Vector
+    """(3,) standard deviation of single fixes about the drive: east, north, up."""
+    acting_sigma_m: Vector
+    """(3,) standard deviations with which fixes of full weight acted: the slow errors are included."""
+    noise: tuple[Noise, Noise | None]
+    """Horizontal and vertical noise of largest likelihood."""
+    costs: tuple[Costs, Costs]
+    """Cost of the held-out fixes for the rigid drive, with this noise, and followed closely; horizontally and
+    vertically."""
+
+
+def calibrate(
+    edges: Sequence[Edge], drive: Drive, prepared: Prepared, matched: Matched, placement: Placement, *, offset_s: float
+) -> Constants:
+    """Clock and lever arm, where they are significant, and the placement with them."""
+    covariance = DriveCovariance(edges, drive.T_map_keyframe)
+    arm_m, measured_s = np.zeros(3), 0.0
+    free = np.ones(2, dtype=bool)
+    for _ in range(CONSTANT_ROUNDS):
+        rotated = covariance.placed(placement.T_enu_map)
+        residual, columns = linearised(drive, matched, placement.T_enu_map, arm_m)
+        kept = placement.chain & (robust_weights(residual, placement.sigma_m, matched.time_s)[:, 0] >= KEPT_WEIGHT)
+        found = estimated(
+            rotated,
+            matched.some(kept),
+            residual[kept],
+            columns[kept],
+            PRIOR * np.repeat([True, *free], [6, 1, 2]),
+            axes=[0, 1],
+            white_m=horizontal_noise(residual[kept]),
+        )
+        clock, arm = found.constants[6], found.constants[7:9]
+        total = abs(measured_s + clock), np.abs(arm_m[:2] + arm)
+        free &= [total[0] > SIGNIFICANT * found.sigma[6], bool((total[1] > SIGNIFICANT * found.sigma[7:9]).any())]
+        measured_s = measured_s + float(clock) if free[0] else 0.0
+        arm_m = arm_m + np.array([*arm, 0.0]) if free[1] else np.zeros(3)
+        matched = prepared.matched(drive, offset_s + measured_s)
+        placement = refined(drive, matched, moved(placement.T_enu_map, found.constants[:6]), arm_m)
+    return Constants(
+        matched, placement, offset_s + measured_s, measured_s, float(found.sigma[6]), found.sigma[7:9], found, rotated
+    )
+
+
+def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> Fused:
+    """Bend the placed drive by its fixes as far as they are better than it. Raises Unsolvable."""
+    matched, placement = constants.matched, constants.placement
+    T_start = placement.T_enu_map @ drive.T_map_keyframe
+    problem = _Problem(PositionedGraph(edges, drive.T_map_keyframe), matched, placement, T_start)
+    interval_s = float(np.median(np.diff(matched.time_s)))
+    residual, columns = linearised(drive, matched, placement.T_enu_map, placement.arm_m)
+    weights = robust_weights(residual, placement.sigma_m, matched.time_s) * placement.chain[:, None]
+    up: Noise | None = None
+    used = weights[:, 1] >= KEPT_WEIGHT
+    if used.sum() >= NUM_BLOCKS:
+        up = estimated(
+            constants.covariance,
+            matched.some(used),
+            residual[used],
+            columns[used],
+            PRIOR * np.repeat([True, False], [6, 3]),
+            axes=[2],
+            white_m=axis_noise(residual[used, 2]),
+        ).noise
+    level = constants.level.noise
+    soft = np.array(
+        [*2 * [level.effective_sigma_m(interval_s)], np.inf if up is None else up.effective_sigma_m(interval_s)]
+    )
+    close = np.array([level.white_m, level.white_m, np.inf if up is None else up.white_m])
+    sigma, costs = _chosen(problem, soft, close)
+    T, weights, precisions = _solved(problem, sigma)
+    scales = _scales(matched.enu_m - problem.positions(T), weights)
+    return Fused(T, weights, precisions, scales, sigma, (level, up), costs)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    graph: PositionedGraph
+    matched: Matched
+    placement: Placement
+    T_start: Poses
+
+    def positions(self, T: Poses) -> Points:
+        return self.matched.positions(T, self.placement.arm_m)
+
+    def solve(self, start: Poses, precisions: Points) -> Poses:
+        points = self.matched.points(self.placement.arm_m)
+        return self.graph.solve(start, self.matched.keyframe, points, self.matched.enu_m, precisions)
+
+
+def _chosen(problem: _Problem, soft: Vector, close: Vector) -> tuple[Vector, tuple[Costs, Costs]]:
+    """(3,) standard deviations with which the fixes act, and the costs that decide, horizontally and vertically."""
+    n = len(problem.matched)
+    sigma = np.full(3, RIGID_M)
+    nothing = (0.0, 0.0, 0.0)
+    if n < LEAST_FUSED:
+        return sigma, (nothing, nothing)
+    blocks = (np.arange(n) * NUM_BLOCKS) // n
+    reference = problem.matched.enu_m - problem.positions(problem.T_start)
+    level, costs_level = _best(problem, [_level_only(one) for one in (sigma, soft, close)], blocks, reference, _level)
+    if not np.isfinite(close[2]):
+        return level, (costs_level, nothing)
+    with_up = [np.array([*level[:2], one]) for one in (RIGID_M, soft[2], close[2])]
+    both, costs_up = _best(problem, with_up, blocks, reference, _up)
+    return both, (costs_level, costs_up)
+
+
+def _level_only(sigma: Vector) -> Vector:
+    return np.array([sigma[0], sigma[1], RIGID_M])
+
+
+def _best(
+    problem: _Problem, candidates: Sequence[Vector], blocks: Indices, reference: Points, of: Measure
+) -> tuple[Vector, Costs]:
+    """The stiffest of three candidates, rigid, soft and close, whose cost is within a standard error of the least."""
+    costs = np.array([_costs(_held_out(problem, one, blocks), reference, blocks, of) for one in candidates])
+    means = costs.mean(axis=1)
+    more = costs - costs[means.argmin()]
+    is_as_good = more.mean(axis=1) <= more.std(axis=1, ddof=1) / np.sqrt(NUM_BLOCKS)
+    rigid, soft, close = means.tolist()
+    return candidates[int(is_as_good.argmax())], (rigid, soft, close)
+
+
+def _held_out(problem: _Problem, sigma: Vector, blocks: np.ndarray) -> Points:
+    """(n, 3) residual of each fix about the drive that was solved without its block."""
+    T, _, precisions = _solved(problem, sigma)
+    residual = np.empty_like(problem.matched.enu_m)
+    for fold in range(NUM_FOLDS):
+        out = blocks % NUM_FOLDS == fold
+        without = precisions * ~out[:, None]
+        T_fold = problem.solve(T, without) if without.any() else problem.T_start
+        residual[out] = (problem.matched.enu_m - problem.positions(T_fold))[out]
+    return residual
+
+
+def _solved(problem: _Problem, sigma: Vector) -> tuple[Poses, Weights, Points]:
+    """Poses, weights (n, 2) and precisions (n, 3) by iteratively reweighted least squares.
+
+    It starts from the largest chain of consistent fixes; later rounds weight all fixes by their residuals.
+    """
+    T, matched = problem.T_start, problem.matched
+    residual = matched.enu_m - problem.positions(T)
+    weights = robust_weights(residual, problem.placement.sigma_m, matched.time_s)
+    weights *= problem.placement.chain[:, None]
+    for _ in range(ROUNDS):
+        precisions = np.column_stack([weights[:, 0], weights[:, 0], weights[:, 1]]) / sigma**2
+        T = problem.solve(T, precisions)
+        residual = matched.enu_m - problem.positions(T)
+        weights = robust_weights(residual, _scales(residual, weights), matched.time_s)
+    return T, weights, precisions
+
+
+def _scales(residual: Points, weights: Weights) -> Vector:
+    used, used_up = weights[:, 0] >= KEPT_WEIGHT, weights[:, 1] >= KEPT_WEIGHT
+    level = horizontal_sigma(residual[used] if used.any() else residual)
+    return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
+
+
+def robust_weights(residual: Points, sigma: Vector, time_s: Vector) -> Weights:
+    """(n, 2) weights horizontally and vertically; a fix in a run of wrong ones has the weight of the run."""
+    level = np.hypot(*residual[:, :2].T) / sigma[0]
+    up = np.abs(residual[:, 2]) / sigma[2]
+    of_run = [_median_near(values, time_s) for values in (level, up)]
+    level, up = np.maximum(level, of_run[0]), np.maximum(up, of_run[1])
+    return np.column_stack([weight(level**2), np.where(np.isfinite(up), weight(np.nan_to_num(up) ** 2), 0.0)])
+
+
+def _median_near(values: Vector, time_s: Vector) -> Vector:
+    first = np.searchsorted(time_s, time_s - RUN_S)
+    last = np.searchsorted(time_s, time_s + RUN_S, side="right")
+    return np.array([_median(values[a:b]) for a, b in zip(first, last, strict=True)])
+
+
+def _median(values: Vector) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else 0.0
+
+
+def _level(residual: Points) -> tuple[Vector, float]:
+    return np.hypot(*residual[:, :2].T), horizontal_sigma(residual)
+
+
+def _up(residual: Points) -> tuple[Vector, float]:
+    known = residual[np.isfinite(residual[:, 2]), 2]
+    return residual[:, 2], axis_sigma(known)
+
+
+def _costs(residual: Points, reference: Points, blocks: Indices, of: Measure) -> Vector:
+    """(b,) mean cost in each block, in units of residuals about the placed drive; far ones count little more."""
+    (values, _), (_, sigma) = of(residual), of(reference)
+    costs = np.log1p(values**2 / sigma**2)
+    known = np.isfinite(costs)
+    counts = np.bincount(blocks[known], minlength=NUM_BLOCKS)
+    return np.bincount(blocks[known], costs[known], minlength=NUM_BLOCKS) / np.maximum(counts, 1)

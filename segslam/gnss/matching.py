@@ -1,0 +1,184 @@
+"""Fixes matched to a drive: where the sensor was, by the trajectory, at the time of each fix."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation as ScipyRotation
+
+from segslam.gnss.fixes import OUTSIDE, Fixes, origin_of
+from segslam.gnss.geodesy import Geodetic, Origin, enu_from_geodetic
+from segslam.trajectory import Poses, travelled_m
+from segslam.types import Indices, Mask, Points, SegslamError, Vector
+
+LONGEST_GAP_S = 2.0
+"""Chosen: a fix between two scans farther apart than this, or so long before the first scan, has no pose."""
+SPEED_OVER_S = 0.2
+"""Chosen: time over which the velocity at a fix is measured."""
+LEAP_SECONDS = {18.0: "GPS time instead of UTC, since 2017", 37.0: "TAI instead of UTC, since 2017"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """A finished trajectory: the poses of all scans, some of which are keyframes."""
+
+    stamp_ns: Indices
+    """(n,) times of the scans (ns), ascending."""
+    T_map_lidar: Poses
+    """(n, 4, 4) poses of the scans in the map."""
+    keyframe_rows: Indices
+    """(k,) row of each keyframe in the two."""
+
+    @property
+    def T_map_keyframe(self) -> Poses:  # noqa: N802  (a transform)
+        """(k, 4, 4) poses of the keyframes in the map."""
+        return self.T_map_lidar[self.keyframe_rows]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """The fixes with a pose of the drive, a row for each, in the order of time."""
+
+    rows: Indices
+    """(n,) row of each in the `Fixes`."""
+    time_s: Vector
+    """(n,) time since the first scan (s), in the clock of the scans."""
+    enu_m: Points
+    """(n, 3) measured position, east, north, up; NaN for an unknown height."""
+    sigma_m: Points
+    """(n, 3) claimed standard deviations; NaN if unknown."""
+    keyframe: Indices
+    """(n,) the keyframe nearest in time."""
+    T_keyframe_lidar: Poses
+    """(n, 4, 4) pose of the LiDAR at the time of the fix in that keyframe."""
+    velocity: Points
+    """(n, 3) velocity of the LiDAR in the frame of that keyframe (m/s)."""
+    travel_m: Vector
+    """(n,) travel of the LiDAR at the time of the fix."""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def positions(self, T_enu_keyframe: Poses, arm_m: Vector) -> Points:
+        """(n, 3) positions of the antenna, for poses of the keyframes (k, 4, 4) and the lever arm (3,) (LiDAR, m)."""
+        T_enu = T_enu_keyframe[self.keyframe]
+        return np.einsum("nij,nj->ni", T_enu[:, :3, :3], self.points(arm_m)) + T_enu[:, :3, 3]
+
+    def points(self, arm_m: Vector) -> Points:
+        """(n, 3) positions of the antenna in the frames of the keyframes."""
+        return self.T_keyframe_lidar[:, :3, :3] @ arm_m + self.T_keyframe_lidar[:, :3, 3]
+
+    def some(self, chosen: Mask | Indices) -> "Matched":
+        """The chosen rows."""
+        return Matched(*(getattr(self, name)[chosen] for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """Fixes in the local frame, before they are matched for one offset of the clocks."""
+
+    fixes: Fixes
+    origin: Origin
+    enu_m: Points
+    """(n, 3) positions of all fixes; NaN for those that cannot be used."""
+
+    def matched(self, drive: Drive, offset_s: float) -> Matched:
+        """The usable fixes within the time of the drive, after `offset_s` is added to their times."""
+        stamps = self.fixes.stamp_ns + round(1e9 * offset_s)
+        rows = np.flatnonzero(self.fixes.usable & has_pose(drive, stamps))
+        begin = int(drive.stamp_ns[0])
+        time_s = 1e-9 * (stamps[rows] - begin)
+        scan_s = 1e-9 * (drive.stamp_ns - begin)
+        keyframe_s = scan_s[drive.keyframe_rows]
+        right = np.clip(np.searchsorted(keyframe_s, time_s), 1, max(len(keyframe_s) - 1, 1))
+        is_left = time_s - keyframe_s[right - 1] <= np.abs(keyframe_s[np.minimum(right, len(keyframe_s) - 1)] - time_s)
+        keyframe = np.where(is_left, right - 1, np.minimum(right, len(keyframe_s) - 1))
+        R_map_keyframe, p_keyframe = _split(drive.T_map_keyframe[keyframe])
+        T_map_lidar = interpolated(drive, scan_s, time_s)
+        T_keyframe_lidar = np.tile(np.eye(4), (len(rows), 1, 1))
+        T_keyframe_lidar[:, :3, :3] = R_map_keyframe.transpose(0, 2, 1) @ T_map_lidar[:, :3, :3]
+        T_keyframe_lidar[:, :3, 3] = _turned_back(R_map_keyframe, T_map_lidar[:, :3, 3] - p_keyframe)
+        ends = [_positions(drive, scan_s, time_s + sign * SPEED_OVER_S / 2) for sign in (-1, 1)]
+        return Matched(
+            rows=rows,
+            time_s=time_s,
+            enu_m=self.enu_m[rows],
+            sigma_m=self.fixes.sigma_m[rows],
+            keyframe=keyframe,
+            T_keyframe_lidar=T_keyframe_lidar,
+            velocity=_turned_back(R_map_keyframe, (ends[1] - ends[0]) / SPEED_OVER_S),
+            travel_m=np.interp(time_s, scan_s, travelled_m(drive.T_map_lidar)),
+        )
+
+
+def prepare(fixes: Fixes, drive: Drive, *, offset_s: float = 0.0) -> Prepared:
+    """The fixes in the local frame at the first one within the drive.
+
+    Raises SegslamError if no usable fix is within the time of the drive, with both times, and the offset that would
+    help if one is obvious.
+    """
+    within = fixes.usable & has_pose(drive, fixes.stamp_ns + round(1e9 * offset_s))
+    if not within.any():
+        raise SegslamError(_elsewhere(fixes, drive, offset_s))
+    origin = origin_of(fixes, within)
+    places: Geodetic = fixes.places.copy()
+    no_height = ~np.isfinite(places[:, 2])
+    places[no_height, 2] = origin.height_m
+    enu_m = np.full((len(fixes), 3), np.nan)
+    usable = fixes.usable
+    enu_m[usable] = enu_from_geodetic(places[usable], origin)
+    enu_m[no_height, 2] = np.nan
+    return Prepared(fixes, origin, enu_m)
+
+
+def has_pose(drive: Drive, stamp_ns: Indices) -> Mask:
+    """(n,) True for times within the drive and near enough to a scan."""
+    right = np.clip(np.searchsorted(drive.stamp_ns, stamp_ns), 1, max(len(drive.stamp_ns) - 1, 1))
+    right = np.minimum(right, len(drive.stamp_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    away = np.minimum(np.abs(stamp_ns - drive.stamp_ns[left]), np.abs(stamp_ns - drive.stamp_ns[right]))
+    inside = (stamp_ns >= drive.stamp_ns[0]) & (stamp_ns <= drive.stamp_ns[-1])
+    return inside & (away <= 1e9 * LONGEST_GAP_S)
+
+
+def outside_reasons(prepared: Prepared, drive: Drive, offset_s: float) -> list[str]:
+    """The reason of each fix that is not matched; empty for the matched ones."""
+    inside = has_pose(drive, prepared.fixes.stamp_ns + round(1e9 * offset_s))
+    return [
+        reason or ("" if within else OUTSIDE) for reason, within in zip(prepared.fixes.reasons, inside, strict=True)
+    ]
+
+
+def interpolated(drive: Drive, scan_s: Vector, time_s: Vector) -> Poses:
+    """(n, 4, 4) poses in the map at some times, between those of the two nearest scans."""
+    row = np.clip(np.searchsorted(scan_s, time_s, side="right") - 1, 0, max(len(scan_s) - 2, 0))
+    after = np.minimum(row + 1, len(scan_s) - 1)
+    share = np.clip((time_s - scan_s[row]) / np.maximum(scan_s[after] - scan_s[row], 1e-9), 0.0, 1.0)
+    poses = drive.T_map_lidar[row].copy()
+    before = ScipyRotation.from_matrix(poses[:, :3, :3])
+    motion = before.inv() * ScipyRotation.from_matrix(drive.T_map_lidar[after, :3, :3])
+    poses[:, :3, :3] = (before * ScipyRotation.from_rotvec(share[:, None] * motion.as_rotvec())).as_matrix()
+    poses[:, :3, 3] += share[:, None] * (drive.T_map_lidar[after, :3, 3] - poses[:, :3, 3])
+    return poses
+
+
+def _positions(drive: Drive, scan_s: Vector, time_s: Vector) -> Points:
+    return np.column_stack([np.interp(time_s, scan_s, column) for column in drive.T_map_lidar[:, :3, 3].T])
+
+
+def _split(poses: Poses) -> tuple[np.ndarray, Points]:
+    return poses[:, :3, :3], poses[:, :3, 3]
+
+
+def _turned_back(rotations: np.ndarray, vectors: Points) -> Points:
+    return np.einsum("nji,nj->ni", rotations, vectors)
+
+
+def _elsewhere(fixes: Fixes, drive: Drive, offset_s: float) -> str:
+    """A message for fixes of another time than the drive."""
+    first, last = (1e-9 * (fixes.stamp_ns[fixes.usable][row]) + offset_s for row in (0, -1))
+    begin, end = 1e-9 * drive.stamp_ns[0], 1e-9 * drive.stamp_ns[-1]
+    return (
+        f"{fixes.source}: its fixes are from {first:.1f} to {last:.1f} s, the scans from {begin:.1f} to {end:.1f} s: "
+        f"no fix is within the drive. If both are of one drive, give the difference of the clocks: --gnss-offset "
+        f"{begin - first + offset_s:.1f} lets them begin together"
+    )

@@ -1,0 +1,47 @@
+"""Lines of a text file, and errors that name the line."""
+
+from pathlib import Path
+
+from segslam.errors import brief
+from segslam.types import SegslamError
+
+MOST_BYTES = 2**30
+"""Chosen: no log of fixes is larger than a gigabyte."""
+
+
+def text_lines(file: Path) -> list[str]:
+    """The lines of a file. Raises SegslamError if it cannot be read as text."""
+    try:
+        if file.stat().st_size > MOST_BYTES:
+            raise SegslamError(f"{file}: larger than 1 GB; is it a file of position fixes?")
+        content = file.read_bytes()
+    except OSError as error:
+        raise SegslamError(f"{file}: cannot be read ({error.strerror}); give another file with --gnss") from error
+    if b"\0" in content[:4096]:
+        raise SegslamError(f"{file}: a binary file; give CSV, NMEA or RTKLIB .pos, a KITTI oxts folder, or a recording")
+    return content.decode("utf-8", errors="replace").lstrip("\ufeff").splitlines()
+
+
+def bad_line(file: Path, number: int, what: str, remedy: str = "correct or remove the line") -> SegslamError:
+    """An error for a line, counted from 1."""
+    return SegslamError(f"{file}:{number}: {what}; {remedy}")
+
+
+def number_in(file: Path, line: int, text: str, name: str) -> float:
+    """The number in a cell. Raises SegslamError if it is none; an empty cell, `nan` and `null` are NaN."""
+    text = text.strip()
+    if text.lower() in ("", "nan", "null", "none", "na"):
+        return float("nan")
+    try:
+        return float(text)
+    except ValueError as error:
+        raise bad_line(file, line, f"{name} {brief(text, 30)} is not a number") from error
+
+
+def check_degrees(file: Path, line: int, latitude_deg: float, longitude_deg: float) -> None:
+    """Raises SegslamError for a latitude beyond 90 or a longitude beyond 360 degrees; NaN is allowed."""
+    if abs(latitude_deg) > 90.0:
+        hint = "is it a longitude, or metres?" if abs(latitude_deg) <= 360.0 else "degrees are needed, not metres"
+        raise bad_line(file, line, f"latitude {latitude_deg:g} is not within -90 and 90 degrees", hint)
+    if abs(longitude_deg) > 360.0:
+        raise bad_line(file, line, f"longitude {longitude_deg:g} is not within -180 and 180 degrees")

@@ -1,0 +1,173 @@
+"""A run with its place on the globe: the files that `georeference` adds to a run folder, and their reader."""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
+from segslam.gnss import georeference as georeference_drive
+from segslam.gnss.reading import read_fixes
+from segslam.pose_graph import read_g2o
+from segslam.run.finished import FinishedRun, read_run
+from segslam.run.folder import ADJUSTED_GRAPH, room_for
+from segslam.system.whole_files import whole_file, write_whole
+from segslam.trajectory import Poses, corrected_poses, read_poses, write_tum
+from segslam.types import SegslamError
+
+FILE, FIXES, GEODETIC, ENU = "georeference.json", "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
+DATUM = "WGS84 (EPSG:4979)"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Globe:
+    """Where a finished run is on the globe."""
+
+    origin: Origin
+    T_enu_lidar: Poses
+    """(n, 4, 4) poses of all scans in the local frame (east, north, up) at the origin."""
+
+    @property
+    def epsg(self) -> int:
+        """EPSG code of the UTM zone of the origin."""
+        return utm_epsg(self.origin.latitude_deg, self.origin.longitude_deg)
+
+
+def georeference(
+    run: str | Path, fixes: Fixes | str | Path, *, use: Use | str = Use.FUSE, offset_s: float = 0.0
+) -> Georeference:
+    """Place a finished run on the globe by its position fixes; the files are added to its folder.
+
+    `use`: "align" places the map as it is, "fuse" also bends it where held-out fixes confirm that. `offset_s` is added
+    to the times of the fixes. Raises SegslamError if the run or the fixes cannot be read, or if the fixes do not
+    determine a placement.
+    """
+    finished = read_run(run)
+    known = fixes if isinstance(fixes, Fixes) else read_fixes(fixes)
+    scans = finished.result.trajectory
+    drive = Drive(scans.stamp_ns, scans.T_world_lidar, finished.result.keyframe_rows)
+    graph = finished.folder / ADJUSTED_GRAPH
+    if not graph.exists():
+        raise SegslamError(
+            f"{graph}: missing, the run was made by an earlier version; `segslam replay` it into a new folder first"
+        )
+    placed = georeference_drive(read_g2o(graph).edges, drive, known, use=Use(use), offset_s=offset_s)
+    _write(finished, placed, Use(use), offset_s)
+    return placed
+
+
+def read_globe(folder: Path) -> Globe | None:
+    """The place of a run on the globe; None if it was not georeferenced. Raises SegslamError for damaged files."""
+    file = folder / FILE
+    if not file.exists():
+        return None
+    try:
+        origin = json.loads(file.read_text(encoding="utf-8"))["origin"]
+        found = Origin(*(float(origin[name]) for name in ("latitude_deg", "longitude_deg", "height_m")))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
+    return Globe(found, read_poses(folder / ENU, format="tum").T_a_b)
+
+
+def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) -> None:
+    trajectory = run.result.trajectory
+    T_enu_lidar = corrected_poses(trajectory.T_world_lidar, run.result.keyframe_rows, placed.T_enu_keyframe)
+    with room_for(run.folder):
+        with whole_file(run.folder / ENU) as part:
+            write_tum(part, trajectory.stamp_ns, T_enu_lidar)
+        _write_geodetic(run, placed.origin, T_enu_lidar)
+        _write_fixes(run.folder, placed)
+        values = figures(placed) | {"use": str(use), "given_offset_s": offset_s}
+        write_whole(run.folder / FILE, json.dumps(values, indent=2) + "\n")
+
+
+def figures(placed: Georeference) -> dict[str, Any]:
+    """The content of `georeference.json`; unknown figures are null."""
+    origin = placed.origin
+    return {
+        "datum": DATUM,
+        "origin": {
+            "latitude_deg": origin.latitude_deg,
+            "longitude_deg": origin.longitude_deg,
+            "height_m": origin.height_m,
+        },
+        "utm_epsg": utm_epsg(origin.latitude_deg, origin.longitude_deg),
+        "T_enu_map": placed.T_enu_map.tolist(),
+        "heading_sigma_deg": placed.heading_sigma_deg,
+        "position_sigma_m": _known(placed.position_sigma_m),
+        "fix_sigma_m": _known(placed.fix_sigma_m),
+        "num_fixes": len(placed.fixes),
+        "num_fixes_kept": placed.num_kept,
+        "is_bent_horizontally": placed.is_bent[0],
+        "is_bent_in_height": placed.is_bent[1],
+        "clock_offset_s": placed.measured_offset_s,
+        "clock_offset_sigma_s": placed.offset_sigma_s,
+        "lever_arm_m": _known(placed.arm_m),
+        "lever_arm_sigma_m": _known(placed.arm_sigma_m),
+        "source": Path(placed.fixes.source).name,
+        "note": placed.fixes.note,
+    }
+
+
+def _known(values: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def _write_geodetic(run: FinishedRun, origin: Origin, T_enu_lidar: Poses) -> None:
+    """A row a scan: number, stamp, latitude, longitude, height, and heading of the x axis clockwise from north."""
+    trajectory = run.result.trajectory
+    places = geodetic_from_enu(T_enu_lidar[:, :3, 3], origin)
+    heading_deg = np.degrees(np.arctan2(T_enu_lidar[:, 0, 0], T_enu_lidar[:, 1, 0])) % 360.0
+    with whole_file(run.folder / GEODETIC) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(("scan", "stamp_ns", "latitude_deg", "longitude_deg", "height_m", "heading_deg"))
+        for scan, stamp_ns, (latitude, longitude, height_m), heading in zip(
+            trajectory.scan_index, trajectory.stamp_ns, places, heading_deg, strict=True
+        ):
+            place = (f"{latitude:.10f}", f"{longitude:.10f}", f"{height_m:.4f}")
+            writer.writerow((int(scan), int(stamp_ns), *place, f"{heading:.4f}"))
+
+
+def _write_fixes(folder: Path, placed: Georeference) -> None:
+    """A row a fix: what was measured, by how much it differs from the drive, and whether it was kept or why not."""
+    head = ("stamp_ns", "latitude_deg", "longitude_deg", "height_m", "east_m", "north_m", "up_m")
+    residuals = ("residual_east_m", "residual_north_m", "residual_up_m")
+    with whole_file(folder / FIXES) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow((*head, *residuals, "weight", "weight_up", "kept", "reason"))
+        for row, reason in enumerate(placed.reasons):
+            measured = (*placed.measured_enu_m[row], *placed.residual_m[row], *placed.weights[row])
+            degrees = (f"{value:.10f}" if np.isfinite(value) else "" for value in placed.fixes.places[row, :2])
+            others = (
+                f"{value:.4f}" if np.isfinite(value) else "" for value in (placed.fixes.places[row, 2], *measured)
+            )
+            writer.writerow((int(placed.fixes.stamp_ns[row]), *degrees, *others, int(not reason), reason))
+
+
+def summary(placed: Georeference) -> str:
+    """What the fixes say, and what they were used for."""
+    east, north, _ = placed.position_sigma_m
+    lines = [
+        f"{placed.num_kept} of {len(placed.fixes)} fixes kept; single fixes are off by {placed.fix_sigma_m[0]:.2f} m, "
+        "a standard deviation",
+        f"map placed: heading known to {placed.heading_sigma_deg:.2f} degrees, position to {east:.2f} m east and "
+        f"{north:.2f} m north",
+    ]
+    axes = [name for name, is_bent in zip(("horizontally", "in height"), placed.is_bent, strict=True) if is_bent]
+    lines.append(f"trajectory bent {' and '.join(axes)} by the fixes" if axes else "trajectory kept its shape")
+    if placed.measured_offset_s:
+        lines.append(
+            f"clock of the receiver: {placed.measured_offset_s:+.3f} s added to its times, "
+            f"known to {placed.offset_sigma_s:.3f} s"
+        )
+    if placed.arm_m.any():
+        lines.append(
+            f"antenna {placed.arm_m[0]:+.2f} m ahead and {placed.arm_m[1]:+.2f} m to the left of the LiDAR, "
+            f"known to {max(placed.arm_sigma_m):.2f} m"
+        )
+    if placed.fixes.note:
+        lines.append(placed.fixes.note)
+    return "\n".join(lines)

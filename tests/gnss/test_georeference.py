@@ -1,0 +1,117 @@
+"""Drives placed on the globe by good and bad fixes."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers.gnss_drive import ORIGIN, SIGMA_M, T_ENU_MAP, motions
+
+from segslam import geometry
+from segslam.gnss import Drive, Fixes, Use, enu_from_geodetic, geodetic_from_enu, georeference
+from segslam.gnss.fixes import Row, make_fixes
+from segslam.trajectory import Poses
+from segslam.types import Points, SegslamError
+
+NUM, STEP_M, PERIOD_S = 240, 2.0, 1.0
+
+
+def _truth() -> Poses:
+    """Two rounds of a block, 480 m."""
+    angle = 2.0 * np.pi * np.arange(NUM) / (NUM / 2)
+    places = np.column_stack([60.0 * np.sin(angle), 45.0 * (1.0 - np.cos(angle)), 0.0 * angle])
+    steps = np.gradient(places, axis=0)
+    return np.stack(
+        [geometry.transform(geometry.yaw(np.arctan2(y, x)), at) for (x, y, _), at in zip(steps, places, strict=True)]
+    )
+
+
+def _drifted(truth: Poses, share: float, seed: int = 0) -> Poses:
+    """The same drive with errors of every motion."""
+    rng = np.random.default_rng(seed)
+    poses = [truth[0]]
+    for before, after in pairwise(truth):
+        noise = geometry.exp(share * SIGMA_M * rng.standard_normal(6))
+        poses.append(poses[-1] @ geometry.inverse(before) @ after @ noise)
+    return np.stack(poses)
+
+
+def _drive(poses: Poses) -> Drive:
+    return Drive(np.arange(NUM) * round(1e9 * PERIOD_S), poses, np.arange(NUM))
+
+
+def _fixes(truth: Poses, *, sigma_m: float = 0.3, off_m: Points | float = 0.0) -> Fixes:
+    noise = sigma_m * np.random.default_rng(1).standard_normal((NUM, 3))
+    places = geodetic_from_enu(geometry.apply(T_ENU_MAP, truth[:, :3, 3]) + noise + off_m, ORIGIN)
+    return make_fixes("fixes", [Row(round(1e9 * PERIOD_S * row), *place) for row, place in enumerate(places)])
+
+
+def _error_m(found: object, truth: Poses) -> float:
+    """Horizontal error on the globe, rms."""
+    assert hasattr(found, "T_enu_keyframe")
+    places = geodetic_from_enu(found.T_enu_keyframe[:, :3, 3], found.origin)
+    off = enu_from_geodetic(places, ORIGIN) - geometry.apply(T_ENU_MAP, truth[:, :3, 3])
+    return float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
+
+
+def test_a_good_drive_is_placed_and_keeps_its_shape() -> None:
+    truth = _truth()
+    found = georeference(motions(truth), _drive(truth), _fixes(truth), use=Use.ALIGN)
+    assert _error_m(found, truth) < 0.15
+    assert found.heading_sigma_deg < 1.0
+    np.testing.assert_allclose(found.T_enu_keyframe, found.T_enu_map @ truth, atol=1e-9)
+    assert found.num_kept > 0.9 * NUM
+    assert found.fix_sigma_m[0] == pytest.approx(0.3, rel=0.3)
+
+
+def test_a_drifted_drive_is_bent_by_good_fixes() -> None:
+    truth = _truth()
+    drifted = _drifted(truth, 0.15)
+    aligned, fused = (
+        georeference(motions(drifted), _drive(drifted), _fixes(truth, sigma_m=0.05), use=use) for use in Use
+    )
+    assert _error_m(aligned, truth) > 0.8
+    assert _error_m(fused, truth) < 0.3 * _error_m(aligned, truth)
+    assert fused.is_bent[0]
+
+
+@pytest.mark.parametrize("first", [20, 150])
+def test_a_run_of_wrong_fixes_is_not_kept_and_does_no_harm(first: int) -> None:
+    truth = _truth()
+    off = np.zeros((NUM, 3))
+    off[first : first + 60] = [25.0, -20.0, 0.0]
+    found = georeference(motions(truth), _drive(truth), _fixes(truth, off_m=off))
+    assert _error_m(found, truth) < 0.3
+    wrong = set(found.reasons[first : first + 60])
+    assert wrong == {"contradicts_drive"}
+    assert found.reasons.count("contradicts_drive") < 75
+
+
+def test_a_clock_that_is_off_is_measured() -> None:
+    truth = _truth()
+    found = georeference(motions(truth), _drive(truth), _fixes(truth, sigma_m=0.05).shifted(0.5))
+    assert found.measured_offset_s == pytest.approx(-0.5, abs=0.05)
+    assert _error_m(found, truth) < 0.2
+
+
+def test_fixes_that_cannot_place_a_drive_are_refused_with_the_reason() -> None:
+    truth = _truth()
+    drive, edges = _drive(truth), motions(truth)
+    fixes = _fixes(truth)
+    rows = [Row(int(fixes.stamp_ns[row]), *fixes.places[row]) for row in range(3)]
+    with pytest.raises(SegslamError, match="3 usable fixes are within the drive; at least 4"):
+        georeference(edges, drive, make_fixes("three", rows))
+    with pytest.raises(SegslamError, match=r"--gnss-offset -86400\.0"):
+        georeference(edges, drive, fixes.shifted(86400.0))
+    with pytest.raises(SegslamError, match="heading"):
+        georeference(edges, drive, replace(fixes, places=fixes.places[[0] * NUM]))
+
+
+def test_fixes_without_heights_place_a_drive_horizontally() -> None:
+    truth = _truth()
+    fixes = _fixes(truth)
+    places = fixes.places.copy()
+    places[:, 2] = np.nan
+    found = georeference(motions(truth), _drive(truth), replace(fixes, places=places))
+    assert _error_m(found, truth) < 0.3
+    assert not np.isfinite(found.position_sigma_m[2])

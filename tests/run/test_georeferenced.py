@@ -1,0 +1,109 @@
+"""A run on the globe: its files, and maps that other programs place where the fixes are."""
+
+import csv
+import json
+from pathlib import Path
+from xml.etree import ElementTree as Xml
+
+import laspy
+import numpy as np
+import pytest
+import rasterio
+from helpers.commands import run
+from helpers.finished_run import MadeRun, make_run
+from helpers.gnss_drive import ORIGIN, T_ENU_MAP, write_fixes, write_graph
+from pyproj import Transformer
+
+from segslam import geometry
+from segslam.gnss import enu_from_geodetic
+from segslam.run.georeferenced import read_globe
+from segslam.types import Points
+
+KML = "{http://www.opengis.net/kml/2.2}"
+GPX = "{http://www.topografix.com/GPX/1/1}"
+SAME_DEG = 1e-7
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> MadeRun:
+    root = tmp_path_factory.mktemp("globe é")
+    found = make_run(root / "run")
+    write_graph(found.folder)
+    trajectory = found.result.trajectory
+    write_fixes(root / "fixes.csv", trajectory.stamp_ns, trajectory.T_world_lidar)
+    assert run("georeference", found.folder, "--gnss", root / "fixes.csv", "--quiet") == 0
+    return found
+
+
+def _enu(rows: Points) -> Points:
+    """Of longitude, latitude, height, in the frame of the fixes."""
+    return enu_from_geodetic(rows[:, [1, 0, 2]], ORIGIN)
+
+
+def test_the_files_say_where_every_scan_is(made: MadeRun) -> None:
+    values = json.loads((made.folder / "georeference.json").read_text())
+    assert values["utm_epsg"] == 32632
+    assert values["num_fixes_kept"] > 100
+    trajectory = made.result.trajectory
+    with (made.folder / "poses_geodetic.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    places = np.array([[float(row[name]) for name in ("longitude_deg", "latitude_deg", "height_m")] for row in rows])
+    true_enu_m = geometry.apply(T_ENU_MAP, trajectory.T_world_lidar[:, :3, 3])
+    np.testing.assert_allclose(_enu(places), true_enu_m, atol=0.2)
+    heading_deg = float(rows[0]["heading_deg"])
+    ahead = (T_ENU_MAP @ trajectory.T_world_lidar[0])[:2, 0]
+    assert abs((heading_deg - np.degrees(np.arctan2(*ahead)) + 180.0) % 360.0 - 180.0) < 0.5
+    with (made.folder / "gnss.csv").open() as stream:
+        fixes = list(csv.DictReader(stream))
+    assert len(fixes) == len(trajectory)
+    assert {row["reason"] for row in fixes if row["kept"] == "1"} == {""}
+
+
+def test_a_place_has_the_same_coordinates_in_all_files(made: MadeRun, tmp_path: Path) -> None:
+    names = ("map.laz", "map.tif", "track.geojson", "track.kml", "track.gpx", "map_projector_info.yaml", "map.ply")
+    assert run("export", made.folder, *(tmp_path / name for name in names), "--quiet") == 0
+    with (made.folder / "poses_geodetic.csv").open() as stream:
+        first = next(csv.DictReader(stream))
+    longitude, latitude = float(first["longitude_deg"]), float(first["latitude_deg"])
+    line = json.loads((tmp_path / "track.geojson").read_text())["features"][0]["geometry"]["coordinates"]
+    in_kml = Xml.parse(tmp_path / "track.kml").findtext(f".//{KML}coordinates", "").split()[0].split(",")
+    in_gpx = Xml.parse(tmp_path / "track.gpx").find(f".//{GPX}trkpt")
+    assert in_gpx is not None
+    for found in (line[0][:2], in_kml[:2], (in_gpx.get("lon"), in_gpx.get("lat"))):
+        np.testing.assert_allclose(np.array(found, float), [longitude, latitude], atol=SAME_DEG)
+    globe = read_globe(made.folder)
+    assert globe is not None
+    cloud = laspy.read(tmp_path / "map.laz")
+    crs = cloud.header.parse_crs()
+    assert crs.to_epsg() == globe.epsg == 32632
+    back = Transformer.from_crs(crs, 4979, always_xy=True)
+    of_cloud = np.column_stack(back.transform(cloud.x, cloud.y, cloud.z))
+    local = _plain_points(tmp_path / "map.ply")
+    np.testing.assert_allclose(enu_from_geodetic(of_cloud[:, [1, 0, 2]], globe.origin), local, atol=0.002)
+    with rasterio.open(tmp_path / "map.tif") as image:
+        assert image.crs.to_epsg() == 32632
+        rows, columns = rasterio.transform.rowcol(image.transform, cloud.x, cloud.y)
+        colors = image.read()[:, np.clip(rows, 0, image.height - 1), np.clip(columns, 0, image.width - 1)]
+    assert (colors != 255).any(axis=0).mean() > 0.9, "points are where the image is not blank"
+
+
+def _plain_points(file: Path) -> Points:
+    """Positions of the PLY file that `export` writes."""
+    import open3d
+
+    return np.asarray(open3d.io.read_point_cloud(str(file)).points)
+
+
+def test_a_run_without_fixes_has_no_such_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = make_run(tmp_path / "run").folder
+    for name in ("map.tif", "track.geojson", "map_projector_info.yaml"):
+        assert run("export", plain, tmp_path / name) == 2
+        assert "segslam georeference" in capsys.readouterr().err
+        assert not (tmp_path / name).exists()
+    write_fixes(tmp_path / "fixes.csv", np.arange(3), np.tile(np.eye(4), (3, 1, 1)))
+    assert run("georeference", plain, "--gnss", tmp_path / "fixes.csv") == 2
+    assert "adjusted.g2o: missing" in capsys.readouterr().err
+    assert run("georeference", plain) == 2
+    assert run("georeference", plain, "--gnss", tmp_path / "fixes.csv", "--gnss-use", "bend") == 2
+    assert "known: fuse, align" in capsys.readouterr().err
+    assert not (plain / "georeference.json").exists()

@@ -96,7 +96,7 @@ class Prepared:
         T_map_lidar = interpolated(drive, scan_s, time_s)
         T_keyframe_lidar = np.tile(np.eye(4), (len(rows), 1, 1))
         T_keyframe_lidar[:, :3, :3] = R_map_keyframe.transpose(0, 2, 1) @ T_map_lidar[:, :3, :3]
-        T_keyframe_lidar[:, :3, 3] = _turned_back(R_map_keyframe, T_map_lidar[:, :3, 3] - p_keyframe)
+        T_keyframe_lidar[:, :3, 3] = _rotated_into(R_map_keyframe, T_map_lidar[:, :3, 3] - p_keyframe)
         ends = [_positions(drive, scan_s, time_s + sign * SPEED_OVER_S / 2) for sign in (-1, 1)]
         return Matched(
             rows=rows,
@@ -105,7 +105,7 @@ class Prepared:
             sigma_m=self.fixes.sigma_m[rows],
             keyframe=keyframe,
             T_keyframe_lidar=T_keyframe_lidar,
-            velocity=_turned_back(R_map_keyframe, (ends[1] - ends[0]) / SPEED_OVER_S),
+            velocity=_rotated_into(R_map_keyframe, (ends[1] - ends[0]) / SPEED_OVER_S),
             travel_m=np.interp(time_s, scan_s, travelled_m(drive.T_map_lidar)),
         )
 
@@ -169,7 +169,7 @@ def _split(poses: Poses) -> tuple[np.ndarray, Points]:
     return poses[:, :3, :3], poses[:, :3, 3]
 
 
-def _turned_back(rotations: np.ndarray, vectors: Points) -> Points:
+def _rotated_into(rotations: np.ndarray, vectors: Points) -> Points:
     return np.einsum("nji,nj->ni", rotations, vectors)
 
 

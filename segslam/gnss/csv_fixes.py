@@ -7,6 +7,7 @@ above. Separators are commas, semicolons, tabs or blanks; text after # is ignore
 import re
 from collections.abc import Sequence
 from datetime import datetime
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ from segslam.errors import brief
 from segslam.gnss.fixes import Row
 from segslam.gnss.text import bad_line, check_degrees, number_in
 from segslam.gnss.times import stamp_of
-from segslam.trajectory import nanoseconds
 from segslam.types import SegslamError
 
 COLUMNS: dict[str, tuple[str, ...]] = {
@@ -33,7 +33,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
 ORDER = ("time", "latitude", "longitude", "height", "sigma_east", "sigma_north", "sigma_up")
 """Columns of a file without header."""
 NEEDED = ("latitude", "longitude")
-LATEST_S = 4e9
+LATEST_S = 4_000_000_000
 """Times above this are not seconds since 1970 (the year 2096) but milli-, micro- or nanoseconds."""
 
 
@@ -78,9 +78,7 @@ def _places_by_name(file: Path, number: int, names: Sequence[str]) -> dict[str, 
         missing.insert(0, "time")
     if missing:
         known = ", ".join(brief(name, 20) for name in names[:12])
-        raise bad_line(
-            file, number, f"no column {' or '.join(missing)} among {known}", "name the columns as in docs/gnss.md"
-        )
+        raise bad_line(file, number, f"no column {' or '.join(missing)} among {known}", "name the columns so")
     return places
 
 
@@ -119,19 +117,12 @@ def _stamp(file: Path, number: int, text: str, unit_ns: int | None) -> int:
             return stamp_of(datetime.fromisoformat(text.replace("Z", "+00:00")))
         if unit_ns is not None:
             return int(text)
-        seconds = nanoseconds(text)
-    except (ValueError, OverflowError) as error:
-        size = text.lstrip("-+").split(".")[0]
-        if size.isdigit() and 13 <= len(size) <= 19:
-            return int(size) * 10 ** (19 - max(len(size), 13) // 3 * 3 - 0) if len(size) < 19 else int(size)
+        value = Decimal(text)
+        steps = next(steps for steps in range(4) if abs(value) < LATEST_S * 1000**steps)  # s, ms, us, ns
+        return int((value * 1000 ** (3 - steps)).to_integral_value())
+    except (ArithmeticError, ValueError, OverflowError, StopIteration) as error:
         what = f"time {brief(text, 40)} is neither a number of seconds nor a date as 2026-01-31T12:00:00Z"
         raise bad_line(file, number, what) from error
-    for power in (3, 6, 9):
-        if abs(seconds) > LATEST_S * 1e9 * 10 ** (power - 3):
-            scaled = seconds // 10**power
-            if abs(scaled) <= LATEST_S * 1e9:
-                return scaled
-    return seconds
 
 
 def _has_fix(text: str) -> bool:
@@ -140,6 +131,6 @@ def _has_fix(text: str) -> bool:
     if text in ("", "true", "yes", "fix", "float", "single", "rtk", "a"):
         return True
     try:
-        return float(text) > 0.0 if text != "0" else False
+        return float(text) > 0.0
     except ValueError:
         return text not in ("false", "no", "none", "nofix", "no_fix", "v", "invalid")

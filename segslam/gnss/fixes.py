@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam.gnss.geodesy import Geodetic, Origin
-from segslam.types import Indices, Mask, Points, SegslamError, Vector
+from segslam.types import Indices, Mask, Points, SegslamError
 
 KEPT = ""
 NO_FIX, NOT_FINITE, DUPLICATE, OUTSIDE = "no_fix", "not_finite", "duplicate", "outside_run"
@@ -98,14 +98,6 @@ def origin_of(fixes: Fixes, usable: Mask) -> Origin:
     if not np.isfinite(height_m):
         height_m = known[0] if len(known) else 0.0
     return Origin(float(latitude), float(longitude), float(height_m))
-
-
-def sigma_or(fixes: Fixes, default_m: float) -> Vector:
-    """(n,) claimed horizontal standard deviation of each fix (m), root of the mean square of both axes."""
-    sigma = np.sqrt(
-        np.nanmean(np.where(np.isfinite(fixes.sigma_m[:, :2]), fixes.sigma_m[:, :2], default_m) ** 2, axis=1)
-    )
-    return sigma
 
 
 def _reason(row: Row) -> str:

@@ -1,11 +1,10 @@
 """Joint solution of a finished graph and the fixes, with a weight that the fixes themselves justify.
 
 The noise of drive and receiver is that of the largest likelihood (`evidence`). With it, the fixes of a receiver with
-slow errors hardly bend a consistent map. But a map may also have systematic errors that its graph does not claim, and
-then a good receiver is right. So blocks of fixes are held out, and of three stiffnesses (the drive keeps its shape, is
-bent by this noise, follows the fixes closely) the stiffest is used whose cost of held-out fixes is within a standard
-error of the least one: the one-standard-error rule (Hastie, Tibshirani and Friedman, "The Elements of Statistical
-Learning", 2nd edition, section 7.10).
+slow errors hardly bend a consistent map. But a map may also have systematic errors that its graph does not claim; then
+a good receiver is right. So blocks of fixes are held out, and of three stiffnesses (the drive keeps its shape, is bent
+by this noise, follows the fixes closely) the stiffest is used that does not predict the held-out fixes significantly
+worse than the best one does (paired t-test over the blocks).
 """
 
 from collections.abc import Callable, Sequence
@@ -24,6 +23,8 @@ from segslam.types import Indices, Points, Vector
 NUM_BLOCKS, NUM_FOLDS = 6, 3
 """Chosen: blocks of fixes in a row and groups in which they are held out; a block is longer than the errors of most
 receivers are correlated."""
+SIGNIFICANT_T = 1.476
+"""Derived: Student's t with 5 degrees of freedom, one-sided, at 10 %: for six blocks."""
 RIGID_M = 1000.0
 """Standard deviation of fixes that do not bend the drive."""
 LEAST_FUSED = 24
@@ -184,11 +185,11 @@ def _level_only(sigma: Vector) -> Vector:
 def _best(
     problem: _Problem, candidates: Sequence[Vector], blocks: Indices, reference: Points, of: Measure
 ) -> tuple[Vector, Costs]:
-    """The stiffest of three candidates, rigid, soft and close, whose cost is within a standard error of the least."""
+    """The stiffest of three candidates, rigid, soft and close, whose cost is not significantly above the least one."""
     costs = np.array([_costs(_held_out(problem, one, blocks), reference, blocks, of) for one in candidates])
     means = costs.mean(axis=1)
     more = costs - costs[means.argmin()]
-    is_as_good = more.mean(axis=1) <= more.std(axis=1, ddof=1) / np.sqrt(NUM_BLOCKS)
+    is_as_good = more.mean(axis=1) <= SIGNIFICANT_T * more.std(axis=1, ddof=1) / np.sqrt(NUM_BLOCKS)
     rigid, soft, close = means.tolist()
     return candidates[int(is_as_good.argmax())], (rigid, soft, close)
 

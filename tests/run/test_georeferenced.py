@@ -35,6 +35,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> MadeRun:
     return found
 
 
+def test_quiet_prints_nothing_and_json_one_value(made: MadeRun, capfd: pytest.CaptureFixture[str]) -> None:
+    fixes = made.folder.parent / "fixes.csv"
+    assert run("georeference", made.folder, "--gnss", fixes, "--quiet") == 0
+    assert capfd.readouterr() == ("", "")
+    assert run("georeference", made.folder, "--gnss", fixes, "--json") == 0
+    assert json.loads(capfd.readouterr().out)["utm_epsg"] == 32632
+
+
 def _enu(rows: Points) -> Points:
     """Of longitude, latitude, height, in the frame of the fixes."""
     return enu_from_geodetic(rows[:, [1, 0, 2]], ORIGIN)

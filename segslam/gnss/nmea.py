@@ -1,0 +1,116 @@
+"""Fixes from NMEA 0183: GGA (position, height, quality) and RMC (position, date); others only give the date (ZDA)."""
+
+from collections.abc import Sequence
+from datetime import UTC, date, datetime, time, timedelta
+from pathlib import Path
+
+from segslam.gnss.fixes import Row
+from segslam.gnss.text import bad_line, check_degrees, number_in
+from segslam.gnss.times import stamp_of
+from segslam.types import SegslamError
+
+NOTE = (
+    "heights: altitude above the geoid and geoid separation, as the receiver gives them, added to ellipsoidal heights"
+)
+NO_DATE = date(1970, 1, 1)
+"""Without RMC or ZDA the times are those of the day."""
+HALF_DAY = timedelta(hours=12)
+
+
+def is_nmea(lines: Sequence[str]) -> bool:
+    """True if one of the first lines is a sentence."""
+    return any(
+        line.lstrip().startswith("$") and line[3:6] in ("GGA", "RMC", "GSA", "GSV", "ZDA") for line in lines[:50]
+    )
+
+
+def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
+    """The fixes of all talkers, and a note about their heights; GGA where there is any, else RMC.
+
+    Lines with a wrong checksum are left out. Raises SegslamError, naming file and line, if all are wrong, or for a
+    position with a right checksum that is none.
+    """
+    found: dict[str, list[Row]] = {"GGA": [], "RMC": []}
+    day, last, num_wrong, num_right = _first_date(lines), None, 0, 0
+    for number, line in enumerate(lines, 1):
+        words = _words(line)
+        if words is None:
+            num_wrong += line.lstrip().startswith("$")
+            continue
+        num_right += 1
+        kind = words[0][-3:]
+        day = _date(words) or day
+        if kind not in found or len(words) < 10 or not words[1]:
+            continue
+        at = _time(file, number, words[1])
+        if last is not None and datetime.combine(day, last) - datetime.combine(day, at) > HALF_DAY:
+            day += timedelta(days=kind == "GGA")  # midnight, before the next RMC
+        last = at
+        found[kind].append(_row(file, number, kind, words, datetime.combine(day, at, tzinfo=UTC)))
+    if not num_right:
+        raise SegslamError(f"{file}: all {num_wrong} NMEA sentences have wrong checksums; log them again")
+    left_out = f"; {num_wrong} lines with wrong checksums left out" if num_wrong else ""
+    return (found["GGA"], NOTE + left_out) if found["GGA"] else (found["RMC"], f"no heights{left_out}")
+
+
+def _words(line: str) -> list[str] | None:
+    """The fields of a sentence; None for a line that is none, or has a wrong checksum."""
+    content, star, checksum = line.strip().removeprefix("$").rpartition("*")
+    if not star or not line.lstrip().startswith("$"):
+        return None
+    total = 0
+    for letter in content.encode(errors="replace"):
+        total ^= letter
+    return content.split(",") if checksum.upper() == f"{total:02X}" else None
+
+
+def _row(file: Path, number: int, kind: str, words: Sequence[str], moment: datetime) -> Row:
+    first = 2 if kind == "GGA" else 3
+    latitude, longitude = (
+        _degrees(file, number, words[place], words[place + 1], digits) for place, digits in ((first, 2), (first + 2, 3))
+    )
+    check_degrees(file, number, latitude, longitude)
+    height_m = float("nan")
+    if kind == "GGA":
+        has_fix = words[6] not in ("", "0")
+        height_m = number_in(file, number, words[9], "altitude")
+        if len(words) > 11 and words[11]:
+            height_m += number_in(file, number, words[11], "geoid separation")
+    else:
+        has_fix = words[2] == "A"
+    return Row(stamp_of(moment), latitude, longitude, height_m, has_fix=has_fix)
+
+
+def _degrees(file: Path, number: int, text: str, hemisphere: str, digits: int) -> float:
+    """Degrees of `ddmm.mmm`, with so many digits of degrees; NaN for an empty field."""
+    if not text:
+        return float("nan")
+    degrees = number_in(file, number, text[:digits], "degrees") + number_in(file, number, text[digits:], "minutes") / 60
+    return -degrees if hemisphere in ("S", "W") else degrees
+
+
+def _time(file: Path, number: int, text: str) -> time:
+    try:
+        whole, _, fraction = text.partition(".")
+        return time(int(whole[:2]), int(whole[2:4]), int(whole[4:6]), int(fraction.ljust(6, "0")[:6] or 0))
+    except ValueError as error:
+        raise bad_line(file, number, f"time {text[:20]} is not hhmmss.ss") from error
+
+
+def _date(words: Sequence[str]) -> date | None:
+    """The date of RMC (ddmmyy) or ZDA; None if there is none."""
+    try:
+        if words[0][-3:] == "RMC" and len(words) > 9:
+            year = int(words[9][4:6])
+            return date(year + (1900 if year > 79 else 2000), int(words[9][2:4]), int(words[9][:2]))
+        if words[0][-3:] == "ZDA" and len(words) > 4:
+            return date(int(words[4]), int(words[3]), int(words[2]))
+    except ValueError:
+        return None
+    return None
+
+
+def _first_date(lines: Sequence[str]) -> date:
+    """The first date in the file: fixes before it are of the same day."""
+    dates = (_date(words) for words in map(_words, lines) if words)
+    return next((one for one in dates if one), NO_DATE)

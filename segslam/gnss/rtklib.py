@@ -1,0 +1,76 @@
+"""Fixes from RTKLIB's .pos files: geodetic or ECEF, GPS time or UTC, with weeks or dates."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from segslam.gnss.fixes import Row
+from segslam.gnss.geodesy import Origin, geodetic_from_ecef, rotation_ecef_enu
+from segslam.gnss.text import bad_line, check_degrees, number_in
+from segslam.gnss.times import stamp_of, stamp_of_week, utc_of_gps
+from segslam.types import Vector
+
+
+def is_rtklib(lines: Sequence[str]) -> bool:
+    """True if the header names the columns of a solution."""
+    return any(line.startswith("%") and ("latitude" in line or "x-ecef" in line) for line in lines[:100])
+
+
+def read_rtklib(file: Path, lines: Sequence[str]) -> list[Row]:
+    """The fixes of a solution. Raises SegslamError, naming file and line, for a line that is none."""
+    rows, is_ecef, is_gpst = [], False, True
+    for number, line in enumerate(lines, 1):
+        if line.startswith("%"):
+            if "latitude" in line or "x-ecef" in line:
+                is_ecef, is_gpst = "x-ecef" in line, "UTC" not in line.split()[1:2] and "JST" not in line
+            continue
+        words = line.replace(",", " ").split()
+        if not words:
+            continue
+        if len(words) < 7:
+            raise bad_line(file, number, f"{len(words)} columns; time, position and quality are needed")
+        rows.append(_row(file, number, words, is_ecef=is_ecef, is_gpst=is_gpst))
+    return rows
+
+
+def _row(file: Path, number: int, words: Sequence[str], *, is_ecef: bool, is_gpst: bool) -> Row:
+    position = np.array([number_in(file, number, word, "coordinate") for word in words[2:5]])
+    errors = np.full(3, np.nan)
+    if len(words) >= 10:
+        errors = np.array([number_in(file, number, word, "standard deviation") for word in words[7:10]])
+    if is_ecef:
+        latitude, longitude, height_m = (
+            geodetic_from_ecef(position[None])[0] if np.isfinite(position).all() else position
+        )
+        sigma_m = _rotated(errors, Origin(float(latitude), float(longitude), float(height_m)))
+    else:
+        latitude, longitude, height_m = position
+        sigma_m = errors[[1, 0, 2]]  # north comes before east
+    check_degrees(file, number, float(latitude), float(longitude))
+    east, north, up = (float(value) for value in sigma_m)
+    stamp_ns = _stamp(file, number, words[0], words[1], is_gpst=is_gpst)
+    return Row(stamp_ns, float(latitude), float(longitude), float(height_m), (east, north, up), words[5] != "0")
+
+
+def _rotated(errors: Vector, origin: Origin) -> Vector:
+    """(3,) standard deviations east, north, up of those along the axes of ECEF, without their correlations."""
+    rotation = rotation_ecef_enu(origin)
+    return np.sqrt((rotation.T**2) @ errors**2)
+
+
+def _stamp(file: Path, number: int, first: str, second: str, *, is_gpst: bool) -> int:
+    """Time (ns) of a week and second, or of a date and time."""
+    try:
+        if "/" not in first:
+            return stamp_of_week(int(first), float(second))
+        moment = datetime.strptime(
+            f"{first} {second}", "%Y/%m/%d %H:%M:%S.%f" if "." in second else "%Y/%m/%d %H:%M:%S"
+        )
+        moment = moment.replace(tzinfo=UTC)
+        return stamp_of(utc_of_gps(moment) if is_gpst else moment)
+    except (ValueError, OverflowError) as error:
+        raise bad_line(
+            file, number, f"time {first[:20]} {second[:20]} is neither week and seconds nor a date"
+        ) from error

@@ -28,11 +28,14 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "sigma_north": ("sigma_north", "sigma_north_m", "sd_north", "sdn", "std_lat", "sigma_n", "sigma_y"),
     "sigma_up": ("sigma_up", "sigma_up_m", "sd_up", "sdu", "std_alt", "sigma_u", "sigma_z", "vertical_accuracy"),
     "sigma": ("sigma", "sigma_m", "accuracy", "horizontal_accuracy", "hacc", "std", "sd"),
-    "status": ("status", "fix", "quality", "valid"),
+    "status": ("status",),
+    "quality": ("quality", "fix", "valid"),
 }
 ORDER = ("time", "latitude", "longitude", "height", "sigma_east", "sigma_north", "sigma_up")
 """Columns of a file without header."""
 NEEDED = ("latitude", "longitude")
+LEAST_STATUS = {"status": 0.0, "quality": 1.0}
+"""Least number of a fix: a status as in NavSatFix is -1 for none, a quality as in NMEA 0."""
 LATEST_S = 4_000_000_000
 """Times above this are not seconds since 1970 (the year 2096) but milli-, micro- or nanoseconds."""
 
@@ -105,7 +108,11 @@ def _row(file: Path, number: int, cells: Sequence[str], places: dict[str, int]) 
         longitude,
         value("height"),
         (both if np.isnan(east) else east, both if np.isnan(north) else north, up),
-        has_fix=_has_fix(cells[places["status"]]) if "status" in places and places["status"] < len(cells) else True,
+        has_fix=all(
+            _has_fix(cells[places[name]], least)
+            for name, least in LEAST_STATUS.items()
+            if places.get(name, len(cells)) < len(cells)
+        ),
     )
 
 
@@ -125,12 +132,12 @@ def _stamp(file: Path, number: int, text: str, unit_ns: int | None) -> int:
         raise bad_line(file, number, what) from error
 
 
-def _has_fix(text: str) -> bool:
-    """Status of NavSatFix (-1: none) or quality (0: none), as number or word."""
+def _has_fix(text: str, least: float) -> bool:
+    """True unless a status, as number or word, is that of no fix."""
     text = text.strip().lower()
     if text in ("", "true", "yes", "fix", "float", "single", "rtk", "a"):
         return True
     try:
-        return float(text) > 0.0
+        return float(text) >= least
     except ValueError:
         return text not in ("false", "no", "none", "nofix", "no_fix", "v", "invalid")

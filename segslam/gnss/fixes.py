@@ -9,6 +9,7 @@ import numpy as np
 from segslam.gnss.geodesy import Geodetic, Origin
 from segslam.types import Indices, Mask, Points, SegslamError
 
+MOST_NS = 2**63
 KEPT = ""
 NO_FIX, NOT_FINITE, DUPLICATE, OUTSIDE = "no_fix", "not_finite", "duplicate", "outside_run"
 """Reasons for which a fix is not used, whatever the trajectory is."""
@@ -67,7 +68,10 @@ def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fi
     if not rows:
         raise SegslamError(f"{source}: contains no position fix; give another file or topic")
     ordered = sorted(rows, key=lambda row: row.stamp_ns)
+    if abs(ordered[-1].stamp_ns) >= MOST_NS or abs(ordered[0].stamp_ns) >= MOST_NS:
+        raise SegslamError(f"{source}: a time is more than 292 years from 1970; correct or remove the line")
     places = np.array([(row.latitude_deg, row.longitude_deg, row.height_m) for row in ordered], dtype=np.float64)
+    places[~np.isfinite(places)] = np.nan
     sigma_m = np.array([row.sigma_m for row in ordered], dtype=np.float64)
     sigma_m = np.where(np.isfinite(sigma_m) & (sigma_m > 0.0), sigma_m, np.nan)
     stamp_ns = np.array([row.stamp_ns for row in ordered], dtype=np.int64)

@@ -106,7 +106,7 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
     if not -80.0 <= latitude_deg <= 84.0:
         return 32661 if latitude_deg > 0.0 else 32761
     longitude = (longitude_deg + 180.0) % 360.0 - 180.0
-    zone = int((longitude + 180.0) // 6.0) + 1
+    zone = min(int((longitude + 180.0) // 6.0), 59) + 1
     if 56.0 <= latitude_deg < 64.0 and 3.0 <= longitude < 12.0:
         zone = 32
     elif latitude_deg >= 72.0 and 0.0 <= longitude < 42.0:

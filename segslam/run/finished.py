@@ -59,6 +59,8 @@ FIGURES = {
     "num_map_moving_points": "points removed from the map by class, as moving",
     "num_map_voxels_seen_through": "voxels removed from the map, because other scans see through them",
     "map_seconds": "time to write the map (s)",
+    "gnss_kept": "position fixes kept",
+    "gnss_dropped": "position fixes not used: without position, outside of the drive, or contradicted by it",
     "seconds_total": "total time (s)",
     "scans_per_second": "scans per second",
     "peak_rss_mb": "peak memory (MB)",

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from segslam.gnss import georeference as georeference_drive
 from segslam.gnss.reading import read_fixes
 from segslam.pose_graph import read_g2o
 from segslam.run.finished import FinishedRun, read_run
-from segslam.run.folder import ADJUSTED_GRAPH, room_for
+from segslam.run.folder import ADJUSTED_GRAPH, room_for, write_metrics
 from segslam.system.whole_files import whole_file, write_whole
 from segslam.trajectory import Poses, corrected_poses, read_poses, write_tum
 from segslam.types import SegslamError
@@ -65,7 +66,7 @@ def read_globe(folder: Path) -> Globe | None:
     if not file.exists():
         return None
     try:
-        origin = json.loads(file.read_text(encoding="utf-8"))["origin"]
+        origin = json.loads(file.read_text(encoding="utf-8"))
         found = Origin(*(float(origin[name]) for name in ("latitude_deg", "longitude_deg", "height_m")))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
@@ -82,6 +83,8 @@ def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) ->
         _write_fixes(run.folder, placed)
         values = figures(placed) | {"use": str(use), "given_offset_s": offset_s}
         write_whole(run.folder / FILE, json.dumps(values, indent=2) + "\n")
+        num_kept = placed.num_kept
+        write_metrics(run.folder, run.metrics | {"gnss_kept": num_kept, "gnss_dropped": len(placed.fixes) - num_kept})
 
 
 def figures(placed: Georeference) -> dict[str, Any]:
@@ -89,15 +92,13 @@ def figures(placed: Georeference) -> dict[str, Any]:
     origin = placed.origin
     return {
         "datum": DATUM,
-        "origin": {
-            "latitude_deg": origin.latitude_deg,
-            "longitude_deg": origin.longitude_deg,
-            "height_m": origin.height_m,
-        },
-        "utm_epsg": utm_epsg(origin.latitude_deg, origin.longitude_deg),
-        "T_enu_map": placed.T_enu_map.tolist(),
-        "heading_sigma_deg": placed.heading_sigma_deg,
-        "position_sigma_m": _known(placed.position_sigma_m),
+        "latitude_deg": origin.latitude_deg,
+        "longitude_deg": origin.longitude_deg,
+        "height_m": origin.height_m,
+        "epsg": utm_epsg(origin.latitude_deg, origin.longitude_deg),
+        "T_enu_map": placed.T_enu_map.ravel().tolist(),
+        "sigma": dict(zip(("east_m", "north_m", "up_m"), _known(placed.position_sigma_m), strict=True))
+        | {"heading_deg": placed.heading_sigma_deg},
         "fix_sigma_m": _known(placed.fix_sigma_m),
         "num_fixes": len(placed.fixes),
         "num_fixes_kept": placed.num_kept,
@@ -117,18 +118,20 @@ def _known(values: np.ndarray) -> list[float | None]:
 
 
 def _write_geodetic(run: FinishedRun, origin: Origin, T_enu_lidar: Poses) -> None:
-    """A row a scan: number, stamp, latitude, longitude, height, and heading of the x axis clockwise from north."""
+    """A row a scan: time, latitude, longitude, height, and heading of the x axis clockwise from north."""
     trajectory = run.result.trajectory
     places = geodetic_from_enu(T_enu_lidar[:, :3, 3], origin)
     heading_deg = np.degrees(np.arctan2(T_enu_lidar[:, 0, 0], T_enu_lidar[:, 1, 0])) % 360.0
     with whole_file(run.folder / GEODETIC) as part, part.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
-        writer.writerow(("scan", "stamp_ns", "latitude_deg", "longitude_deg", "height_m", "heading_deg"))
-        for scan, stamp_ns, (latitude, longitude, height_m), heading in zip(
-            trajectory.scan_index, trajectory.stamp_ns, places, heading_deg, strict=True
+        writer.writerow(("seconds", "latitude", "longitude", "height", "heading"))
+        for stamp_ns, (latitude, longitude, height_m), heading in zip(
+            trajectory.stamp_ns, places, heading_deg, strict=True
         ):
-            place = (f"{latitude:.10f}", f"{longitude:.10f}", f"{height_m:.4f}")
-            writer.writerow((int(scan), int(stamp_ns), *place, f"{heading:.4f}"))
+            seconds = Decimal(int(stamp_ns)).scaleb(-9)
+            writer.writerow(
+                (f"{seconds:f}", f"{latitude:.10f}", f"{longitude:.10f}", f"{height_m:.4f}", f"{heading:.4f}")
+            )
 
 
 def _write_fixes(folder: Path, placed: Georeference) -> None:

@@ -199,7 +199,7 @@ def test_midnight_is_passed(tmp_path: Path) -> None:
 
 
 def test_fixes_without_position_are_not_used(tmp_path: Path) -> None:
-    rows = ["time,lat,lon,alt,status", "1,48,8,100,1", "2,nan,8,100,1", "3,48.1,8,100,0", "4,48,8,100,1", "5,0,0,0,1"]
+    rows = ["time,lat,lon,alt,quality", "1,48,8,100,1", "2,nan,8,100,1", "3,48.1,8,100,0", "4,48,8,100,1", "5,0,0,0,1"]
     rows += ["6,48.2,8,,1", "6,48.3,8,,1"]
     (tmp_path / "a.csv").write_text("\n".join(rows))
     fixes = read_fixes(tmp_path / "a.csv")
@@ -207,6 +207,11 @@ def test_fixes_without_position_are_not_used(tmp_path: Path) -> None:
     (tmp_path / "none.csv").write_text("\n".join([rows[0], rows[2], rows[3]]))
     with pytest.raises(SegslamError, match="none of its 2 fixes can be used"):
         read_fixes(tmp_path / "none.csv")
+
+
+def test_a_status_is_that_of_navsatfix(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time,lat,lon,alt,status\n1,48,8,100,0\n2,48.1,8,100,-1\n")
+    assert read_fixes(tmp_path / "a.csv").reasons == ("", "no_fix")
 
 
 @pytest.mark.parametrize("unit", [1, 1000, 10**6, 10**9])
@@ -224,6 +229,7 @@ BAD = {
         ("time,lat,lon\n1,4898.0,8\n", r"a\.csv:2: latitude 4898 .* not metres"),
         ("time,lat,lon\nsoon,48,8\n", r"a\.csv:2: time soon"),
         ("when,lat,lon\n1,48,8\n", r"a\.csv:1: no column time"),
+        (f"stamp_ns,lat,lon\n1{30 * '0'},48,8\n", "292 years"),
     ],
     "a.nmea": [("$GPGGA,1,2,N,3,E,1,1,1,1,M,1,M,,*00\n", "all 1 NMEA sentences have wrong checksums")],
     "a.pos": [("%  GPST latitude(deg) longitude(deg)\n2158 95599 48.0\n", r"a\.pos:2: 3 columns")],

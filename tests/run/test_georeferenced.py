@@ -40,7 +40,7 @@ def test_quiet_prints_nothing_and_json_one_value(made: MadeRun, capfd: pytest.Ca
     assert run("georeference", made.folder, "--gnss", fixes, "--quiet") == 0
     assert capfd.readouterr() == ("", "")
     assert run("georeference", made.folder, "--gnss", fixes, "--json") == 0
-    assert json.loads(capfd.readouterr().out)["utm_epsg"] == 32632
+    assert json.loads(capfd.readouterr().out)["epsg"] == 32632
 
 
 def _enu(rows: Points) -> Points:
@@ -50,15 +50,19 @@ def _enu(rows: Points) -> Points:
 
 def test_the_files_say_where_every_scan_is(made: MadeRun) -> None:
     values = json.loads((made.folder / "georeference.json").read_text())
-    assert values["utm_epsg"] == 32632
+    assert values["epsg"] == 32632
     assert values["num_fixes_kept"] > 100
+    assert len(values["T_enu_map"]) == 16
+    metrics = json.loads((made.folder / "metrics.json").read_text())
+    assert metrics["gnss_kept"] + metrics["gnss_dropped"] == values["num_fixes"]
     trajectory = made.result.trajectory
     with (made.folder / "poses_geodetic.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    places = np.array([[float(row[name]) for name in ("longitude_deg", "latitude_deg", "height_m")] for row in rows])
+    places = np.array([[float(row[name]) for name in ("longitude", "latitude", "height")] for row in rows])
+    assert [round(1e9 * float(row["seconds"])) for row in rows[:3]] == trajectory.stamp_ns[:3].tolist()
     true_enu_m = geometry.apply(T_ENU_MAP, trajectory.T_world_lidar[:, :3, 3])
     np.testing.assert_allclose(_enu(places), true_enu_m, atol=0.2)
-    heading_deg = float(rows[0]["heading_deg"])
+    heading_deg = float(rows[0]["heading"])
     ahead = (T_ENU_MAP @ trajectory.T_world_lidar[0])[:2, 0]
     assert abs((heading_deg - np.degrees(np.arctan2(*ahead)) + 180.0) % 360.0 - 180.0) < 0.5
     with (made.folder / "gnss.csv").open() as stream:
@@ -72,7 +76,7 @@ def test_a_place_has_the_same_coordinates_in_all_files(made: MadeRun, tmp_path: 
     assert run("export", made.folder, *(tmp_path / name for name in names), "--quiet") == 0
     with (made.folder / "poses_geodetic.csv").open() as stream:
         first = next(csv.DictReader(stream))
-    longitude, latitude = float(first["longitude_deg"]), float(first["latitude_deg"])
+    longitude, latitude = float(first["longitude"]), float(first["latitude"])
     line = json.loads((tmp_path / "track.geojson").read_text())["features"][0]["geometry"]["coordinates"]
     in_kml = Xml.parse(tmp_path / "track.kml").findtext(f".//{KML}coordinates", "").split()[0].split(",")
     in_gpx = Xml.parse(tmp_path / "track.gpx").find(f".//{GPX}trkpt")

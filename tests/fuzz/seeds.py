@@ -141,6 +141,16 @@ def network(folder: Path) -> tuple[bytes, bytes]:
     return model.read_bytes(), model.with_suffix(".yaml").read_bytes()
 
 
+FIXES = (
+    b"time,latitude,longitude,height,sigma\n1.5,48.98,8.39,115.2,0.5\n2.5,48.9801,8.3902,115.4,0.5\n",
+    b"$GNRMC,023317.50,A,4858.8,N,00823.4,E,0.1,,170521,,,A*6A\r\n"
+    b"$GNGGA,023317.50,4858.8,N,00823.4,E,4,12,0.8,67.0,M,48.0,M,,*44\r\n",
+    b"%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn sde sdu\n"
+    b"2158 95599.0 48.98 8.39 115.2 1 9 0.4 0.5 0.9 0 0 0 0 0\n"
+    b"2021/05/17 02:33:36.5 48.98 8.39 115.4 1 9 0.4 0.5 0.9\n",
+    b"%  UTC  x-ecef(m) y-ecef(m) z-ecef(m) Q ns sdx sdy sdz\n"
+    b"2021/05/17 02:33:17 4149480.1 611982.2 4789370.5 5 9 0.4 0.5 0.9 0 0 0 0 0\n",
+)
 KITTI_POSES = b"1 0 0 0.5 0 1 0 0 0 0 1 0\n0.8 -0.6 0 1.5 0.6 0.8 0 2e-3 0 0 1 -4\n" * 2
 TUM_POSES = b"# seconds\n1317354880.1 1 2 3 0 0 0 1\n1317354880.2 1.5 2 3 0 0 0.6 0.8\n"
 TIMES = b"0.0\n1.036e-01\n2.072e-01\n1317354880.25\n"

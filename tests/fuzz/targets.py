@@ -20,6 +20,7 @@ from segslam.datasets.clouds import read_file
 from segslam.datasets.kitti import read_calibration
 from segslam.datasets.point_cloud2 import CloudReader
 from segslam.datasets.scans import make_scan, read_stamps
+from segslam.gnss.reading import read_fixes
 from segslam.log import read_log
 from segslam.pose_graph import Robust, optimize_graph, read_g2o
 from segslam.semantics.label_files import encoding_of, read_labels
@@ -92,6 +93,7 @@ def targets(folder: Path) -> list[Target]:
         Target("poses", at("poses") / "p.txt", [seeds.KITTI_POSES, seeds.TUM_POSES], read_poses, is_text=True),
         Target("times", at("times") / "times.txt", [seeds.TIMES], read_stamps, is_text=True),
         Target("calib", at("calib") / "calib.txt", [seeds.CALIB], read_calibration, is_text=True),
+        Target("gnss", at("gnss") / "fixes.txt", list(seeds.FIXES), read_fixes, is_text=True),
         Target("g2o", at("g2o") / "a.g2o", [seeds.G2O + b"\n" * k for k in range(len(ROBUST))], _graph, is_text=True),
         Target("config", at("config") / "a.yaml", [seeds.CONFIG], load_config, is_text=True),
         Target("set", at("set") / "text", list(seeds.OVERRIDES), _override, is_text=True),

@@ -37,7 +37,11 @@ def test_requirements_are_those_of_the_project() -> None:
 def test_las_and_ros_messages_have_the_install_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clouds, "find_spec", lambda _: None)
     with pytest.raises(SegslamError, match=r"pip install 'laspy<.*' 'lazrs<"):
-        clouds.check_las(tmp_path / "map.laz")
+        clouds.check_las(tmp_path / "map.laz", is_projected=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(clouds, "find_spec", lambda name: None if name == "pyproj" else object())
+        with pytest.raises(SegslamError, match=r"pip install 'pyproj<.*' 'rasterio<"):
+            clouds.check_las(tmp_path / "map.laz", is_projected=True)
     monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
     with pytest.raises(ImportError, match="pip install 'mcap-ros2-support<"):
         McapClouds(tmp_path / "drive.mcap", "")

@@ -37,6 +37,7 @@ def finish(
     from segslam.calibration import vertical_angle_advice
     from segslam.log import read_log
     from segslam.run.accuracy import accuracy
+    from segslam.run.finished import read_metrics
     from segslam.run.folder import LOG, room_for, write_metrics
     from segslam.run.report import write_report
     from segslam.system.memory import peak_mb
@@ -49,7 +50,10 @@ def finish(
     metrics |= more(result)
     write_metrics(run.folder, metrics)
     try:
-        placed = place(run.folder) if place is not None else ""
+        placed = ""
+        if place is not None:
+            placed = place(run.folder)
+            metrics = read_metrics(run.folder)
         if map_files:
             log = read_log(run.folder / LOG)
             metrics |= write_maps(log, map_files, config=log.config.map, quiet=quiet)

@@ -30,12 +30,14 @@ def georeference(
     announce(f"georeference: reading {gnss}", quiet=quiet)
     from segslam.run.folder import folder_of
     from segslam.run.georeferenced import FILE
+    from segslam.run.report import write_report
 
     folder = folder_of(run)
     place = GnssOptions(gnss, gnss_use, gnss_offset).placing(_recording_of(folder))
     if place is None:
         raise SegslamError("--gnss: give the position fixes, as in --gnss fixes.csv")
     placed = place(folder)
+    write_report(folder)
     if json:
         print_out((folder / FILE).read_text(encoding="utf-8").rstrip())
     else:

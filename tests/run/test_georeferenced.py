@@ -2,10 +2,12 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
 import laspy
+import matplotlib
 import numpy as np
 import pytest
 import rasterio
@@ -17,6 +19,8 @@ from pyproj import Transformer
 from segslam import geometry
 from segslam.gnss import enu_from_geodetic
 from segslam.run.georeferenced import read_globe
+from segslam.run.report.figures import STYLE
+from segslam.run.report.fixes import draw_fixes
 from segslam.types import Points
 
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -119,3 +123,12 @@ def test_a_run_without_fixes_has_no_such_files(tmp_path: Path, capsys: pytest.Ca
     assert run("georeference", plain, "--gnss", tmp_path / "fixes.csv", "--gnss-use", "bend") == 2
     assert "known: fuse, align" in capsys.readouterr().err
     assert not (plain / "georeference.json").exists()
+
+
+def test_the_report_shows_the_fixes(made: MadeRun, tmp_path: Path) -> None:
+    with matplotlib.rc_context(STYLE):
+        drawn = draw_fixes(made.folder)
+    assert drawn is not None
+    assert "residual (m)" in drawn
+    assert re.search(r">kept: 1\d\d<", drawn)
+    assert draw_fixes(tmp_path) is None

@@ -11,6 +11,7 @@ from segslam.map.before_after import BeforeAfter
 from segslam.run.finished import FinishedRun, read_run
 from segslam.run.folder import LOG
 from segslam.run.report import figures, gallery, interactive
+from segslam.run.report.fixes import draw_fixes
 from segslam.run.report.page import Pictures, page
 from segslam.system.whole_files import write_whole
 from segslam.types import Keyframe, LoopAttempt
@@ -61,6 +62,8 @@ def _plots(run: FinishedRun) -> dict[str, str]:
     true = figures.compared(run)
     if true is not None:
         plots["Error along the drive, after alignment"] = figures.draw_errors(true)
+    if (fixes := draw_fixes(run.folder)) is not None:
+        plots["Position fixes, top view and residuals"] = fixes
     plots["Loops by outcome"] = figures.draw_loops(run)
     if run.result.attempts:
         plots["Loops over time"] = figures.draw_loops_over_time(run)

@@ -1,5 +1,6 @@
 """Lines of a text file, and errors that name the line."""
 
+import math
 from pathlib import Path
 
 from segslam.errors import brief
@@ -28,12 +29,13 @@ def bad_line(file: Path, number: int, what: str, remedy: str = "correct or remov
 
 
 def number_in(file: Path, line: int, text: str, name: str) -> float:
-    """The number in a cell. Raises SegslamError if it is none; an empty cell, `nan` and `null` are NaN."""
+    """The number in a cell. Raises SegslamError if it is none; an empty cell, `nan`, `null` and infinity are NaN."""
     text = text.strip()
     if text.lower() in ("", "nan", "null", "none", "na"):
         return float("nan")
     try:
-        return float(text)
+        value = float(text)
+        return value if math.isfinite(value) else float("nan")
     except ValueError as error:
         raise bad_line(file, line, f"{name} {brief(text, 30)} is not a number") from error
 

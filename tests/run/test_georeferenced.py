@@ -14,9 +14,11 @@ import rasterio
 from helpers.commands import run
 from helpers.finished_run import MadeRun, make_run
 from helpers.gnss_drive import ORIGIN, T_ENU_MAP, write_fixes, write_graph
+from helpers.sessions import write_day
 from pyproj import Transformer
 
 from segslam import geometry
+from segslam.datasets import open_dataset
 from segslam.gnss import enu_from_geodetic
 from segslam.run.georeferenced import read_globe
 from segslam.run.report.figures import STYLE
@@ -132,3 +134,29 @@ def test_the_report_shows_the_fixes(made: MadeRun, tmp_path: Path) -> None:
     assert "residual (m)" in drawn
     assert re.search(r">kept: 1\d\d<", drawn)
     assert draw_fixes(tmp_path) is None
+
+
+@pytest.mark.usefixtures("short_runs")
+def test_map_places_a_run_before_its_maps_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, out = write_day(tmp_path / "monday", day=0, first=0, num_scans=22), tmp_path / "run"
+    reference = open_dataset(data).reference
+    assert reference is not None
+    write_fixes(tmp_path / "fixes.csv", reference.stamp_ns, reference.T_world_lidar)
+    options = ("--out", out, "--set", "adjustment.max_minutes=0", "--map-file", "map.laz")
+    assert run("map", data, *options, "--gnss", tmp_path / "none.csv") == 2
+    assert "none.csv: no such file" in capsys.readouterr().err
+    assert not out.exists(), "before anything is mapped"
+    assert run("map", data, *options, "--gnss", tmp_path / "fixes.csv") == 0
+    assert "map placed: heading known to" in capsys.readouterr().err
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["gnss_kept"] > 15
+    assert metrics["num_map_points"] > 0
+    assert laspy.read(out / "map.laz").header.parse_crs().to_epsg() == 32632
+    off_m = geometry.apply(T_ENU_MAP, reference.T_world_lidar[:, :3, 3]) - _enu(_geodetic(out))
+    assert np.hypot(*off_m[:, :2].T).max() < 0.3
+
+
+def _geodetic(folder: Path) -> Points:
+    """(n, 3) longitude, latitude, height of a run."""
+    rows = np.loadtxt(folder / "poses_geodetic.csv", delimiter=",", skiprows=1)
+    return rows[:, [2, 1, 3]]

@@ -15,7 +15,8 @@ import numpy as np
 from segslam.gnss.alignment import PRIOR, Placement, linearised, moved, refined
 from segslam.gnss.evidence import DriveCovariance, Estimate, Noise, estimated
 from segslam.gnss.matching import Drive, Matched, Prepared
-from segslam.gnss.statistics import Weights, axis_noise, axis_sigma, horizontal_noise, horizontal_sigma, weight
+from segslam.gnss.robust_weights import KEPT_WEIGHT, robust_weights
+from segslam.gnss.statistics import Weights, axis_noise, axis_sigma, horizontal_noise, horizontal_sigma
 from segslam.pose_graph import Edge, PositionedGraph
 from segslam.trajectory import Poses
 from segslam.types import Indices, Points, Vector
@@ -31,10 +32,6 @@ LEAST_FUSED = 24
 """Chosen: with fewer fixes, four a block, the drive keeps its shape."""
 ROUNDS = 4
 """Chosen: iterations of weights and poses; they settle in three."""
-RUN_S = 15.0
-"""Chosen: the weight of a fix is at most that of the median residual within this time before and after it."""
-KEPT_WEIGHT = 0.25
-"""A fix is kept if its weight is that of a residual within three standard deviations, or more."""
 SIGNIFICANT = 4.0
 """Chosen: the clock and the lever arm are corrected beyond this many standard deviations."""
 CONSTANT_ROUNDS = 3
@@ -227,26 +224,6 @@ def _scales(residual: Points, weights: Weights) -> Vector:
     used, used_up = weights[:, 0] >= KEPT_WEIGHT, weights[:, 1] >= KEPT_WEIGHT
     level = horizontal_sigma(residual[used] if used.any() else residual)
     return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
-
-
-def robust_weights(residual: Points, sigma: Vector, time_s: Vector) -> Weights:
-    """(n, 2) weights horizontally and vertically; a fix in a run of wrong ones has the weight of the run."""
-    level = np.hypot(*residual[:, :2].T) / sigma[0]
-    up = np.abs(residual[:, 2]) / sigma[2]
-    of_run = [_median_near(values, time_s) for values in (level, up)]
-    level, up = np.maximum(level, of_run[0]), np.maximum(up, of_run[1])
-    return np.column_stack([weight(level**2), np.where(np.isfinite(up), weight(np.nan_to_num(up) ** 2), 0.0)])
-
-
-def _median_near(values: Vector, time_s: Vector) -> Vector:
-    first = np.searchsorted(time_s, time_s - RUN_S)
-    last = np.searchsorted(time_s, time_s + RUN_S, side="right")
-    return np.array([_median(values[a:b]) for a, b in zip(first, last, strict=True)])
-
-
-def _median(values: Vector) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else 0.0
 
 
 def _level(residual: Points) -> tuple[Vector, float]:

@@ -8,9 +8,10 @@ import numpy as np
 
 from segslam.gnss.alignment import place
 from segslam.gnss.fixes import Fixes
-from segslam.gnss.fusion import KEPT_WEIGHT, RIGID_M, Constants, calibrate, fuse, robust_weights
+from segslam.gnss.fusion import RIGID_M, Constants, calibrate, fuse
 from segslam.gnss.geodesy import Origin
 from segslam.gnss.matching import Drive, outside_reasons, prepare
+from segslam.gnss.robust_weights import KEPT_WEIGHT, robust_weights
 from segslam.gnss.statistics import Weights
 from segslam.pose_graph import Edge
 from segslam.trajectory import Poses

@@ -16,6 +16,9 @@ from segslam.trajectory import Poses, read_poses
 if TYPE_CHECKING:
     from segslam.fleets.orchestrate import FleetResult
 
+TEXT = '<th style="text-align: left; width: auto">'
+"""Head of a column of text; the other columns after the first are numbers."""
+
 
 def write_report(result: "FleetResult") -> Path:
     """Write `report.html` into the folder of a fleet; returns its path."""
@@ -42,22 +45,25 @@ def _title(number: int, component: Mapping[str, Any]) -> str:
 
 
 def _components(result: "FleetResult") -> str:
-    rows = ["<tr><th>component</th><th>drives</th><th>loops between them</th><th>error</th></tr>"]
+    rows = [f"<tr><th>component</th>{TEXT}drives</th><th>loops between them</th><th>error</th></tr>"]
     for number, one in enumerate(result.components):
         error = one.get("reason") or (f"{one['ate_m']:.3f} m" if "ate_m" in one else "no truth in one frame")
         link = f'<a href="{escape(one["folder"])}/report.html">{number}</a>'
-        cells = (link, escape(", ".join(one["drives"])), str(one.get("num_loops_between", 0)), escape(error))
-        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+        figures_of = (str(one.get("num_loops_between", 0)), escape(error))
+        numbers = "".join(f'<td class="number">{cell}</td>' for cell in figures_of)
+        rows.append(f"<tr><td>{link}</td><td>{escape(', '.join(one['drives']))}</td>{numbers}</tr>")
     return f"<table>{''.join(rows)}</table>"
 
 
 def _drives(drives: Mapping[str, Mapping[str, Any]]) -> str:
-    rows = ["<tr><th>drive</th><th>state</th><th>component</th></tr>"]
+    rows = [f"<tr><th>drive</th>{TEXT}state</th><th>component</th></tr>"]
     for name, drive in drives.items():
-        link = f'<a href="runs/{escape(name)}/report.html">{escape(name)}</a>' if drive["state"] == "mapped" else name
+        link = escape(name)
+        if drive["state"] == "mapped":
+            link = f'<a href="runs/{link}/report.html">{link}</a>'
         state = f"{drive['state']}: {drive['reason']}" if "reason" in drive else drive["state"]
         number = "" if drive["component"] is None else drive["component"]
-        rows.append(f"<tr><td>{link}</td><td>{escape(state)}</td><td>{number}</td></tr>")
+        rows.append(f'<tr><td>{link}</td><td>{escape(state)}</td><td class="number">{number}</td></tr>')
     return f"<table>{''.join(rows)}</table>"
 
 

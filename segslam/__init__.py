@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from segslam.run.evaluate import evaluate
     from segslam.run.export import export
     from segslam.run.finished import read_run
+    from segslam.run.georeferenced import georeference
     from segslam.run.locator import Located, Locator, locate
     from segslam.run.map_folder import map_folder
     from segslam.run.replay import replay
@@ -44,6 +45,7 @@ __all__ = [
     "evaluate",
     "export",
     "fleet",
+    "georeference",
     "keep_freed_memory",
     "load_config",
     "localise",
@@ -71,6 +73,7 @@ _HOMES = {
     "evaluate": "run.evaluate",
     "export": "run.export",
     "fleet": "fleets",
+    "georeference": "run.georeferenced",
     "keep_freed_memory": "system.memory",
     "load_config": "config",
     "locate": "run.locator",

@@ -68,7 +68,7 @@ def _growth(given: argparse.Namespace) -> None:
     ran = _run(folder, drives[: number + 1], given.workers)
     rows.append(_row(f"1 added to {number}", 1, ran))
     towns = [
-        {"component": ", ".join(one["drives"]), "ATE (m)": one.get("ate_m"), "loops": one["num_loops_between"]}
+        {"component": ", ".join(one["drives"]), "ATE (m)": one.get("ate_m"), "loops": one.get("num_loops_between", 0)}
         | {"mapped at once (m)": at_once[one["drives"][0].split("_")[0]]}
         for one in ran["components"]
     ]

@@ -71,7 +71,7 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
     channels: dict[int, Channel] = {}
     start = 0
     with path.open("rb") as stream:
-        if since_last is not None and (summary := _summary(stream)) is not None:
+        if since_last is not None and (summary := summary_of(stream)) is not None:
             schemas, channels = dict(summary.schemas), dict(summary.channels)
             start = _last_chunk_with(since_last, summary)
         for offset, size, outer in _records(stream, start):
@@ -113,7 +113,7 @@ def metadata(path: Path) -> tuple[dict[str, dict[str, str]], CutError | None]:
 def count(path: Path, topic: str) -> int:
     """Number of messages of a topic, from the index if there is one, otherwise by reading the file."""
     with path.open("rb") as stream:
-        summary = _summary(stream)
+        summary = summary_of(stream)
         if summary is not None and summary.statistics is not None:
             counts = summary.statistics.channel_message_counts
             return sum(counts.get(channel.id, 0) for channel in summary.channels.values() if channel.topic == topic)
@@ -124,7 +124,7 @@ def count(path: Path, topic: str) -> int:
     return number
 
 
-def _summary(stream: IO[bytes]) -> Summary | None:
+def summary_of(stream: IO[bytes]) -> Summary | None:
     """The index at the end of a file; None if it is missing or damaged."""
     with suppress(OSError, *_DAMAGE):
         if _has_whole_summary(stream):

@@ -52,7 +52,11 @@ LOG = "/log"
 GRAPH = "/graph"
 """foxglove.SceneUpdate: all closures, as often as /estimate; green: full weight, red: rejected by the optimiser."""
 
-WORLD, ODOM, LIDAR = "world", "odom", "lidar"
+FIXES, POSITIONS = "/gnss/fixes", "/gnss/positions"
+"""foxglove.LocationFix: position fixes within the drive, and the position of every scan; behind the result, in logs of
+georeferenced runs. See `locations`."""
+
+WORLD, ODOM, LIDAR, ANTENNA = "world", "odom", "lidar", "antenna"
 """Frames."""
 
 RUN_METADATA = "segslam"

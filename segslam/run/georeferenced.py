@@ -11,13 +11,16 @@ import numpy as np
 
 from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
 from segslam.gnss import georeference as georeference_drive
+from segslam.gnss.geodesy import Geodetic
 from segslam.gnss.reading import read_fixes
+from segslam.log import schema
+from segslam.log.locations import Locations, write_locations
 from segslam.pose_graph import read_g2o
 from segslam.run.finished import FinishedRun, read_run
-from segslam.run.folder import ADJUSTED_GRAPH, room_for, write_metrics
+from segslam.run.folder import ADJUSTED_GRAPH, log_of, room_for, write_metrics
 from segslam.system.whole_files import whole_file, write_whole
 from segslam.trajectory import Poses, corrected_poses, read_poses, write_tum
-from segslam.types import SegslamError
+from segslam.types import Indices, SegslamError
 
 FILE, FIXES, GEODETIC, ENU = "georeference.json", "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
 DATUM = "WGS84 (EPSG:4979)"
@@ -79,7 +82,9 @@ def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) ->
     with room_for(run.folder):
         with whole_file(run.folder / ENU) as part:
             write_tum(part, trajectory.stamp_ns, T_enu_lidar)
-        _write_geodetic(run, placed.origin, T_enu_lidar)
+        places = geodetic_from_enu(T_enu_lidar[:, :3, 3], placed.origin)
+        _write_geodetic(run, places, T_enu_lidar)
+        write_locations(log_of(run.folder), _locations(placed, trajectory.stamp_ns, places, offset_s))
         _write_fixes(run.folder, placed)
         values = figures(placed) | {"use": str(use), "given_offset_s": offset_s}
         write_whole(run.folder / FILE, json.dumps(values, indent=2) + "\n")
@@ -117,10 +122,19 @@ def _known(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-def _write_geodetic(run: FinishedRun, origin: Origin, T_enu_lidar: Poses) -> None:
+def _locations(placed: Georeference, stamp_ns: Indices, places: Geodetic, offset_s: float) -> dict[str, Locations]:
+    """What the Map panel of Foxglove shows: the fixes within the drive, and the scans."""
+    within = np.isfinite(placed.residual_m[:, 0])
+    measured_ns = placed.fixes.stamp_ns[within] + round(1e9 * (offset_s + placed.measured_offset_s))
+    return {
+        schema.FIXES: Locations(schema.ANTENNA, measured_ns, placed.fixes.places[within], placed.fix_sigma_m),
+        schema.POSITIONS: Locations(schema.LIDAR, stamp_ns, places, placed.position_sigma_m),
+    }
+
+
+def _write_geodetic(run: FinishedRun, places: Geodetic, T_enu_lidar: Poses) -> None:
     """A row a scan: time, latitude, longitude, height, and heading of the x axis clockwise from north."""
     trajectory = run.result.trajectory
-    places = geodetic_from_enu(T_enu_lidar[:, :3, 3], origin)
     heading_deg = np.degrees(np.arctan2(T_enu_lidar[:, 0, 0], T_enu_lidar[:, 1, 0])) % 360.0
     with whole_file(run.folder / GEODETIC) as part, part.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
@@ -15,15 +16,19 @@ from helpers.commands import run
 from helpers.finished_run import MadeRun, make_run
 from helpers.gnss_drive import ORIGIN, T_ENU_MAP, write_fixes, write_graph
 from helpers.sessions import write_day
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 from pyproj import Transformer
 
 from segslam import geometry
 from segslam.datasets import open_dataset
 from segslam.gnss import enu_from_geodetic
+from segslam.log import read_log, schema
+from segslam.log.locations import write_locations
 from segslam.run.georeferenced import read_globe
 from segslam.run.report.figures import STYLE
 from segslam.run.report.fixes import draw_fixes
-from segslam.types import Points
+from segslam.types import Points, SegslamError
 
 KML = "{http://www.opengis.net/kml/2.2}"
 GPX = "{http://www.topografix.com/GPX/1/1}"
@@ -75,6 +80,44 @@ def test_the_files_say_where_every_scan_is(made: MadeRun) -> None:
         fixes = list(csv.DictReader(stream))
     assert len(fixes) == len(trajectory)
     assert {row["reason"] for row in fixes if row["kept"] == "1"} == {""}
+
+
+def test_the_log_shows_fixes_and_positions_on_a_map(made: MadeRun, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(made.folder, tmp_path / "run"))
+    before = [(step.scan_index, step.stamp_ns) for step in read_log(folder / "log.mcap").steps()]
+    size = (folder / "log.mcap").stat().st_size
+    assert run("georeference", folder, "--gnss", made.folder.parent / "fixes.csv", "--quiet") == 0
+    assert (folder / "log.mcap").stat().st_size == size, "the positions of before are replaced"
+    trajectory = made.result.trajectory
+    with (folder / "log.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        shown = {
+            topic: [message for *_, message in reader.iter_decoded_messages(topics=[topic])]
+            for topic in (schema.FIXES, schema.POSITIONS)
+        }
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == sum(1 for _ in reader.iter_messages())
+    assert {len(messages) for messages in shown.values()} == {len(trajectory)}
+    for messages, allowed_m in zip(shown.values(), (0.3, 0.2), strict=True):
+        assert [message.timestamp.ToNanoseconds() for message in messages[:3]] == trajectory.stamp_ns[:3].tolist()
+        places = np.array([(message.longitude, message.latitude, message.altitude) for message in messages])
+        np.testing.assert_allclose(
+            _enu(places), geometry.apply(T_ENU_MAP, trajectory.T_world_lidar[:, :3, 3]), atol=allowed_m
+        )
+    log = read_log(folder / "log.mcap")
+    assert [(step.scan_index, step.stamp_ns) for step in log.steps()] == before
+    found = log.result()
+    assert found is not None
+    np.testing.assert_array_equal(found[1].T_world_lidar, trajectory.T_world_lidar)
+
+
+def test_a_log_without_index_is_named(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    log.write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(SegslamError, match="has no index"):
+        write_locations(log, {})
 
 
 def test_a_place_has_the_same_coordinates_in_all_files(made: MadeRun, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Options of commands that place a run on the globe."""
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -38,13 +39,32 @@ class GnssOptions:
         """
         if self.gnss is None:
             return None
-        if self.gnss_use not in USES:
-            raise SegslamError(f"--gnss-use {self.gnss_use}: unknown; known: {', '.join(USES)}")
+        self._check_use()
         from segslam.gnss.reading import read_fixes
         from segslam.run.georeferenced import georeference, summary
 
         fixes = read_fixes(self.gnss, recording=recording)
         return lambda folder: summary(georeference(folder, fixes, use=self.gnss_use, offset_s=self.gnss_offset))
+
+    def placing_live(self, stack: ExitStack) -> Callable[[Path], str] | None:
+        """Listens to a ROS 2 topic until `stack` ends; returns what georeferences a run with the fixes that arrived.
+
+        None without a topic. Raises SegslamError for a wrong option.
+        """
+        if self.gnss is None:
+            return None
+        self._check_use()
+        from segslam.live.ros import FixTopic
+        from segslam.run.georeferenced import georeference_if_possible
+
+        name, topic = self.gnss, stack.enter_context(FixTopic(self.gnss))
+        return lambda folder: georeference_if_possible(
+            folder, name, topic.rows.copy(), use=self.gnss_use, offset_s=self.gnss_offset
+        )
+
+    def _check_use(self) -> None:
+        if self.gnss_use not in USES:
+            raise SegslamError(f"--gnss-use {self.gnss_use}: unknown; known: {', '.join(USES)}")
 
     def recorded(self) -> dict[str, str]:
         """The options as the log of a run keeps them, for `resume`."""

@@ -1,5 +1,6 @@
-"""The pipeline of a run that is localised in the map of an earlier run."""
+"""The pipeline of a run that is localised in the map of an earlier run, and its place on the globe."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,3 +18,12 @@ def pipeline(in_map: Path | None) -> "SlamOf | None":
     from segslam.sessions.localiser import Localiser
 
     return partial(Localiser, Locator.from_run(in_map))
+
+
+def placing_in(in_map: Path | None) -> Callable[[Path], str] | None:
+    """Function that gives the place of a georeferenced map to a run localised in it; None without a map."""
+    if in_map is None:
+        return None
+    from segslam.run.georeferenced import GEODETIC, take_over
+
+    return lambda folder: f"place on the globe: that of the map, see {GEODETIC}" if take_over(folder, in_map) else ""

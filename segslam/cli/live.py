@@ -16,6 +16,7 @@ from segslam.cli.compiling import compile_kernels
 from segslam.cli.console import announce, how_to_go_on, say
 from segslam.cli.ending import finish
 from segslam.cli.foxglove import serve_foxglove
+from segslam.cli.gnss_options import GnssOptions
 from segslam.cli.live_status import LiveFigures, Status, too_slow
 from segslam.cli.overwriting import check_free, make_room
 from segslam.cli.preset import live_config
@@ -63,6 +64,7 @@ def live(
     labels: Annotated[str, typer.Option("--labels", help="Labels: geometric (auto is the same) or none.")] = "auto",
     preset: PresetOption = "auto",
     options: OutputOptions,
+    gnss: GnssOptions,
 ) -> None:
     """Map scans while they arrive. Ctrl-C or SIGTERM finishes the run.
 
@@ -72,6 +74,8 @@ def live(
     if options.view:
         check_display()
     _check_source(folder, topic, out)
+    if gnss.gnss is not None:
+        _check_ros("--gnss")
     options.load_config()  # reports a wrong setting before the scans are looked at
     if labels not in ("auto", "geometric", "none"):
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
@@ -106,6 +110,7 @@ def live(
             map_files=map_files,
             scene=scene,
             server=server,
+            gnss=gnss,
             json=options.json,
             quiet=quiet,
         )
@@ -126,6 +131,7 @@ def map_live(
     map_files: list[Path],
     scene: "Scene | None",
     server: "FoxgloveServer | None",
+    gnss: GnssOptions,
     json: bool,
     quiet: bool,
 ) -> str:
@@ -148,6 +154,7 @@ def map_live(
         mirror = server.send if server else None
         run = stack.enter_context(Run(folder, slam, dataset=source.name, options=options, mirror=mirror))
         publisher = _publisher(source, run, stack)
+        place = gnss.placing_live(stack)
         front = stack.enter_context(Front(source, settings, tell=tell, idle_s=idle_s))
         stops: list[bool] = []
 
@@ -180,6 +187,7 @@ def map_live(
             more=lambda _: more,
             search_s=FINAL_SEARCH_S,
             stopped=bool(stops),
+            place=place,
         )
         if advice := too_slow(more, settings.odometry.voxel_size_m):
             say(advice, quiet=quiet)
@@ -239,8 +247,15 @@ def _check_source(folder: Path | None, topic: str | None, out: Path) -> None:
         check_exists(folder, "give the folder into which scans are written")
         if not folder.is_dir():
             raise SegslamError(f"{folder}: not a folder; for a recording: segslam map {folder} --out {out}")
-    elif find_spec("rclpy") is None:
-        raise SegslamError(f"--topic needs ROS 2: source its setup script (Jazzy, Kilted), or: {how_to_install('ros')}")
+    else:
+        _check_ros("--topic")
+
+
+def _check_ros(option: str) -> None:
+    if find_spec("rclpy") is None:
+        raise SegslamError(
+            f"{option} needs ROS 2: source its setup script (Jazzy, Kilted), or: {how_to_install('ros')}"
+        )
 
 
 def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertical_angle_deg: float) -> "Source":

@@ -16,7 +16,7 @@ from segslam.cli.ending import finish
 from segslam.cli.export import map_summary, write_maps
 from segslam.cli.foxglove import serve_foxglove
 from segslam.cli.gnss_options import GnssOptions
-from segslam.cli.in_map import pipeline
+from segslam.cli.in_map import pipeline, placing_in
 from segslam.cli.overwriting import check_free, make_room
 from segslam.cli.preset import check_preset, preset_config
 from segslam.cli.run_options import DataArgument, DryRunOption, OutputOptions, RunOptions
@@ -91,7 +91,7 @@ def map_data(
     if settings.map.color == "intensity":
         check_intensities(scans)
     choices = resume_options(options.source(data), odometry=options.odometry, map_files=map_names)
-    place = gnss.placing(data)
+    place = gnss.placing(data) or placing_in(in_map)
     choices |= gnss.recorded()
     choices |= {"in_map": str(in_map.expanduser().resolve())} if in_map else {}
     if recorded is None:

@@ -83,7 +83,15 @@ def merge(
         if interrupted:
             raise typer.Exit(EXIT_STATUS)
         files = [folder / name for name in WITH_MAP] if with_map else []
-        finish(run, merged.reference, map_files=files, json=json, quiet=quiet, more=merged.figures)
+        finish(
+            run,
+            merged.reference,
+            map_files=files,
+            json=json,
+            quiet=quiet,
+            more=merged.figures,
+            place=merged.georeference,
+        )
 
 
 def _shown(items: Iterable[Any], total: int, title: str, *, quiet: bool) -> Iterator[Any]:

@@ -32,6 +32,7 @@ class Drive:
     odometry: str = ""
     preset: str = "auto"
     config: str = ""
+    gnss: str = ""
     set: tuple[str, ...] = ()
 
     def key(self, version: str) -> str:
@@ -40,12 +41,13 @@ class Drive:
         Of a recording the names, sizes and times of its files are used. Raises SegslamError if it is missing.
         """
         options = {name: value for name, value in asdict(self).items() if name not in ("name", "data")}
-        files = [path for path in (self.config, self.odometry) if path]
+        gnss = self.gnss if self.gnss and Path(self.gnss).exists() else ""  # otherwise a topic
+        files = [path for path in (self.config, self.odometry, gnss) if path]
         return key_of(version, options, _state(Path(self.data)), *(_state(Path(file)) for file in files))
 
 
 OPTIONS = tuple(field.name for field in fields(Drive))
-PATHS = ("data", "odometry", "config")
+PATHS = ("data", "odometry", "config", "gnss")
 
 
 def key_of(*parts: Any) -> str:

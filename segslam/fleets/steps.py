@@ -18,13 +18,16 @@ from segslam.config import Config, load_config
 from segslam.datasets import DataSource
 from segslam.fleets.drives import Drive
 from segslam.fleets.relations import Relation, read_relation, write_relation
+from segslam.gnss.reading import read_fixes
 from segslam.presets import SETTINGS, Preset, extent_m, preset, preset_for
 from segslam.retrieval import Places, PlaceSignature
 from segslam.run.finished import read_metrics
 from segslam.run.folder import write_poses
+from segslam.run.georeferenced import georeference
 from segslam.run.given_odometry import given_odometry
 from segslam.run.locator import Locator
 from segslam.run.map_folder import map_folder, open_scans
+from segslam.run.report import write_report
 from segslam.semantics.encodings import Encoding
 from segslam.sessions.merge import arranged, write_merged
 from segslam.sessions.recorded import Session, read_session
@@ -96,6 +99,9 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
         topic=source.topic,
         odometry=odometry,
     )
+    if drive.gnss:
+        georeference(part, read_fixes(drive.gnss, recording=source.data))
+        write_report(part)
     _made(part, mapped.folder(fleet), key)
     return mapped
 

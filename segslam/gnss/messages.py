@@ -21,7 +21,7 @@ def read_messages(recording: Path, topic: str) -> list[Row]:
     read, or if a package is missing.
     """
     try:
-        return [_row(message) for message in _messages(recording, topic)]
+        return [row_of(message) for message in _messages(recording, topic)]
     except SegslamError:
         raise
     except Exception as error:  # the readers raise anything for damaged data
@@ -67,8 +67,8 @@ def _chosen(recording: Path, topic: str, known: list[str]) -> str:
     return found[0]
 
 
-def _row(message: Any) -> Row:
-    """REP 145: the covariance is that of east, north, up; status -1 is no fix."""
+def row_of(message: Any) -> Row:
+    """The fix of a message. REP 145: the covariance is that of east, north, up; status -1 is no fix."""
     stamp = message.header.stamp
     nanosec = stamp.nanosec if hasattr(stamp, "nanosec") else stamp.nsec
     sigma_m = (float("nan"), float("nan"), float("nan"))

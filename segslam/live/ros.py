@@ -23,12 +23,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 from scipy.spatial.transform import Rotation as ScipyRotation
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import NavSatFix, PointCloud2, PointField
 
 from segslam import geometry
 from segslam.datasets.point_cloud2 import CloudReader
 from segslam.datasets.scans import make_scan
 from segslam.datasets.sweep_times import sweep_times
+from segslam.gnss.fixes import Row
+from segslam.gnss.messages import row_of
 from segslam.live.live_map import DrawnMap
 from segslam.live.waiting import Arrival, Waiting
 from segslam.types import BadScan, GraphEstimate, Labels, Points, Scan, SegslamError, Transform
@@ -202,7 +204,7 @@ class MappingPublisher:
         self._context, self._node = start_node("mapping")
         if Trigger is not None:
             self._node.create_service(Trigger, f"/{NAMESPACE}/save_map", self._save_map)
-        self._services = Thread(target=self._serve, name="services", daemon=True)
+        self._services = Thread(target=_spin, args=(self._context, self._node), name="services", daemon=True)
         self._path = self._node.create_publisher(Path, f"/{NAMESPACE}/path", LATCHED)
         self._map = self._node.create_publisher(PointCloud2, f"/{NAMESPACE}/map", LATCHED)
         self._correction = self._node.create_publisher(TransformStamped, f"/{NAMESPACE}/map_to_odom", LATCHED)
@@ -243,18 +245,45 @@ class MappingPublisher:
         self._path.publish(path)
         self._map.publish(point_cloud2(drawn.points, drawn.labels, frame=MAP, stamp_ns=drawn.stamp_ns))
 
-    def _serve(self) -> None:
-        executor = SingleThreadedExecutor(context=self._context)
-        executor.add_node(self._node)
-        with suppress(ExternalShutdownException):
-            executor.spin()
-
     def _save_map(self, _: Any, response: Any) -> Any:
         try:
             response.success, response.message = True, self._save()
         except (SegslamError, OSError) as error:
             response.success, response.message = False, str(error)
         return response
+
+
+class FixTopic:
+    """Collects the position fixes of a topic, sensor_msgs/NavSatFix, in its own thread; a context manager."""
+
+    def __init__(self, topic: str) -> None:
+        """Raises SegslamError for an invalid topic name."""
+        self.rows: list[Row] = []
+        try:
+            validate_full_topic_name(topic)
+        except (InvalidTopicNameException, ValueError) as error:
+            raise SegslamError(f"--gnss {topic}: not a topic name ({error}); give it as in --gnss /fix") from error
+        self._context, self._node = start_node("gnss")
+        profile = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)  # receives from both kinds
+        self._node.create_subscription(NavSatFix, topic, lambda message: self.rows.append(row_of(message)), profile)
+        self._listening = Thread(target=_spin, args=(self._context, self._node), name="gnss", daemon=True)
+
+    def __enter__(self) -> "FixTopic":
+        self._listening.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.try_shutdown()
+        self._listening.join()
+        self._node.destroy_node()
+
+
+def _spin(context: Any, node: Any) -> None:
+    """Serve a node until its context is shut down."""
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    with suppress(ExternalShutdownException):
+        executor.spin()
 
 
 def start_node(name: str) -> tuple[Any, Any]:

@@ -2,28 +2,38 @@
 
 import csv
 import json
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
 from segslam.gnss import georeference as georeference_drive
+from segslam.gnss.fixes import DUPLICATE, NO_FIX, NOT_FINITE, Row, make_fixes
 from segslam.gnss.geodesy import Geodetic
 from segslam.gnss.reading import read_fixes
 from segslam.log import schema
 from segslam.log.locations import Locations, write_locations
 from segslam.pose_graph import read_g2o
 from segslam.run.finished import FinishedRun, read_run
-from segslam.run.folder import ADJUSTED_GRAPH, log_of, room_for, write_metrics
+from segslam.run.folder import ADJUSTED_GRAPH, folder_of, log_of, room_for, write_metrics
 from segslam.system.whole_files import whole_file, write_whole
 from segslam.trajectory import Poses, corrected_poses, read_poses, write_tum
 from segslam.types import Indices, SegslamError
 
+logger = logging.getLogger(__name__)
+
 FILE, FIXES, GEODETIC, ENU = "georeference.json", "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
 DATUM = "WGS84 (EPSG:4979)"
+PLACE = ("datum", "latitude_deg", "longitude_deg", "height_m", "epsg", "T_enu_map", "sigma")
+"""What a run localised in the map takes over from `FILE`."""
+SIGMAS = ("east_m", "north_m", "up_m")
+DEGREES_AND_HEIGHT = ("latitude_deg", "longitude_deg", "height_m")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,26 +80,105 @@ def read_globe(folder: Path) -> Globe | None:
         return None
     try:
         origin = json.loads(file.read_text(encoding="utf-8"))
-        found = Origin(*(float(origin[name]) for name in ("latitude_deg", "longitude_deg", "height_m")))
+        found = Origin(*(float(origin[name]) for name in DEGREES_AND_HEIGHT))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
     return Globe(found, read_poses(folder / ENU, format="tum").T_a_b)
+
+
+def georeference_if_possible(
+    folder: Path, source: str, rows: Sequence[Row], *, use: Use | str = Use.FUSE, offset_s: float = 0.0
+) -> str:
+    """As `georeference`, at the end of a run that has results without it, too; a failure is a warning.
+
+    `source` names the fixes `rows` in messages. Returns what was found; empty after a failure.
+    """
+    try:
+        return summary(georeference(folder, make_fixes(source, rows), use=use, offset_s=offset_s))
+    except SegslamError as error:
+        logger.warning("%s: has no place on the globe: %s", folder, error)
+        return ""
+
+
+def take_over(run: str | Path, map_run: str | Path) -> bool:
+    """Place a run that was localised in the map of a georeferenced run on the globe; False if that has no place.
+
+    Each scan keeps its pose relative to the nearest keyframe of the map, so that it moves as the map was bent.
+    """
+    source = folder_of(Path(map_run))
+    globe = read_globe(source)
+    if globe is None:
+        return False
+    made, mapped = read_run(run), read_run(source).result
+    T_enu_map = globe.T_enu_lidar[mapped.keyframe_rows] @ np.linalg.inv(
+        mapped.trajectory.T_world_lidar[mapped.keyframe_rows]
+    )
+    poses = made.result.trajectory.T_world_lidar
+    _, nearest = cKDTree(mapped.trajectory.T_world_lidar[mapped.keyframe_rows, :3, 3]).query(poses[:, :3, 3])
+    of_map = json.loads((source / FILE).read_text(encoding="utf-8"))
+    values = {name: of_map[name] for name in PLACE if name in of_map} | {"in_map": str(source.resolve())}
+    with room_for(made.folder):
+        places = _write_poses(made, globe.origin, T_enu_map[nearest] @ poses)
+        is_localised = made.result.localised()
+        stamp_ns = made.result.trajectory.stamp_ns[is_localised]
+        sigma_m = np.array([values.get("sigma", {}).get(name) or np.nan for name in SIGMAS])
+        shown = Locations(schema.LIDAR, stamp_ns, places[is_localised], sigma_m)
+        write_locations(log_of(made.folder), {schema.POSITIONS: shown})
+        write_whole(made.folder / FILE, json.dumps(values, indent=2) + "\n")
+    return True
+
+
+def use_of(folder: Path) -> str:
+    """How the fixes of a run were used; empty without fixes. Raises SegslamError for a damaged file."""
+    file = folder / FILE
+    try:
+        return str(json.loads(file.read_text(encoding="utf-8")).get("use", "")) if file.exists() else ""
+    except (OSError, ValueError, AttributeError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
+
+
+def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
+    """The fixes of a georeferenced run in the clock of its scans, shifted; none for another run.
+
+    Raises SegslamError for damaged files.
+    """
+    file = folder / FIXES
+    if not file.exists():
+        return []
+    try:
+        values = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        offset_ns = round(1e9 * (values["given_offset_s"] + values["clock_offset_s"])) + stamp_shift_ns
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = [row for row in csv.DictReader(stream) if row["reason"] not in (NO_FIX, NOT_FINITE, DUPLICATE)]
+        found = []
+        for row in rows:
+            latitude, longitude, height_m = (float(row[name] or "nan") for name in DEGREES_AND_HEIGHT)
+            found.append(Row(int(row["stamp_ns"]) + offset_ns, latitude, longitude, height_m))
+        return found
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
 
 
 def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) -> None:
     trajectory = run.result.trajectory
     T_enu_lidar = corrected_poses(trajectory.T_world_lidar, run.result.keyframe_rows, placed.T_enu_keyframe)
     with room_for(run.folder):
-        with whole_file(run.folder / ENU) as part:
-            write_tum(part, trajectory.stamp_ns, T_enu_lidar)
-        places = geodetic_from_enu(T_enu_lidar[:, :3, 3], placed.origin)
-        _write_geodetic(run, places, T_enu_lidar)
+        places = _write_poses(run, placed.origin, T_enu_lidar)
         write_locations(log_of(run.folder), _locations(placed, trajectory.stamp_ns, places, offset_s))
         _write_fixes(run.folder, placed)
         values = figures(placed) | {"use": str(use), "given_offset_s": offset_s}
         write_whole(run.folder / FILE, json.dumps(values, indent=2) + "\n")
         num_kept = placed.num_kept
         write_metrics(run.folder, run.metrics | {"gnss_kept": num_kept, "gnss_dropped": len(placed.fixes) - num_kept})
+
+
+def _write_poses(run: FinishedRun, origin: Origin, T_enu_lidar: Poses) -> Geodetic:
+    """The two files with poses; returns the geodetic positions of all scans."""
+    places = geodetic_from_enu(T_enu_lidar[:, :3, 3], origin)
+    with whole_file(run.folder / ENU) as part:
+        write_tum(part, run.result.trajectory.stamp_ns, T_enu_lidar)
+    _write_geodetic(run, places, T_enu_lidar)
+    return places
 
 
 def figures(placed: Georeference) -> dict[str, Any]:
@@ -102,7 +191,7 @@ def figures(placed: Georeference) -> dict[str, Any]:
         "height_m": origin.height_m,
         "epsg": utm_epsg(origin.latitude_deg, origin.longitude_deg),
         "T_enu_map": placed.T_enu_map.ravel().tolist(),
-        "sigma": dict(zip(("east_m", "north_m", "up_m"), _known(placed.position_sigma_m), strict=True))
+        "sigma": dict(zip(SIGMAS, _known(placed.position_sigma_m), strict=True))
         | {"heading_deg": placed.heading_sigma_deg},
         "fix_sigma_m": _known(placed.fix_sigma_m),
         "num_fixes": len(placed.fixes),
@@ -133,14 +222,14 @@ def _locations(placed: Georeference, stamp_ns: Indices, places: Geodetic, offset
 
 
 def _write_geodetic(run: FinishedRun, places: Geodetic, T_enu_lidar: Poses) -> None:
-    """A row a scan: time, latitude, longitude, height, and heading of the x axis clockwise from north."""
+    """A row a localised scan: time, latitude, longitude, height, and heading of the x axis clockwise from north."""
     trajectory = run.result.trajectory
     heading_deg = np.degrees(np.arctan2(T_enu_lidar[:, 0, 0], T_enu_lidar[:, 1, 0])) % 360.0
     with whole_file(run.folder / GEODETIC) as part, part.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(("seconds", "latitude", "longitude", "height", "heading"))
         for stamp_ns, (latitude, longitude, height_m), heading in zip(
-            trajectory.stamp_ns, places, heading_deg, strict=True
+            *(values[run.result.localised()] for values in (trajectory.stamp_ns, places, heading_deg)), strict=True
         ):
             seconds = Decimal(int(stamp_ns)).scaleb(-9)
             writer.writerow(
@@ -150,7 +239,7 @@ def _write_geodetic(run: FinishedRun, places: Geodetic, T_enu_lidar: Poses) -> N
 
 def _write_fixes(folder: Path, placed: Georeference) -> None:
     """A row a fix: what was measured, by how much it differs from the drive, and whether it was kept or why not."""
-    head = ("stamp_ns", "latitude_deg", "longitude_deg", "height_m", "east_m", "north_m", "up_m")
+    head = ("stamp_ns", *DEGREES_AND_HEIGHT, *SIGMAS)
     residuals = ("residual_east_m", "residual_north_m", "residual_up_m")
     with whole_file(folder / FIXES) as part, part.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)

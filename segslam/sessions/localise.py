@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from segslam.run.finished import FinishedRun
+from segslam.run.georeferenced import take_over
 from segslam.run.locator import Locator
 from segslam.run.map_folder import map_folder
 from segslam.sessions.localiser import Localiser
@@ -13,14 +14,17 @@ from segslam.sessions.localiser import Localiser
 def localise(run: str | Path, data: str | Path, out: str | Path, **options: Any) -> FinishedRun:
     """Localise a folder of scans or a recording in the map of a finished run, like `segslam localise`.
 
-    The new folder `out` has the files of `map_folder`; its world frame is that of the finished run. Options are those
+    The new folder `out` has the files of `map_folder`; its world frame, and its place on the
+    globe, is that of the finished run. Options are those
     of `map_folder`. Raises SegslamError as `map_folder`, and if the run did not finish or is damaged.
     """
     locator = Locator.from_run(run)
-    return map_folder(
+    made = map_folder(
         data,
         out,
         slam_of=partial(Localiser, locator),
         options={"in_map": str(Path(run).expanduser().resolve())},
         **options,
     )
+    take_over(made.folder, run)
+    return made

@@ -10,9 +10,12 @@ import numpy as np
 
 from segslam import geometry
 from segslam.config import Config
+from segslam.gnss import Use
+from segslam.gnss.fixes import Row
 from segslam.run.accuracy import accuracy
 from segslam.run.finished import FinishedRun, read_run
 from segslam.run.folder import new_folder, write_metrics
+from segslam.run.georeferenced import georeference_if_possible, recorded_fixes, use_of
 from segslam.run.locator import Locator
 from segslam.run.run import Run
 from segslam.sessions.recorded import Session, Shift, next_shift, read_sessions, shifted_steps
@@ -91,6 +94,19 @@ class Merged:
             return {}
         target_shift = self.shifts[found.earlier].keyframe_id
         return {one[0]: (attempt(one, shift.keyframe_id, target_shift),) for one in found.found}
+
+    def georeference(self, folder: Path) -> str:
+        """Place the merged run on the globe by the fixes of all its sessions.
+
+        Returns what was found; empty if no session has a place on the globe, or after a warning.
+        """
+        rows, uses = list[Row](), set[str]()
+        for session, shift in zip(self.sessions, self.shifts, strict=True):
+            rows += recorded_fixes(session.run.folder, stamp_shift_ns=shift.stamp_ns)
+            uses |= {use} if (use := use_of(session.run.folder)) else set()
+        source = " + ".join(session.name for session in self.sessions)
+        use = Use.ALIGN if uses == {Use.ALIGN} else Use.FUSE
+        return georeference_if_possible(folder, source, rows, use=use) if rows else ""
 
     def figures(self, result: SlamResult) -> dict[str, Any]:
         """The figures of `metrics.json` that only merged runs have."""
@@ -176,6 +192,7 @@ def write_merged(
     if merged.reference is not None:
         metrics |= accuracy(result, merged.reference)
     write_metrics(folder, metrics)
+    merged.georeference(folder)
     write_report(folder)
     return read_run(folder)
 

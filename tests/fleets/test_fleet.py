@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.commands import run
+from helpers.gnss_drive import ORIGIN, write_fixes
 from helpers.recorded_drive import TOPIC, clouds, write_mcap
 from helpers.sessions import write_day
 from helpers.terminal import in_terminal
 
 import segslam.fleets.orchestrate
+from segslam.datasets import open_dataset
 from segslam.fleets import Drive, FleetResult, fleet, read_drives, workers
 from segslam.fleets.orchestrate import FILE
+from segslam.gnss import enu_from_geodetic
 from segslam.run.finished import read_run
 from segslam.sessions import session_pose
 from segslam.trajectory import read_poses
@@ -38,9 +41,18 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def _drives(recordings: list[Path]) -> list[Drive]:
     """From a list in YAML."""
     file = recordings[0].parent / "drives.yaml"
-    entries = [{"data": path.name, "topic": TOPIC if path.suffix else ""} for path in recordings]
+    entries = [{"data": path.name, "topic": TOPIC} if path.suffix else _on_globe(path) for path in recordings]
     file.write_text(json.dumps(entries))
     return read_drives(file)
+
+
+def _on_globe(data: Path) -> dict[str, str]:
+    """A recording with the fixes of a receiver beside it."""
+    fixes = data.with_suffix(".csv")
+    reference = open_dataset(data).reference
+    if not fixes.exists() and reference is not None:
+        write_fixes(fixes, reference.stamp_ns, reference.T_world_lidar)
+    return {"data": data.name, "gnss": fixes.name}
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +91,20 @@ def test_a_component_is_a_run_with_the_poses_of_each_drive(joined: FleetResult) 
     np.testing.assert_allclose(own.T_a_b, last, atol=1e-5)
     alone = read_run(joined.folder / "component_1")
     assert alone.dataset == read_run(joined.folder / "runs" / "stranger").dataset
+
+
+def test_drives_with_fixes_are_on_the_globe_alone_and_together(joined: FleetResult) -> None:
+    """Both drives end where they were: the fixes of both place the component."""
+    component = np.loadtxt(joined.folder / "component_0" / "poses_geodetic.csv", delimiter=",", skiprows=1)
+    alone = [
+        np.loadtxt(joined.folder / "runs" / name / "poses_geodetic.csv", delimiter=",", skiprows=1)
+        for name in ("monday", "friday")
+    ]
+    apart_m = enu_from_geodetic(component[:, 1:4], ORIGIN) - enu_from_geodetic(np.vstack(alone)[:, 1:4], ORIGIN)
+    assert np.hypot(*apart_m[:, :2].T).max() < 0.4
+    values = json.loads((joined.folder / "component_0" / "georeference.json").read_text())
+    assert values["num_fixes"] == len(component)
+    assert not (joined.folder / "component_1" / "georeference.json").exists()
 
 
 def _made(folder: Path) -> dict[str, int]:

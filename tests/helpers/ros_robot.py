@@ -1,7 +1,7 @@
 """A robot on ROS 2 for tests: `python -m helpers.ros_robot` publishes clouds of a simulated drive, until it is killed.
 
 Arguments: scans as .npz, seconds between two clouds, `reliable` or `best_effort`, numbers of the first scan and the
-end.
+end. If the .npz has `places` (latitude, longitude, height of each scan), they are published as fixes.
 """
 
 import sys
@@ -12,9 +12,9 @@ from time import monotonic, sleep
 import numpy as np
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import NavSatFix, NavSatStatus, PointCloud2, PointField
 
-TOPIC = "/test/points"
+TOPIC, FIXES = "/test/points", "/test/fix"
 FIELDS = [PointField(name=axis, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, axis in enumerate("xyz")]
 
 
@@ -25,6 +25,7 @@ def publish(points: Path, every_s: float, reliability: str, first: int, last: in
     node = rclpy.create_node("robot")
     profile = QoSProfile(depth=5, reliability=ReliabilityPolicy[reliability.upper()])
     publisher = node.create_publisher(PointCloud2, TOPIC, profile)
+    fixes = node.create_publisher(NavSatFix, FIXES, profile)
     while publisher.get_subscription_count() == 0:
         sleep(0.05)
     sleep(1.0)
@@ -35,6 +36,12 @@ def publish(points: Path, every_s: float, reliability: str, first: int, last: in
         message.header.frame_id = "lidar_top"
         message.header.stamp = node.get_clock().now().to_msg()
         message.data = array("B", rows.tobytes())
+        if "places" in clouds:
+            latitude, longitude, height_m = clouds["places"][number].tolist()
+            fix = NavSatFix(latitude=latitude, longitude=longitude, altitude=height_m)
+            fix.status.status = NavSatStatus.STATUS_FIX
+            fix.header.stamp = message.header.stamp
+            fixes.publish(fix)
         publisher.publish(message)
         print(number, flush=True)
         next_s += every_s

@@ -13,20 +13,24 @@ import numpy as np
 import pytest
 from helpers.commands import run
 from helpers.drives import round_drive
+from helpers.gnss_drive import ORIGIN, T_ENU_MAP
 from helpers.live_command import LiveCommand
 
 pytest.importorskip("rclpy", reason="no rclpy: source a ROS 2 installation, or pip install '.[ros]'")
 
 import rclpy
 from geometry_msgs.msg import TransformStamped
-from helpers.ros_robot import TOPIC
+from helpers.ros_robot import FIXES, TOPIC
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import ReliabilityPolicy
+from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
+from segslam import geometry
 from segslam.datasets.point_cloud2 import CloudReader
+from segslam.gnss import enu_from_geodetic, geodetic_from_enu
 from segslam.live.live_map import DrawnMap
 from segslam.live.ros import LATCHED, MappingPublisher, TopicSource, _common_reliability, point_cloud2
 from segslam.log import read_log
@@ -149,6 +153,32 @@ def test_a_publisher_is_followed_through_its_death_and_every_cloud_accounted_for
     assert listener.heard["path"][-1].header.frame_id == "map"
     points, _ = CloudReader()(listener.heard["map"][-1])
     assert len(points) > 1000
+
+
+@pytest.mark.slow
+def test_a_live_run_is_placed_by_the_fixes_of_a_topic(tmp_path: Path) -> None:
+    scans, truth = round_drive()
+    enu_m = geometry.apply(T_ENU_MAP, truth.T_world_lidar[:12, :3, 3])
+    file = tmp_path / "clouds.npz"
+    np.savez(file, *[scan.points for scan in scans[:12]], places=geodetic_from_enu(enu_m, ORIGIN))
+    out = tmp_path / "run"
+    with LiveCommand("--topic", TOPIC, "--gnss", FIXES, "--out", out, *SETTINGS) as command:
+        command.wait_for("waiting for scans")
+        publishing = robot(file, every_s=0.6, reliability="best_effort", first=0, last=12)
+        publishing.communicate(timeout=120)
+        command.signal(signal.SIGINT)
+        status, metrics = command.ended()
+    assert status == 0, command.output
+    assert metrics["gnss_kept"] >= 10, command.output
+    rows = np.loadtxt(out / "poses_geodetic.csv", delimiter=",", skiprows=1)
+    distance_m, _ = cKDTree(enu_m[:, :2]).query(enu_from_geodetic(rows[:, 1:4], ORIGIN)[:, :2])
+    assert distance_m.max() < 0.5, "some clouds may be dropped on a busy machine"
+    assert read_log(out / "log.mcap").result() is not None
+
+
+def test_a_wrong_topic_of_fixes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("live", "--topic", TOPIC, "--gnss", "no topic", "--out", tmp_path / "run") == 2
+    assert "--gnss no topic: not a topic name" in capsys.readouterr().err
 
 
 def test_a_pose_and_a_map_are_published_as_they_are(listener: Listener) -> None:

@@ -3,12 +3,14 @@
 import hashlib
 import json
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.commands import run
+from helpers.gnss_drive import ORIGIN, T_ENU_MAP, write_fixes
 from helpers.sessions import write_day
 from helpers.terminal import in_terminal
 
@@ -16,8 +18,9 @@ import segslam
 from segslam import geometry
 from segslam.config import Config, load_config
 from segslam.evaluation import align_positions
+from segslam.gnss import enu_from_geodetic
 from segslam.log import read_log
-from segslam.run.finished import FinishedRun
+from segslam.run.finished import FinishedRun, read_run
 from segslam.sessions import session_pose
 from segslam.types import LoopClosure, MotionState, Trajectory
 
@@ -100,6 +103,51 @@ def test_scans_and_stamps_of_the_second_session_follow_the_first(days: Days, mer
     assert shift["stamp_shift_ns"] == whole.stamp_ns[-1] - second.stamp_ns[-1]
     states = [motion.state for motion in merged.result.motions]
     assert states.index(MotionState.BEGUN) == len(first)
+
+
+@pytest.fixture(scope="module")
+def on_globe(days: Days, tmp_path_factory: pytest.TempPathFactory) -> Days:
+    """The same runs, each georeferenced by its own fixes in one true frame, Friday's with its clock 2 s off."""
+    root = tmp_path_factory.mktemp("on_globe")
+    made = []
+    for number, one in enumerate((days.monday, days.friday)):
+        folder = Path(shutil.copytree(one.folder, root / one.folder.name))
+        assert one.reference is not None
+        late_ns = 2_000_000_000 * number
+        write_fixes(root / "fixes.csv", one.reference.stamp_ns - late_ns, one.reference.T_world_lidar)
+        segslam.georeference(folder, root / "fixes.csv", offset_s=1e-9 * late_ns)
+        made.append(read_run(folder))
+    return Days(made[0], made[1], days.friday_scans)
+
+
+def _off_globe_m(folder: Path, truth: Trajectory) -> np.ndarray:
+    """Horizontal errors of the scans in `poses_geodetic.csv`."""
+    rows = np.loadtxt(folder / "poses_geodetic.csv", delimiter=",", skiprows=1)
+    own = np.searchsorted(truth.stamp_ns, np.rint(1e9 * rows[:, 0]).astype(np.int64) - 1000)
+    true_m = geometry.apply(T_ENU_MAP, truth.T_world_lidar[own, :3, 3])
+    return np.hypot(*(enu_from_geodetic(rows[:, 1:4], ORIGIN) - true_m)[:, :2].T)
+
+
+def test_a_merged_run_is_placed_by_the_fixes_of_all_sessions(
+    on_globe: Days, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_pose, "NUM_ENOUGH", 5)
+    made = segslam.merge([on_globe.monday.folder, on_globe.friday.folder], tmp_path / "both", same_reference=True)
+    values = json.loads((made.folder / "georeference.json").read_text())
+    assert values["num_fixes"] == len(made.result.trajectory)
+    assert values["num_fixes_kept"] > 0.9 * values["num_fixes"]
+    assert made.reference is not None
+    assert _off_globe_m(made.folder, made.reference).max() < 0.4
+
+
+def test_a_run_localised_in_a_georeferenced_map_is_on_the_globe(on_globe: Days, tmp_path: Path) -> None:
+    made = segslam.localise(on_globe.monday.folder, on_globe.friday_scans, tmp_path / "there", config=UNADJUSTED)
+    assert on_globe.friday.reference is not None
+    errors_m = _off_globe_m(made.folder, on_globe.friday.reference)
+    assert len(errors_m) == made.result.localised().sum()
+    assert errors_m.max() < 0.5
+    assert not (made.folder / "gnss.csv").exists()
+    assert run("export", made.folder, tmp_path / "track.geojson", "--quiet") == 0
 
 
 @pytest.mark.slow

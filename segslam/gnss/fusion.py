@@ -2,12 +2,13 @@
 
 The noise of drive and receiver is that of the largest likelihood (`evidence`). With it, the fixes of a receiver with
 slow errors hardly bend a consistent map. But a map may also have systematic errors that its graph does not claim; then
-a good receiver is right. So blocks of fixes are held out, and of three stiffnesses (the drive keeps its shape, is bent
+a good receiver is right. So windows of fixes are held out, and of three stiffnesses (the drive keeps its shape, is bent
 by this noise, follows the fixes closely) the stiffest is used that does not predict the held-out fixes significantly
-worse than the best one does (paired t-test over the blocks).
+worse than the best one does (paired t-test over the windows). A window is as long as the longest part of the drive
+without fixes: the solution is used there, too, and between fixes that are near every bent drive predicts well.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,18 +19,20 @@ from segslam.gnss.matching import Drive, Matched, Prepared
 from segslam.gnss.robust_weights import KEPT_WEIGHT, robust_weights
 from segslam.gnss.statistics import Weights, axis_noise, axis_sigma, horizontal_noise, horizontal_sigma
 from segslam.pose_graph import Edge, PositionedGraph
-from segslam.trajectory import Poses
-from segslam.types import Indices, Points, Vector
+from segslam.trajectory import Poses, travelled_m
+from segslam.types import Mask, Points, Vector
 
-NUM_BLOCKS, NUM_FOLDS = 6, 3
-"""Chosen: blocks of fixes in a row and groups in which they are held out; a block is longer than the errors of most
-receivers are correlated."""
+NUM_WINDOWS = 6
+"""Chosen: windows of fixes in a row that are held out, one at a time; a sixth of the fixes is longer than the errors of
+most receivers are correlated. Longer windows overlap."""
+MOST_HELD_OUT = 0.5
+"""Chosen: largest share of the fixes in a window; the others place the drive."""
 SIGNIFICANT_T = 1.476
-"""Derived: Student's t with 5 degrees of freedom, one-sided, at 10 %: for six blocks."""
+"""Derived: Student's t with 5 degrees of freedom, one-sided, at 10 %: for six windows."""
 RIGID_M = 1000.0
 """Standard deviation of fixes that do not bend the drive."""
 LEAST_FUSED = 24
-"""Chosen: with fewer fixes, four a block, the drive keeps its shape."""
+"""Chosen: with fewer fixes, four a window, the drive keeps its shape."""
 ROUNDS = 4
 """Chosen: iterations of weights and poses; they settle in three."""
 SIGNIFICANT = 4.0
@@ -39,8 +42,6 @@ CONSTANT_ROUNDS = 3
 
 
 Costs = tuple[float, float, float]
-Measure = Callable[[Points], tuple[Vector, float]]
-"""Residuals along an axis, or their lengths, and their robust standard deviation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +123,7 @@ def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> Fused:
     weights = robust_weights(residual, placement.sigma_m, matched.time_s) * placement.chain[:, None]
     up: Noise | None = None
     used = weights[:, 1] >= KEPT_WEIGHT
-    if used.sum() >= NUM_BLOCKS:
+    if used.sum() >= NUM_WINDOWS:
         up = estimated(
             constants.covariance,
             matched.some(used),
@@ -160,18 +161,15 @@ class _Problem:
 
 def _chosen(problem: _Problem, soft: Vector, close: Vector) -> tuple[Vector, tuple[Costs, Costs]]:
     """(3,) standard deviations with which the fixes act, and the costs that decide, horizontally and vertically."""
-    n = len(problem.matched)
     sigma = np.full(3, RIGID_M)
     nothing = (0.0, 0.0, 0.0)
-    if n < LEAST_FUSED:
+    if len(problem.matched) < LEAST_FUSED:
         return sigma, (nothing, nothing)
-    blocks = (np.arange(n) * NUM_BLOCKS) // n
-    reference = problem.matched.enu_m - problem.positions(problem.T_start)
-    level, costs_level = _best(problem, [_level_only(one) for one in (sigma, soft, close)], blocks, reference, _level)
+    level, costs_level = _best(problem, [_level_only(one) for one in (sigma, soft, close)], 0)
     if not np.isfinite(close[2]):
         return level, (costs_level, nothing)
     with_up = [np.array([*level[:2], one]) for one in (RIGID_M, soft[2], close[2])]
-    both, costs_up = _best(problem, with_up, blocks, reference, _up)
+    both, costs_up = _best(problem, with_up, 1)
     return both, (costs_level, costs_up)
 
 
@@ -179,28 +177,54 @@ def _level_only(sigma: Vector) -> Vector:
     return np.array([sigma[0], sigma[1], RIGID_M])
 
 
-def _best(
-    problem: _Problem, candidates: Sequence[Vector], blocks: Indices, reference: Points, of: Measure
-) -> tuple[Vector, Costs]:
-    """The stiffest of three candidates, rigid, soft and close, whose cost is not significantly above the least one."""
-    costs = np.array([_costs(_held_out(problem, one, blocks), reference, blocks, of) for one in candidates])
+def _best(problem: _Problem, candidates: Sequence[Vector], axis: int) -> tuple[Vector, Costs]:
+    """The stiffest of three candidates, rigid, soft and close, whose cost is not significantly above the least one.
+
+    `axis`: 0 horizontally, 1 vertically.
+    """
+    matched = problem.matched
+    reference = matched.enu_m - problem.positions(problem.T_start)
+    weights = robust_weights(reference, problem.placement.sigma_m, matched.time_s)[:, axis]
+    windows = _windows(problem, problem.placement.chain & (weights >= KEPT_WEIGHT))
+    known = reference[np.isfinite(_along(reference, axis))]
+    scale = axis_sigma(known[:, 2]) if axis else horizontal_sigma(known)
+    costs = np.array([_held_out(problem, one, windows, axis, scale) for one in candidates])
     means = costs.mean(axis=1)
     more = costs - costs[means.argmin()]
-    is_as_good = more.mean(axis=1) <= SIGNIFICANT_T * more.std(axis=1, ddof=1) / np.sqrt(NUM_BLOCKS)
+    is_as_good = more.mean(axis=1) <= SIGNIFICANT_T * more.std(axis=1, ddof=1) / np.sqrt(NUM_WINDOWS)
     rigid, soft, close = means.tolist()
     return candidates[int(is_as_good.argmax())], (rigid, soft, close)
 
 
-def _held_out(problem: _Problem, sigma: Vector, blocks: np.ndarray) -> Points:
-    """(n, 3) residual of each fix about the drive that was solved without its block."""
+def _windows(problem: _Problem, used: Mask) -> list[slice]:
+    """Fixes in a row to hold out, spread over the drive; each window is as long as the largest gap between used fixes.
+
+    The gap is a share of the travel, with the fixes that remain as the whole.
+    """
+    total_m = float(travelled_m(problem.T_start)[-1])
+    gaps_m = np.diff([0.0, *problem.matched.travel_m[used], total_m])
+    gap = min(float(gaps_m.max()) / max(total_m, 1e-9), MOST_HELD_OUT)
+    share = float(np.clip(gap / (1.0 - gap), 1.0 / NUM_WINDOWS, MOST_HELD_OUT))
+    n = len(used)
+    size = int(n * share)
+    return [slice(first, first + size) for first in np.linspace(0, n - size, NUM_WINDOWS).astype(int).tolist()]
+
+
+def _held_out(problem: _Problem, sigma: Vector, windows: Sequence[slice], axis: int, scale: float) -> Vector:
+    """(w,) mean cost of the fixes of each window about the drive that was solved without them.
+
+    In units of `scale`, the standard deviation about the placed drive; far ones count little more.
+    """
     T, _, precisions = _solved(problem, sigma)
-    residual = np.empty_like(problem.matched.enu_m)
-    for fold in range(NUM_FOLDS):
-        out = blocks % NUM_FOLDS == fold
-        without = precisions * ~out[:, None]
-        T_fold = problem.solve(T, without) if without.any() else problem.T_start
-        residual[out] = (problem.matched.enu_m - problem.positions(T_fold))[out]
-    return residual
+    costs = []
+    for window in windows:
+        without = precisions.copy()
+        without[window] = 0.0
+        T_without = problem.solve(T, without) if without.any() else problem.T_start
+        values = _along((problem.matched.enu_m - problem.positions(T_without))[window], axis)
+        known = values[np.isfinite(values)]
+        costs.append(float(np.mean(np.log1p(known**2 / scale**2))) if len(known) else 0.0)
+    return np.array(costs)
 
 
 def _solved(problem: _Problem, sigma: Vector) -> tuple[Poses, Weights, Points]:
@@ -226,19 +250,6 @@ def _scales(residual: Points, weights: Weights) -> Vector:
     return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
 
 
-def _level(residual: Points) -> tuple[Vector, float]:
-    return np.hypot(*residual[:, :2].T), horizontal_sigma(residual)
-
-
-def _up(residual: Points) -> tuple[Vector, float]:
-    known = residual[np.isfinite(residual[:, 2]), 2]
-    return residual[:, 2], axis_sigma(known)
-
-
-def _costs(residual: Points, reference: Points, blocks: Indices, of: Measure) -> Vector:
-    """(b,) mean cost in each block, in units of residuals about the placed drive; far ones count little more."""
-    (values, _), (_, sigma) = of(residual), of(reference)
-    costs = np.log1p(values**2 / sigma**2)
-    known = np.isfinite(costs)
-    counts = np.bincount(blocks[known], minlength=NUM_BLOCKS)
-    return np.bincount(blocks[known], costs[known], minlength=NUM_BLOCKS) / np.maximum(counts, 1)
+def _along(residual: Points, axis: int) -> Vector:
+    """(n,) horizontal lengths for axis 0, heights for axis 1."""
+    return residual[:, 2] if axis else np.hypot(*residual[:, :2].T)

@@ -8,7 +8,7 @@ import pytest
 from helpers.gnss_drive import ORIGIN, SIGMA_M, T_ENU_MAP, motions
 
 from segslam import geometry
-from segslam.gnss import Drive, Fixes, Use, enu_from_geodetic, geodetic_from_enu, georeference
+from segslam.gnss import Drive, Fixes, Origin, Use, enu_from_geodetic, geodetic_from_enu, georeference, utm_epsg
 from segslam.gnss.fixes import Row, make_fixes
 from segslam.trajectory import Poses
 from segslam.types import Points, SegslamError
@@ -40,17 +40,17 @@ def _drive(poses: Poses) -> Drive:
     return Drive(np.arange(NUM) * round(1e9 * PERIOD_S), poses, np.arange(NUM))
 
 
-def _fixes(truth: Poses, *, sigma_m: float = 0.3, off_m: Points | float = 0.0) -> Fixes:
+def _fixes(truth: Poses, *, sigma_m: float = 0.3, off_m: Points | float = 0.0, origin: Origin = ORIGIN) -> Fixes:
     noise = sigma_m * np.random.default_rng(1).standard_normal((NUM, 3))
-    places = geodetic_from_enu(geometry.apply(T_ENU_MAP, truth[:, :3, 3]) + noise + off_m, ORIGIN)
+    places = geodetic_from_enu(geometry.apply(T_ENU_MAP, truth[:, :3, 3]) + noise + off_m, origin)
     return make_fixes("fixes", [Row(round(1e9 * PERIOD_S * row), *place) for row, place in enumerate(places)])
 
 
-def _error_m(found: object, truth: Poses) -> float:
+def _error_m(found: object, truth: Poses, origin: Origin = ORIGIN) -> float:
     """Horizontal error on the globe, rms."""
     assert hasattr(found, "T_enu_keyframe")
     places = geodetic_from_enu(found.T_enu_keyframe[:, :3, 3], found.origin)
-    off = enu_from_geodetic(places, ORIGIN) - geometry.apply(T_ENU_MAP, truth[:, :3, 3])
+    off = enu_from_geodetic(places, origin) - geometry.apply(T_ENU_MAP, truth[:, :3, 3])
     return float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
 
 
@@ -105,6 +105,21 @@ def test_fixes_that_cannot_place_a_drive_are_refused_with_the_reason() -> None:
         georeference(edges, drive, fixes.shifted(86400.0))
     with pytest.raises(SegslamError, match="heading"):
         georeference(edges, drive, replace(fixes, places=fixes.places[[0] * NUM]))
+    equal = make_fixes("equal", [Row(int(stamp_ns), *fixes.places[0]) for stamp_ns in fixes.stamp_ns])
+    with pytest.raises(SegslamError, match="1 usable fixes are within the drive"):
+        georeference(edges, drive, equal)
+
+
+@pytest.mark.parametrize("longitude", [11.9999, 179.9999, -180.0])
+def test_a_drive_across_the_edge_of_a_zone_or_the_date_line_is_placed(longitude: float) -> None:
+    """One zone, that of the origin, is used for the whole map."""
+    truth, origin = _truth(), Origin(17.0, longitude, 5.0)
+    fixes = _fixes(truth, origin=origin)
+    zones = {utm_epsg(*place) for place in fixes.places[:, :2].tolist()}
+    assert len(zones) == 2
+    found = georeference(motions(truth), _drive(truth), fixes)
+    assert _error_m(found, truth, origin) < 0.3
+    assert found.num_kept > 0.9 * NUM
 
 
 def test_fixes_without_heights_place_a_drive_horizontally() -> None:

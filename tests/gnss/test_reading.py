@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from segslam.gnss.fixes import make_fixes
 from segslam.gnss.geodesy import Origin, ecef_from_geodetic, enu_from_geodetic
+from segslam.gnss.messages import row_of
 from segslam.gnss.reading import read_fixes
 from segslam.gnss.times import stamp_of
 from segslam.types import SegslamError
@@ -212,6 +215,31 @@ def test_fixes_without_position_are_not_used(tmp_path: Path) -> None:
 def test_a_status_is_that_of_navsatfix(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("time,lat,lon,alt,status\n1,48,8,100,0\n2,48.1,8,100,-1\n")
     assert read_fixes(tmp_path / "a.csv").reasons == ("", "no_fix")
+
+
+def _message(*, status: int, variance: float, kind: int = 2) -> SimpleNamespace:
+    stamp = SimpleNamespace(sec=10, nanosec=5)
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp),
+        status=SimpleNamespace(status=status),
+        latitude=48.0,
+        longitude=8.0,
+        altitude=100.0,
+        position_covariance=[variance, 0, 0, 0, variance, 0, 0, 0, variance],
+        position_covariance_type=kind,
+    )
+
+
+def test_messages_without_fix_or_covariance_are_what_they_are() -> None:
+    """A receiver without a fix sends status -1, and often NaN as covariance; NaN alone is an unknown one."""
+    rows = [_message(status=-1, variance=np.nan), _message(status=0, variance=np.nan), _message(status=0, variance=0.0)]
+    rows += [_message(status=0, variance=4.0), _message(status=0, variance=4.0, kind=0)]
+    found = [row_of(row) for row in rows]
+    assert [row.has_fix for row in found] == [False, True, True, True, True]
+    np.testing.assert_array_equal([row.sigma_m[0] for row in found], [np.nan, np.nan, np.nan, 2.0, np.nan])
+    assert make_fixes("fix", found[:2]).reasons == ("no_fix", "")
+    with pytest.raises(SegslamError, match=r"none of its 1 fixes can be used \(1 no_fix\)"):
+        make_fixes("fix", found[:1])
 
 
 @pytest.mark.parametrize("unit", [1, 1000, 10**6, 10**9])

@@ -9,7 +9,11 @@ from helpers.gnss_drive import ORIGIN, SIGMA_M, T_ENU_MAP, motions
 
 from segslam import geometry
 from segslam.gnss import Drive, Fixes, Origin, Use, enu_from_geodetic, geodetic_from_enu, georeference, utm_epsg
+from segslam.gnss.alignment import place
 from segslam.gnss.fixes import Row, make_fixes
+from segslam.gnss.fusion import _Problem, _windows
+from segslam.gnss.matching import prepare
+from segslam.pose_graph import PositionedGraph
 from segslam.trajectory import Poses
 from segslam.types import Points, SegslamError
 
@@ -120,6 +124,24 @@ def test_a_drive_across_the_edge_of_a_zone_or_the_date_line_is_placed(longitude:
     found = georeference(motions(truth), _drive(truth), fixes)
     assert _error_m(found, truth, origin) < 0.3
     assert found.num_kept > 0.9 * NUM
+
+
+@pytest.mark.parametrize(("first", "last", "share"), [(0, 0, 1 / 6), (80, 140, 1 / 3), (0, 80, 0.5), (40, 220, 0.5)])
+def test_held_out_windows_are_as_long_as_the_longest_part_without_fixes(first: int, last: int, share: float) -> None:
+    """`first` to `last` of the fixes are wrong; each window is a share of all, and the windows reach both ends."""
+    truth = _truth()
+    off = np.zeros((NUM, 3))
+    off[first:last] = [25.0, -20.0, 0.0]
+    drive = _drive(truth)
+    prepared = prepare(_fixes(truth, sigma_m=0.05, off_m=off), drive)
+    matched, placement = place(prepared, drive)
+    T_start = placement.T_enu_map @ drive.T_map_keyframe
+    problem = _Problem(PositionedGraph(motions(truth), drive.T_map_keyframe), matched, placement, T_start)
+    good = np.ones(NUM, dtype=bool)
+    good[first:last] = False
+    windows = _windows(problem, good)
+    assert [window.stop - window.start for window in windows] == pytest.approx([share * NUM] * 6, abs=0.03 * NUM)
+    assert (windows[0].start, windows[-1].stop) == (0, NUM)
 
 
 def test_fixes_without_heights_place_a_drive_horizontally() -> None:

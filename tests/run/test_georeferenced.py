@@ -22,12 +22,14 @@ from pyproj import Transformer
 
 from segslam import geometry
 from segslam.datasets import open_dataset
-from segslam.gnss import enu_from_geodetic
+from segslam.gnss import Origin, enu_from_geodetic, geodetic_from_enu
 from segslam.log import read_log, schema
 from segslam.log.locations import write_locations
-from segslam.run.georeferenced import read_globe
+from segslam.map.projected import Utm, _affine
+from segslam.run.georeferenced import Globe, read_globe
 from segslam.run.report.figures import STYLE
 from segslam.run.report.fixes import draw_fixes
+from segslam.run.tracks import track
 from segslam.types import Points, SegslamError
 
 KML = "{http://www.opengis.net/kml/2.2}"
@@ -146,6 +148,63 @@ def test_a_place_has_the_same_coordinates_in_all_files(made: MadeRun, tmp_path: 
         rows, columns = rasterio.transform.rowcol(image.transform, cloud.x, cloud.y)
         colors = image.read()[:, np.clip(rows, 0, image.height - 1), np.clip(columns, 0, image.width - 1)]
     assert (colors != 255).any(axis=0).mean() > 0.9, "points are where the image is not blank"
+
+
+def _opened(file: Path, layer: str | None = None) -> Points:
+    """(n, 2 or 3) longitude, latitude and height of the lines of a file, as GDAL reads them."""
+    gdal = pytest.importorskip("pyogrio", reason="pip install '.[dev]'").raw
+    _, _, (geometry, *_), _ = gdal.read(file, layer=layer)
+    return _coordinates(memoryview(geometry))
+
+
+def _coordinates(wkb: memoryview) -> Points:
+    """The points of a LineString or MultiLineString in well-known binary, with the dimensions of its type."""
+    kind, number = np.frombuffer(wkb[1:9], "<u4").tolist()
+    dimensions = 3 if kind >> 31 or (kind & 0xFFFF) // 1000 == 1 else 2
+    if (kind & 0xFFFF) % 1000 == 2:
+        return np.frombuffer(wkb[9 : 9 + 8 * dimensions * number], "<f8").reshape(number, dimensions)
+    parts, start = [], 9
+    for _ in range(number):
+        parts.append(_coordinates(wkb[start:]))
+        start += 9 + parts[-1].nbytes
+    return np.vstack(parts)
+
+
+def test_tracks_open_in_gdal_where_the_scans_are(made: MadeRun, tmp_path: Path) -> None:
+    rows = _geodetic(made.folder)
+    for name, layer in (("track.geojson", None), ("track.kml", None), ("track.gpx", "tracks")):
+        assert run("export", made.folder, tmp_path / name, "--quiet") == 0
+        np.testing.assert_allclose(_opened(tmp_path / name, layer)[:, :2], rows[:, :2], rtol=0, atol=SAME_DEG)
+
+
+def test_a_track_across_the_date_line_is_cut_there(tmp_path: Path) -> None:
+    """RFC 7946: two parts; otherwise a map shows a line round the Earth."""
+    east_m = np.arange(-40.0, 41.0, 10.0)
+    poses = np.tile(np.eye(4), (len(east_m), 1, 1))
+    poses[:, 0, 3] = east_m
+    globe = Globe(Origin(17.0, 179.99999, 5.0), poses)
+    file = tmp_path / "track.geojson"
+    file.write_bytes(track(file, globe, np.arange(len(east_m)), name="a"))
+    parts = json.loads(file.read_text())["features"][0]["geometry"]["coordinates"]
+    assert [len(part) for part in parts] == [5, 4]
+    assert parts[0][-1][0] > 179.0
+    assert parts[1][0][0] < -179.0
+    opened = _opened(file)
+    np.testing.assert_allclose(enu_from_geodetic(opened[:, [1, 0, 2]], globe.origin)[:, 0], east_m, atol=0.001)
+
+
+def test_a_pixel_of_the_geotiff_is_where_the_point_is() -> None:
+    """Up to the edge of a UTM zone, 500 m from the origin."""
+    for longitude in (8.39, 11.9999, 179.9999):
+        utm = Utm(Origin(48.98, longitude, 115.0))
+        window, pixels = (-500.0, 500.0, -300.0, 300.0), np.array([[0.0, 0.0], [321.0, 55.0], [1000.0, 600.0]])
+        affine = _affine(utm, window, 600, 1000, 0.0)
+        east_north = np.column_stack([-500.0 + pixels[:, 0], 300.0 - pixels[:, 1], np.zeros(3)])
+        expected = geodetic_from_enu(east_north, Origin(48.98, longitude, 115.0))
+        there = np.column_stack([pixels, np.ones(3)]) @ affine.T
+        back = Transformer.from_crs(utm.epsg, 4979, always_xy=True).transform(*there.T)
+        off_deg = (np.column_stack(back) - expected[:, [1, 0]] + 180.0) % 360.0 - 180.0
+        assert np.abs(off_deg).max() < SAME_DEG
 
 
 def _plain_points(file: Path) -> Points:

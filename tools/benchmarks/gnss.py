@@ -2,8 +2,9 @@
 
     python -m tools.benchmarks.gnss RUN FIXES --out FILE.json [--truth-origin LAT,LON,HEIGHT] [--residuals POS TRUTH]
 
-Prints for each alteration the error of the run without fixes and with them, after the best rigid motion, and, with
-`--truth-origin` (of the local frame of the true poses), horizontally without any. `--residuals`: a file of RTKLIB and
+Prints for each alteration the error of the run without fixes and with them, after the best rigid motion, the error of
+the heading of the map (the true poses placed by the fixes as they are), and, with `--truth-origin` (of the local frame
+of the true poses), the horizontal error without any motion. `--residuals`: a file of RTKLIB and
 the true positions as UrbanNav has them, whose differences are added to the fixes.
 """
 
@@ -16,13 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.evaluation import trajectory_metrics
+from segslam import geometry
+from segslam.evaluation import align_positions, trajectory_metrics
 from segslam.gnss import Fixes, Origin, enu_from_geodetic, geodetic_from_enu
 from segslam.gnss.reading import read_fixes
 from segslam.run.finished import FinishedRun, read_run
 from segslam.run.georeferenced import georeference, read_globe
 from segslam.trajectory import rows_of_same_scan
-from segslam.types import Points
+from segslam.types import Indices, Points, Transform
 from tools.benchmarks.common import Row, markdown, parser, write_report
 
 SEED = 3401
@@ -42,7 +44,7 @@ def main() -> None:
     run, fixes = read_run(given.run), read_fixes(given.fixes)
     rows = []
     for name, altered in _alterations(given.residuals).items():
-        rows.append({"fixes": name} | _row(run, altered(fixes), given.truth_origin))
+        rows.append({"fixes": name} | _row(run, altered(fixes), fixes, given.truth_origin))
         print(rows[-1], flush=True)
     print(markdown(run.folder.name, rows))
     write_report(given.out, {"run": run.folder.name, "rows": rows})
@@ -62,7 +64,7 @@ def _alterations(residuals: list[Path] | None) -> dict[str, Alteration]:
     return made
 
 
-def _row(run: FinishedRun, fixes: Fixes, truth_origin: Origin | None) -> Row:
+def _row(run: FinishedRun, fixes: Fixes, unaltered: Fixes, truth_origin: Origin | None) -> Row:
     assert run.reference is not None, "the run has no true poses"
     matches = rows_of_same_scan(run.result.trajectory.scan_index, run.reference.scan_index)
     truth = run.reference.T_world_lidar[matches[:, 1]]
@@ -80,10 +82,23 @@ def _row(run: FinishedRun, fixes: Fixes, truth_origin: Origin | None) -> Row:
         "with (m)": round(trajectory_metrics(poses, truth)["ate_m"], 3),
         "clock (s)": round(placed.measured_offset_s, 3),
     }
+    T_enu_truth = np.eye(4)
+    if truth_origin is None:
+        stamps = run.result.trajectory.stamp_ns[matches[:, 0]]
+        T_enu_truth = _placed(truth[:, :3, 3], stamps, unaltered, globe.origin)
+    turn = align_positions(truth[:, :3, 3], poses[:, :3, 3]) @ geometry.inverse(T_enu_truth)
+    found["heading (deg)"] = round(float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0]))), 3)
     if truth_origin is not None:
         off = _enu(poses[:, :3, 3], globe.origin, truth_origin) - truth[:, :3, 3]
         found["unaligned, horizontal (m)"] = round(float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1)))), 3)
     return found
+
+
+def _placed(positions: Points, stamp_ns: Indices, fixes: Fixes, origin: Origin) -> Transform:
+    """The rigid motion of true positions to the fixes, which are all right."""
+    within = fixes.usable & (fixes.stamp_ns >= stamp_ns[0]) & (fixes.stamp_ns <= stamp_ns[-1])
+    there = np.column_stack([np.interp(fixes.stamp_ns[within], stamp_ns, column) for column in positions.T])
+    return align_positions(there, enu_from_geodetic(fixes.places[within], origin))
 
 
 def _enu(positions: Points, origin: Origin, other: Origin) -> Points:

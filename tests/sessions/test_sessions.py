@@ -140,6 +140,7 @@ def test_a_merged_run_is_placed_by_the_fixes_of_all_sessions(
     assert _off_globe_m(made.folder, made.reference).max() < 0.4
 
 
+@pytest.mark.slow
 def test_a_run_localised_in_a_georeferenced_map_is_on_the_globe(on_globe: Days, tmp_path: Path) -> None:
     made = segslam.localise(on_globe.monday.folder, on_globe.friday_scans, tmp_path / "there", config=UNADJUSTED)
     assert on_globe.friday.reference is not None

@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from segslam.config.yaml_text import parse_yaml
 from segslam.datasets.in_order import InOrder
 from segslam.datasets.mcap_clouds import MESSAGE
 from segslam.system.extras import how_to_install
@@ -14,7 +15,8 @@ from segslam.system.extras import how_to_install
 class BagClouds:
     """Messages with clouds, read in order. Replaces kiss_icp's reader, which ends the program for a missing topic.
 
-    Raises ValueError if the bag has no such topic, ImportError if the package is missing, and what rosbags raises.
+    Raises ValueError if the bag has no such topic, SegslamError if its metadata are damaged, ImportError if the package
+    is missing, and what rosbags raises.
     """
 
     is_sequential = True
@@ -25,6 +27,10 @@ class BagClouds:
         except ImportError as error:
             raise ImportError(f"reading ROS bags needs a package: {how_to_install('recordings')}") from error
         files = [file for file in sorted(data.glob("*.bag")) if not file.name.startswith(".")] if data.is_dir() else []
+        metadata = data / "metadata.yaml"
+        if not files and metadata.is_file():
+            # rosbags needs seconds before it refuses a damaged text that is nested deeply
+            parse_yaml(metadata.read_text(encoding="utf-8"), str(metadata))
         self._bag = AnyReader(files or [data])
         self._bag.open()
         weakref.finalize(self, _close, self._bag)

@@ -1,11 +1,12 @@
 """Measurement of time and additional memory."""
 
-import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter, process_time
+
+from segslam.system.memory import give_back
 
 PROCESS = Path("/proc/self")
 RESET_PEAK = "5"
@@ -27,20 +28,13 @@ class Cost:
 def measured() -> Iterator[Cost]:
     """Context manager that yields the cost of its block."""
     cost = Cost()
-    _give_back()
+    give_back()
     before_mb = _memory_mb("VmRSS") if _reset_peak() else None
     started, cpu_started = perf_counter(), process_time()
     yield cost
     cost.seconds, cost.cpu_seconds = perf_counter() - started, process_time() - cpu_started
     if before_mb is not None:
         cost.peak_mb = max(_memory_mb("VmHWM") - before_mb, 0.0)
-
-
-def _give_back() -> None:
-    """Return free memory to the system: reused memory would not be counted."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
-    if trim is not None:
-        trim(0)
 
 
 def _reset_peak() -> bool:

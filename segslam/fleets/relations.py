@@ -10,13 +10,10 @@ import numpy as np
 
 from segslam import geometry
 from segslam.pose_graph.closure_pairs import adjoints
-from segslam.sessions.session_pose import SessionPose
+from segslam.sessions.session_pose import MOST_FAILED, SessionPose
 from segslam.types import Alignment, Registration, SegslamError, Transform
 
 Found = tuple[int, int, Alignment]
-MOST_FAILED = 4
-"""Chosen: two drives that so many others each could not be joined to are not tried with each other; the cost of a drive
-then does not grow with the number of drives."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +121,10 @@ class Components:
         return None
 
     def next_pairs(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
-        """For each component the most similar pair with another one, of those not tried yet."""
+        """For each component the most similar pair with another one, of those not tried yet.
+
+        Two drives that `MOST_FAILED` others each could not be joined to are not tried with each other.
+        """
         best: dict[int, tuple[float, tuple[int, int]]] = {}
         for pair, value in similarity.items():
             ends = {self.of(drive) for drive in pair}

@@ -1,5 +1,6 @@
 """Where the steps of a fleet run: in this process, or in the processes of a Dask cluster."""
 
+import gc
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from uuid import uuid4
 
 from segslam.system.cluster import cluster
+from segslam.system.memory import give_back
 from segslam.types import SegslamError
 
 logger = logging.getLogger(__name__)
@@ -38,7 +40,11 @@ def here(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> Iter
 
 
 def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
-    """The outcome of one task. A bug, too, is the failure of one task, with its traceback in the worker's log."""
+    """The outcome of one task. A bug, too, is the failure of one task, with its traceback in the worker's log.
+
+    Memory that the task freed is returned to the system: a worker does many tasks, and what each leaves behind in
+    another place of the heap would add up.
+    """
     try:
         return Outcome(function(*arguments))
     except (SegslamError, OSError) as error:
@@ -46,6 +52,9 @@ def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
     except Exception as error:
         logger.exception("%s failed", function.__name__)
         return Outcome(None, f"{type(error).__name__}: {error}")
+    finally:
+        gc.collect()
+        give_back()
 
 
 @contextmanager

@@ -132,6 +132,8 @@ class RunLog:
                 if message.topic == schema.STEP:
                     if cloud is not None:
                         kept.append(self._decoded(_recorded_keyframe, (parts, cloud)))
+                        if kept[-1].keyframe.id != len(kept) - 1:
+                            raise SegslamError(f"{self.path}: keyframe {len(kept) - 1} is missing; map the data again")
                     parts.clear()
                     cloud = None
         return RecordedKeyframes(self.path, kept)
@@ -198,7 +200,7 @@ def read_log(path: Path) -> RunLog:
 def _is_readable(written: bytes, own: dict[str, Any]) -> bool:
     try:
         return schema.is_readable(json.loads(written), own)
-    except (ValueError, AttributeError, TypeError):
+    except (ValueError, AttributeError, TypeError, RecursionError):
         return False
 
 

@@ -26,6 +26,9 @@ NUM_ENOUGH = 12
 """Chosen: the search ends when this many are found; further loops are found by proximity."""
 MIN_FOUND = 3
 """Chosen: smallest number of consistent locations that relate two sessions."""
+MOST_FAILED = 4
+"""Chosen on two fleets: the search for the pose of a session ends when so many of its likely keyframes, the first ones,
+were not found; in each of 15 pairs of drives that share places the first was."""
 MIN_SPREAD_M = 10.0
 """Chosen: smallest travel between the first and the last of them; a single place may be a wrong one."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
@@ -65,7 +68,8 @@ def find_session(
     """The pose of a session in the earlier session of this `number`, or the reason as text if it is unknown.
 
     At most `NUM_QUERIES` keyframes, spread over the session, are searched; sparse ones together with their neighbours.
-    `likely`: these keyframes are searched instead, in this order, and those before and after each that is found.
+    `likely`: these keyframes are searched instead, in this order, and those before and after each that is found, until
+    the first `MOST_FAILED` were not.
     """
     submap = submaps(session, config)
     found: list[tuple[int, int, Alignment]] = []
@@ -79,7 +83,7 @@ def find_session(
         place = locator.locate(*submap(keyframe_id))
         if not isinstance(place, Rejected):
             found.append((keyframe_id, place.keyframe_id, place.alignment))
-        if len(found) == NUM_ENOUGH:
+        if len(found) == NUM_ENOUGH or (likely is not None and not found and num_tried == MOST_FAILED):
             break
     summary = f"{len(found)} of {num_tried} keyframes were found there"
     if len(found) < MIN_FOUND:

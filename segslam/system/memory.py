@@ -28,6 +28,13 @@ def keep_freed_memory() -> None:
         mallopt(TRIM_THRESHOLD, KEPT_BYTES)
 
 
+def give_back() -> None:
+    """Return all freed memory to the system (glibc only); no effect elsewhere."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
 _others_mb = 0.0
 
 

@@ -113,6 +113,7 @@ def _made(folder: Path) -> dict[str, int]:
     return {str(file): file.stat().st_mtime_ns for file in files if file.name not in (FILE, "report.html")}
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
     joined: FleetResult, recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 from segslam.errors import SegslamError
 
-MAX_CPU_S = 3.0
-"""Longest processor time for a file; the clock on the wall would measure the other jobs of the machine."""
+MAX_CPU_S = 1.0
+"""Longest processor time for a file, the shorter of two readings; the clock on the wall would measure the other jobs of
+the machine, and a machine that is stopped and started again adds its pause to one of the readings."""
 MAX_MEMORY, SPARE_BYTES = 2, 64 * 2**20
 """Most memory: twice the size of the file, and what libraries take on the way."""
 ADDRESS_BYTES = 8 * 2**30
@@ -94,6 +95,15 @@ def _work(read: Callable[[Path], Any], file: Path, contents: Sequence[bytes], si
 
 def _outcome(read: Callable[[Path], Any], file: Path) -> str:
     """The kind of a defect; empty if there is none."""
+    kind, spent = _one_reading(read, file)
+    if not kind and spent > MAX_CPU_S:
+        kind, again = _one_reading(read, file)
+        spent = min(spent, again)
+    return kind or (f"{spent:.0f} s" if spent > MAX_CPU_S else "")
+
+
+def _one_reading(read: Callable[[Path], Any], file: Path) -> tuple[str, float]:
+    """The kind of a defect, empty if there is none, and the processor time in seconds."""
     size = file.stat().st_size
     before = int(Path("/proc/self/statm").read_text().split()[1]) * PAGE_BYTES
     highest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -112,11 +122,9 @@ def _outcome(read: Callable[[Path], Any], file: Path) -> str:
         signal.setitimer(signal.ITIMER_PROF, 0)
     spent = time.process_time() - started
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    if not kind and spent > MAX_CPU_S:
-        return f"{spent:.0f} s"
     if not kind and peak > highest and peak * 1024 - before > MAX_MEMORY * size + SPARE_BYTES:
-        return f"{(peak * 1024 - before) >> 20} MB"
-    return kind
+        kind = f"{(peak * 1024 - before) >> 20} MB"
+    return kind, spent
 
 
 def named(error: SegslamError, file: Path) -> bool:

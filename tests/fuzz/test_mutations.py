@@ -1,4 +1,4 @@
-"""Damaged files: an error that names the file or a result, in 3 s and with little memory, and nothing else."""
+"""Damaged files: an error that names the file or a result, in a second and with little memory, and nothing else."""
 
 import mmap
 import os

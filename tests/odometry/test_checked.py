@@ -129,7 +129,7 @@ def _elsewhere(scan: Scan) -> Scan:
     return replace(scan, points=points.astype(np.float32), labels=np.zeros(20_000, np.uint8))
 
 
-@pytest.mark.parametrize("interval_s", [0.3, 6.0])
+@pytest.mark.parametrize("interval_s", [0.3, pytest.param(6.0, marks=pytest.mark.slow)])
 def test_a_scan_from_another_town_is_a_break_though_the_odometry_is_steady(interval_s: float) -> None:
     scans, _ = round_drive()
     odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
@@ -154,7 +154,7 @@ def test_a_long_pause_before_the_second_scan_does_not_set_the_usual_interval() -
     np.testing.assert_allclose(gaps, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 10.0, 1.0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("is_given", [True, False])
+@pytest.mark.parametrize("is_given", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_scan_that_nothing_explains_is_no_evidence_against_the_drive(is_given: bool) -> None:
     scans, truth = round_drive()
     given = [*scans[:20], _elsewhere(scans[20]), *scans[21:26]]
@@ -246,7 +246,9 @@ def test_the_quick_check_measures_a_small_slip(moved_m: float) -> None:
     assert geometry.distance(geometry.inverse(T_slipped) @ found) == pytest.approx(moved_m, abs=0.06)
 
 
-@pytest.mark.parametrize("last", [15, SLIP_AT + 1, SLIP_AT + 12])
+@pytest.mark.parametrize(
+    "last", [pytest.param(15, marks=pytest.mark.slow), SLIP_AT + 1, pytest.param(SLIP_AT + 12, marks=pytest.mark.slow)]
+)
 def test_an_interrupted_drive_continues_from_its_last_scans(last: int) -> None:
     scans, _ = round_drive()
     config = CONFIG

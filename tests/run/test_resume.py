@@ -121,7 +121,8 @@ def _resumed_as_whole(kitti: Path, whole: Path, out: Path) -> None:
     _assert_as_whole(whole, out)
 
 
-@pytest.mark.parametrize("share", [0.08, pytest.param(0.83, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.08, 0.83])
 def test_a_killed_run_ends_as_an_uninterrupted_one(kitti: Path, whole: Path, tmp_path: Path, share: float) -> None:
     size = int(share * _size(whole / "log.mcap"))
     _resumed_as_whole(kitti, whole, _killed(kitti, tmp_path / "run", log_bytes=size))

@@ -65,12 +65,25 @@ class Command:
 
 
 def kill(pid: int, victim: str, rng: random.Random) -> None:
-    """Kill a command (`main`), the process that it spawned (`front`), or that of KISS-ICP (`odometry`)."""
+    """Kill a command (`main`), the process that it spawned (`front`), or that of KISS-ICP (`odometry`).
+
+    A process that is being started again is waited for; if none comes, nothing is killed.
+    """
+    end = monotonic() + LIMIT_S
+    while len(pids := _with_spawned(pid)) < 2 and victim != "main":
+        if monotonic() > end:
+            return
+        sleep(0.05)
+    chosen = {"main": 0, "front": 1, "odometry": -1}[victim]
+    os.kill(pids[chosen], rng.choice(KILLS))
+
+
+def _with_spawned(pid: int) -> list[int]:
+    """A process, the one that it spawned, and so on."""
     pids = [pid]
     while children := _spawned(pids[-1]):
         pids.append(children[0])
-    chosen = {"main": pid, "front": pids[min(1, len(pids) - 1)], "odometry": pids[-1]}[victim]
-    os.kill(chosen, rng.choice(KILLS))
+    return pids
 
 
 def _spawned(pid: int) -> list[int]:

@@ -3,11 +3,13 @@
     python -m tools.benchmarks.fleet simulate POSES TOWNS [--frames N]
     python -m tools.benchmarks.fleet growth TOWNS OUT [--numbers 4,8,16,23] [--workers 1]
     python -m tools.benchmarks.fleet troubles TOWNS OUT [--number 4]
+    python -m tools.benchmarks.fleet search FLEET [--numbers 10000,100000,1000000]
 
 `simulate` writes 24 drives of six towns along KITTI's true poses, and each town in one drive. `growth` joins more and
 more of them, prints ATE beside that of the town mapped at once, CPU and wall time and peak memory of the largest
 process, and then adds one drive. `troubles` kills a worker in each step, the scheduler, and fills a disk; the result
-must have the same bytes as without trouble, and nothing finished may be done twice.
+must have the same bytes as without trouble, and nothing finished may be done twice. `search` measures the search for
+similar places with the signatures of a finished fleet, repeated.
 """
 
 import argparse
@@ -19,7 +21,10 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from tools.benchmarks.common import Row, markdown, parser, write_report
+from tools.benchmarks.fleet.search import search_costs
 from tools.benchmarks.fleet.towns import NUM_FRAMES, drives_in, write_list, write_towns
 from tools.benchmarks.fleet.troubles import troubles
 
@@ -39,6 +44,9 @@ def main() -> None:
         kind.add_argument("towns", type=Path)
         kind.add_argument("out", type=Path)
     kinds.choices["growth"].add_argument("--numbers", default="4,8,16,23")
+    search = kinds.add_parser("search")
+    search.add_argument("fleet", type=Path)
+    search.add_argument("--numbers", default="10000,100000,1000000")
     kinds.choices["growth"].add_argument("--workers", default="1")
     kinds.choices["troubles"].add_argument("--number", type=int, default=4)
     given = options.parse_args()
@@ -47,6 +55,9 @@ def main() -> None:
             print(name, flush=True)
     elif given.kind == "growth":
         _growth(given)
+    elif given.kind == "search":
+        signatures = np.concatenate([np.load(file) for file in sorted((given.fleet / "index").glob("*.npy"))])
+        print(markdown("Search", search_costs(signatures, list(map(int, given.numbers.split(","))))))
     else:
         given.out.mkdir(parents=True, exist_ok=True)
         rows = troubles(given.out, drives_in(given.towns)[: given.number])

@@ -207,7 +207,7 @@ def _up(reference: "Poses", *, camera: bool) -> tuple["Up", str]:
 
     found = upward_axis(reference)
     if found is not None:
-        return found, "the path lies across it"
+        return found, "the path is flattest along it"
     return ("-y", "as in KITTI's files; the path does not show it") if camera else ("z", "the path does not show it")
 
 

@@ -72,5 +72,9 @@ def lines(found: dict[str, Any]) -> str:
     for title, values in (("options", found["options"]), ("settings changed", found["changed_settings"])):
         text += [f"{title}: {'none' if not values else ''}".rstrip()]
         text += [f"  {key}={value}" for key, value in values.items()]
-    text += ["files:", *(f"{size / 1e6:10.2f} MB  {name}" for name, size in found["files"].items())]
+    text += ["files:", *(f"{_size(size):>10}  {name}" for name, size in found["files"].items())]
     return "\n".join(text)
+
+
+def _size(num_bytes: int) -> str:
+    return f"{num_bytes / 1e3:.1f} kB" if num_bytes < 1_000_000 else f"{num_bytes / 1e6:.1f} MB"

@@ -43,7 +43,7 @@ class BeforeAfter:
         self._whole = [_Density(whole) for _ in self._maps]
         self._loops = [pair for pair, weight in estimate.closure_weights.items() if weight >= TRUSTED]
         detail = most_changed(*self._maps, self._loops)
-        self._detail = [] if detail is None else [_Density(_detail(poses, detail)) for poses in self._maps]
+        self._detail = [] if detail is None else [_Density(window) for window in _details(self._maps, detail)]
 
     def add(self, keyframe: Keyframe) -> None:
         """Draw a keyframe into both maps."""
@@ -128,9 +128,9 @@ def _around(xy: np.ndarray, margin_m: float) -> Window:
     return float(west), float(east), float(south), float(north)
 
 
-def _detail(poses: Mapping[int, Transform], loop: tuple[int, int]) -> Window:
-    """A window around both ends of a loop, twice as wide as high."""
-    ends = np.array([poses[keyframe_id][:2, 3] for keyframe_id in loop])
-    (x, y), apart_m = ends.mean(axis=0), float(np.linalg.norm(ends[0] - ends[1]))
+def _details(maps: Iterable[Mapping[int, Transform]], loop: tuple[int, int]) -> list[Window]:
+    """A window of each map around both ends of a loop; all have one size, so that the panels have one scale."""
+    ends = np.array([[poses[keyframe_id][:2, 3] for keyframe_id in loop] for poses in maps])
+    apart_m = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max())
     half_m = DETAIL_M + min(apart_m, DETAIL_M)
-    return x - half_m, x + half_m, y - half_m / 1.6, y + half_m / 1.6
+    return [(x - half_m, x + half_m, y - half_m / 1.6, y + half_m / 1.6) for x, y in ends.mean(axis=1)]

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from segslam import geometry
 from segslam.config import MapConfig
 from segslam.map import MapSummary, write_map
-from segslam.map.before_after import BeforeAfter, most_changed
+from segslam.map.before_after import BeforeAfter, _details, most_changed
 from segslam.map.free_ranges import NUM_DIRECTIONS, free_range_m
 from segslam.map.from_above import LEAST_PX, LEGEND_PX, PATH, round_length_m
 from segslam.map.picture import MARGIN_M
@@ -134,6 +134,14 @@ def test_the_map_by_odometry_is_smeared_and_the_corrected_one_is_not(tmp_path: P
     lit = [(half > 0.15).mean() for half in np.array_split(picture[40:], 2, axis=1)]
     assert lit[0] > 1.15 * lit[1] > 0.01  # walls twice; paths once
     assert most_changed({k.id: k.T_odom_keyframe for k in yard}, poses, [(1, 0), (4, 0)]) == (4, 0)
+
+
+def test_the_details_before_and_after_have_one_size() -> None:
+    before = {0: np.eye(4), 1: geometry.transform(np.eye(3), [20.0, 0.0, 0.0])}
+    after = {0: np.eye(4), 1: geometry.transform(np.eye(3), [1.0, 5.0, 0.0])}
+    windows = np.array(_details((before, after), (1, 0)))
+    np.testing.assert_allclose(windows[:, 1::2] - windows[:, ::2], [[100.0, 62.5]] * 2)
+    np.testing.assert_allclose(windows.reshape(2, 2, 2).mean(axis=2), [[10.0, 0.0], [0.5, 2.5]])
 
 
 @pytest.mark.parametrize(("longest_m", "length_m"), [(31.0, 20.0), (50.0, 50.0), (0.3, 0.2), (199.0, 100.0)])

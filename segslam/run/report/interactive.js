@@ -17,7 +17,7 @@
   const axis = { zeroline: false, automargin: true };
   const layout = (more) => ({
     margin: { l: 50, r: 10, t: 40, b: 40 }, hovermode: "closest", dragmode: "pan", font: { size: 13 },
-    legend: { orientation: "h", y: 1.02, yanchor: "bottom" },
+    legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, modebar: { orientation: "v" },
     xaxis: { ...axis, title: { text: "x (m)" } },
     yaxis: { ...axis, title: { text: "y (m)" }, scaleanchor: "x" }, ...more,
   });

@@ -92,18 +92,39 @@ def test_the_example_that_scores_agrees_with_the_known_error(
     assert float(ate) == pytest.approx(1.30, abs=0.005)  # as the data's description has it
 
 
+def _code_cells() -> list[dict[str, Any]]:
+    cells = json.loads((ROOT / "docs" / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]
+    return [cell for cell in cells if cell["cell_type"] == "code"]
+
+
+def test_the_notebook_has_the_outputs_of_its_cells_in_order() -> None:
+    cells = _code_cells()
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    kinds = {kind for cell in cells for output in cell["outputs"] for kind in output.get("data", {})}
+    assert {"image/png", "text/html"} <= kinds
+    assert not [output for cell in cells for output in cell["outputs"] if output["output_type"] == "error"]
+    assert (ROOT / "docs" / "tutorial.ipynb").stat().st_size < 600_000
+
+
 @pytest.mark.slow
-def test_the_notebook_maps_and_registers_simulated_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.data
+def test_the_notebook_gives_the_errors_that_it_shows(
+    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SEGSLAM_DATA", str(data_dir.resolve()))
     matplotlib.use("Agg")
     names: dict[str, Any] = {}
-    for cell in json.loads((ROOT / "docs" / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]:
-        if cell["cell_type"] == "code":
-            exec(compile("".join(cell["source"]), cell["id"], "exec"), names)  # as a kernel does
+    cells = _code_cells()
+    for cell in cells:
+        exec(compile("".join(cell["source"]), cell["id"], "exec"), names)  # as a kernel does
     plt.close("all")
-    assert names["errors"]["ate_m"] < 0.3
-    assert names["found"]
-    assert names["off_m"] < 0.3
+    shown = "".join("".join(output.get("text", [])) for cell in cells for output in cell["outputs"])
+    for name in ("kiss_icp_ate_m", "odometry_ate_m", "ate_m"):
+        [figure] = re.findall(rf"(?m)^{name} +(\S+)$", shown)
+        assert names["run"].metrics[name] == pytest.approx(float(figure), abs=0.02), name
+    [off_m] = re.findall(r"the pose is (\S+) m off", shown)
+    assert names["off_m"] == pytest.approx(float(off_m), abs=0.05)
 
 
 def test_the_site_lists_the_commands_in_the_groups_and_order_of_the_help() -> None:

@@ -9,7 +9,7 @@ from segslam.cli.checks import check_links
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
 from segslam.cli.evaluate_folder import score_folders
 from segslam.cli.overwriting import OverwriteOption, check_free
-from segslam.cli.tables import CsvOption, LatexOption, as_text, write_tables
+from segslam.cli.tables import CsvOption, LatexOption, as_text, figure, write_tables
 
 if TYPE_CHECKING:
     from segslam.evaluation import Up
@@ -103,7 +103,7 @@ def table(figures: dict[str, Any]) -> str:
     from segslam.scores import MEANINGS
 
     meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
-    return "\n".join(f"{figures[key]:10.4g}  {meaning}" for key, meaning in meanings.items() if key in figures)
+    return "\n".join(f"{figure(figures[key]):>10}  {meaning}" for key, meaning in meanings.items() if key in figures)
 
 
 class _How(NamedTuple):

@@ -32,6 +32,11 @@ Rows = Mapping[str, Mapping[str, Any]]
 """Name -> figures."""
 
 
+def figure(value: float) -> str:
+    """Whole numbers in full, others with four digits."""
+    return str(value) if isinstance(value, int) else f"{value:.4g}"
+
+
 def write_tables(rows: Rows, *, csv_file: Path | None, latex_file: Path | None) -> None:
     """Write the files that are given: CSV has all numbers in full, LaTeX the columns for people."""
     if csv_file is not None:

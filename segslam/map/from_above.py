@@ -3,17 +3,21 @@
 import io
 import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from PIL import Image
 
 from segslam.map.part import Window
 from segslam.types import Points
 
 DPI = 100
 PATH = "#d62728"
+SMALL_PX = 1500
+"""Chosen: a little more than the width of the report."""
 LEGEND_PX, LEAST_PX = 190, 700
 """Chosen: width of the legend, and smallest width of the map."""
 
@@ -62,6 +66,18 @@ def draw_path(axes: Axes, path_m: Points | Sequence[Points], *, color: str, widt
     xy = np.asarray(path_m)[:, :2]
     axes.plot(*xy.T, color=color, linewidth=width, solid_joinstyle="round")
     axes.plot(*xy[0], "o", color=color, markersize=3 + 2 * width, markeredgecolor="white", markeredgewidth=0.8)
+
+
+def small_png(file: Path) -> bytes:
+    """A PNG file, reduced to `SMALL_PX` along its longer side if it is larger."""
+    with Image.open(file) as image:
+        if max(image.size) <= SMALL_PX:
+            return file.read_bytes()
+        small = image.convert("RGB")
+        small.thumbnail((SMALL_PX, SMALL_PX))
+        content = io.BytesIO()
+        small.save(content, format="png")
+        return content.getvalue()
 
 
 def png(figure: Figure) -> bytes:

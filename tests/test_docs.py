@@ -15,12 +15,15 @@ import pytest
 from helpers.commands import all_commands
 from helpers.drives import round_drive, write_kitti_sequence
 from helpers.finished_run import make_run
+from helpers.gnss_drive import write_fixes
+from helpers.sessions import write_day
 from typer.main import get_command
 
 import segslam
 from segslam import cli
 from segslam.cli import commands
 from segslam.config import Config
+from segslam.datasets import open_dataset
 from segslam.trajectory import read_poses
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -125,6 +128,30 @@ def test_the_notebook_gives_the_errors_that_it_shows(
         assert names["run"].metrics[name] == pytest.approx(float(figure), abs=0.02), name
     [off_m] = re.findall(r"the pose is (\S+) m off", shown)
     assert names["off_m"] == pytest.approx(float(off_m), abs=0.05)
+
+
+@pytest.mark.slow
+def test_the_examples_of_the_public_names_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monday = write_day(tmp_path / "monday", day=0, first=0, num_scans=22)
+    write_day(tmp_path / "tuesday", day=1, first=6, num_scans=22)
+    truth = open_dataset(monday).reference
+    assert truth is not None
+    write_fixes(tmp_path / "fixes.csv", truth.stamp_ns, truth.T_world_lidar)
+    monkeypatch.chdir(tmp_path)
+    names = runpy.run_path(str(EXAMPLES / "api.py"))
+    assert names["found"].ok
+    assert not names["nothing"].ok
+    assert isinstance(names["pose"], segslam.Located)
+    assert names["second"].metrics["localised_percent"] > 50
+    assert names["both"].metrics["num_loops_between"] > 0
+    assert names["figures"]["ate_m"] < 0.5
+    assert (tmp_path / "map.png").is_file()
+
+
+def test_every_public_name_has_an_example() -> None:
+    examples = runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))["api_examples"]()
+    assert set(examples) == set(segslam.__all__)
+    assert all("segslam." in text or name == "Located" for name, text in examples.items())
 
 
 def test_the_site_lists_the_commands_in_the_groups_and_order_of_the_help() -> None:

@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from helpers.commands import all_commands
+from helpers.commands import all_commands, run
 from helpers.drives import round_drive, write_kitti_sequence
 from helpers.finished_run import make_run
 from helpers.gnss_drive import write_fixes
@@ -146,6 +147,18 @@ def test_the_examples_of_the_public_names_run(tmp_path: Path, monkeypatch: pytes
     assert names["both"].metrics["num_loops_between"] > 0
     assert names["figures"]["ate_m"] < 0.5
     assert (tmp_path / "map.png").is_file()
+
+
+@pytest.mark.data
+def test_the_table_of_the_page_about_kitti_is_the_output_of_its_command(
+    data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("00", "05", "07"):
+        shutil.copy(data_dir / "trajectories" / f"simple_online_{name}.txt", tmp_path / f"{name}.txt")
+    assert run("eval", "--estimate", tmp_path, "--reference", data_dir / "kitti" / "poses") == 0
+    page = (ROOT / "docs" / "kitti.md").read_text(encoding="utf-8")
+    shown = capsys.readouterr().out.strip("\n").splitlines()
+    assert "\n".join(f"    {line}" for line in shown) in page
 
 
 def test_every_public_name_has_an_example() -> None:

@@ -1,5 +1,6 @@
 """`segslam eval`."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -75,13 +76,15 @@ def evaluate(
         rows = {run.resolve().name: figures}
     elif run is None and estimate is not None and reference is not None:
 
-        def score(made: Path, true: Path) -> dict[str, Any]:
+        def score(made: Path, true: Path, *, quiet: bool = quiet) -> dict[str, Any]:
             return _score_files(made, true, format, up, max_difference, plot, how, quiet=quiet)
 
         if estimate.is_dir():
             if plot is not None:
                 raise SegslamError("--plot: draws one drive; give two files")
-            rows = score_folders(estimate, reference, score)
+            rows = score_folders(estimate, reference, partial(score, quiet=True))
+            axes = ", ".join(sorted({str(row["up"]) for row in rows.values() if "up" in row}))
+            say(f"{reference}: upward axis {axes}" + ("" if up else "; for another: --up"), quiet=quiet)
             figures = {"drives": rows}
         else:
             figures = score(estimate, reference)

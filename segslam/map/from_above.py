@@ -28,18 +28,30 @@ def drawn_map(
     """A PNG of a map in top view: an image (rows, columns, 3), a path, a scale bar, and a legend beside it."""
     height, width = image.shape[:2]
     zoom = max(1.0, LEAST_PX / width)
-    share = zoom * width / (zoom * width + LEGEND_PX)
-    figure = Figure(figsize=((zoom * width + LEGEND_PX) / DPI, zoom * height / DPI), facecolor="white")
+    large = max(1.0, zoom * width / SMALL_PX)  # text stays readable in a reduced picture
+    share = zoom * width / (zoom * width + large * LEGEND_PX)
+    figure = Figure(figsize=((zoom * width + large * LEGEND_PX) / DPI, zoom * height / DPI), facecolor="white")
     axes, legend = (figure.add_axes(place) for place in ((0.0, 0.0, share, 1.0), (share, 0.0, 1.0 - share, 1.0)))
     axes.imshow(image, extent=window, interpolation="nearest", aspect="auto")
-    draw_path(axes, path_m, color=PATH, width=1.5)
-    scale_bar(axes, window[1] - window[0], color="black")
+    draw_path(axes, path_m, color=PATH, width=1.5 * large)
+    scale_bar(axes, window[1] - window[0], color="black", size=11.0 * large)
     axes.set(xlim=window[:2], ylim=window[2:])
     axes.axis("off")
     legend.axis("off")
-    handles = [Line2D([], [], color=color, marker="s", linestyle="", label=text) for text, color in marks]
+    handles = [
+        Line2D([], [], color=color, marker="s", linestyle="", label=text, markersize=6 * large) for text, color in marks
+    ]
     handles.insert(0, Line2D([], [], color=PATH, label="trajectory"))
-    legend.legend(handles=handles, title=title, loc="upper left", frameon=False, fontsize=10, alignment="left")
+    size = 10.0 * large
+    legend.legend(
+        handles=handles,
+        title=title,
+        loc="upper left",
+        frameon=False,
+        fontsize=size,
+        title_fontsize=size,
+        alignment="left",
+    )
     return png(figure)
 
 

@@ -81,12 +81,14 @@ class VerticalAngle:
 
 
 def vertical_angle_advice(metrics: Mapping[str, Any], sensor: SensorCalibrationConfig) -> str:
-    """A line about the vertical angle of a run, with the setting that corrects it; empty if not significant."""
+    """A line about the vertical angle of a run: its correction, or the setting for it; empty if not significant."""
     if "vertical_deg" not in metrics:
         return ""
     found = VerticalAngle(metrics["vertical_deg"], metrics["vertical_sigma_deg"], MIN_PAIRS)
     if not found.is_significant:
         return ""
+    if metrics.get("vertical_correction_deg"):
+        return f"{described(found)}; the adjustment and the map are corrected by it"
     total_deg = found.angle_deg + (sensor.vertical_angle_deg or 0.0)
     return f"{described(found)}; map again with --set sensor.vertical_angle_deg={total_deg:.2f}"
 

@@ -129,6 +129,11 @@ def test_scans_of_one_place_do_not_determine_the_angle() -> None:
             0.205,
             "beams point 0.10 +- 0.02 degrees high; map again with --set sensor.vertical_angle_deg=0.10",
         ),
+        (
+            {"vertical_deg": 0.14, "vertical_sigma_deg": 0.03, "vertical_correction_deg": 0.14},
+            None,
+            "beams point 0.14 +- 0.03 degrees low; the adjustment and the map are corrected by it",
+        ),
     ],
 )
 def test_only_a_significant_angle_is_reported_with_the_setting_that_corrects_it(

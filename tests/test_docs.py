@@ -3,6 +3,7 @@
 import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,15 +13,18 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from helpers.commands import all_commands
+from helpers.commands import all_commands, run
 from helpers.drives import round_drive, write_kitti_sequence
 from helpers.finished_run import make_run
+from helpers.gnss_drive import write_fixes
+from helpers.sessions import write_day
 from typer.main import get_command
 
 import segslam
 from segslam import cli
 from segslam.cli import commands
 from segslam.config import Config
+from segslam.datasets import open_dataset
 from segslam.trajectory import read_poses
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -92,18 +96,75 @@ def test_the_example_that_scores_agrees_with_the_known_error(
     assert float(ate) == pytest.approx(1.30, abs=0.005)  # as the data's description has it
 
 
+def _code_cells() -> list[dict[str, Any]]:
+    cells = json.loads((ROOT / "docs" / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]
+    return [cell for cell in cells if cell["cell_type"] == "code"]
+
+
+def test_the_notebook_has_the_outputs_of_its_cells_in_order() -> None:
+    cells = _code_cells()
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    kinds = {kind for cell in cells for output in cell["outputs"] for kind in output.get("data", {})}
+    assert {"image/png", "text/html"} <= kinds
+    assert not [output for cell in cells for output in cell["outputs"] if output["output_type"] == "error"]
+    assert (ROOT / "docs" / "tutorial.ipynb").stat().st_size < 600_000
+
+
 @pytest.mark.slow
-def test_the_notebook_maps_and_registers_simulated_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.data
+def test_the_notebook_gives_the_errors_that_it_shows(
+    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SEGSLAM_DATA", str(data_dir.resolve()))
     matplotlib.use("Agg")
     names: dict[str, Any] = {}
-    for cell in json.loads((ROOT / "docs" / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]:
-        if cell["cell_type"] == "code":
-            exec(compile("".join(cell["source"]), cell["id"], "exec"), names)  # as a kernel does
+    cells = _code_cells()
+    for cell in cells:
+        exec(compile("".join(cell["source"]), cell["id"], "exec"), names)  # as a kernel does
     plt.close("all")
-    assert names["errors"]["ate_m"] < 0.3
-    assert names["found"]
-    assert names["off_m"] < 0.3
+    shown = "".join("".join(output.get("text", [])) for cell in cells for output in cell["outputs"])
+    for name in ("kiss_icp_ate_m", "odometry_ate_m", "ate_m"):
+        [figure] = re.findall(rf"(?m)^{name} +(\S+)$", shown)
+        assert names["run"].metrics[name] == pytest.approx(float(figure), abs=0.02), name
+    [off_m] = re.findall(r"the pose is (\S+) m off", shown)
+    assert names["off_m"] == pytest.approx(float(off_m), abs=0.05)
+
+
+@pytest.mark.slow
+def test_the_examples_of_the_public_names_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monday = write_day(tmp_path / "monday", day=0, first=0, num_scans=22)
+    write_day(tmp_path / "tuesday", day=1, first=6, num_scans=22)
+    truth = open_dataset(monday).reference
+    assert truth is not None
+    write_fixes(tmp_path / "fixes.csv", truth.stamp_ns, truth.T_world_lidar)
+    monkeypatch.chdir(tmp_path)
+    names = runpy.run_path(str(EXAMPLES / "api.py"))
+    assert names["found"].ok
+    assert not names["nothing"].ok
+    assert isinstance(names["pose"], segslam.Located)
+    assert names["second"].metrics["localised_percent"] > 50
+    assert names["both"].metrics["num_loops_between"] > 0
+    assert names["figures"]["ate_m"] < 0.5
+    assert (tmp_path / "map.png").is_file()
+
+
+@pytest.mark.data
+def test_the_table_of_the_page_about_kitti_is_the_output_of_its_command(
+    data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("00", "05", "07"):
+        shutil.copy(data_dir / "trajectories" / f"simple_online_{name}.txt", tmp_path / f"{name}.txt")
+    assert run("eval", "--estimate", tmp_path, "--reference", data_dir / "kitti" / "poses") == 0
+    page = (ROOT / "docs" / "kitti.md").read_text(encoding="utf-8")
+    shown = capsys.readouterr().out.strip("\n").splitlines()
+    assert "\n".join(f"    {line}" for line in shown) in page
+
+
+def test_every_public_name_has_an_example() -> None:
+    examples = runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))["api_examples"]()
+    assert set(examples) == set(segslam.__all__)
+    assert all("segslam." in text or name == "Located" for name, text in examples.items())
 
 
 def test_the_site_lists_the_commands_in_the_groups_and_order_of_the_help() -> None:

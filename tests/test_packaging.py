@@ -1,11 +1,14 @@
 """A wheel built from the sources, installed into a bare environment, works there."""
 
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -14,6 +17,21 @@ def _run(*words: object, folder: Path) -> str:
     done = subprocess.run([str(word) for word in words], cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout + done.stderr
+
+
+def test_the_conda_recipe_has_the_version_and_the_dependencies_of_the_project() -> None:
+    whole = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    project = whole["project"]
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe" / "recipe.yaml").read_text())
+    assert (recipe["package"]["version"], recipe["about"]["summary"]) == (project["version"], project["description"])
+    python, *dependencies = recipe["requirements"]["run"]
+    assert python == f"python {project['requires-python']}"
+    assert [text.replace(" ", "") for text in dependencies] == project["dependencies"]
+    assert all(re.fullmatch(r"[\w-]+ \S+", text) for text in dependencies)
+    built = [text.replace(" ", "") for text in recipe["requirements"]["host"]]
+    assert set(whole["build-system"]["requires"]) <= set(built)
+    [(name, target)] = project["scripts"].items()
+    assert recipe["build"]["python"]["entry_points"] == [f"{name} = {target}"]
 
 
 @pytest.mark.slow

@@ -10,8 +10,15 @@ import segslam
 from segslam import cli
 from segslam.cli import commands
 
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples" / "api.py"
 BENCH_GROUP = "Paper"
 RECORDS = "segslam.types"
+INTRODUCTION = """# Python
+
+`import segslam` gives these names. Each has an example; together they are
+one program, [api.py](examples/api.py), in which later examples use the
+results of earlier ones. It is run by a test.
+"""
 CONFIG = """All settings, by section, frozen: `segslam.Config()` has the defaults,
 `segslam.load_config(path, overrides)` changes some of them. [Every setting](options.md) has a page of its own."""
 
@@ -43,21 +50,30 @@ def commands_page() -> str:
 
 def api_page() -> str:
     """Public functions and classes, and the records of `segslam.types`."""
-    parts = ["# Python\n\n`import segslam` gives these names.\n"]
-    for name in segslam.__all__:
+    parts = [INTRODUCTION]
+    examples = api_examples()
+    for name in examples:
         made = getattr(segslam, name)
         if not hasattr(made, "__doc__") or not callable(made):
             continue
         if name == "Config":
-            parts.append(f"## Config\n\n{CONFIG}\n")
+            parts.append(f"## Config\n\n{CONFIG}\n\n{examples[name]}\n")
             continue
         kind = "autoclass" if inspect.isclass(made) else "autofunction"
         target = f"{made.__module__}.{made.__qualname__}"
         members = "\n:members:" if kind == "autoclass" else ""
-        parts.append(f"## {name}\n\n```{{eval-rst}}\n.. {kind}:: {target}{_indented(members)}\n```\n")
+        reference = f"```{{eval-rst}}\n.. {kind}:: {target}{_indented(members)}\n```"
+        parts.append(f"## {name}\n\n{reference}\n\n{examples[name]}\n")
     parts.append("## Records\n\nStages exchange these frozen records.\n")
     parts.append(f"```{{eval-rst}}\n.. automodule:: {RECORDS}\n   :members:\n   :noindex:\n```\n")
     return "\n".join(parts)
+
+
+def api_examples() -> dict[str, str]:
+    """Name -> its example as a code block, in the order of `docs/examples/api.py`."""
+    _, *sections = EXAMPLES.read_text(encoding="utf-8").split("\n# %% ")
+    named = [section.partition("\n") for section in sections]
+    return {name: f"```python\n{code.strip()}\n```" for name, _, code in named}
 
 
 def _indented(text: str) -> str:

@@ -8,7 +8,7 @@ import typer
 from segslam.cli.checks import check_exists
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
 from segslam.cli.overwriting import OverwriteOption, check_free
-from segslam.cli.tables import CsvOption, LatexOption, write_tables
+from segslam.cli.tables import CsvOption, LatexOption, figure, write_tables
 from segslam.errors import SegslamError
 
 COLUMN = 14
@@ -68,6 +68,6 @@ def table(figures: dict[str, dict[str, Any]]) -> str:
     for key, meaning in FIGURES.items():
         values = [run.get(key) for run in figures.values()]
         if any(value is not None for value in values):
-            cells = ("-" if value is None else f"{value:.4g}" for value in values)
+            cells = ("-" if value is None else figure(value) for value in values)
             lines.append("".join(f"{cell:>{width}}" for cell in cells) + f"  {meaning}")
     return "\n".join(lines)

@@ -56,8 +56,7 @@ RefineMinutesOption = Annotated[
     typer.Option(
         "--refine-minutes",
         metavar="MINUTES",
-        help="Time limit of the adjustment of the whole map after the loops; 0: no adjustment.",
-        show_default="60",
+        help="Time limit of the adjustment of the whole map after the loops; 60 by default, 0: no adjustment.",
     ),
 ]
 DatasetOption = Annotated[

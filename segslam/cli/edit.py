@@ -1,13 +1,23 @@
 """`segslam edit`."""
 
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from segslam.cli.checks import check_exists
-from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, say
+from segslam.cli.console import (
+    ConfigOption,
+    JsonOption,
+    QuietOption,
+    RefineMinutesOption,
+    SetOption,
+    announce,
+    say,
+    with_minutes,
+)
 from segslam.cli.overwriting import OverwriteOption
 from segslam.cli.replay import replay_log
 from segslam.errors import SegslamError
@@ -32,6 +42,7 @@ def edit(
     ] = None,
     config: ConfigOption = None,
     settings: SetOption = None,
+    refine_minutes: RefineMinutesOption = None,
     overwrite: OverwriteOption = False,
     json: JsonOption = False,
     quiet: QuietOption = False,
@@ -48,7 +59,7 @@ def edit(
     if edits == LoopEdits():
         raise SegslamError("nothing to edit: give --forbid I:J or --add I:J")
     announce(f"edit: reading {run}", quiet=quiet)
-    _check_keyframes(run, edits)
+    _check_keyframes(run, edits, quiet=quiet)
 
     def after(result: "SlamResult") -> Mapping[str, Any]:
         outcomes = _outcomes(result)
@@ -61,7 +72,7 @@ def edit(
         run,
         out,
         config=config,
-        settings=settings or [],
+        settings=with_minutes(settings, refine_minutes),
         edits=edits,
         after=after,
         overwrite=overwrite,
@@ -70,8 +81,11 @@ def edit(
     )
 
 
-def _check_keyframes(run: Path, edits: LoopEdits) -> None:
-    """Raises SegslamError for a keyframe that the run does not have, and for a run localised in a map."""
+def _check_keyframes(run: Path, edits: LoopEdits, *, quiet: bool) -> None:
+    """Raises SegslamError for a keyframe that the run does not have, and for a run localised in a map.
+
+    A pair that is forbidden but was never tried is reported: it may be a mistyped id.
+    """
     from segslam.log import read_log
     from segslam.run.folder import log_of
 
@@ -82,6 +96,15 @@ def _check_keyframes(run: Path, edits: LoopEdits) -> None:
     for newer, older in sorted(edits.forbidden | edits.added):
         if newer >= num:
             raise SegslamError(f"{newer}:{older}: {run} has keyframes 0 to {num - 1}; the report shows their ids")
+    attempts = chain(
+        (attempt for step in recorded.steps(clouds=False) for attempt in step.attempts), recorded.late_loops()
+    )
+    tried = {(attempt.candidate.source_id, attempt.candidate.target_id) for attempt in attempts}
+    for newer, older in sorted(edits.forbidden - tried):
+        say(
+            f"{newer}:{older}: {run} has not tried this loop; forbidden all the same (loops.csv has the ids)",
+            quiet=quiet,
+        )
 
 
 def _outcomes(result: "SlamResult") -> dict[Pair, str]:

@@ -122,7 +122,10 @@ def _length(metrics: dict[str, Any]) -> list[str]:
 def _ends(metrics: dict[str, Any], folder: Path) -> list[str]:
     """Lines about the results, and the command that comes next."""
     where = shlex.quote(str(folder))
-    follows = f"segslam export {where} {shlex.quote(str(folder / 'map.ply'))}"
+    map_file = folder / "map.ply"
+    follows = f"segslam locate {where} SCAN"
+    if not map_file.exists():
+        follows = f"segslam export {where} {shlex.quote(str(map_file))}"
     if "ate_m" not in metrics:
         follows = f"segslam eval {where} --reference POSES.txt"
     return [

@@ -1,5 +1,6 @@
 """`segslam eval`."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -9,7 +10,7 @@ from segslam.cli.checks import check_links
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
 from segslam.cli.evaluate_folder import score_folders
 from segslam.cli.overwriting import OverwriteOption, check_free
-from segslam.cli.tables import CsvOption, LatexOption, as_text, write_tables
+from segslam.cli.tables import CsvOption, LatexOption, as_text, figure, write_tables
 
 if TYPE_CHECKING:
     from segslam.evaluation import Up
@@ -75,13 +76,15 @@ def evaluate(
         rows = {run.resolve().name: figures}
     elif run is None and estimate is not None and reference is not None:
 
-        def score(made: Path, true: Path) -> dict[str, Any]:
+        def score(made: Path, true: Path, *, quiet: bool = quiet) -> dict[str, Any]:
             return _score_files(made, true, format, up, max_difference, plot, how, quiet=quiet)
 
         if estimate.is_dir():
             if plot is not None:
                 raise SegslamError("--plot: draws one drive; give two files")
-            rows = score_folders(estimate, reference, score)
+            rows = score_folders(estimate, reference, partial(score, quiet=True))
+            axes = ", ".join(sorted({str(row["up"]) for row in rows.values() if "up" in row}))
+            say(f"{reference}: upward axis {axes}" + ("" if up else "; for another: --up"), quiet=quiet)
             figures = {"drives": rows}
         else:
             figures = score(estimate, reference)
@@ -103,7 +106,7 @@ def table(figures: dict[str, Any]) -> str:
     from segslam.scores import MEANINGS
 
     meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
-    return "\n".join(f"{figures[key]:10.4g}  {meaning}" for key, meaning in meanings.items() if key in figures)
+    return "\n".join(f"{figure(figures[key]):>10}  {meaning}" for key, meaning in meanings.items() if key in figures)
 
 
 class _How(NamedTuple):
@@ -207,7 +210,7 @@ def _up(reference: "Poses", *, camera: bool) -> tuple["Up", str]:
 
     found = upward_axis(reference)
     if found is not None:
-        return found, "the path lies across it"
+        return found, "the path is flattest along it"
     return ("-y", "as in KITTI's files; the path does not show it") if camera else ("z", "the path does not show it")
 
 

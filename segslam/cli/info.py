@@ -7,6 +7,7 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out
+from segslam.cli.tables import figure
 
 if TYPE_CHECKING:
     from segslam.log import RunLog
@@ -68,9 +69,13 @@ def lines(found: dict[str, Any]) -> str:
 
     then = f"; continue with: segslam resume {found['run']}" if found["state"] == "interrupted" else ""
     text = [f"{found['run']}: {found['data']}, {found['state']}, {found['num_steps']} scans in the log{then}"]
-    text += [f"{value:10.4g}  {FIGURES[key]}" for key, value in found["figures"].items()]
+    text += [f"{figure(value):>10}  {FIGURES[key]}" for key, value in found["figures"].items()]
     for title, values in (("options", found["options"]), ("settings changed", found["changed_settings"])):
         text += [f"{title}: {'none' if not values else ''}".rstrip()]
         text += [f"  {key}={value}" for key, value in values.items()]
-    text += ["files:", *(f"{size / 1e6:10.2f} MB  {name}" for name, size in found["files"].items())]
+    text += ["files:", *(f"{_size(size):>10}  {name}" for name, size in found["files"].items())]
     return "\n".join(text)
+
+
+def _size(num_bytes: int) -> str:
+    return f"{num_bytes / 1e3:.1f} kB" if num_bytes < 1_000_000 else f"{num_bytes / 1e6:.1f} MB"

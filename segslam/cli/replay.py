@@ -51,6 +51,8 @@ def replay(
 
     Example: segslam replay runs/00/log.mcap --out runs/00-strict --set verify.min_overlap=0.6
     """
+    check_exists(log, "give a run folder, or its log.mcap")
+    announce(f"replay: reading {log}", quiet=quiet)
     replay_log(
         log,
         out,
@@ -82,9 +84,7 @@ def replay_log(
     """
     from segslam.config import load_config
 
-    check_exists(log, "give a run folder, or its log.mcap")
     load_config(config, settings)  # reports a wrong setting before the log is read
-    announce(f"replay: reading {log}", quiet=quiet)
     from segslam.log import read_log
     from segslam.run.folder import copy_alone, log_of, new_folder
     from segslam.run.replay import check_settings

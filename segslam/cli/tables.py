@@ -15,21 +15,26 @@ LatexOption = Annotated[
     Path | None, typer.Option("--latex", help="Write the table to this file as a LaTeX tabular, a row for each.")
 ]
 SHORT = {
-    "ate_m": "ATE rms (m)",
+    "ate_m": "ATE (m)",
     "ate_mean_m": "mean (m)",
     "ate_median_m": "median (m)",
     "ate_max_m": "max (m)",
     "odometry_ate_m": "odometry (m)",
     "kiss_icp_ate_m": "KISS-ICP (m)",
     "rpe_over_distance_percent": "RPE (%)",
-    "kitti_translation_percent": "KITTI t (%)",
-    "kitti_rotation_deg_per_100m": "KITTI r (deg/100 m)",
+    "kitti_translation_percent": "t (%)",
+    "kitti_rotation_deg_per_100m": "r (deg/100 m)",
     "num_loops_accepted": "loops",
     "num_poses": "poses",
 }
 """Columns of a table for people: figures that at least one row has."""
 Rows = Mapping[str, Mapping[str, Any]]
 """Name -> figures."""
+
+
+def figure(value: float) -> str:
+    """Whole numbers in full, others with four digits."""
+    return str(value) if isinstance(value, int) else f"{value:.4g}"
 
 
 def write_tables(rows: Rows, *, csv_file: Path | None, latex_file: Path | None) -> None:
@@ -65,7 +70,7 @@ def as_text(rows: Rows) -> str:
     """The columns of `SHORT`, aligned."""
     columns = _columns(rows)
     width = max(map(len, rows), default=4)
-    widths = [max(len(SHORT[key]), 8) for key in columns]
+    widths = [max(len(SHORT[key]), 7) for key in columns]
     lines = [" " * width + "".join(f"  {SHORT[key]:>{w}}" for key, w in zip(columns, widths, strict=True))]
     for name, row in rows.items():
         cells = (f"  {_cell(row.get(key)):>{w}}" for key, w in zip(columns, widths, strict=True))

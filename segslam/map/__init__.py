@@ -98,7 +98,8 @@ def write_map(
         store = MapStore(scratch, config)
         for keyframe, T_world_keyframe in placed:
             store.add(keyframe, T_world_keyframe)
-        extent = store.extent()
+        has_picture = any(issubclass(KINDS[file.suffix.lower()], Picture) for file in files)
+        extent = store.extent(for_picture=has_picture)
         if extent is None:
             raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
         parts = show(store.parts(), store.num_tiles)

@@ -12,6 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from segslam import geometry
 from segslam.map.from_above import draw_path, png, scale_bar
+from segslam.map.overhead import cut_heights, visible
 from segslam.map.part import Window
 from segslam.points import within_range
 from segslam.types import GROUND_LABELS, GraphEstimate, Keyframe, Label, Points, Transform
@@ -33,27 +34,39 @@ BEFORE, AFTER, BACKGROUND = "#E69F00", "#56B4E9", "#10141a"
 class BeforeAfter:
     """Draws the figure from keyframes added one by one."""
 
-    def __init__(self, T_odom_keyframe: Mapping[int, Transform], estimate: GraphEstimate) -> None:
-        """Takes the poses of all keyframes by odometry, and the last estimate."""
+    def __init__(
+        self, T_odom_keyframe: Mapping[int, Transform], estimate: GraphEstimate, keyframes: Iterable[Keyframe] = ()
+    ) -> None:
+        """Takes the poses of all keyframes by odometry, and the last estimate.
+
+        `keyframes`: those whose points show where ceilings hang over the path, which are not drawn; see `overhead`.
+        """
         first = min(T_odom_keyframe)
         T_world_odom = estimate.T_world_keyframe[first] @ geometry.inverse(T_odom_keyframe[first])
         poses = {keyframe_id: T_world_odom @ T for keyframe_id, T in T_odom_keyframe.items()}
         self._maps = (poses, estimate.T_world_keyframe)
+        self._path_m = np.array([T[:3, 3] for _, T in sorted(estimate.T_world_keyframe.items())])
+        self._cut_m = cut_heights(self._path_m, (self._placed(keyframe) for keyframe in keyframes))
         whole = _around(np.array([T[:2, 3] for poses in self._maps for T in poses.values()]), REACH_M / 2)
         self._whole = [_Density(whole) for _ in self._maps]
         self._loops = [pair for pair, weight in estimate.closure_weights.items() if weight >= TRUSTED]
         detail = most_changed(*self._maps, self._loops)
-        self._detail = [] if detail is None else [_Density(_detail(poses, detail)) for poses in self._maps]
+        self._detail = [] if detail is None else [_Density(window) for window in _details(self._maps, detail)]
 
     def add(self, keyframe: Keyframe) -> None:
         """Draw a keyframe into both maps."""
         stands = ~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8)) & (keyframe.labels < Label.MOVING_CAR)
-        points = keyframe.points[stands & within_range(keyframe.points, 0.0, REACH_M)].astype(np.float64)
+        stands &= within_range(keyframe.points, 0.0, REACH_M)
+        stands &= visible(self._placed(keyframe), self._path_m, self._cut_m)
+        points = keyframe.points[stands].astype(np.float64)
         for number, poses in enumerate(self._maps):
             placed = geometry.apply(poses[keyframe.id], points)
             for panels in (self._whole, self._detail):
                 if panels:
                     panels[number].add(placed)
+
+    def _placed(self, keyframe: Keyframe) -> Points:
+        return geometry.apply(self._maps[1][keyframe.id], keyframe.points.astype(np.float64))
 
     def draw(self) -> bytes:
         """The figure as a PNG: the whole maps above, the detail of the largest change below, if there are closures."""
@@ -128,9 +141,9 @@ def _around(xy: np.ndarray, margin_m: float) -> Window:
     return float(west), float(east), float(south), float(north)
 
 
-def _detail(poses: Mapping[int, Transform], loop: tuple[int, int]) -> Window:
-    """A window around both ends of a loop, twice as wide as high."""
-    ends = np.array([poses[keyframe_id][:2, 3] for keyframe_id in loop])
-    (x, y), apart_m = ends.mean(axis=0), float(np.linalg.norm(ends[0] - ends[1]))
+def _details(maps: Iterable[Mapping[int, Transform]], loop: tuple[int, int]) -> list[Window]:
+    """A window of each map around both ends of a loop; all have one size, so that the panels have one scale."""
+    ends = np.array([[poses[keyframe_id][:2, 3] for keyframe_id in loop] for poses in maps])
+    apart_m = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max())
     half_m = DETAIL_M + min(apart_m, DETAIL_M)
-    return x - half_m, x + half_m, y - half_m / 1.6, y + half_m / 1.6
+    return [(x - half_m, x + half_m, y - half_m / 1.6, y + half_m / 1.6) for x, y in ends.mean(axis=1)]

@@ -3,17 +3,21 @@
 import io
 import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from PIL import Image
 
 from segslam.map.part import Window
 from segslam.types import Points
 
 DPI = 100
 PATH = "#d62728"
+SMALL_PX = 1500
+"""Chosen: a little more than the width of the report."""
 LEGEND_PX, LEAST_PX = 190, 700
 """Chosen: width of the legend, and smallest width of the map."""
 
@@ -24,18 +28,30 @@ def drawn_map(
     """A PNG of a map in top view: an image (rows, columns, 3), a path, a scale bar, and a legend beside it."""
     height, width = image.shape[:2]
     zoom = max(1.0, LEAST_PX / width)
-    share = zoom * width / (zoom * width + LEGEND_PX)
-    figure = Figure(figsize=((zoom * width + LEGEND_PX) / DPI, zoom * height / DPI), facecolor="white")
+    large = max(1.0, zoom * width / SMALL_PX)  # text stays readable in a reduced picture
+    share = zoom * width / (zoom * width + large * LEGEND_PX)
+    figure = Figure(figsize=((zoom * width + large * LEGEND_PX) / DPI, zoom * height / DPI), facecolor="white")
     axes, legend = (figure.add_axes(place) for place in ((0.0, 0.0, share, 1.0), (share, 0.0, 1.0 - share, 1.0)))
     axes.imshow(image, extent=window, interpolation="nearest", aspect="auto")
-    draw_path(axes, path_m, color=PATH, width=1.5)
-    scale_bar(axes, window[1] - window[0], color="black")
+    draw_path(axes, path_m, color=PATH, width=1.5 * large)
+    scale_bar(axes, window[1] - window[0], color="black", size=11.0 * large)
     axes.set(xlim=window[:2], ylim=window[2:])
     axes.axis("off")
     legend.axis("off")
-    handles = [Line2D([], [], color=color, marker="s", linestyle="", label=text) for text, color in marks]
+    handles = [
+        Line2D([], [], color=color, marker="s", linestyle="", label=text, markersize=6 * large) for text, color in marks
+    ]
     handles.insert(0, Line2D([], [], color=PATH, label="trajectory"))
-    legend.legend(handles=handles, title=title, loc="upper left", frameon=False, fontsize=10, alignment="left")
+    size = 10.0 * large
+    legend.legend(
+        handles=handles,
+        title=title,
+        loc="upper left",
+        frameon=False,
+        fontsize=size,
+        title_fontsize=size,
+        alignment="left",
+    )
     return png(figure)
 
 
@@ -62,6 +78,18 @@ def draw_path(axes: Axes, path_m: Points | Sequence[Points], *, color: str, widt
     xy = np.asarray(path_m)[:, :2]
     axes.plot(*xy.T, color=color, linewidth=width, solid_joinstyle="round")
     axes.plot(*xy[0], "o", color=color, markersize=3 + 2 * width, markeredgecolor="white", markeredgewidth=0.8)
+
+
+def small_png(file: Path) -> bytes:
+    """A PNG file, reduced to `SMALL_PX` along its longer side if it is larger."""
+    with Image.open(file) as image:
+        if max(image.size) <= SMALL_PX:
+            return file.read_bytes()
+        small = image.convert("RGB")
+        small.thumbnail((SMALL_PX, SMALL_PX))
+        content = io.BytesIO()
+        small.save(content, format="png")
+        return content.getvalue()
 
 
 def png(figure: Figure) -> bytes:

@@ -31,6 +31,8 @@ class Extent:
     """Both ends of the colour scale, for heights or intensities."""
     free_ranges: FreeRanges
     """Free space observed by the keyframes."""
+    cut_m: Vector | None = None
+    """Heights (n,) of `overhead.cut_heights` for each position of the path; None if no picture is drawn."""
     origin: Origin | None = None
     """Place of the world frame (east, north, up) on the globe, if it is known."""
 

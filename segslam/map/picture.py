@@ -7,6 +7,7 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from segslam.config import MapConfig
 from segslam.map.colors import scale_of
+from segslam.map.overhead import visible
 from segslam.map.part import Extent, Part, Window
 from segslam.map.tiles import TILE_M, corner
 from segslam.semantics.class_colors import COLORS
@@ -24,7 +25,7 @@ RELIEF_M, CONTRAST = 1.5, 0.35
 
 
 class Picture:
-    """Top view with north (y) up; the highest point of a pixel is visible."""
+    """Top view with north (y) up; the highest point of a pixel is visible, below ceilings: see `overhead`."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._file = file
@@ -39,7 +40,11 @@ class Picture:
 
     def add(self, part: Part) -> None:
         """Draw a part into its area of the image."""
-        order = np.argsort(part.points[:, 2], kind="stable")  # the last assignment to a pixel remains
+        cut_m = self._extent.cut_m
+        seen = np.arange(len(part.points))
+        if cut_m is not None:
+            seen = seen[visible(part.points, self._extent.path_m, cut_m)]
+        order = seen[np.argsort(part.points[seen, 2], kind="stable")]  # the last assignment to a pixel remains
         inside = (part.points[order] - corner(part.tile))[:, :2] / TILE_M * self._pixels
         column, row = np.clip(inside.astype(np.int64), 0, self._pixels - 1).T
         top = (self._extent.north - part.tile[1]) * self._pixels
@@ -47,7 +52,7 @@ class Picture:
         square = np.s_[top : top + self._pixels, left : left + self._pixels]
         self._image[square][self._pixels - 1 - row, column] = part.colors[order]
         self._height_m[square][self._pixels - 1 - row, column] = part.points[order, 2]
-        self._labels |= set(np.unique(part.labels).tolist())
+        self._labels |= set(np.unique(part.labels[order]).tolist())
 
     def close(self) -> None:
         """Write the image."""

@@ -10,12 +10,13 @@ from segslam.config import MapConfig
 from segslam.map import colors
 from segslam.map.cleaning import moved
 from segslam.map.free_ranges import FreeRanges
+from segslam.map.overhead import BESIDE_M, cut_heights
 from segslam.map.part import Extent, Part
 from segslam.map.tiles import Tile, Tiles, corner, distance_m
 from segslam.map.views import Views
 from segslam.points import within_range
 from segslam.semantics.class_colors import Colors, of_classes
-from segslam.types import Keyframe, Label, Labels, SegslamError, Transform, Vector
+from segslam.types import Keyframe, Label, Labels, Points, SegslamError, Transform, Vector
 
 
 class MapStore:
@@ -65,8 +66,8 @@ class MapStore:
         self._T_keyframe_world.append(geometry.inverse(T_world_keyframe))
         self._places.append(T_world_keyframe[:3, 3])
 
-    def extent(self) -> Extent | None:
-        """Extent of the tiles that have voxels; None if there are none."""
+    def extent(self, *, for_picture: bool) -> Extent | None:
+        """Extent of the tiles that have voxels; None if there are none. Heights to cut are found for pictures only."""
         tiles = list(self._tiles)
         if not tiles:
             return None
@@ -82,7 +83,14 @@ class MapStore:
             path_m=path_m,
             span=self._span(),
             free_ranges=self._free_ranges,
+            cut_m=cut_heights(path_m, self._near_path()) if for_picture else None,
         )
+
+    def _near_path(self) -> Iterator[Points]:
+        """The voxels of each tile through which the path leads, in the world."""
+        for tile in self._tiles:
+            if any(distance_m(tile, place) < BESIDE_M for place in self._places):
+                yield self._tiles.voxels(tile)["point"] + corner(tile)
 
     def parts(self) -> Iterator[Part]:
         """The clean voxels of each tile, in the order that `MapFile` requires."""

@@ -52,6 +52,17 @@ def test_wrong_pairs_are_refused_in_one_line(log: Path, tmp_path: Path, capsys: 
     assert not (tmp_path / "no").exists()
 
 
+def test_forbidding_a_pair_that_is_no_loop_is_reported(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    newer, older = max(_closures(log))
+    arguments = ["--forbid", "1:0", "--forbid", f"{newer}:{older}", "--set", "adjustment.max_minutes=0"]
+    assert run("edit", log, *arguments, "--out", tmp_path / "edited") == 0
+    shown = capsys.readouterr().err
+    assert "1:0: " in shown
+    assert f"{newer}:{older}: " not in shown
+
+
 def test_info_shows_data_state_settings_and_files(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -67,7 +78,8 @@ def test_info_shows_data_state_settings_and_files(
     assert found["files"]["log.mcap"] == (out / "log.mcap").stat().st_size
     assert run("info", out) == 0
     shown = capsys.readouterr().out
-    for text in ("finished", "verify.min_overlap=0.25", "loops accepted", "log.mcap"):
+    size = f"{(out / 'config.yaml').stat().st_size / 1e3:.1f} kB  config.yaml"
+    for text in ("finished", "verify.min_overlap=0.25", "loops accepted", "log.mcap", size):
         assert text in shown
 
 

@@ -35,8 +35,11 @@ def test_two_folders_are_compared_drive_by_drive(
     table, latex = tmp_path / "all.csv", tmp_path / "all.tex"
     given = ["eval", "--estimate", estimates, "--reference", references, "--up", "z", "--csv", table, "--latex", latex]
     assert run(*given) == 0
-    shown = capsys.readouterr().out.splitlines()
+    out, err = capsys.readouterr()
+    shown = out.splitlines()
     assert [line.split()[0] for line in shown[1:]] == ["00", "02", "mean"]
+    assert max(map(len, shown)) <= 80
+    assert err.count("upward axis z") == 1
     rows = {row["name"]: row for row in csv.DictReader(table.read_text().splitlines())}
     expected = scores(ESTIMATE, TRUTH.T_world_lidar)
     for key in ("ate_m", "ate_mean_m", "ate_median_m", "ate_max_m"):

@@ -1,5 +1,6 @@
 """The map of a yard with known keyframes: kept points, removed points, and the content of the files."""
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +16,9 @@ from scipy.spatial import cKDTree
 from segslam import geometry
 from segslam.config import MapConfig
 from segslam.map import MapSummary, write_map
-from segslam.map.before_after import BeforeAfter, most_changed
+from segslam.map.before_after import BeforeAfter, _details, most_changed
 from segslam.map.free_ranges import NUM_DIRECTIONS, free_range_m
-from segslam.map.from_above import LEAST_PX, LEGEND_PX, PATH, round_length_m
+from segslam.map.from_above import LEAST_PX, LEGEND_PX, PATH, drawn_map, round_length_m
 from segslam.map.picture import MARGIN_M
 from segslam.semantics.class_colors import COLORS
 from segslam.types import GraphEstimate, Label, SegslamError
@@ -134,6 +135,28 @@ def test_the_map_by_odometry_is_smeared_and_the_corrected_one_is_not(tmp_path: P
     lit = [(half > 0.15).mean() for half in np.array_split(picture[40:], 2, axis=1)]
     assert lit[0] > 1.15 * lit[1] > 0.01  # walls twice; paths once
     assert most_changed({k.id: k.T_odom_keyframe for k in yard}, poses, [(1, 0), (4, 0)]) == (4, 0)
+
+
+def test_the_legend_of_a_large_map_grows_with_it() -> None:
+    pictures = []
+    for factor in (1, 3):
+        image = np.full((600 * factor, 1500 * factor, 3), 255, np.uint8)
+        png = drawn_map(
+            image, (0.0, 15.0, 0.0, 6.0), path_m=np.zeros((2, 3)), title="class", marks=[("car", "#000000")]
+        )
+        pictures.append(imread(io.BytesIO(png))[:, :, :3])
+    small, large = pictures
+    assert large.shape[1] == pytest.approx(3 * small.shape[1], abs=3)
+    dark = [(picture[:, int(0.9 * picture.shape[1]) :].mean(axis=2) < 0.5).mean() for picture in pictures]
+    assert dark[1] == pytest.approx(dark[0], rel=0.2)
+
+
+def test_the_details_before_and_after_have_one_size() -> None:
+    before = {0: np.eye(4), 1: geometry.transform(np.eye(3), [20.0, 0.0, 0.0])}
+    after = {0: np.eye(4), 1: geometry.transform(np.eye(3), [1.0, 5.0, 0.0])}
+    windows = np.array(_details((before, after), (1, 0)))
+    np.testing.assert_allclose(windows[:, 1::2] - windows[:, ::2], [[100.0, 62.5]] * 2)
+    np.testing.assert_allclose(windows.reshape(2, 2, 2).mean(axis=2), [[10.0, 0.0], [0.5, 2.5]])
 
 
 @pytest.mark.parametrize(("longest_m", "length_m"), [(31.0, 20.0), (50.0, 50.0), (0.3, 0.2), (199.0, 100.0)])

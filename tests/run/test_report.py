@@ -12,9 +12,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from helpers.finished_run import make_run
+from PIL import Image
 
 from segslam import cli, geometry
 from segslam.config import Config, load_config
+from segslam.map.from_above import small_png
 from segslam.run.accuracy import accuracy
 from segslam.run.finished import FIGURES, read_run
 from segslam.run.folder import write_alone, write_metrics
@@ -65,11 +67,19 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_map_from_above_is_on_the_page(scored: Path, tmp_path: Path) -> None:
     assert "Map in top view" not in scored.read_text()
     folder = shutil.copytree(scored.parent, tmp_path / "run")
-    (folder / "map.png").write_bytes(b"a picture")
+    Image.new("RGB", (300, 200)).save(folder / "map.png")
     html = write_report(folder).read_text()
     [data] = re.findall(r'alt="Map in top view" src="data:image/png;base64,([^"]*)">', html)
-    assert base64.b64decode(data) == b"a picture"
+    assert base64.b64decode(data) == (folder / "map.png").read_bytes()
     assert html.index("Map by odometry, and corrected") < html.index("Map in top view") < html.index("Trajectory, top")
+
+
+def test_a_large_map_is_reduced_on_the_page(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (2000, 3000, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "map.png")
+    (tmp_path / "small.png").write_bytes(small_png(tmp_path / "map.png"))
+    with Image.open(tmp_path / "small.png") as small:
+        assert small.size == (1500, 1000)
 
 
 def test_page_is_whole_and_loads_nothing(scored: Path) -> None:

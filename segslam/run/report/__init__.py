@@ -1,6 +1,6 @@
 """The report of a run: one HTML page with map, plots, figures and settings, without network access."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 
@@ -8,6 +8,7 @@ import matplotlib
 
 from segslam.log import read_log
 from segslam.map.before_after import BeforeAfter
+from segslam.map.from_above import small_png
 from segslam.run.finished import FinishedRun, read_run
 from segslam.run.folder import LOG
 from segslam.run.report import figures, gallery, interactive
@@ -81,7 +82,7 @@ def _pictures(run: FinishedRun) -> Pictures:
     map_file = run.folder / "map.png"
     return Pictures(
         before_after=before_after,
-        map=map_file.read_bytes() if map_file.is_file() else None,
+        map=small_png(map_file) if map_file.is_file() else None,
         loops=gallery.draw(run, chosen, kept),
         top_view=interactive.top_view(run, of_view),
     )
@@ -92,13 +93,18 @@ def _keyframes_of(attempts: Iterable[LoopAttempt]) -> set[int]:
 
 
 def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:
-    """The map before and after, and the keyframes with these ids, in one pass over the log."""
+    """The map before and after, and the keyframes with these ids, in two passes over the log."""
     poses = run.result.odometry.T_world_lidar[run.result.keyframe_rows]
-    before_after = BeforeAfter(dict(enumerate(poses)), run.result.estimate)
     every = 1 + len(poses) // MOST_KEYFRAMES
     kept: dict[int, Keyframe] = {}
-    keyframes = (step.keyframe for step in read_log(run.folder / LOG).steps() if step.keyframe is not None)
-    for keyframe in islice(keyframes, len(poses)):
+
+    def keyframes() -> Iterator[Keyframe]:
+        steps = read_log(run.folder / LOG).steps()
+        return islice((step.keyframe for step in steps if step.keyframe is not None), len(poses))
+
+    drawn = (keyframe for keyframe in keyframes() if keyframe.id % every == 0)
+    before_after = BeforeAfter(dict(enumerate(poses)), run.result.estimate, drawn)
+    for keyframe in keyframes():
         if keyframe.id % every == 0:
             before_after.add(keyframe)
         if keyframe.id in wanted:

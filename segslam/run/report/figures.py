@@ -158,7 +158,7 @@ def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
     axes.barh(stages, [stage_ms[stage]["p95"] for stage in stages], color="#CFE3F1", label="95th percentile")
     axes.barh(stages, [stage_ms[stage]["median"] for stage in stages], color=CORRECTED, height=0.45, label="median")
     axes.grid(visible=False, axis="y")
-    axes.set(xlabel="time (ms)")
+    axes.set(xlabel="time (ms)", xscale="log")  # from a keyframe's fraction of a millisecond to minutes of adjustment
     _legend_on_top(axes)
     return svg(figure, "stages")
 

@@ -16,8 +16,8 @@
   const colours = { accepted: "#009E73", "rejected by the optimiser": "#D55E00", rejected: "#7F7F7F" };
   const axis = { zeroline: false, automargin: true };
   const layout = (more) => ({
-    margin: { l: 50, r: 10, t: 40, b: 40 }, hovermode: "closest", dragmode: "pan", font: { size: 13 },
-    legend: { orientation: "h", y: 1.02, yanchor: "bottom" },
+    margin: { l: 50, r: 30, t: 40, b: 40 }, hovermode: "closest", dragmode: "pan", font: { size: 13 },
+    legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, modebar: { orientation: "v" },
     xaxis: { ...axis, title: { text: "x (m)" } },
     yaxis: { ...axis, title: { text: "y (m)" }, scaleanchor: "x" }, ...more,
   });

@@ -1,5 +1,6 @@
 """Top view of a map as a PNG: shaded by height, with the trajectory, a scale bar and a legend."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ SHADED_M = 3.0
 """Chosen: the shading of a height is relative to the mean height in a square of this size."""
 GAP_PX = 1.5
 """Chosen: a pixel is filled if one of its 8 neighbours is known."""
+BAND_PX = 256
+"""Rows of the image that are shaded at once; the result does not depend on it."""
 RELIEF_M, CONTRAST = 1.5, 0.35
 """Chosen: height difference with strong shading, and strength of the shading."""
 
@@ -57,6 +60,7 @@ class Picture:
     def close(self) -> None:
         """Write the image."""
         image, window, _ = self._finished()
+        del self._image, self._height_m  # drawing needs as much memory again
         from segslam.map.from_above import drawn_map  # importing matplotlib takes long
 
         titles = {"class": "class", "height": "height (m)", "intensity": "intensity"}
@@ -66,8 +70,9 @@ class Picture:
     def _finished(self) -> tuple[np.ndarray, Window, float]:
         """The shaded image (rows, columns, 3), its window, and the median height of its pixels (m)."""
         rows, columns = self._seen()
-        colors, height_m = closed(self._image[rows, columns], self._height_m[rows, columns])
-        image = shaded(colors, height_m, SHADED_M * self._pixels / TILE_M)
+        image, height_m = closed_and_shaded(
+            self._image[rows, columns], self._height_m[rows, columns], max(round(SHADED_M * self._pixels / TILE_M), 3)
+        )
         return image, self._window(rows, columns), float(np.nanmedian(height_m))
 
     def _seen(self) -> tuple[slice, slice]:
@@ -99,6 +104,18 @@ class Picture:
         return [(f"{value:.3g}", color) for value, color in scale_of(self._extent.span)]
 
 
+def closed_and_shaded(image: np.ndarray, height_m: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and heights with gaps filled, and the colours shaded, band by band: a large image takes little memory."""
+    shades, heights = np.empty_like(image), np.empty_like(height_m)
+    around = window // 2 + math.ceil(GAP_PX)
+    for first in range(0, len(image), BAND_PX):
+        low, last = max(first - around, 0), first + BAND_PX
+        colors, filled_m = closed(image[low : last + around], height_m[low : last + around])
+        band = slice(first - low, first - low + BAND_PX)
+        shades[first:last], heights[first:last] = shaded(colors, filled_m, window)[band], filled_m[band]
+    return shades, heights
+
+
 def closed(image: np.ndarray, height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colours and heights with gaps between points filled from a known neighbouring pixel."""
     away, nearest = distance_transform_edt(np.isnan(height_m), return_indices=True)
@@ -109,15 +126,14 @@ def closed(image: np.ndarray, height_m: np.ndarray) -> tuple[np.ndarray, np.ndar
     return full, heights
 
 
-def shaded(image: np.ndarray, height_m: np.ndarray, window: float) -> np.ndarray:
+def shaded(image: np.ndarray, height_m: np.ndarray, window: int) -> np.ndarray:
     """Colours (rows, columns, 3), brighter above and darker below the mean height of the surroundings.
 
     `height_m` is NaN for unknown pixels; `window` is the size of the surroundings in pixels.
     """
     known = np.isfinite(height_m)
-    size = max(round(window), 3)
-    weight = uniform_filter(known.astype(np.float32), size)
-    mean = uniform_filter(np.where(known, height_m, 0.0).astype(np.float32), size) / np.maximum(weight, 1e-6)
+    weight = uniform_filter(known.astype(np.float32), window)
+    mean = uniform_filter(np.where(known, height_m, 0.0).astype(np.float32), window) / np.maximum(weight, 1e-6)
     relief = np.tanh(np.where(known, height_m - mean, 0.0) / RELIEF_M)
     factor = np.where(known, 1.0 + CONTRAST * relief, 1.0)[..., None]
     return np.clip(image * factor, 0, 255).astype(np.uint8)

@@ -40,6 +40,10 @@ def edit(
             metavar="I:J", help="Register these two keyframes, wherever the drift has put them; may be repeated."
         ),
     ] = None,
+    add_near_fixes: Annotated[
+        bool,
+        typer.Option("--add-near-fixes", help="Add keyframes that the fixes of the run place near each other."),
+    ] = False,
     config: ConfigOption = None,
     settings: SetOption = None,
     refine_minutes: RefineMinutesOption = None,
@@ -55,9 +59,17 @@ def edit(
     Example: segslam edit runs/00 --forbid 120:15 --add 300:40 --out runs/00-edited
     """
     check_exists(run, "give a run folder, or its log.mcap")
-    edits = LoopEdits(pairs_of(forbid or (), "--forbid"), pairs_of(add or (), "--add"))
+    forbidden, added = pairs_of(forbid or (), "--forbid"), pairs_of(add or (), "--add")
+    if add_near_fixes:
+        from segslam.run.near_fixes import pairs_near_fixes
+
+        added |= pairs_near_fixes(run) - forbidden
+    edits = LoopEdits(forbidden, added)
     if edits == LoopEdits():
-        raise SegslamError("nothing to edit: give --forbid I:J or --add I:J")
+        no_pairs = (
+            "the fixes propose no loop that was not tried" if add_near_fixes else "give --forbid I:J or --add I:J"
+        )
+        raise SegslamError(f"nothing to edit: {no_pairs}")
     announce(f"edit: reading {run}", quiet=quiet)
     _check_keyframes(run, edits, quiet=quiet)
 

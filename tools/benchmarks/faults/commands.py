@@ -87,9 +87,9 @@ def _with_spawned(pid: int) -> list[int]:
 
 
 def _spawned(pid: int) -> list[int]:
-    """The processes of multiprocessing that a process has started."""
+    """The processes of multiprocessing that a process has started, in any of its threads."""
     try:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        children = " ".join(file.read_text() for file in Path(f"/proc/{pid}/task").glob("*/children")).split()
         return [int(child) for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
     except OSError:
         return []

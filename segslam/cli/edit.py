@@ -59,17 +59,7 @@ def edit(
     Example: segslam edit runs/00 --forbid 120:15 --add 300:40 --out runs/00-edited
     """
     check_exists(run, "give a run folder, or its log.mcap")
-    forbidden, added = pairs_of(forbid or (), "--forbid"), pairs_of(add or (), "--add")
-    if add_near_fixes:
-        from segslam.run.near_fixes import pairs_near_fixes
-
-        added |= pairs_near_fixes(run) - forbidden
-    edits = LoopEdits(forbidden, added)
-    if edits == LoopEdits():
-        no_pairs = (
-            "the fixes propose no loop that was not tried" if add_near_fixes else "give --forbid I:J or --add I:J"
-        )
-        raise SegslamError(f"nothing to edit: {no_pairs}")
+    edits = _edits(run, forbid or [], add or [], add_near_fixes=add_near_fixes)
     announce(f"edit: reading {run}", quiet=quiet)
     _check_keyframes(run, edits, quiet=quiet)
 
@@ -91,6 +81,19 @@ def edit(
         json=json,
         quiet=quiet,
     )
+
+
+def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool) -> LoopEdits:
+    """The edits of the options. Raises SegslamError if there are none."""
+    forbidden, added = pairs_of(forbid, "--forbid"), pairs_of(add, "--add")
+    if add_near_fixes:
+        from segslam.run.near_fixes import pairs_near_fixes
+
+        added |= pairs_near_fixes(run) - forbidden
+    if not forbidden | added:
+        remedy = "the fixes propose no further loop" if add_near_fixes else "give --forbid I:J or --add I:J"
+        raise SegslamError(f"nothing to edit: {remedy}")
+    return LoopEdits(forbidden, added)
 
 
 def _check_keyframes(run: Path, edits: LoopEdits, *, quiet: bool) -> None:

@@ -10,14 +10,15 @@ from scipy.spatial import cKDTree
 from segslam.config import ProximityConfig
 from segslam.loop_edits import Pair
 from segslam.run.finished import read_run
+from segslam.run.folder import folder_of
 from segslam.run.georeferenced import FILE, read_globe
 from segslam.trajectory import travelled_m
 from segslam.types import LoopClosure, SegslamError, Vector
 
 
-def pairs_near_fixes(folder: Path) -> frozenset[Pair]:
+def pairs_near_fixes(run_or_log: Path) -> frozenset[Pair]:
     """Loops of a georeferenced run that were not tried. Raises SegslamError if it has no place on the globe."""
-    run = read_run(folder)
+    run = read_run(folder_of(run_or_log))
     globe = read_globe(run.folder)
     if globe is None:
         raise SegslamError(f"{run.folder / FILE}: missing; `segslam georeference` the run first")

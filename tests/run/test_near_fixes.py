@@ -46,5 +46,6 @@ def test_places_that_a_loop_joins_and_pairs_that_were_tried_are_left_out() -> No
 
 def test_a_run_without_a_place_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = make_run(tmp_path / "run")
-    assert run("edit", made.folder, "--add-near-fixes", "--out", tmp_path / "new", "--quiet") == 2
-    assert "georeference.json: missing; `segslam georeference` the run first" in capsys.readouterr().err
+    for given in (made.folder, made.folder / "log.mcap"):
+        assert run("edit", given, "--add-near-fixes", "--out", tmp_path / "new", "--quiet") == 2
+        assert "georeference.json: missing; `segslam georeference` the run first" in capsys.readouterr().err

@@ -4,6 +4,7 @@ A step writes its result beside the final name and renames it when it is whole. 
 """
 
 import json
+import logging
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from segslam.config import Config, load_config
 from segslam.datasets import DataSource
 from segslam.fleets.drives import Drive
 from segslam.fleets.relations import Relation, read_relation, write_relation
+from segslam.gnss.fixes import Fixes
 from segslam.gnss.reading import read_fixes
 from segslam.presets import SETTINGS, Preset, extent_m, preset, preset_for
 from segslam.retrieval import Places, PlaceSignature
@@ -34,6 +36,7 @@ from segslam.sessions.recorded import Session, read_session
 from segslam.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
 from segslam.types import SegslamError, Trajectory
 
+logger = logging.getLogger(__name__)
 RUNS, INDEX, PROPOSALS, PAIRS = "runs", "index", "proposals", "pairs"
 KEY = "fleet.key"
 """File in a run folder of a fleet: the key that it was made with."""
@@ -84,6 +87,7 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
         drive.topic,
     )
     config = _config(drive, source)
+    fixes = read_fixes(drive.gnss, recording=source.data) if drive.gnss else None  # fails before the drive is mapped
     odometry = None
     if drive.odometry:
         odometry = given_odometry(Path(drive.odometry), open_scans(source, config), config.odometry)
@@ -99,11 +103,20 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
         topic=source.topic,
         odometry=odometry,
     )
-    if drive.gnss:
-        georeference(part, read_fixes(drive.gnss, recording=source.data))
-        write_report(part)
+    if fixes is not None:
+        _georeference(part, drive.name, fixes)
     _made(part, mapped.folder(fleet), key)
     return mapped
+
+
+def _georeference(part: Path, name: str, fixes: Fixes) -> None:
+    """Place a mapped drive by its fixes; where they do not determine a place, the drive remains without."""
+    try:
+        georeference(part, fixes)
+    except SegslamError as error:
+        logger.warning("%s: has no place on the globe: %s", name, error)
+        return
+    write_report(part)
 
 
 def _config(drive: Drive, source: DataSource) -> Config:

@@ -14,9 +14,9 @@ from segslam.sessions.localiser import Localiser
 def localise(run: str | Path, data: str | Path, out: str | Path, **options: Any) -> FinishedRun:
     """Localise a folder of scans or a recording in the map of a finished run, like `segslam localise`.
 
-    The new folder `out` has the files of `map_folder`; its world frame, and its place on the
-    globe, is that of the finished run. Options are those
-    of `map_folder`. Raises SegslamError as `map_folder`, and if the run did not finish or is damaged.
+    The new folder `out` has the files of `map_folder`; its world frame, and its place on the globe, is that
+    of the finished run. Options are those of `map_folder`. Raises SegslamError as `map_folder`, and if the run did not
+    finish or is damaged.
     """
     locator = Locator.from_run(run)
     made = map_folder(

@@ -17,6 +17,7 @@ import segslam.fleets.orchestrate
 from segslam.datasets import open_dataset
 from segslam.fleets import Drive, FleetResult, fleet, read_drives, workers
 from segslam.fleets.orchestrate import FILE
+from segslam.fleets.steps import map_drive
 from segslam.gnss import enu_from_geodetic
 from segslam.run.finished import read_run
 from segslam.sessions import session_pose
@@ -39,9 +40,13 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def _drives(recordings: list[Path]) -> list[Drive]:
-    """From a list in YAML."""
+    """From a list in YAML; the fixes of the recordings in one file are too few for a place."""
     file = recordings[0].parent / "drives.yaml"
-    entries = [{"data": path.name, "topic": TOPIC} if path.suffix else _on_globe(path) for path in recordings]
+    reference = open_dataset(recordings[0]).reference
+    assert reference is not None
+    write_fixes(file.with_name("few.csv"), reference.stamp_ns[:2], reference.T_world_lidar[:2])
+    in_file = {"topic": TOPIC, "gnss": "few.csv"}
+    entries = [{"data": path.name} | in_file if path.suffix else _on_globe(path) for path in recordings]
     file.write_text(json.dumps(entries))
     return read_drives(file)
 
@@ -105,6 +110,13 @@ def test_drives_with_fixes_are_on_the_globe_alone_and_together(joined: FleetResu
     values = json.loads((joined.folder / "component_0" / "georeference.json").read_text())
     assert values["num_fixes"] == len(component)
     assert not (joined.folder / "component_1" / "georeference.json").exists()
+
+
+def test_fixes_that_cannot_be_read_end_a_drive_before_it_is_mapped(recordings: list[Path], tmp_path: Path) -> None:
+    drive = Drive("monday", str(recordings[0]), gnss=str(tmp_path / "none.csv"))
+    with pytest.raises(SegslamError, match=r"none\.csv"):
+        map_drive(tmp_path, drive, "key")
+    assert list(tmp_path.iterdir()) == []
 
 
 def _made(folder: Path) -> dict[str, int]:

@@ -25,7 +25,6 @@ from segslam.types import (
     RejectReason,
     Transform,
 )
-from segslam.verification import gates
 
 MIN_SCORE = 0.6
 """Chosen on the real places of KITTI 05: 97 % of the revisits are more similar, 99 % of other best places less."""
@@ -47,13 +46,12 @@ class FarLoops:
         config: Config,
         graph: Graph,
         prepared: Callable[[int], PreparedScan],
-        floor: Callable[[int], gates.NoiseFloor],
         confirmation: Confirmation,
         forbidden: frozenset[tuple[int, int]] = frozenset(),
     ) -> None:
         """`forbidden`: pairs (newer, older) of keyframes that are never tried."""
         self._config, self._graph = config, graph
-        self._prepared, self._floor = prepared, floor
+        self._prepared = prepared
         self._confirmation = confirmation
         self._forbidden = forbidden
         self._places = Places()
@@ -79,7 +77,6 @@ class FarLoops:
             self._prepared,
             lambda number: self._graph.T_world_keyframes[number],
             config=self._config,
-            floor=self._floor(keyframe_id),
             gate=lambda place_id: partial(_not_far, candidate=candidate, expected_m=self._expected_m(candidate)),
             watch=own,
         )

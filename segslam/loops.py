@@ -18,7 +18,6 @@ from segslam.retrieval import PlaceSignature, signature_of
 from segslam.submaps import Submaps
 from segslam.system.threads import at_once
 from segslam.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
-from segslam.verification.noise_floor import NeighbourNoise
 from segslam.verification.prior import far_from_prior
 
 NO_EDITS = LoopEdits()
@@ -49,14 +48,8 @@ class LoopCloser:
         self._detector = ProximityDetector(config.proximity)
         self.submaps = Submaps(config, clouds, labeller, lambda: graph.travel_m)
         self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
-        self._floor = NeighbourNoise(
-            lambda number: self._prepared(number).observed,
-            lambda number: self.submaps.T_odom[number],
-            self.submaps.lag,
-            config=config,
-        )
         self._confirmation = Confirmation(graph, lambda number: self.submaps.T_odom[number])
-        self._far = FarLoops(config, graph, self._prepared, self._floor.at, self._confirmation, edits.forbidden)
+        self._far = FarLoops(config, graph, self._prepared, self._confirmation, edits.forbidden)
         self._tried: set[tuple[int, int]] = set(edits.forbidden)
         self._unsearched: set[int] = set()
         """Keyframes for which no loop was searched when they were added, because the machine was too slow."""
@@ -153,19 +146,17 @@ class LoopCloser:
             source, target = at_once(
                 lambda: self._prepared(candidate.source_id), lambda: self._prepared(candidate.target_id)
             )
-        floor = self._floor.at(candidate.source_id)
         outcome: Alignment | Rejected | None = None
         is_by_hand = (candidate.source_id, candidate.target_id) in self._edits.added
         if is_known:
             prior = candidate.T_target_source_prior
-            outcome = register_near(source, target, prior, config=self._config, floor=floor, watch=own)
+            outcome = register_near(source, target, prior, config=self._config, watch=own)
         if not isinstance(outcome, Alignment):
             outcome = register_prepared(
                 source,
                 target,
                 config=self._config,
                 gate=anywhere if is_by_hand else self._near_prior(candidate),
-                floor=floor,
                 watch=own,
             )
         for stage, seconds in own.seconds.items():

@@ -3,7 +3,6 @@
 A place is accepted only if no other place fits almost as well, because streets repeat.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,12 +10,14 @@ from typing import NamedTuple
 
 from segslam import geometry
 from segslam.config import Config
-from segslam.registration import Gate, PreparedScan, Stopwatch, anywhere, may_match, register_prepared
+from segslam.registration import Gate, PreparedScan, Stopwatch, anywhere
+from segslam.registration.pair import tried_poses
+from segslam.registration.trial import Found, Trial
 from segslam.retrieval import PlaceCandidate
 from segslam.system.short_repr import Record
 from segslam.system.threads import at_once
 from segslam.types import Alignment, Rejected, RejectReason, Transform
-from segslam.verification import gates
+from segslam.verification import score
 
 MAX_PLACES = 6
 """Chosen: number of places tried until one is found; each takes about 100 ms."""
@@ -45,40 +46,38 @@ def recognise(
     T_world_place: Callable[[int], Transform],
     *,
     config: Config,
-    floor: gates.NoiseFloor = gates.SINGLE_PAIR,
     gate: Callable[[int], Gate] = lambda place_id: anywhere,
     max_places: int = MAX_PLACES,
     watch: Stopwatch | None = None,
 ) -> Recognised | Rejected:
     """The place at which a scan was taken, among candidates sorted by similarity.
 
-    Rejects with AMBIGUOUS if two places fit almost equally well; with the reason of the first candidate if none fits;
+    Rejects with AMBIGUOUS if another place fits almost as well; with the reason of the first candidate if none fits;
     with TOO_FEW_CORRESPONDENCES if there are no candidates. `gate` adds prior knowledge about the pose at a place.
     """
     watch = watch or Stopwatch()
 
-    def tried(place_id: int, also: Gate, mismatch: float = math.inf) -> Recognised | Rejected:
+    def tried(place_id: int, also: Gate) -> tuple[Trial, list[Found] | Rejected]:
         with watch("prepare"):
             place = places(place_id)
-        both = _Both(gate(place_id), also)
-        if mismatch < math.inf and not may_match(
-            scan, place, config=config, gate=both, floor=floor, mismatch=mismatch, watch=watch
-        ):
-            return Rejected(RejectReason.LOW_OVERLAP, "fits much worse")
-        found = register_prepared(scan, place, config=config, gate=both, floor=floor, watch=watch)
-        if isinstance(found, Rejected):
-            return found
-        return Recognised(place_id, T_world_place(place_id) @ found.fine.T_target_source, found)
+        trial = Trial(scan, place, config, _Both(gate(place_id), also), watch, score.shipped())
+        return trial, tried_poses(trial)
 
     rejection: Rejected | None = None
     for place_id in _spread(candidates, T_world_place, max_places):
-        outcome = tried(place_id, anywhere)
-        if isinstance(outcome, Recognised):
-            most = config.verify.rival_ratio * _mismatch(scan, places(place_id), outcome.alignment)
-            others = _others(outcome, candidates, T_world_place)
-            elsewhere = [(other, _Elsewhere(outcome.T_world_lidar, T_world_place(other)), most) for other in others]
+        trial, found = tried(place_id, anywhere)
+        if isinstance(found, Rejected):
+            outcome: Alignment | Rejected = found
+        else:
+            outcome = trial.judge(found[0], found[1:])
+        if isinstance(outcome, Alignment):
+            assert not isinstance(found, Rejected)
+            T_world_lidar = T_world_place(place_id) @ found[0].T_target_source
+            others = _others(T_world_lidar, candidates, T_world_place)
+            elsewhere = [(other, _Elsewhere(T_world_lidar, T_world_place(other))) for other in others]
             halves = at_once(partial(_found, tried, elsewhere[0::2]), partial(_found, tried, elsewhere[1::2]))
-            return _clear_winner(scan, [outcome, *halves[0], *halves[1]], places, config)
+            outcome = trial.judge(found[0], [*found[1:], *halves[0], *halves[1]])
+            return outcome if isinstance(outcome, Rejected) else Recognised(place_id, T_world_lidar, outcome)
         if rejection is None:
             rejection = outcome
     if rejection is None:
@@ -86,9 +85,12 @@ def recognise(
     return rejection
 
 
-def _found(tried: Callable[..., Recognised | Rejected], places: Sequence[tuple[object, ...]]) -> list[Recognised]:
-    outcomes = [tried(*place) for place in places]
-    return [outcome for outcome in outcomes if isinstance(outcome, Recognised)]
+def _found(
+    tried: Callable[[int, Gate], tuple[Trial, list[Found] | Rejected]], places: Sequence[tuple[int, Gate]]
+) -> list[Found]:
+    """The best poses at other places."""
+    outcomes = [tried(*place)[1] for place in places]
+    return [found[0] for found in outcomes if not isinstance(found, Rejected)]
 
 
 class _Both(NamedTuple):
@@ -129,37 +131,19 @@ def _spread(
 
 
 def _others(
-    found: Recognised, candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform]
+    T_world_found: Transform, candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform]
 ) -> list[int]:
     """At most `MAX_RIVALS` most similar places, `ELSEWHERE_M` from the found one and from each other."""
     taken: list[int] = []
     for candidate in candidates:
         T_world = T_world_place(candidate.place_id)
-        if _apart_m(T_world, found.T_world_lidar) < ELSEWHERE_M:
+        if _apart_m(T_world, T_world_found) < ELSEWHERE_M:
             continue
         if all(_apart_m(T_world, T_world_place(other)) >= ELSEWHERE_M for other in taken):
             taken.append(candidate.place_id)
         if len(taken) == MAX_RIVALS:
             break
     return taken
-
-
-def _clear_winner(
-    scan: PreparedScan, found: Sequence[Recognised], places: Callable[[int], PreparedScan], config: Config
-) -> Recognised | Rejected:
-    """The place that fits best; AMBIGUOUS if another place fits almost as well."""
-    ranked = sorted(((_mismatch(scan, places(one.place_id), one.alignment), one) for one in found), key=lambda p: p[0])
-    (least, best), *others = ranked
-    for mismatch, other in others:
-        if mismatch < config.verify.rival_ratio * least:
-            return Rejected(RejectReason.AMBIGUOUS, f"two places: keyframes {best.place_id} and {other.place_id}")
-    return best
-
-
-def _mismatch(scan: PreparedScan, place: PreparedScan, alignment: Alignment) -> float:
-    """Mismatch as defined by `gates.mismatch`."""
-    roughness_m = max(scan.surface.roughness_m, place.surface.roughness_m)
-    return gates.mismatch(alignment.overlap, alignment.rms_m / roughness_m)
 
 
 def _apart_m(T_world_a: Transform, T_world_b: Transform) -> float:

@@ -58,6 +58,13 @@ class Surface:
         """(k, 3) points on surfaces steeper than 45 degrees; the scan's z points up."""
         return self.points[_stands(self.normals)]
 
+    @property
+    def standing_with_normals(self) -> tuple[Points, Points]:
+        """(k, 3) each: these points, and their unit normals."""
+        normals = self.normals
+        stands = _stands(normals)
+        return self.points[stands], normals[stands]
+
     def __len__(self) -> int:
         return self.cloud.size()
 

@@ -23,6 +23,7 @@ from segslam.types import (
     Trajectory,
     Transform,
     Vector,
+    probability_text,
 )
 
 if TYPE_CHECKING:
@@ -159,4 +160,5 @@ def outcome_text(attempt: LoopAttempt, closure_weights: Mapping[tuple[int, int],
         return f"rejected, {reason}" + (f" ({outcome.detail})" if outcome.detail else "")
     weight = closure_weights[outcome.source_id, outcome.target_id]
     found = outcome.alignment
-    return f"accepted, overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m, weight {weight:.2f}"
+    probable = "" if found.probability is None else f"{probability_text(found.probability, found.evidence)}, "
+    return f"accepted, {probable}overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m, weight {weight:.2f}"

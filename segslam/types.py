@@ -103,6 +103,7 @@ class RejectReason(StrEnum):
     LOW_OVERLAP = "low_overlap"
     HIGH_RESIDUAL = "high_residual"
     FREE_SPACE_VIOLATED = "free_space_violated"
+    IMPROBABLE = "improbable"
     AMBIGUOUS = "ambiguous"
     NO_PLACE = "no_place"
     UNCONFIRMED = "unconfirmed"
@@ -279,6 +280,10 @@ class Rejected:
 
     reason: RejectReason
     detail: str = ""
+    probability: float | None = None
+    """That the best pose is right; None if none could be judged."""
+    evidence: dict[str, float] = field(default_factory=dict)
+    """As that of `Alignment`."""
 
     def __bool__(self) -> NoReturn:
         raise TypeError("a Rejected is neither true nor false; ask isinstance(found, Rejected), or found.ok")
@@ -303,6 +308,10 @@ class Alignment(Record):
     """Share of the points in space that the other scan observed empty."""
     observability: float = 1.0
     """Smallest divided by largest variance of the translation, 0 to 1: small along a corridor."""
+    probability: float | None = None
+    """That the pose is right; None in logs of older versions."""
+    evidence: dict[str, float] = field(default_factory=dict)
+    """Summands of its log odds by name (nats): `surfaces`, `no_surface`, `free_space`, `usual`, and `other_pose`."""
 
     @property
     def T_target_source(self) -> Transform:  # noqa: N802  (a transform)
@@ -344,6 +353,12 @@ class LoopAttempt(Record):
     outcome: LoopClosure | Rejected
     seconds: dict[str, float]
     """Seconds by stage (prepare, match, refine, verify); only stages that ran."""
+
+
+def probability_text(probability: float, evidence: dict[str, float]) -> str:
+    """In words: the probability that a pose is right, and the evidence that it is made of (nats)."""
+    parts = ", ".join(f"{name.replace('_', ' ')} {value:+.1f}" for name, value in evidence.items())
+    return f"probability {probability:.4f} ({parts})"
 
 
 REJECTED_WEIGHT = 0.5

@@ -45,7 +45,6 @@ def locate(
         raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; omit the option for other data")
     locator = Locator.from_run(folder_of(run))
     compile_kernels(quiet=quiet)
-    locator.floor()  # computed before the first scan is timed
     num_bad = 0
     found = []
     for scan in progress(scans, total=len(scans), title="locate", quiet=quiet):
@@ -100,21 +99,26 @@ def _figures(found: "Located | Rejected") -> dict[str, Any]:
     from segslam.types import Rejected
 
     if isinstance(found, Rejected):
-        return _not_found(found.reason.value, found.detail)
+        return _not_found(found.reason.value, found.detail, found.probability, found.evidence)
     return {
         "found": True,
         "T_world_lidar": found.T_world_lidar.ravel().tolist(),
         "keyframe": found.keyframe_id,
         "inliers": found.inliers,
         "overlap": found.overlap,
+        "probability": found.alignment.probability,
+        "evidence": found.alignment.evidence,
         "reason": None,
         "detail": None,
     }
 
 
-def _not_found(reason: str, detail: str) -> dict[str, Any]:
+def _not_found(
+    reason: str, detail: str, probability: float | None = None, evidence: dict[str, float] | None = None
+) -> dict[str, Any]:
     nothing = dict.fromkeys(("T_world_lidar", "keyframe", "inliers", "overlap"))
-    return {"found": False, **nothing, "reason": reason, "detail": detail}
+    judged = {"probability": probability, "evidence": evidence or None}
+    return {"found": False, **nothing, **judged, "reason": reason, "detail": detail}
 
 
 def _show(scans: list[Path], found: list[dict[str, Any]], *, quiet: bool) -> None:
@@ -124,7 +128,7 @@ def _show(scans: list[Path], found: list[dict[str, Any]], *, quiet: bool) -> Non
             print_out(f"{scan} " + " ".join(f"{value:.6f}" for value in one["T_world_lidar"]))
             say(
                 f"{scan}: at keyframe {one['keyframe']}, {one['inliers']} inliers, overlap {one['overlap']:.2f}, "
-                f"{1000 * one['seconds']:.0f} ms",
+                f"probability {one['probability']:.4f}, {1000 * one['seconds']:.0f} ms",
                 quiet=quiet,
             )
         else:

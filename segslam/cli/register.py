@@ -170,13 +170,16 @@ def _figures(found: "Estimate | Rejected", watch: "Stopwatch") -> dict[str, Any]
         reason, detail = found.reason.value, found.detail
     else:
         pose = found.T_target_source.ravel().tolist()
-    shown = {key: getattr(found, key, None) for key in ("num_correspondences", "num_edges", "num_inliers", "overlap")}
+    names = ("probability", "evidence", "num_correspondences", "num_edges", "num_inliers", "overlap")
+    shown = {key: getattr(found, key, None) for key in names}
     answer = {"accepted": reason is None, "reason": reason, "detail": detail, "T_target_source": pose}
     return answer | shown | {"seconds": watch.seconds}
 
 
 def _show(figures: dict[str, Any], *, json: bool, quiet: bool) -> None:
     import numpy as np
+
+    from segslam.types import probability_text
 
     if json:
         print_json(figures)
@@ -187,5 +190,7 @@ def _show(figures: dict[str, Any], *, json: bool, quiet: bool) -> None:
     print_out("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
     overlap = "" if figures["overlap"] is None else f", overlap {figures['overlap']:.2f}"
     times = ", ".join(f"{stage} {1000 * seconds:.0f} ms" for stage, seconds in figures["seconds"].items())
+    if figures["probability"] is not None:
+        say(probability_text(figures["probability"], figures["evidence"]), quiet=quiet)
     inliers = "" if figures["num_inliers"] is None else f"{figures['num_inliers']} inliers{overlap}; "
     say(f"{inliers}{times}", quiet=quiet)

@@ -17,6 +17,19 @@ logger = logging.getLogger(__name__)
 REMOVED = (
     "graph.systematic_drift",
     *(
+        f"verify.{name}"
+        for name in (
+            "min_overlap",
+            "max_residual_ratio",
+            "min_weak_support",
+            "min_second_support",
+            "max_free_space_violation",
+            "max_violation_ratio",
+            "well_observed",
+            "rival_ratio",
+        )
+    ),
+    *(
         f"health.{name}"
         for name in (
             "tolerance_m",

@@ -29,8 +29,7 @@ USER_SETTINGS = (
     "keyframes.voxel_m",
     "proximity.min_travel_m",
     "proximity.max_radius_m",
-    "verify.min_overlap",
-    "verify.max_residual_ratio",
+    "verify.max_false_share",
     "graph.final",
     "graph.error_allowance",
     "map.voxel_m",
@@ -416,18 +415,12 @@ class RefineConfig(Section):
 class VerifyConfig(Section):
     """Conditions under which a registered pose is accepted."""
 
-    min_overlap: float = Field(
-        0.2,
-        ge=0,
-        le=1,
-        description="smallest overlap: the share of points above the ground within reach that lie on the other scan "
-        "[chosen on simulated 00 and 08]",
-    )
-    max_residual_ratio: float = Field(
-        1.5,
+    max_false_share: float = Field(
+        0.001,
         gt=0,
-        description="largest residual of these points, relative to neighbouring keyframes "
-        "[chosen on KITTI 00, courtyard, NCLT]",
+        lt=0.5,
+        description="share of false ones among loops that are as probable as the least probable one that is accepted "
+        "[the user's choice]",
     )
     max_hypotheses: int = Field(3, ge=1, description="number of coarse poses tried, the best first [chosen]")
     max_plan_hypotheses: int = Field(
@@ -441,37 +434,10 @@ class VerifyConfig(Section):
         gt=0,
         description="distance to the other scan within which a point overlaps it (m) [chosen: refine.voxel_m]",
     )
-    min_weak_support: float = Field(
-        0.2,
-        ge=0,
-        le=1,
-        description="smallest share of matching points, relative to the overlap, among points facing the direction in "
-        "which they constrain the pose least [chosen on courtyard and simulated corridors]",
-    )
-    min_second_support: float = Field(
-        0.15,
-        ge=0,
-        le=1,
-        description="the same without the surface that most of them match, for poses with an unobserved direction, "
-        "scans that see one side only, and poses in narrow or badly observed places that fit less well than "
-        "neighbouring keyframes; these need 1.3 times as much, with scans that see one side only twice as much "
-        "[chosen on simulated corridors and tunnels]",
-    )
     max_range_m: float = Field(
         50.0,
         gt=0,
         description="points farther from the other sensor are out of its reach (m) [chosen on simulated 00 and 08]",
-    )
-    max_free_space_violation: float = Field(
-        0.035,
-        ge=0,
-        le=1,
-        description="largest share of points in space that the other scan saw empty [chosen on simulated 00 and 08]",
-    )
-    max_violation_ratio: float = Field(
-        5.0,
-        ge=0,
-        description="the same limit relative to neighbouring keyframes; the larger of the two limits holds [chosen]",
     )
     free_space_margin_m: float = Field(
         1.0,
@@ -485,24 +451,10 @@ class VerifyConfig(Section):
     max_coarse_fine_m: float = Field(
         2.0, gt=0, description="largest correction of a coarse pose by refinement (m) [chosen]"
     )
-    well_observed: float = Field(
-        0.1,
-        ge=0,
-        le=1,
-        description="a pose is compared with rivals if the ratio of the smallest to the largest variance of its "
-        "translation is below this; if it also fits less well than neighbouring keyframes, more than one surface must "
-        "confirm it (`min_second_support`) [chosen on KITTI 00]",
-    )
     max_rivals: int = Field(
         6,
         ge=0,
         description="number of floor-plan poses tried as rivals, besides shifts along the weak direction [chosen]",
-    )
-    rival_ratio: float = Field(
-        1.2,
-        ge=1,
-        description="a pose is ambiguous if a rival has less than this many times its mismatch "
-        "[chosen on a simulated corridor and tunnel]",
     )
     prior_gate: float = Field(
         1.5, gt=0, description="largest horizontal distance from the prior, in search radii [chosen]"

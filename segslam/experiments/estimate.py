@@ -14,3 +14,7 @@ class Estimate:
     num_inliers: int | None = None
     num_edges: int | None = None
     """Number of edges of the consistency graph."""
+    probability: float | None = None
+    """That the pose is right."""
+    evidence: dict[str, float] | None = None
+    """As that of `segslam.types.Alignment`."""

@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from segslam import refinement, registration, segregator
@@ -126,7 +126,8 @@ def _align(source: Values, target: Values, config: Config, watch: Stopwatch) -> 
     )
     found = registration.register_prepared(*scans, config=config, watch=watch)
     if isinstance(found, Alignment):
-        return _estimate(found.coarse, found.fine)
+        estimate = _estimate(found.coarse, found.fine)
+        return replace(estimate, probability=found.probability, evidence=found.evidence)
     return found
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from segslam.log.foxglove import timestamp
-from segslam.types import LoopClosure, MotionState, Step
+from segslam.types import LoopClosure, MotionState, Step, probability_text
 
 INFO, WARNING = Log.Level.Value("INFO"), Log.Level.Value("WARNING")
 NAME = "segslam"
@@ -28,8 +28,9 @@ def messages_of(step: Step) -> Iterator[Log]:
     for attempt in step.attempts:
         if isinstance(attempt.outcome, LoopClosure):
             closure, found = attempt.outcome, attempt.outcome.alignment
+            probable = "" if found.probability is None else probability_text(found.probability, found.evidence) + ", "
             text = (
-                f"loop from keyframe {closure.source_id} to {closure.target_id}: overlap {found.overlap:.2f}, "
-                f"residual {found.rms_m:.2f} m"
+                f"loop from keyframe {closure.source_id} to {closure.target_id}: {probable}"
+                f"overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m"
             )
             yield Log(timestamp=timestamp(step.stamp_ns), level=INFO, message=text, name=NAME)

@@ -1,6 +1,6 @@
 """Registration of two scans: describe and prepare each scan once, then match, refine and verify the pair."""
 
-from segslam.registration.pair import may_match, register, register_near, register_prepared
+from segslam.registration.pair import register, register_near, register_prepared
 from segslam.registration.prepared import Labeller, PreparedScan, prepare_observed, prepare_scan, shape_labels
 from segslam.registration.stopwatch import Stopwatch
 from segslam.registration.trial import Gate, anywhere
@@ -11,7 +11,6 @@ __all__ = [
     "PreparedScan",
     "Stopwatch",
     "anywhere",
-    "may_match",
     "prepare_observed",
     "prepare_scan",
     "register",

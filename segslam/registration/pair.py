@@ -1,6 +1,7 @@
-"""Registration of two scans: hypotheses are tried in turn; the first that passes all gates is compared with rivals."""
+"""Registration of two scans: hypotheses are tried in turn; the first that is no chance fit is compared with rivals."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 from numpy.typing import ArrayLike
@@ -9,20 +10,12 @@ from segslam import geometry, refinement
 from segslam.config import Config
 from segslam.registration.hypotheses import coarse_poses
 from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
-from segslam.registration.rivals import SPARSE_MARGIN, Searched, sparsely_refined, unless_ambiguous
+from segslam.registration.rivals import differs, rivals_of
 from segslam.registration.stopwatch import Stopwatch
-from segslam.registration.trial import (
-    EQUAL_M,
-    EQUAL_RAD,
-    Found,
-    Gate,
-    Trial,
-    anywhere,
-    is_near,
-)
+from segslam.registration.trial import EQUAL_M, EQUAL_RAD, Found, Gate, Trial, anywhere, is_near
 from segslam.system.threads import at_once
 from segslam.types import Alignment, Labels, Registration, Rejected, RejectReason, Transform, as_points
-from segslam.verification import gates
+from segslam.verification import score
 
 KNOWN_M, KNOWN_RAD = 1.0, math.radians(3.0)
 """Chosen: largest error of a known pose. A rival this near is mostly the same pose (`rivals.SAME_POSE_M`)."""
@@ -60,43 +53,64 @@ def register_prepared(
     *,
     config: Config,
     gate: Gate = anywhere,
-    floor: gates.NoiseFloor = gates.SINGLE_PAIR,
     watch: Stopwatch | None = None,
 ) -> Alignment | Rejected:
     """The refined and verified pose of the source in the target without an initial guess, or the reason of rejection.
 
-    Hypotheses are tried from best to worst, and the first that passes all gates is returned. If the scans constrain it
-    badly in some direction and a different pose fits almost as well, the result is AMBIGUOUS. `gate` may reject a pose
-    before and after refinement. `floor` is the noise of the run. If no hypothesis passes, the rejection of the best one
-    is returned.
+    Hypotheses are tried from best to worst until one is probably no chance fit. It is compared with all other poses
+    that were tried and with rivals; the best of them is returned if it is as probable as `verify.max_false_share`
+    asks. `gate` may reject a pose before and after refinement. If no hypothesis leads anywhere, the rejection of the
+    best one is returned.
     """
-    allowed = gates.limits(floor, config=config.verify)
-    trial = Trial(source, target, config, gate, floor, allowed, watch or Stopwatch())
+    trial = Trial(source, target, config, gate, watch or Stopwatch(), score.shipped())
+    tried = tried_poses(trial)
+    if isinstance(tried, Rejected):
+        return tried
+    best, *others = tried
+    return trial.judge(best, others)
+
+
+def tried_poses(trial: Trial) -> list[Found] | Rejected:
+    """The best pose that the prior allows, then all that differ from it; or the rejection of the best hypothesis.
+
+    Rivals are searched unless the best pose is a chance fit already.
+    """
     rejections: list[Rejected] = []
-    refused: list[tuple[Transform, Rejected]] = []
+    found: list[Found] = []
     for coarse in coarse_poses(trial):
-        outcome = coarse if isinstance(coarse, Rejected) else _outcome(trial, coarse, refused)
+        outcome = coarse if isinstance(coarse, Rejected) else _outcome(trial, coarse, found)
         if isinstance(outcome, Found):
-            return unless_ambiguous(outcome, trial)
-        rejections.append(outcome)
-    return rejections[0]
+            found.append(outcome)
+            if trial.match_odds(outcome) >= trial.least_odds:
+                break
+        elif outcome is not None:
+            rejections.append(outcome)
+    allowed = [pose for pose in found if trial.gate(pose.T_target_source, slack_m=0.0) is None]
+    if not allowed:
+        excluded = [trial.gate(pose.T_target_source, slack_m=0.0) for pose in found]
+        return [*(rejected for rejected in excluded if rejected is not None), *rejections][0]
+    best = max(allowed, key=trial.match_odds)
+    if trial.match_odds(best) >= trial.least_odds:
+        rivals = rivals_of(best, found, trial)
+        found += rivals
+        allowed += [pose for pose in rivals if trial.gate(pose.T_target_source, slack_m=0.0) is None]
+        best = max(allowed, key=trial.match_odds)
+    return [best, *(pose for pose in found if differs(pose, best))]
 
 
-def _outcome(trial: Trial, coarse: Registration, refused: list[tuple[Transform, Rejected]]) -> Found | Rejected:
-    """A hypothesis, refined with few points, then with all, and verified; `Rejected` by the first gate that it fails.
-
-    `refused`: poses to which few points led and all points were rejected. This one is added; one that equals
-    another gets the same rejection.
-    """
+def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Found | Rejected | None:
+    """A hypothesis, refined with few points, then with all; None if few points lead to a pose of `found`."""
     begun = trial.begin(coarse)
     if isinstance(begun, Rejected):
         return begun
-    for T_other, rejected in refused:
-        if is_near(begun, [T_other], within_m=EQUAL_M, within_rad=EQUAL_RAD):
-            return rejected
+    if is_near(begun, [pose.T_target_source for pose in found], within_m=EQUAL_M, within_rad=EQUAL_RAD):
+        return None
     outcome = trial.refined(coarse, begun)
-    if isinstance(outcome, Rejected) and outcome.reason != RejectReason.REFINEMENT_DIVERGED:
-        refused.append((begun, outcome))
+    if isinstance(outcome, Found):
+        moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ outcome.T_target_source)
+        most_m = trial.config.verify.max_coarse_fine_m
+        if moved_m > most_m:
+            return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m")
     return outcome
 
 
@@ -106,14 +120,13 @@ def register_near(
     T_target_source: Transform,
     *,
     config: Config,
-    floor: gates.NoiseFloor,
     watch: Stopwatch,
 ) -> Alignment | Rejected:
     """The refined and verified pose near one that is known to `KNOWN_M` and `KNOWN_RAD`; no other poses are tried.
 
     Rejects FAR_FROM_PRIOR if refinement moves the pose farther.
     """
-    trial = Trial(source, target, config, anywhere, floor, gates.limits(floor, config=config.verify), watch)
+    trial = Trial(source, target, config, anywhere, watch, score.shipped())
     with watch("refine"):
         fine = refinement.refine(source.surface, target.surface, T_target_source, config=config.refine)
     if isinstance(fine, Rejected):
@@ -123,27 +136,4 @@ def register_near(
         detail = f"moved {geometry.distance(moved):.2f} m, {math.degrees(geometry.angle(moved)):.1f} degrees"
         return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
     coarse = replace(fine, T_target_source=T_target_source, num_inliers=0, num_correspondences=0)
-    with watch("verify"):
-        found = trial.verified(coarse, fine)
-    return found if isinstance(found, Rejected) else found.alignment
-
-
-def may_match(
-    source: PreparedScan,
-    target: PreparedScan,
-    *,
-    config: Config,
-    gate: Gate,
-    floor: gates.NoiseFloor,
-    mismatch: float,
-    watch: Stopwatch,
-) -> bool:
-    """True if `register_prepared` may find a pose with about this mismatch or less, by registering a few points."""
-    trial = Trial(source, target, config, gate, floor, gates.limits(floor, config=config.verify), watch)
-    most = SPARSE_MARGIN * mismatch
-    ends = (
-        sparsely_refined(trial, coarse, Searched(most))
-        for coarse in coarse_poses(trial)
-        if isinstance(coarse, Registration)
-    )
-    return any(led is not None and trial.mismatch(led.T_target_source) <= most for led in ends)
+    return trial.judge(trial.found(coarse, fine), None)

@@ -7,8 +7,8 @@ from segslam import refinement, segregator
 from segslam.config import Config
 from segslam.semantics import geometric_labels
 from segslam.types import Description, Label, Labels, Points
-from segslam.verification import gates
 from segslam.verification.free_space import FreeSpace, observe_free_space
+from segslam.verification.patches import Observed
 
 Labeller = Callable[[Points], Labels]
 
@@ -22,8 +22,8 @@ class PreparedScan:
     free_space: FreeSpace
 
     @property
-    def observed(self) -> gates.Observed:
-        """Input of the gates: surface and free space."""
+    def observed(self) -> Observed:
+        """Input of verification: surface and free space."""
         return self.surface, self.free_space
 
 
@@ -46,7 +46,7 @@ def prepare_scan(
 
 def prepare_observed(
     points: Points, labels: Labels, *, config: Config, seen_from_here: Points | None = None
-) -> gates.Observed:
+) -> Observed:
     """Surface and free space as in `prepare_scan`: sufficient to refine and verify a pose that is nearly known."""
     still = points.compress(labels < Label.MOVING_CAR, axis=0)
     surface = refinement.make_surface(refinement.downsample(still, config=config.refine), config=config.refine)

@@ -1,4 +1,4 @@
-"""One pose between two scans: refined with few points, then with all, and verified by all gates."""
+"""One pose between two scans: refined with few points, then with all, and what the scans show there."""
 
 import math
 from collections.abc import Sequence
@@ -9,24 +9,20 @@ from segslam import geometry, refinement
 from segslam.config import Config, RefineConfig
 from segslam.registration.prepared import PreparedScan
 from segslam.registration.stopwatch import Stopwatch
-from segslam.types import Alignment, Direction, Points, Registration, Rejected, RejectReason, Transform
-from segslam.verification import gates
+from segslam.types import Alignment, Registration, Rejected, RejectReason, Transform
+from segslam.verification import patches, score
+from segslam.verification.verdict import judged
 
 NUM_FEW = 4
 """Number of sources of which few points are in memory."""
-NUM_SAMPLED = 800
-"""Chosen: number of standing points that show how well a pose fits, to 0.02."""
 FEW_OFF_M = 0.5
 """Chosen: few points lead to a pose nearer than this to that of all points. Of 210 accepted poses (KITTI 00, NCLT, its
 submaps, simulated 06, scenes of even seeds) none was farther off than 0.33 m."""
-FEW_MARGIN = 1.05
-"""Chosen: a hypothesis is dropped if a few points, refined, have a mismatch of more than so many times the largest that
-the limits allow. The 210 poses had up to 0.82."""
-FEW_VIOLATION = 1.5
-"""Chosen: or if free space is violated there by more than so many times the limit. The 210 poses had up to 0.8; 7
-rivals that made a pose ambiguous had up to 1.02 of their looser limit after the first iterations."""
+FEW_RATIO = 0.15
+"""Chosen: a pose is not refined further if its mean log ratio, of the patches of one scan after a refinement with few
+points, is more than this below what it needs (nats)."""
 EQUAL_M, EQUAL_RAD = 0.1, math.radians(0.5)
-"""Chosen: a hypothesis is not refined with all points if few points lead it this close to where another was refused."""
+"""Chosen: a hypothesis is not refined with all points if few points lead it this close to where another was refined."""
 
 
 @runtime_checkable
@@ -43,192 +39,103 @@ def anywhere(T_target_source: Transform, *, slack_m: float) -> Rejected | None:
     return None
 
 
-class FewPoints(NamedTuple):
-    """A few points of a source, which lead to poses and show how well they fit."""
-
-    surface: refinement.Surface
-    standing: Points
-
-
 @lru_cache(NUM_FEW)
-def few_points(source: PreparedScan, config: RefineConfig) -> FewPoints:
-    """Some points of a source: its sparse surface, and `NUM_SAMPLED` standing points."""
-    standing = source.surface.standing
-    return FewPoints(
-        refinement.sparse(source.surface, config=config), standing[:: max(len(standing) // NUM_SAMPLED, 1)]
-    )
+def few_points(source: PreparedScan, config: RefineConfig) -> refinement.Surface:
+    """Some points of a source, which lead to poses."""
+    return refinement.sparse(source.surface, config=config)
 
 
 class Found(NamedTuple):
-    """A pose that passed all gates."""
+    """A refined pose, and what the scans show there."""
 
-    alignment: Alignment
-    agreement: gates.Agreement
-    weak_direction: Direction
-    """Level direction in the source's frame in which the scans constrain the pose least."""
+    coarse: Registration
+    fine: Registration
+    agreement: patches.Agreement
+
+    @property
+    def T_target_source(self) -> Transform:  # noqa: N802  (a transform)
+        """The refined pose, (4, 4)."""
+        return self.fine.T_target_source
 
 
 class Trial(NamedTuple):
-    """Two scans, and the gates that a pose between them must pass."""
+    """Two scans, and what is known about the pose between them."""
 
     source: PreparedScan
     target: PreparedScan
     config: Config
     gate: Gate
-    floor: gates.NoiseFloor
-    limits: gates.Limits
     watch: Stopwatch
-    is_rival: bool = False
-    """True if the poses are rivals of one that was found; their limits are looser."""
+    table: score.Table
 
-    def begin(self, coarse: Registration) -> Transform | Rejected:
-        """The pose to which few points of the source lead from a hypothesis; `Rejected` if it cannot pass with all.
+    @property
+    def least_odds(self) -> float:
+        """Log odds that an accepted pose has at least."""
+        return score.least_odds(self.config.verify)
 
-        Takes a fifth of the time of a refinement with all points, which most wrong hypotheses do not need.
+    @property
+    def least_ratio(self) -> float:
+        """Mean log ratio of the patches that an accepted pose has at least (nats)."""
+        return (self.least_odds - self.table.match[1]) / self.table.match[0]
+
+    def begin(self, coarse: Registration, *, least_ratio: float | None = None) -> Transform | Rejected:
+        """The pose to which few points of the source lead from a hypothesis; `Rejected` if it is hopeless with all.
+
+        It is if a first look at its patches shows a mean ratio far below `least_ratio`, by default that of an accepted
+        pose. Takes a third of the time of a refinement with all points, which most wrong hypotheses do not need.
         """
-        rejected = self.rejection_of_coarse(coarse)
+        config = self.config
+        if coarse.num_inliers < config.verify.min_inliers:
+            return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {config.verify.min_inliers}")
+        rejected = self.gate(coarse.T_target_source, slack_m=config.verify.max_coarse_fine_m)
         if rejected is not None:
             return rejected
-        few, target = few_points(self.source, self.config.refine), self.target.surface
         with self.watch("refine"):
             led = refinement.refine(
-                few.surface, target, coarse.T_target_source, config=self.config.refine, must_converge=False
+                few_points(self.source, config.refine),
+                self.target.surface,
+                coarse.T_target_source,
+                config=config.refine,
+                must_converge=False,
             )
         if isinstance(led, Rejected):
             return led
         moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ led.T_target_source)
-        most_m = self.config.verify.max_coarse_fine_m + FEW_OFF_M
+        most_m = config.verify.max_coarse_fine_m + FEW_OFF_M
         if moved_m > most_m:
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m with few points")
-        rejected = self.rejection_of_few(led.T_target_source)
-        return led.T_target_source if rejected is None else rejected
+        ratio = self.first_ratio(led.T_target_source)
+        least = (self.least_ratio if least_ratio is None else least_ratio) - FEW_RATIO
+        if ratio < least:
+            return Rejected(RejectReason.IMPROBABLE, f"{ratio:.2f} < {least:.2f} nats a patch with few points")
+        return led.T_target_source
 
-    def rejection_of_few(self, T_target_source: Transform, *, most: float = math.inf) -> Rejected | None:
-        """Rejects a pose to which few points lead, if all points would not lead to one that passes.
-
-        `most`: largest mismatch, if smaller than that of the limits.
-        """
-        most = min(most, FEW_MARGIN * self.limits.most_mismatch)
-        with self.watch("verify"):
-            mismatch = self.mismatch_of_few(few_points(self.source, self.config.refine), T_target_source)
-        if mismatch > most:
-            return Rejected(RejectReason.LOW_OVERLAP, f"mismatch {mismatch:.3f} > {most:.3f} with few points")
-        return self.free_space_rejection(T_target_source, factor=FEW_VIOLATION)
-
-    def free_space_rejection(
-        self, T_target_source: Transform, *, factor: float = gates.COARSE_VIOLATION
-    ) -> Rejected | None:
-        """Rejects a pose before refinement with all points, as `gates.early_rejection` does."""
+    def first_ratio(self, T_target_source: Transform) -> float:
+        """Mean log ratio of the patches of the source at this pose (nats); takes 2 ms."""
         scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            return gates.early_rejection(*scans, T_target_source, self.limits, config=self.config.verify, factor=factor)
-
-    def rejection_of_coarse(self, coarse: Registration) -> Rejected | None:
-        """Rejects a hypothesis that cannot be refined to a possible pose."""
-        config = self.config.verify
-        if coarse.num_inliers < config.min_inliers:
-            return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {config.min_inliers}")
-        rejected = self.gate(coarse.T_target_source, slack_m=config.max_coarse_fine_m)
-        if rejected is not None:
-            return rejected
-        return self.free_space_rejection(coarse.T_target_source)
+            return self.table.mean_ratio(patches.first_look(*scans, T_target_source, config=self.config.verify))
 
     def refined(self, coarse: Registration, T_begun: Transform) -> Found | Rejected:
-        """A hypothesis refined with all points from `T_begun`, and verified."""
+        """A hypothesis refined with all points from `T_begun`, and what the scans show there."""
         with self.watch("refine"):
             fine = refinement.refine(self.source.surface, self.target.surface, T_begun, config=self.config.refine)
-        if isinstance(fine, Rejected):
-            return fine
-        with self.watch("verify"):
-            return self.verified(coarse, fine)
+        return fine if isinstance(fine, Rejected) else self.found(coarse, fine)
 
-    def mismatch_of_few(self, few: FewPoints, T_target_source: Transform) -> float:
-        """Mismatch of a few points of the source at this pose; takes 1 ms."""
-        roughness_m = max(self.source.surface.roughness_m, self.target.surface.roughness_m)
-        return gates.mismatch_of_some(
-            few.standing, self.target.surface, T_target_source, roughness_m=roughness_m, config=self.config.verify
-        )
-
-    def mismatch(self, T_target_source: Transform) -> float:
-        """Mismatch of the scans at this pose."""
+    def found(self, coarse: Registration, fine: Registration) -> Found:
+        """A refined pose, and what the scans show there."""
         scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            return gates.agreement(*scans, T_target_source, config=self.config.verify).mismatch
+            return Found(coarse, fine, patches.agreement(*scans, fine.T_target_source, config=self.config.verify))
 
-    def verified(self, coarse: Registration, fine: Registration) -> Found | Rejected:
-        """A refined pose as `Found` if it passes all gates, else the rejection."""
-        config = self.config.verify
-        moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ fine.T_target_source)
-        if moved_m > config.max_coarse_fine_m:
-            detail = f"moved {moved_m:.2f} m > {config.max_coarse_fine_m} m"
-            return Rejected(RejectReason.REFINEMENT_DIVERGED, detail)
-        far = self.gate(fine.T_target_source, slack_m=0.0)
-        if far is not None:
-            return far
-        found = gates.agreement(self.source.observed, self.target.observed, fine.T_target_source, config=config)
-        observability, _ = refinement.observability(fine.information, config=self.config.refine)
-        alignment = Alignment(
-            coarse, fine, found.overlap, found.rms_m, found.free_space_violation, observability=observability
-        )
-        passed = Found(alignment, found, refinement.weakest_level(fine.information))
-        rejected = self.rejection(passed)
-        return passed if rejected is None else rejected
+    def match_odds(self, pose: Found) -> float:
+        """Log odds that a pose is no chance fit, whatever other poses show."""
+        return self.table.match_odds(pose.agreement.counts)
 
-    def rejection(self, pose: Found) -> Rejected | None:
-        """Rejects a pose that fits badly, or that no surface confirms along its weak direction, as in a corridor.
-
-        More than one surface must match there if the fine Hessian hardly constrains a direction, if it constrains one
-        badly and the pose fits less well than neighbours do, if a scan sees one side of the place only, or if the
-        stricter limits of narrow places are exceeded. Rivals need less evidence.
-        """
-        found = pose.agreement
-        config = self.config.verify
-        rejected = gates.rejection(found, self.limits.unreduced())
-        if rejected is not None:
-            return rejected
-        scans = self.source.surface, self.target.surface
-        T_target_source = pose.alignment.fine.T_target_source
-        support = gates.weak_support(*scans, T_target_source, pose.weak_direction, config=config)
-        least = config.min_weak_support * found.overlap
-        if support.whole < least:
-            return Rejected(RejectReason.LOW_OVERLAP, f"{support.whole:.3f} < {least:.3f} along the weakest direction")
-        is_doubtful = not self.is_rival and not gates.is_certain(found, self.floor)
-        is_narrow = min(self.source.free_space.view, self.target.free_space.view) < gates.NARROW_VIEW
-        if not self.is_rival:
-            rejected = self.violation_with_little_evidence(pose, is_narrow=is_narrow)
-            if rejected is not None:
-                return rejected
-        least = config.min_second_support * found.overlap
-        if is_doubtful:
-            least *= gates.DOUBTFUL_NARROW if is_narrow else gates.DOUBTFUL
-        has_second = support.second >= least
-        rejected = None
-        if not has_second or (is_doubtful and not gates.is_free(found, self.floor)):
-            rejected = gates.rejection(found, self.limits)
-        if has_second:
-            return rejected
-        detail = f"{support.second:.3f} < {least:.3f} beside one surface along the weakest direction"
-        if rejected is not None:
-            return Rejected(rejected.reason, f"{rejected.detail}, and {detail}")
-        needed = refinement.UNOBSERVED if self.is_rival else gates.WEAKLY_OBSERVED
-        is_open = pose.alignment.observability < (config.well_observed if is_doubtful else needed)
-        return Rejected(RejectReason.LOW_OVERLAP, detail) if is_narrow or is_open else None
-
-    def violation_with_little_evidence(self, pose: Found, *, is_narrow: bool) -> Rejected | None:
-        """Rejects a pose that violates free space and has little else to prove it.
-
-        If a scan sees one side of the place only (`is_narrow`), it may violate free space as little as neighbours do;
-        if a direction is badly observed, by half of the limit.
-        """
-        found = pose.agreement
-        if is_narrow and not gates.is_free(found, self.floor):
-            detail = f"{found.free_space_violation:.4f}, more than neighbours, and only one side of the place is seen"
-            return Rejected(RejectReason.FREE_SPACE_VIOLATED, detail)
-        most = gates.VIOLATION_BADLY_OBSERVED * self.limits.max_free_space_violation
-        if pose.alignment.observability < gates.BADLY_OBSERVED and found.free_space_violation > most:
-            detail = f"{found.free_space_violation:.4f} > {most:.4f} where a direction is badly observed"
-            return Rejected(RejectReason.FREE_SPACE_VIOLATED, detail)
-        return None
+    def judge(self, pose: Found, others: Sequence[Found] | None) -> Alignment | Rejected:
+        """The pose with its probability, `Rejected` if too improbable; `others`: as for `score.Table.judge`."""
+        agreements = None if others is None else [other.agreement for other in others]
+        return judged(pose.coarse, pose.fine, pose.agreement, agreements, config=self.config, table=self.table)
 
 
 def is_near(T_target_source: Transform, others: Sequence[Transform], *, within_m: float, within_rad: float) -> bool:

@@ -13,7 +13,18 @@ import numpy as np
 from segslam.errors import reason
 from segslam.system.whole_files import whole_file, write_whole
 from segslam.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
-from segslam.types import LoopAttempt, LoopClosure, Mask, SegslamError, Trajectory, Transform, Vector, WorkFailed
+from segslam.types import (
+    Alignment,
+    LoopAttempt,
+    LoopClosure,
+    Mask,
+    Rejected,
+    SegslamError,
+    Trajectory,
+    Transform,
+    Vector,
+    WorkFailed,
+)
 
 POSE_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
 STAGES = ("prepare", "match", "refine", "verify")
@@ -137,9 +148,10 @@ def read_localised(folder: Path, num_scans: int) -> Vector | None:
 def write_loops(file: Path, attempts: tuple[LoopAttempt, ...], weights: dict[tuple[int, int], float]) -> None:
     """One row per attempt; cells that do not apply are empty. `weight`: final weight in the graph, 0 to 1."""
     head = ("source", "target", "outcome", "detail", "distance_m", "correspondences", "inliers", "overlap", "rms_m")
+    last = ("free_space_violation", "probability", "evidence", "weight")
     with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
-        writer.writerow((*head, "free_space_violation", "weight", *POSE_COLUMNS, *(f"{stage}_s" for stage in STAGES)))
+        writer.writerow((*head, *last, *POSE_COLUMNS, *(f"{stage}_s" for stage in STAGES)))
         writer.writerows(_loop_row(attempt, weights) for attempt in attempts)
 
 
@@ -167,9 +179,27 @@ def _loop_row(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> li
     ids = (candidate.source_id, candidate.target_id)
     seconds = [f"{attempt.seconds[stage]:.6f}" if stage in attempt.seconds else "" for stage in STAGES]
     if not isinstance(outcome, LoopClosure):
-        nothing = [""] * (6 + len(POSE_COLUMNS))
-        return [*ids, outcome.reason.value, outcome.detail, candidate.distance_m, *nothing, *seconds]
+        unknown = [""] * 5
+        weight_and_pose = [""] * (1 + len(POSE_COLUMNS))
+        judged = _judged_cells(outcome)
+        return [
+            *ids,
+            outcome.reason.value,
+            outcome.detail,
+            candidate.distance_m,
+            *unknown,
+            *judged,
+            *weight_and_pose,
+            *seconds,
+        ]
     found = outcome.alignment
     figures = (found.coarse.num_correspondences, found.coarse.num_inliers, found.overlap, found.rms_m)
-    last = (found.free_space_violation, weights[ids], *outcome.T_target_source.ravel())
+    last = (found.free_space_violation, *_judged_cells(found), weights[ids], *outcome.T_target_source.ravel())
     return [*ids, "accepted", "", candidate.distance_m, *figures, *last, *seconds]
+
+
+def _judged_cells(outcome: Alignment | Rejected) -> tuple[str, str]:
+    """Probability that the pose is right, and its evidence (nats by name, as JSON); empty if it was not judged."""
+    if outcome.probability is None:
+        return "", ""
+    return f"{outcome.probability:.6f}", json.dumps({name: round(value, 2) for name, value in outcome.evidence.items()})

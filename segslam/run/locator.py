@@ -22,8 +22,6 @@ from segslam.submaps import Submaps
 from segslam.system.short_repr import Record
 from segslam.system.threads import at_once
 from segslam.types import Alignment, Keyframe, Labels, Points, Rejected, RejectReason, Transform, as_points
-from segslam.verification import gates
-from segslam.verification.noise_floor import NeighbourNoise
 
 NUM_PREPARED = 256
 """Number of keyframes prepared for alignment in memory, about 2 MB each."""
@@ -77,12 +75,6 @@ class Locator:
         self.submaps = Submaps(config, lambda: clouds, partial(shape_labels, config=config), lambda: travel_m)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         """A keyframe by its id, prepared for alignment."""
-        self._floor = NeighbourNoise(
-            lambda number: self.prepared(number).observed,
-            lambda number: self.submaps.T_odom[number],
-            self.submaps.lag,
-            config=config,
-        )
         for keyframe in keyframes:
             self.submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
         self.signatures = [self._signature(keyframe) for keyframe in keyframes]
@@ -97,10 +89,6 @@ class Locator:
         recorded = read_log(log_of(run.folder)).keyframes()
         keyframes = [recorded[number] for number in range(len(recorded))]
         return cls(keyframes, recorded, run.result.estimate.T_world_keyframe, config=run.config)
-
-    def floor(self) -> gates.NoiseFloor:
-        """Residuals between neighbouring keyframes of the run; computed on first use."""
-        return self._floor.at(len(self.T_world_keyframe) - 1)
 
     def locate(self, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:
         """The pose of a scan, or the reason why it was not found. `points`: rows of x, y, z in the sensor's frame (m).
@@ -145,7 +133,6 @@ class Locator:
             self.prepared,
             self.T_world_keyframe.__getitem__,
             config=self.config,
-            floor=self.floor(),
             max_places=max_places,
         )
 

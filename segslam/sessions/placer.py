@@ -19,8 +19,9 @@ from segslam.registration import Stopwatch, prepare_observed
 from segslam.run.locator import Located, Locator
 from segslam.sessions.anchored import AnchoredGraph
 from segslam.submaps import Submaps
-from segslam.types import Alignment, Placement, Registration, Rejected, RejectReason, Transform
-from segslam.verification import gates
+from segslam.types import Placement, Registration, Rejected, RejectReason, Transform
+from segslam.verification.patches import Observed, agreement
+from segslam.verification.verdict import judged
 
 REACH_M = 12.0
 """Chosen: the map's keyframes within this distance of a prediction are used for registration."""
@@ -56,10 +57,9 @@ class Placer:
     def __init__(self, config: Config, locator: Locator, graph: AnchoredGraph, submaps: Submaps) -> None:
         """`submaps` provides the keyframes of the drive, which are in the graph."""
         self._config, self._locator, self._graph, self._submaps = config, locator, graph, submaps
-        self._allowed = gates.limits(gates.SINGLE_PAIR, config=config.verify)
         ids = sorted(locator.T_world_keyframe)
         self._T_world_map = np.array([locator.T_world_keyframe[number] for number in ids])
-        self._map_seen: Callable[[int], gates.Observed] = lru_cache(NUM_PREPARED)(self._seen_of_map)
+        self._map_seen: Callable[[int], Observed] = lru_cache(NUM_PREPARED)(self._seen_of_map)
         self._last: _Pose | None = None
         """The newest placed keyframe."""
         self._found: list[Placement] = []
@@ -112,7 +112,7 @@ class Placer:
     def _registered(
         self,
         keyframe_id: int,
-        own: gates.Observed,
+        own: Observed,
         target_id: int,
         T_world_predicted: Transform,
         since_m: float,
@@ -134,15 +134,11 @@ class Placer:
             detail = f"{geometry.distance(moved):.1f} m, {np.degrees(geometry.angle(moved)):.1f} degrees"
             return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
         with watch("verify"):
-            found = gates.agreement(own, target, fine.T_target_source, config=self._config.verify)
-        rejected = gates.rejection(found, self._allowed)
-        if rejected is not None:
-            return rejected
-        observability, _ = refinement.observability(fine.information, config=self._config.refine)
+            found = agreement(own, target, fine.T_target_source, config=self._config.verify)
         coarse = replace(fine, T_target_source=T_target_predicted, num_inliers=0, num_correspondences=0)
-        alignment = Alignment(
-            coarse, fine, found.overlap, found.rms_m, found.free_space_violation, observability=observability
-        )
+        alignment = judged(coarse, fine, found, None, config=self._config)
+        if isinstance(alignment, Rejected):
+            return alignment
         T_world_keyframe = T_world_target @ fine.T_target_source
         return Placement(keyframe_id, target_id, T_world_keyframe, fine.information, alignment, is_found=False)
 
@@ -181,7 +177,7 @@ class Placer:
     def _motion(self, earlier_id: int, later_id: int) -> Transform:
         return geometry.inverse(self._submaps.T_odom[earlier_id]) @ self._submaps.T_odom[later_id]
 
-    def _seen_of_map(self, map_keyframe_id: int) -> gates.Observed:
+    def _seen_of_map(self, map_keyframe_id: int) -> Observed:
         submap = self._locator.submaps.submap(map_keyframe_id)
         return prepare_observed(submap.points, submap.labels, config=self._config, seen_from_here=submap.seen_from_here)
 

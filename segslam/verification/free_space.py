@@ -15,7 +15,7 @@ from segslam import geometry
 from segslam.config import VerifyConfig
 from segslam.points import within_range
 from segslam.system.kernels import kernel
-from segslam.types import Indices, Points, Transform, Vector
+from segslam.types import Indices, Mask, Points, Transform, Vector
 
 NUM_COLUMNS = 360
 """A cell is one degree wide."""
@@ -93,12 +93,24 @@ def violation(
     than a narrow place allows, is `free_space_margin_m` everywhere.
     """
     moved = geometry.apply(T_view_points, points).astype(np.float32)
-    margin_m = min(max(SHARE_OF_PATH * seen.free_path_m, MIN_MARGIN_M), config.free_space_margin_m)
-    if is_coarse:
-        margin_m = config.free_space_margin_m
+    margin_m = config.free_space_margin_m if is_coarse else _margin_m(seen, config)
     margins = np.array([margin_m, config.free_space_margin_ratio])
     num_violations, num_seen = _count_violations(moved, seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
     return num_violations / num_seen if num_seen else 0.0
+
+
+def fates(points: Points, seen: FreeSpace, *, config: VerifyConfig) -> tuple[Mask, Mask]:
+    """(n,) each: points that violate free space, and points behind all that was seen or where nothing was.
+
+    `points` (n, 3) in the frame of the scan that sees.
+    """
+    margins = np.array([_margin_m(seen, config), config.free_space_margin_ratio])
+    found = _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
+    return found < 0, found > 0
+
+
+def _margin_m(seen: FreeSpace, config: VerifyConfig) -> float:
+    return min(max(SHARE_OF_PATH * seen.free_path_m, MIN_MARGIN_M), config.free_space_margin_m)
 
 
 @kernel("UniTuple(int64, 2)(float32, float32, float32, float64, float64)")
@@ -135,3 +147,21 @@ def _count_violations(points, nearest, lowest_rad, row_rad, margins):
             if distance + margins[0] + margins[1] * distance < nearest[row, column]:
                 num_violations += 1
     return num_violations, num_seen
+
+
+@kernel("int8[:](float32[:, :], float32[:, :], float64, float64, float64[:])")
+def _fates(points, nearest, lowest_rad, row_rad, margins):
+    """For each point -1 if it is in front of the returns in its direction by `margins` (m, and per metre), 1 if it is
+    behind them by as much or there is no return, else 0."""
+    found = np.zeros(len(points), np.int8)
+    for at in range(len(points)):
+        x, y, z = points[at]
+        row, column = _cell(x, y, z, lowest_rad, row_rad)
+        return_m = nearest[row, column] if 0 <= row < len(nearest) else np.inf
+        distance = math.sqrt(x * x + y * y + z * z)
+        margin_m = margins[0] + margins[1] * distance
+        if return_m == np.inf or distance > return_m + margin_m:
+            found[at] = 1
+        elif distance + margin_m < return_m:
+            found[at] = -1
+    return found

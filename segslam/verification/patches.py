@@ -1,36 +1,137 @@
-"""Residuals that the points of a patch have in common.
+"""What the patches of two scans show at a pose: on a surface of the other scan, on none, or where it saw free space.
 
-Noise differs from point to point and vanishes in the mean of a patch. At a wrong pose whole surfaces are displaced,
-however noisy the sensor: the recess of a door coincides with a wall.
+A patch has the standing points of a cube of `PATCH_M` whose normals have the same largest component, seen from the
+other scan. The residuals of its points have a cause in common, so it counts once, however many points it has. Ground
+does not count, because it fits the ground of any street.
 """
 
-import numpy as np
+import math
+from typing import NamedTuple
 
-from segslam.points import cell_keys
-from segslam.types import Points, Vector
+import numpy as np
+from jaxtyping import Float
+
+from segslam import geometry
+from segslam.config import VerifyConfig
+from segslam.points import cell_keys, within_range
+from segslam.refinement import Surface
+from segslam.types import Points, Transform, Vector
+from segslam.verification.free_space import FreeSpace, fates, violation
+
+Observed = tuple[Surface, FreeSpace]
+"""A scan as verification sees it."""
 
 PATCH_M = 1.5
-"""Chosen on simulated corridors, seed 2: of patches of 0.6, 1.0, 1.5 and 2.0 m these separate wrong poses best."""
-MIN_POINTS = 4
-"""Number of points of a patch whose variance is meaningful."""
+"""Edge of the cube of a patch."""
+RESIDUALS = (0.6, 1.0, 1.6)
+"""Edges of the bins of a patch's root mean square distance to the surface, in units of the roughness."""
+FAR_M = 10.0
+"""Patches farther from the other sensor than this have bins of their own."""
+SAME_NORMAL = 0.8
+"""Two surfaces face the same way within 37 degrees."""
+VIOLATING, KNOWN = 0.3, 1.0 / 3.0
+"""Shares of the points of a patch: in free space, and known, for a patch that is there or that is judged at all."""
+BINS = (
+    "free space",
+    "no surface",
+    *(
+        f"{where}, {how}, residual {level}"
+        for where in ("near", "far")
+        for how in ("same normal", "turned")
+        for level in range(len(RESIDUALS) + 1)
+    ),
+)
+
+Counts = Float[np.ndarray, "18"]
+"""Number of patches in each of `BINS`."""
 
 
-def common_residual_m(points: Points, normals: Points, residuals_m: Vector) -> float:
-    """Root mean square of the mean residuals of patches, without the part that the scatter within them explains (m).
+class Agreement(NamedTuple):
+    """What two scans show at a pose; of overlap, residual and violation the worse of both directions of comparison."""
 
-    `points` (n, 3) in the sensor's frame, with unit normals (n, 3) of either sign and distances (n,) along them to
-    another surface. A patch has the points of a cube of `PATCH_M` whose normals have the same largest component. 0 if
-    no patch has enough points.
-    """
-    away = np.einsum("ij,ij->i", normals, points) > 0
-    behind_m = np.where(away, residuals_m, -residuals_m)
+    overlap: float
+    """Share of the standing points within reach of the other scan that lie within `inlier_m` of it."""
+    rms_m: float
+    """Root mean square distance of these points to the planes of the other surface (m); infinite if there are none."""
+    roughness_m: float
+    """The larger roughness of the two surfaces."""
+    free_space_violation: float
+    """Share of the points that violate the free space of the other scan, of those in directions with a return."""
+    counts: Counts
+    """Of both directions."""
+
+    @property
+    def num_patches(self) -> float:
+        """Mean number of patches of a scan."""
+        return float(self.counts.sum()) / 2.0
+
+
+def agreement(source: Observed, target: Observed, T_target_source: Transform, *, config: VerifyConfig) -> Agreement:
+    """Agreement of two scans at this pose of the source in the target."""
+    roughness_m = max(source[0].roughness_m, target[0].roughness_m)
+    ways = [
+        (*_seen_from(b, a, T_b_a, roughness_m, config), violation(a[0].points, b[1], T_b_a, config=config))
+        for a, b, T_b_a in ((source, target, T_target_source), (target, source, geometry.inverse(T_target_source)))
+    ]
+    overlaps, residuals_m, counts, violations = zip(*ways, strict=True)
+    return Agreement(min(overlaps), max(residuals_m), roughness_m, max(violations), counts[0] + counts[1])
+
+
+def first_look(source: Observed, target: Observed, T_target_source: Transform, *, config: VerifyConfig) -> Counts:
+    """Twice the patches of the source alone, in half of the time: a first look at a pose that may still be refined."""
+    roughness_m = max(source[0].roughness_m, target[0].roughness_m)
+    return 2.0 * _seen_from(target, source, T_target_source, roughness_m, config)[2]
+
+
+def _seen_from(
+    b: Observed, a: Observed, T_b_a: Transform, roughness_m: float, config: VerifyConfig
+) -> tuple[float, float, Counts]:
+    """Overlap, residual (m) and patches of a's standing points in the view of b."""
+    surface = b[0]
+    standing, turned = a[0].standing_with_normals
+    moved = geometry.apply(T_b_a, standing)
+    within = within_range(moved, 0.0, config.max_range_m)
+    points, normals = moved[within], turned[within] @ T_b_a[:3, :3].T
+    if not len(points):
+        return 0.0, math.inf, np.zeros(len(BINS))
+    rows, apart_m = surface.nearest(points)
+    there = surface.normals[rows]
+    to_plane_m = np.einsum("ij,ij->i", points - surface.points[rows], there)
+    is_near = apart_m < config.inlier_m
+    rms_m = float(np.sqrt(np.mean(to_plane_m[is_near] ** 2))) if is_near.any() else math.inf
+    is_same = np.abs(np.einsum("ij,ij->i", normals, there)) > SAME_NORMAL
     keys, _ = cell_keys(points, PATCH_M)
     _, patch = np.unique(3 * keys + np.abs(normals).argmax(axis=1), return_inverse=True)
-    count = np.bincount(patch)
-    is_full = count >= MIN_POINTS
-    if not is_full.any():
-        return 0.0
-    mean, squared = (np.bincount(patch, weights)[is_full] / count[is_full] for weights in (behind_m, behind_m**2))
-    count = count[is_full]
-    of_mean = (squared - mean**2) / (count - 1)
-    return float(np.sqrt(max(np.average(mean**2 - of_mean, weights=count), 0.0)))
+    counts = _binned(patch, points, is_near, to_plane_m / roughness_m, is_same, b[1], config)
+    return float(np.mean(is_near)), rms_m, counts
+
+
+def _binned(
+    patch: np.ndarray,
+    points: Points,
+    is_near: np.ndarray,
+    residual: Vector,
+    is_same: np.ndarray,
+    seen: FreeSpace,
+    config: VerifyConfig,
+) -> Counts:
+    """Patches in each bin; `patch`: the number of the patch of each point."""
+    violates, is_beyond = fates(points, seen, config=config)
+    is_known = is_near | violates | ~is_beyond
+    size = np.bincount(patch)
+    known, near, same, squared, violating, range_m = (
+        np.bincount(patch, weights)
+        for weights in (
+            is_known,
+            is_near,
+            is_near & is_same,
+            is_near * residual**2,
+            violates,
+            np.linalg.norm(points, axis=1),
+        )
+    )
+    level = np.digitize(np.sqrt(squared / np.maximum(near, 1.0)), RESIDUALS)
+    level += (len(RESIDUALS) + 1) * ((same <= 0.5 * near) + 2 * (range_m >= FAR_M * size))
+    shown = np.where(near > KNOWN * known, 2 + level, 1)
+    shown[violating > VIOLATING * size] = 0
+    return np.bincount(shown[known >= KNOWN * size], minlength=len(BINS)).astype(np.float64)

@@ -42,7 +42,6 @@ def main() -> None:
     scans = run.result.trajectory.scan_index[run.result.keyframe_rows]
     T_keyframes = np.stack([T_of_scan[int(scan)] for scan in scans])
     locator = Locator.from_run(options.run)
-    locator.floor()
     outcomes: Counter[str] = Counter()
     seconds, cpu_seconds = [], []
     for row in range(0, len(data), options.every):

@@ -24,8 +24,7 @@ from segslam.registration import PreparedScan, prepare_scan, register_prepared, 
 from segslam.simulation.scene_sensors import SENSORS, scan_points
 from segslam.simulation.scenes import SCENES, Scene, pose
 from segslam.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
-from segslam.verification.gates import NoiseFloor, agreement
-from segslam.verification.noise_floor import NeighbourNoise
+from segslam.verification.patches import agreement
 from segslam.verification.prior import far_from_prior
 from tools.benchmarks import common
 
@@ -46,16 +45,6 @@ class Place:
 
     def pose(self, row: int, visit: int) -> Transform:
         return pose(self.scene, row, np.random.default_rng([self._seed, row, visit]), turned=visit % 2 == 1)
-
-    def floor(self) -> NoiseFloor:
-        """The noise floor that a run would measure: five scans and their neighbours, some 2 m on."""
-        step_m = float(np.median(np.linalg.norm(np.diff(self.scene.path[:, :3], axis=0), axis=1)))
-        lag = max(1, round(2.0 / step_m))
-        poses = {row: self.pose(row, 0) for row in range(len(self.scene.path))}
-        noise = NeighbourNoise(
-            lambda row: self.prepared(row, 0).observed, poses.__getitem__, lambda _: lag, config=self._config
-        )
-        return noise.at(len(self.scene.path) - 1)
 
     def _prepare(self, row: int, visit: int) -> PreparedScan:
         rng = np.random.default_rng([self._seed, row, visit, 1])
@@ -85,15 +74,15 @@ def _heights(scene: Scene) -> np.ndarray:
 class Judge:
     """Registers and verifies pairs like a run."""
 
-    def __init__(self, floor: NoiseFloor, config: Config) -> None:
-        self._floor, self._config = floor, config
+    def __init__(self, config: Config) -> None:
+        self._config = config
 
     def __call__(
         self, source: PreparedScan, target: PreparedScan, T_prior: Transform, R_world_target: Rotation
     ) -> Alignment | Rejected:
         candidate = LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), RADIUS_M, CHAIN_M)
         gate = partial(far_from_prior, candidate=candidate, R_world_target=R_world_target, config=self._config)
-        return register_prepared(source, target, config=self._config, floor=self._floor, gate=gate)
+        return register_prepared(source, target, config=self._config, gate=gate)
 
 
 def prior(T_target_source: Transform, rng: np.random.Generator) -> Transform:
@@ -116,11 +105,10 @@ def bench(name: str, sensor: str, noise_m: float, *, count: int, seed: int, conf
     rng = np.random.default_rng([seed, 9])
     started = time.perf_counter()
     here, elsewhere = (Place(SCENES[name](other), sensor, noise_m, other, config) for other in (seed, seed + ELSEWHERE))
-    floor = here.floor()
-    judge = Judge(floor, config)
+    judge = Judge(config)
     row: dict[str, object] = {"scene": name, "sensor": sensor, "noise_m": noise_m}
     row |= _true(here, judge, count, rng, config) | _false(here, elsewhere, judge, count, rng)
-    return row | {"floor": round(floor.residual_ratio, 2), "seconds": round(time.perf_counter() - started, 1)}
+    return row | {"seconds": round(time.perf_counter() - started, 1)}
 
 
 def _true(place: Place, judge: Judge, count: int, rng: np.random.Generator, config: Config) -> dict[str, object]:

@@ -14,8 +14,8 @@ from segslam.experiments.meter import measured
 from segslam.experiments.trials import Trial
 from segslam.registration import prepare_scan, register
 from segslam.types import Description, Label, Points, Registration
-from segslam.verification import gates
 from segslam.verification.free_space import observe_free_space
+from segslam.verification.patches import agreement
 from tools.benchmarks.common import Row
 from tools.benchmarks.registration.scans import Labelled
 
@@ -54,7 +54,7 @@ def _timed_stages(source: Labelled, target: Labelled, config: Config) -> Iterabl
             timed(lambda: refinement.refine(one.surface, other.surface, T_target_source, config=config.refine)),
         )
         sides = (one.surface, one.free_space), (other.surface, other.free_space)
-        yield "verify", timed(lambda: gates.agreement(*sides, T_target_source, config=config.verify))
+        yield "verify", timed(lambda: agreement(*sides, T_target_source, config=config.verify))
     yield "cold pair", timed(lambda: _cold(source, target, config))
     yield BESIDE, timed(lambda: align_gicp(*(prepare_gicp(points) for points, _ in (source, target))))
 

@@ -1,9 +1,11 @@
-"""One score for a pose between two scans, in the shadow of the gates: how much likelier are the scans if it is right.
+"""The score of a pose: how probable it is, learnt and tested on pairs of scans whose poses are known.
 
-    python -m tools.benchmarks.score DATA --out FILE.json [--parts corridor,kitti_whole] [--pairs 5] [--seed 21]
+    python -m tools.benchmarks.score describe DATA --out FILE.pickle [--parts corridor,nclt] [--pairs 5] [--seed 40]
+    python -m tools.benchmarks.score learn FILE.pickle ... --table segslam/verification/score.json
+    python -m tools.benchmarks.score test FILE.pickle ... [--learnt FILE.pickle ...] --out FILE.json
 
-Each pair is registered and verified as in a run, and then scored: its poses, slides along the weakest direction among
-them, are refined, and each is described by what its patches show (`evidence`). Tables of how often right and wrong
-poses show it, and the weights of match and uniqueness, are learnt from the other parts (`ratio`): a part never scores
-itself. Prints for each part what the gates and the score accept, and the curve of the score over all parts.
+`describe` registers pairs as a run does and stores what the scans show at each pose that was tried; that takes about a
+second a pair. `learn` writes the table that the package ships, calibrated on what each part is given by all others.
+`test` prints, for each part, what the package accepted, and what a table learnt from all other parts accepts; with
+`--learnt` such a table is learnt from other files, so that neither places nor seeds are those that are tested.
 """

@@ -1,42 +1,59 @@
 """Command line of the benchmark of the score."""
 
+import argparse
+import json
+import pickle
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
 
 from segslam.config import Config, load_config
 from segslam.simulation.scenes import SCENES
+from segslam.verification.patches import BINS
+from segslam.verification.score import Table, least_odds
 from tools.benchmarks import common, score
-from tools.benchmarks.score.pairs import Task, described, of_drive, of_scene
-from tools.benchmarks.score.ratio import Pair, Score, Scored
+from tools.benchmarks.score import ratio
+from tools.benchmarks.score.pairs import Task, described, of_drive, of_scene, of_towns
+from tools.benchmarks.score.ratio import Best, Pair
 
-DRIVES = ("kitti_whole", "nclt", "courtyard")
-SHARES = (0.0, 0.01, 0.05)
-"""Shares of the pairs without a right pose that the curve lets pass."""
+DRIVES = ("kitti_whole", "nclt", "courtyard", "town")
+TENTHS = np.linspace(0.0, 1.0, 11)
 
 
 def main() -> None:
-    parser = common.parser(score.__doc__, "score")
-    parser.add_argument("data", type=Path, help="folder with nclt/, courtyard/ and kitti_whole/ (unpacked)")
-    parser.add_argument("--parts", default=",".join((*SCENES, *DRIVES)))
-    parser.add_argument("--sensors", default="70 wide,16,64")
-    parser.add_argument("--noise", default="0.03,0.1,0.01", help="taken in turn by scenes and sensors")
-    parser.add_argument("--pairs", type=int, default=5, help="true ones, and as many false ones, of each part")
-    parser.add_argument("--seed", type=int, default=21)
-    common.add_settings(parser)
-    parser.add_argument("--out", type=Path, required=True)
+    parser = argparse.ArgumentParser("score", description=score.__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    jobs = parser.add_subparsers(dest="job", required=True)
+    describe = jobs.add_parser("describe")
+    describe.add_argument("data", type=Path, help="folder with nclt/, courtyard/, kitti_whole/ (unpacked) and town/")
+    describe.add_argument("--parts", default=",".join((*SCENES, *DRIVES)))
+    describe.add_argument("--sensors", default="70 wide,16,64,non-repeating,32,90 high,128")
+    describe.add_argument("--noise", default="0.03,0.1,0.01", help="taken in turn by scenes and sensors")
+    describe.add_argument("--pairs", type=int, default=5, help="true ones, and as many false ones, of each cell")
+    describe.add_argument("--seed", type=int, default=40)
+    common.add_settings(describe)
+    describe.add_argument("--out", type=Path, required=True)
+    learn = jobs.add_parser("learn")
+    learn.add_argument("pairs", type=Path, nargs="+")
+    learn.add_argument("--table", type=Path, required=True)
+    test = jobs.add_parser("test")
+    test.add_argument("pairs", type=Path, nargs="+")
+    test.add_argument("--learnt", type=Path, nargs="+")
+    test.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
+    {"describe": _describe, "learn": _learn, "test": _test}[options.job](options)
+
+
+def _describe(options: Namespace) -> None:
     config = load_config(overrides=options.set)
     pairs: list[Pair] = []
     for task in _tasks(options, config):
         pairs.append(described(task, config))
-        run = pairs[-1].run
-        print(f"{run.part}, {run.sensor}: {len(pairs)} pairs, {pairs[-1].verdict}", flush=True)
-    figures = compared(pairs)
-    print(common.markdown("gates and score", figures["parts"]))
-    print(common.markdown("score", figures["curve"]))
-    common.write_report(options.out, figures)
+        print(f"{pairs[-1].part}, {pairs[-1].sensor}: {len(pairs)} pairs, {pairs[-1].verdict}", flush=True)
+    options.out.write_bytes(pickle.dumps(pairs))
 
 
 def _tasks(options: Namespace, config: Config) -> Iterator[Task]:
@@ -47,50 +64,101 @@ def _tasks(options: Namespace, config: Config) -> Iterator[Task]:
         for number, name in enumerate(part for part in parts if part in SCENES):
             yield from drawn(name, sensor, noises[(turn + number) % len(noises)])
     for part in parts:
-        if part not in SCENES:
+        if part == "town":
+            yield from of_towns(options.data, count=options.pairs, seed=options.seed, config=config)
+        elif part not in SCENES:
             yield from of_drive(part, options.data, count=options.pairs, seed=options.seed, config=config)
 
 
-def compared(pairs: Sequence[Pair]) -> dict[str, list[common.Row]]:
-    """Rows of the parts, each scored by what the others taught, and of the curve over all."""
-    parts = sorted({pair.run.part for pair in pairs})
-    scored: list[tuple[Pair, Scored, float]] = []
-    rows: list[common.Row] = []
-    for part in parts:
-        taught = Score.learnt([pair for pair in pairs if pair.run.part != part])
-        own = [pair for pair in pairs if pair.run.part == part]
-        found = [(pair, one, taught.log_odds(one)) for pair in own if pair.poses for one in [taught.scored(pair, own)]]
-        scored += found
-        rows.append(_row(part, own, found))
-    return {"parts": rows, "curve": [_point(scored, share) for share in SHARES]}
+def _read(files: Sequence[Path]) -> list[Pair]:
+    return [pair for file in files for pair in pickle.loads(file.read_bytes())]
 
 
-def _row(part: str, own: Sequence[Pair], found: Sequence[tuple[Pair, Scored, float]]) -> common.Row:
-    wrong = [odds for _, one, odds in found if not one.best.is_right]
-    most = max(wrong, default=-float("inf"))
+def _learn(options: Namespace) -> None:
+    pairs = _read(options.pairs)
+    table = _shipped(pairs)
+    content = {
+        "made_by": "python -m tools.benchmarks.score learn",
+        "pairs": len(pairs),
+        "ratios": {name: round(float(value), 3) for name, value in zip(BINS, table.ratios, strict=True)},
+        "match": [round(value, 2) for value in table.match],
+        "lead": [round(value, 2) for value in table.lead],
+    }
+    options.table.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    print(content)
+
+
+def _shipped(pairs: Sequence[Pair]) -> Table:
+    return ratio.calibrated(ratio.learnt(pairs), ratio.calibration(ratio.left_out(pairs)))
+
+
+def _test(options: Namespace) -> None:
+    tested = _read(options.pairs)
+    taught = tested if options.learnt is None else _read(options.learnt)
+    scored: list[tuple[Best, float]] = []
+    for part in sorted({pair.part for pair in tested}):
+        table = _shipped([pair for pair in taught if pair.part != part])
+        bests = ratio.bests([pair for pair in tested if pair.part == part], table)
+        scored += [(best, ratio.odds_of(best, table)) for best in bests]
+    least = least_odds(Config().verify)
+    parts = [_row(part, tested, scored, least) for part in sorted({pair.part for pair in tested})]
+    figures = {"parts": [*parts, _row("", tested, scored, least)], "curve": curve(scored), "tenths": tenths(scored)}
+    for name, rows in figures.items():
+        print(common.markdown(name, rows))
+    common.write_report(options.out, figures)
+
+
+def _row(part: str, pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]], least: float) -> common.Row:
+    """What the package accepted, and what the table accepts that others taught; all parts if `part` is empty."""
+    own = [pair for pair in pairs if not part or pair.part == part]
+    found = [(best, odds) for best, odds in scored if not part or best.pair.part == part]
+    seen = [pair for pair in own if pair.overlap > 0.4]
+    right = [best.pair for best, odds in found if best.pose.is_right and odds >= least]
     return {
-        "part": part,
+        "part": part or "all",
         "true": sum(pair.is_true for pair in own),
-        "gates_right": sum(pair.verdict == "right" for pair in own),
-        "gates_wrong": sum(pair.verdict == "wrong" for pair in own),
-        "tried_right": sum(any(pose.is_right for pose in pair.poses) for pair in own),
-        "best_right": sum(one.best.is_right for _, one, _ in found),
-        "right_above_all_wrong": sum(one.best.is_right and odds > most for _, one, odds in found),
+        "false": sum(not pair.is_true for pair in own),
+        "tried_right": sum(any(pose.is_right and pose.is_allowed for pose in pair.poses) for pair in own),
+        "package_right": sum(pair.verdict == "right" for pair in own),
+        "package_wrong": sum(pair.verdict == "wrong" for pair in own),
+        "right": len(right),
+        "wrong": sum(not best.pose.is_right and odds >= least for best, odds in found),
+        "overlapping": len(seen),
+        "right_of_them": sum(pair.overlap > 0.4 for pair in right),
+        "seconds": round(float(np.mean([pair.seconds for pair in own])), 3),
     }
 
 
-def _point(scored: Sequence[tuple[Pair, Scored, float]], share: float) -> common.Row:
-    """How many right poses are above the limit that lets this share of the wrong best poses pass."""
-    wrong = sorted((odds for _, one, odds in scored if not one.best.is_right), reverse=True)
-    limit = wrong[int(share * len(wrong))] if wrong else -float("inf")
-    kept = sum(one.best.is_right and odds > limit for _, one, odds in scored)
-    return {
-        "false_share": share,
-        "log_odds_above": round(limit, 2) if wrong else None,
-        "kept": kept,
-        "right": sum(one.best.is_right for _, one, _ in scored),
-        "wrong": len(wrong),
-    }
+def curve(scored: Sequence[tuple[Best, float]]) -> list[common.Row]:
+    """How many right poses are above the limit that lets so many wrong ones pass."""
+    wrong = sorted((odds for best, odds in scored if not best.pose.is_right), reverse=True)
+    right = np.array([odds for best, odds in scored if best.pose.is_right])
+    return [
+        {
+            "wrong_accepted": number,
+            "of": len(wrong),
+            "log_odds_above": round(wrong[number], 2),
+            "right_accepted": int((right > wrong[number]).sum()),
+            "of_right": len(right),
+        }
+        for number in (0, 1, 2, 5, 10)
+        if number < len(wrong)
+    ]
+
+
+def tenths(scored: Sequence[tuple[Best, float]]) -> list[common.Row]:
+    """Poses by probability, at even prior odds: its mean and the share of right ones; both classes weigh the same."""
+    probability = 1.0 / (1.0 + np.exp(-np.clip([odds for _, odds in scored], -500.0, 500.0)))
+    is_right = np.array([best.pose.is_right for best, _ in scored])
+    weight = np.where(is_right, 0.5 / max(is_right.sum(), 1), 0.5 / max((~is_right).sum(), 1))
+    rows: list[common.Row] = []
+    for low, high in pairwise(TENTHS):
+        within = (probability >= low) & ((probability < high) | (high == 1.0))
+        if within.any():
+            share = np.average(is_right[within], weights=weight[within])
+            mean = np.average(probability[within], weights=weight[within])
+            rows.append({"from": round(float(low), 1), "poses": int(within.sum()), "probability": mean, "right": share})
+    return rows
 
 
 if __name__ == "__main__":

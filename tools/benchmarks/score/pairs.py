@@ -8,50 +8,51 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam import geometry, refinement
+from segslam import geometry
 from segslam.config import Config
-from segslam.datasets import open_dataset
+from segslam.datasets import Dataset, open_dataset
 from segslam.evaluation import PoseError
 from segslam.keyframes import downsample_keyframe
 from segslam.registration import Gate, PreparedScan, Stopwatch, anywhere, prepare_scan, register_prepared, shape_labels
+from segslam.registration.pair import tried_poses
 from segslam.registration.trial import Trial
 from segslam.simulation.scenes import SCENES
 from segslam.types import Alignment, LoopCandidate, Points, Rejected, Rotation, Transform
-from segslam.verification import gates
-from segslam.verification.noise_floor import NeighbourNoise
+from segslam.verification import score
+from segslam.verification.patches import agreement
 from segslam.verification.prior import far_from_prior
 from tools.benchmarks import common, scenes
 from tools.benchmarks.registration.scans import courtyard_points
-from tools.benchmarks.score.evidence import Counts, evidence
-from tools.benchmarks.score.poses import tried
-from tools.benchmarks.score.ratio import Pair, Pose, Run
+from tools.benchmarks.score.ratio import Pair, Pose
 from tools.benchmarks.submaps import Submaps, poses_of
 
 SEEN_M, APART_M, GAP = 20.0, 100.0, 40
 """Pairs of real drives: scans this near and this many later are true ones, farther than `APART_M` false ones."""
 TRUTH_KITTI = 2.0, 3.0
 """m, degrees: the truth of KITTI's thinned keyframes is off by up to 0.8 m along the road, and its own revisits."""
-NUM_NEIGHBOURS, NEIGHBOURS_M = 4, (2.0, 4.0, 8.0)
-"""Places along a drive whose neighbours are registered, and how far these are."""
+SEARCH_SHARE = 0.1
+"""Poses are searched as for this `verify.max_false_share`: also around poses that would be rejected without rivals."""
+DAYS = ("_0", "_1", "_2", "_3")
+"""Ends of the names of the drives through a town."""
 TRUTH = common.RIGHT_M, common.RIGHT_DEG
 
 
 class Task(NamedTuple):
     """Two scans of a part, and what is known about their pose."""
 
-    run: Run
+    part: str
+    sensor: str
     source: PreparedScan
     target: PreparedScan
     T_target_source: Transform | None
     """None for scans of different worlds."""
     is_true: bool
     gate: Gate
-    floor: gates.NoiseFloor
     tolerance: tuple[float, float]
 
 
 def described(task: Task, config: Config) -> Pair:
-    """The verdict of the gates, and the evidence at the poses that are scored."""
+    """What the scans show at the poses that the registration tries, and its verdict."""
 
     def is_right(T_target_source: Transform) -> bool:
         if task.T_target_source is None:
@@ -59,16 +60,27 @@ def described(task: Task, config: Config) -> Pair:
         return PoseError.of(geometry.inverse(task.T_target_source) @ T_target_source).within(*task.tolerance)
 
     started = time.process_time()
-    found = register_prepared(task.source, task.target, config=config, gate=task.gate, floor=task.floor)
+    found = register_prepared(task.source, task.target, config=config, gate=task.gate)
     seconds = time.process_time() - started
     verdict = "wrong" if isinstance(found, Alignment) else found.reason.value
     if isinstance(found, Alignment) and is_right(found.fine.T_target_source):
         verdict = "right"
-    allowed = gates.limits(task.floor, config=config.verify)
-    trial = Trial(task.source, task.target, config, task.gate, task.floor, allowed, Stopwatch())
-    scans = task.source.observed, task.target.observed
-    poses = [Pose(T, evidence(*scans, T, config=config.verify), is_right(T)) for T in tried(trial)]
-    return Pair(task.run, task.is_true, poses, verdict, seconds)
+    searching = config.model_copy(update={"verify": config.verify.model_copy(update={"max_false_share": SEARCH_SHARE})})
+    tried = tried_poses(Trial(task.source, task.target, searching, task.gate, Stopwatch(), score.shipped()))
+    poses = [
+        Pose(
+            one.T_target_source,
+            one.agreement.counts,
+            is_right(one.T_target_source),
+            task.gate(one.T_target_source, slack_m=0.0) is None,
+        )
+        for one in ([] if isinstance(tried, Rejected) else tried)
+    ]
+    overlap = 0.0
+    if task.is_true and task.T_target_source is not None:
+        scans = task.source.observed, task.target.observed
+        overlap = agreement(*scans, task.T_target_source, config=config.verify).overlap
+    return Pair(task.part, task.sensor, task.is_true, overlap, poses, verdict, seconds)
 
 
 def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, config: Config) -> Iterator[Task]:
@@ -76,12 +88,6 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
     rng = np.random.default_rng([seed, 9])
     here, elsewhere = (
         scenes.Place(SCENES[name](other), sensor, noise_m, other, config) for other in (seed, seed + scenes.ELSEWHERE)
-    )
-    floor = here.floor()
-    run = Run(
-        name,
-        sensor,
-        _neighbours(lambda row: here.prepared(row, 0), lambda row: here.pose(row, 0), here.scene.path[:, :3], config),
     )
 
     def gate(T_prior: Transform, R_world_target: Rotation) -> Gate:
@@ -97,7 +103,7 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
         T_true = geometry.inverse(T_target) @ T_source
         prior = gate(scenes.prior(T_true, rng), T_target[:3, :3])
         scans = here.prepared(source, first), here.prepared(target, second)
-        yield Task(run, *scans, T_true, True, prior, floor, TRUTH)
+        yield Task(name, sensor, *scans, T_true, True, prior, TRUTH)
     for number, (source, target) in enumerate(scenes.false_pairs(here.scene, count, rng)):
         place = here if number % 2 else elsewhere
         source %= len(place.scene.path)
@@ -106,17 +112,14 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
         T_true = geometry.inverse(here.pose(target, second)) @ place.pose(source, first)
         scans = place.prepared(source, first), here.prepared(target, second)
         prior = gate(scenes.prior(T_near, rng), np.eye(3))
-        yield Task(run, *scans, T_true if place is here else None, False, prior, floor, TRUTH)
+        yield Task(name, sensor, *scans, T_true if place is here else None, False, prior, TRUTH)
 
 
 def of_drive(part: str, data: Path, *, count: int, seed: int, config: Config) -> Iterator[Task]:
     """True and false pairs of a real drive, without a prior; the courtyard is too small for false ones."""
     rng = np.random.default_rng([seed, 10])
-    prepared, T_world_lidar, lag = _drive(part, data, config)
-    noise = NeighbourNoise(lambda row: prepared(row).observed, T_world_lidar.__getitem__, lambda _: lag, config=config)
-    floor = noise.at(len(T_world_lidar) - 1)
+    prepared, T_world_lidar = _drive(part, data, config)
     at = T_world_lidar[:, :3, 3]
-    run = Run(part, "real", _neighbours(prepared, T_world_lidar.__getitem__, at, config))
     apart_m = np.linalg.norm(at[:, None] - at, axis=-1)
     is_later = np.arange(len(at))[:, None] - np.arange(len(at)) > GAP
     near = common.draw_pairs(is_later & (apart_m < SEEN_M), count, rng)
@@ -125,40 +128,45 @@ def of_drive(part: str, data: Path, *, count: int, seed: int, config: Config) ->
         for source, target in drawn:
             T_true = geometry.inverse(T_world_lidar[target]) @ T_world_lidar[source]
             tolerance = TRUTH_KITTI if part == "kitti_whole" else TRUTH
-            yield Task(run, prepared(source), prepared(target), T_true, is_true, anywhere, floor, tolerance)
+            yield Task(part, "real", prepared(source), prepared(target), T_true, is_true, anywhere, tolerance)
 
 
-def _neighbours(
-    prepared: Callable[[int], PreparedScan], T_world: Callable[[int], Transform], at: Points, config: Config
-) -> list[Counts]:
-    """What pairs along the drive show at their known poses, refined."""
-    step_m = float(np.median(np.linalg.norm(np.diff(at, axis=0), axis=1)))
-    found = []
-    for row in np.linspace(0, len(at) - 1, NUM_NEIGHBOURS).astype(int).tolist():
-        for apart_m in NEIGHBOURS_M:
-            older = row - max(1, round(apart_m / step_m))
-            if older < 0:
-                continue
-            source, target = prepared(row), prepared(older)
-            T_known = geometry.inverse(T_world(older)) @ T_world(row)
-            fine = refinement.refine(source.surface, target.surface, T_known, config=config.refine)
-            if isinstance(fine, Rejected):
-                continue
-            if PoseError.of(geometry.inverse(T_known) @ fine.T_target_source).within(*TRUTH_KITTI):
-                scans = source.observed, target.observed
-                found.append(evidence(*scans, fine.T_target_source, config=config.verify))
-    return found
+def of_towns(data: Path, *, count: int, seed: int, config: Config) -> Iterator[Task]:
+    """Pairs of drives through a simulated town on two days, and through two towns, without a prior."""
+    rng = np.random.default_rng([seed, 11])
+    drives: dict[str, list[tuple[Callable[[int], PreparedScan], np.ndarray]]] = {}
+    for folder in sorted(path for path in (data / "town").iterdir() if path.name[-2:] in DAYS):
+        scans = open_dataset(folder)
+        assert scans.reference is not None
+        prepared = _preparer(partial(_points_of, scans), config)
+        drives.setdefault(folder.name[:-2], []).append((prepared, scans.reference.T_world_lidar))
+    names = sorted(drives)
+    for number, name in enumerate(names):
+        (here, T_here), (later, T_later) = (
+            drives[name][day] for day in rng.choice(len(drives[name]), 2, replace=False)
+        )
+        near = np.linalg.norm(T_later[:, None, :3, 3] - T_here[:, :3, 3], axis=-1) < SEEN_M
+        for source, target in common.draw_pairs(near, count, rng):
+            T_true = geometry.inverse(T_here[target]) @ T_later[source]
+            yield Task("town", name, later(source), here(target), T_true, True, anywhere, TRUTH)
+        other, T_other = drives[names[number - 1]][0]
+        for source, target in rng.integers([len(T_other), len(T_here)], size=(count, 2)).tolist():
+            yield Task("town", name, other(source), here(target), None, False, anywhere, TRUTH)
 
 
-def _drive(part: str, data: Path, config: Config) -> tuple[Callable[[int], PreparedScan], np.ndarray, int]:
-    """Prepared scans by their row, their poses, and the rows between neighbours."""
+def _points_of(scans: Dataset, row: int) -> Points:
+    return scans[row].points
+
+
+def _drive(part: str, data: Path, config: Config) -> tuple[Callable[[int], PreparedScan], np.ndarray]:
+    """Prepared scans by their row, and their poses."""
     if part == "nclt":
         submaps = Submaps(data / "nclt", config)
-        return submaps.prepared, submaps.T_world_lidar, 11
+        return submaps.prepared, submaps.T_world_lidar
     if part == "courtyard":
-        return _preparer(partial(courtyard_points, data), config), poses_of(data / "courtyard" / "poses.txt"), 1
+        return _preparer(partial(courtyard_points, data), config), poses_of(data / "courtyard" / "poses.txt")
     scans = open_dataset(data / part)
-    return _preparer(lambda row: scans[row].points, config), poses_of(data / part / "poses.txt"), 1
+    return _preparer(partial(_points_of, scans), config), poses_of(data / part / "poses.txt")
 
 
 def _preparer(points_of: Callable[[int], Points], config: Config) -> Callable[[int], PreparedScan]:

@@ -1,12 +1,12 @@
-"""The ratio of likelihoods of right and wrong poses, learnt from pairs whose poses are known.
+"""The table of `segslam.verification.score`, learnt from pairs whose poses are known.
 
-A pose is right if it is no chance fit of two places, and if no other pose that was tried explains the scans as well.
-The first is judged against the run itself: its neighbours, whose poses are known, and its impossible pairs, each at its
-best pose. In a corridor both look similar, and the demand rises by itself.
+A pair counts as much as all others of its part together allow: each part weighs the same, and so do right and wrong
+poses, so the prior odds are even.
 """
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,15 +15,16 @@ from scipy.optimize import minimize
 from segslam.registration.rivals import SAME_POSE_M, SAME_POSE_RAD
 from segslam.registration.trial import is_near
 from segslam.types import Transform, Vector
-from tools.benchmarks.score.evidence import BINS, Counts
+from segslam.verification.patches import BINS, Counts
+from segslam.verification.score import NO_OTHER, TYPICAL_PATCHES, Table
 
 PRIOR_COUNT = 0.5
 """Jeffreys': pseudo-counts of a bin that was never seen."""
-NUM_LEARNT = 3.0
-"""Chosen: number of pairs of a run that count as much as what other runs taught."""
-START = np.array([np.log(30.0), 0.0, np.log(10.0), np.log(10.0), 0.0])
-START_SIGMA = 2.0
-"""Chosen: normal prior of the parameters of a `Score`, wide: the slopes within factors of 7."""
+PART_WEIGHT, CLASS_WEIGHT = 100.0, 60.0
+"""Number of poses as which a part counts in the ratios, and either class of a part in the slopes."""
+START = np.array([0.7, 0.7, 2.0, 2.0])
+SIGMA = np.array([1.5, 1.5, 3.0, 3.0])
+"""Normal prior of the logarithms of two slopes, in standard deviations of what they multiply, and of two offsets."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,64 +34,54 @@ class Pose:
     T_target_source: Transform
     counts: Counts
     is_right: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Run:
-    """Scans of one sensor in one world, and what its neighbours show at their known poses."""
-
-    part: str
-    sensor: str
-    neighbours: list[Counts] = field(default_factory=list)
+    is_allowed: bool
+    """By the prior."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Two scans, the poses that were tried, and what the gates said."""
+    """Two scans, and the poses that were tried."""
 
-    run: Run
+    part: str
+    sensor: str
     is_true: bool
     """True if the scans show the same place."""
+    overlap: float
+    """At the true pose; 0 for scans of different places."""
     poses: Sequence[Pose]
     verdict: str
-    """Of the gates: right, wrong, or the reason of the rejection."""
+    """Of the package with its own table: right, wrong, or the reason of the rejection."""
     seconds: float
-    """CPU of the registration with the gates."""
+    """CPU of the registration."""
 
 
-class Scored(NamedTuple):
-    """The best pose of a pair, and the ingredients of its score (nats a patch)."""
+class Best(NamedTuple):
+    """The best pose of a pair that the prior allows."""
 
-    best: Pose
+    pair: Pair
+    pose: Pose
+    ratio: float
     lead: float
-    """Mean log ratio of its patches over that of the best other pose; infinite if no other was tried."""
-    above_impossible: float
-    """Over that of the impossible pairs of the run."""
-    above_neighbours: float
-    """Over that of the neighbours of the run; mostly negative."""
-    num_patches: float
-
-    @property
-    def ingredients(self) -> Vector:
-        return np.array(self[1:])
+    """In units of the scatter of `TYPICAL_PATCHES` patches."""
 
 
-def log_ratios(pairs: Sequence[Pair]) -> Counts:
+def log_ratios(pairs: Sequence[Pair]) -> Vector:
     """log p1 / p0 of each bin: p1 of right poses, p0 of the wrong pose of each pair that resembles them most.
 
     A pose counts once, however many patches it has. What resembles right poses is judged by the ratios themselves.
     """
-    ratios = np.zeros((2, len(BINS)))
-    ratios[:, 0] = -1.0
+    ratios = np.zeros(len(BINS))
+    ratios[0] = -1.0
+    weight = {part: PART_WEIGHT / number for part, number in Counter(pair.part for pair in pairs).items()}
     for _ in range(3):
-        right, wrong = np.full(ratios.shape, PRIOR_COUNT), np.full(ratios.shape, PRIOR_COUNT)
+        right, wrong = np.full(len(BINS), PRIOR_COUNT), np.full(len(BINS), PRIOR_COUNT)
         for pair in pairs:
             for pose in pair.poses:
-                right += pose.is_right * _shares(pose.counts)
-            others = [pose.counts for pose in pair.poses if not pose.is_right]
+                right += weight[pair.part] * pose.is_right * _shares(pose.counts)
+            others = [_shares(pose.counts) for pose in pair.poses if not pose.is_right]
             if others:
-                wrong += _shares(others[int(np.argmax([mean_ratio(counts, ratios) for counts in others]))])
-        ratios = np.log(right / right.sum(axis=1, keepdims=True)) - np.log(wrong / wrong.sum(axis=1, keepdims=True))
+                wrong += weight[pair.part] * max(others, key=lambda shares: float(shares @ ratios))
+        ratios = np.log(right / right.sum()) - np.log(wrong / wrong.sum())
     return ratios
 
 
@@ -98,93 +89,90 @@ def _shares(counts: Counts) -> Counts:
     return counts / max(counts.sum(), 1.0)
 
 
-def mean_ratio(counts: Counts, ratios: Counts) -> float:
-    """Mean log ratio of a patch (nats), whatever the other poses show."""
-    return float((_shares(counts) * ratios).sum())
+def best_of(pair: Pair, table: Table) -> Best | None:
+    """The best pose, and its lead over those that differ from it; None if the prior allows none."""
+    ratios = [table.mean_ratio(pose.counts) for pose in pair.poses]
+    allowed = [number for number, pose in enumerate(pair.poses) if pose.is_allowed]
+    if not allowed:
+        return None
+    first = max(allowed, key=ratios.__getitem__)
+    best = pair.poses[first]
+    others = [
+        ratio
+        for ratio, pose in zip(ratios, pair.poses, strict=True)
+        if not is_near(pose.T_target_source, [best.T_target_source], within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
+    ]
+    lead = min(ratios[first] - max(others, default=-np.inf), NO_OTHER)
+    return Best(pair, best, ratios[first], lead * np.sqrt(best.counts.sum() / 2.0 / TYPICAL_PATCHES))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Score:
-    """log odds that the best pose of a pair is right: of the two ways to be wrong, the likelier one counts."""
-
-    ratios: Counts
-    impossible: float
-    neighbours: float
-    """Mean ratio of best poses of impossible pairs, and of right poses: for runs that have measured none."""
-    num_patches: float = 1.0
-    """Of the median pose."""
-    slopes: Vector = field(default_factory=lambda: START)
-
-    @classmethod
-    def learnt(cls, pairs: Sequence[Pair]) -> "Score":
-        """From pairs with poses. Right and wrong best poses weigh the same, so the prior odds are even."""
-        ratios = log_ratios(pairs)
-        blank = cls(ratios, _mean(_impossible(pairs, ratios), 0.0), _mean(_right(pairs, ratios), 0.0))
-        scored = [blank.scored(pair, pairs) for pair in pairs if pair.poses]
-        ingredients = np.array([one.ingredients for one in scored])
-        typical = float(np.median(ingredients[:, -1]))
-        is_right = np.array([one.best.is_right for one in scored])
-        slopes = _fitted(ingredients, is_right, typical)
-        return cls(ratios, blank.impossible, blank.neighbours, typical, slopes)
-
-    def scored(self, pair: Pair, others: Sequence[Pair]) -> Scored:
-        """A pair with poses; `others`: pairs of which those of the same run show what impossible ones look like."""
-        ratios = np.array([mean_ratio(pose.counts, self.ratios) for pose in pair.poses])
-        best = pair.poses[int(ratios.argmax())]
-        rivals = [
-            ratio
-            for ratio, pose in zip(ratios, pair.poses, strict=True)
-            if not is_near(pose.T_target_source, [best.T_target_source], within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
-        ]
-        own = [other for other in others if other.run is pair.run and other is not pair]
-        impossible = _shrunk(_impossible(own, self.ratios), self.impossible)
-        known = [mean_ratio(counts, self.ratios) for counts in pair.run.neighbours]
-        most = float(ratios.max())
-        lead = most - max(rivals, default=-np.inf)
-        return Scored(best, lead, most - impossible, most - _shrunk(known, self.neighbours), best.counts.sum() / 2.0)
-
-    def log_odds(self, scored: Scored) -> float:
-        """At even prior odds."""
-        return float(_log_odds(self.slopes, scored.ingredients[None], self.num_patches)[0])
+def bests(pairs: Sequence[Pair], table: Table) -> list[Best]:
+    """Those of all pairs that have one."""
+    return [best for pair in pairs for best in [best_of(pair, table)] if best is not None]
 
 
-def _impossible(pairs: Sequence[Pair], ratios: Counts) -> list[float]:
-    return [max(mean_ratio(pose.counts, ratios) for pose in p.poses) for p in pairs if p.poses and not p.is_true]
+def learnt(pairs: Sequence[Pair]) -> Table:
+    """The table that these pairs teach. Its odds are too certain for other parts: `calibrated`."""
+    blank = Table(log_ratios(pairs), (1.0, 0.0), (1.0, 0.0))
+    found = bests(pairs, blank)
+    values = np.array([[best.ratio, best.lead] for best in found])
+    mean, scale = values.mean(axis=0), values.std(axis=0) + 1e-9
+    is_right, weight = _weighed(found)
+
+    def loss(numbers: Vector) -> float:
+        odds = _odds((values - mean) / scale * np.exp(numbers[:2]) + numbers[2:])
+        prior = 0.5 * (((numbers - START) / SIGMA) ** 2).sum()
+        return float((weight * np.logaddexp(0.0, np.where(is_right, -odds, odds))).sum() + prior)
+
+    numbers = minimize(loss, START).x
+    slopes = np.exp(numbers[:2]) / scale
+    offsets = numbers[2:] - slopes * mean
+    return Table(blank.ratios, (slopes[0], offsets[0]), (slopes[1], offsets[1]))
 
 
-def _right(pairs: Sequence[Pair], ratios: Counts) -> list[float]:
-    return [mean_ratio(pose.counts, ratios) for pair in pairs for pose in pair.poses if pose.is_right]
+def left_out(pairs: Sequence[Pair]) -> list[tuple[Best, float]]:
+    """Best poses and their log odds by what all other parts teach."""
+    found: list[tuple[Best, float]] = []
+    for part in sorted({pair.part for pair in pairs}):
+        table = learnt([pair for pair in pairs if pair.part != part])
+        found += [(best, odds_of(best, table)) for best in bests([pair for pair in pairs if pair.part == part], table)]
+    return found
 
 
-def _mean(values: Sequence[float], otherwise: float) -> float:
-    return float(np.mean(values)) if values else otherwise
+def odds_of(best: Best, table: Table) -> float:
+    """Log odds of a best pose."""
+    both = np.array([[table.match[0] * best.ratio + table.match[1], table.lead[0] * best.lead + table.lead[1]]])
+    return float(_odds(both)[0])
 
 
-def _shrunk(own: Sequence[float], learnt: float) -> float:
-    """Mean of the run's own values, with what other runs taught as `NUM_LEARNT` further ones."""
-    return (sum(own) + NUM_LEARNT * learnt) / (len(own) + NUM_LEARNT)
+def calibration(scored: Sequence[tuple[Best, float]]) -> tuple[float, float]:
+    """Slope and offset by which log odds of parts that taught nothing become those observed."""
+    odds = np.array([value for _, value in scored])
+    is_right, weight = _weighed([best for best, _ in scored])
+
+    def loss(line: Vector) -> float:
+        line_odds = line[0] * odds + line[1]
+        prior = 0.5 * (((line - [1.0, 0.0]) / 2.0) ** 2).sum()
+        return float((weight * np.logaddexp(0.0, np.where(is_right, -line_odds, line_odds))).sum() + prior)
+
+    slope, offset = minimize(loss, np.array([1.0, 0.0])).x
+    return float(slope), float(offset)
 
 
-def _log_odds(slopes: Vector, ingredients: np.ndarray, typical: float) -> Vector:
-    """(n,) that a pose is right, neither ambiguous nor a chance fit.
-
-    The scatter of a mean ratio falls with the root of the number of patches, so the lead counts in its unit.
-    """
-    lead, above_impossible, above_neighbours, num_patches = ingredients.T
-    ambiguous = slopes[1] - np.exp(slopes[0]) * lead * np.sqrt(num_patches / typical)
-    chance = slopes[4] - np.exp(slopes[2]) * above_impossible - np.exp(slopes[3]) * above_neighbours
-    return -np.logaddexp(ambiguous, chance)
+def calibrated(table: Table, line: tuple[float, float]) -> Table:
+    """A table whose log odds are those of `table` moved to this line."""
+    (match, also), (lead, more) = table.match, table.lead
+    return Table(table.ratios, (line[0] * match, line[0] * also + line[1]), (line[0] * lead, line[0] * more + line[1]))
 
 
-def _fitted(ingredients: np.ndarray, is_right: np.ndarray, typical: float) -> Vector:
-    """Maximum a posteriori slopes; both classes weigh the same."""
-    share = np.where(is_right, is_right.mean(), 1.0 - is_right.mean())
-    importance = 0.5 / np.maximum(share, 1.0 / len(is_right))
+def _weighed(found: Sequence[Best]) -> tuple[np.ndarray, Vector]:
+    """Right or not, and the weight, of each best pose."""
+    groups = [(best.pair.part, best.pose.is_right) for best in found]
+    number = Counter(groups)
+    return np.array([right for _, right in groups]), np.array([CLASS_WEIGHT / number[group] for group in groups])
 
-    def loss(slopes: Vector) -> float:
-        odds = _log_odds(slopes, ingredients, typical)
-        losses = importance * np.logaddexp(0.0, np.where(is_right, -odds, odds))
-        return float(losses.sum() + 0.5 * (((slopes - START) / START_SIGMA) ** 2).sum())
 
-    found: Vector = minimize(loss, START).x
+def _odds(both: np.ndarray) -> Vector:
+    """(n,) of the two ways to be wrong, the likelier one counts; `both` (n, 2)."""
+    found: Vector = -np.logaddexp(-both[:, 0], -both[:, 1])
     return found

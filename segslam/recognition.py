@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+
 from segslam import geometry
 from segslam.config import Config
 from segslam.registration import Gate, PreparedScan, Stopwatch, anywhere
@@ -25,6 +27,8 @@ MAX_RIVALS = 2
 """Chosen: number of other places tried after one is found."""
 SPREAD_M = 4.0
 """Chosen: candidates nearer than this to a tried one are the same place."""
+NO_PATCHES = np.empty(0, np.int8)
+"""The patches of another place are not those of the place found."""
 ELSEWHERE_M = 10.0
 """Chosen: a candidate farther than this from the found place is another place."""
 
@@ -88,9 +92,10 @@ def recognise(
 def _found(
     tried: Callable[[int, Gate], tuple[Trial, list[Found] | Rejected]], places: Sequence[tuple[int, Gate]]
 ) -> list[Found]:
-    """The best poses at other places."""
+    """The best poses at other places, by what the patches of the scan show there."""
     outcomes = [tried(*place)[1] for place in places]
-    return [found[0] for found in outcomes if not isinstance(found, Rejected)]
+    best = [found[0] for found in outcomes if not isinstance(found, Rejected)]
+    return [one._replace(agreement=one.agreement._replace(of_target=NO_PATCHES)) for one in best]
 
 
 class _Both(NamedTuple):

@@ -3,20 +3,26 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from segslam import geometry, refinement
 from segslam.registration.hypotheses import plans_near
-from segslam.registration.trial import EQUAL_M, EQUAL_RAD, FEW_RATIO, Found, Trial, anywhere, few_points, is_near
+from segslam.registration.trial import Found, Trial, anywhere, few_points, is_near
 from segslam.types import Direction, Registration, Rejected, Transform
+from segslam.verification import score
 
 MOST_SHIFT_M = 8
 """Chosen: largest shift along the weak direction at which rivals are searched, in steps of 1 m; refinement finds rivals
 within 0.5 m."""
-APPROACH_RATIO = 0.3
-"""Chosen: a rival is dropped if, after the first iterations, its mean log ratio is more than this below that of the
-poses that are searched (nats)."""
+FEW_LEAD, APPROACH_LEAD = 2.0, 4.0
+"""Chosen: a rival is dropped if the found pose, by the patches of the source, leads by so many standard deviations more
+than matters, after a refinement with few points and after its first iterations."""
+MOST_RIVALS = 4
+"""Chosen: number of rivals that are refined with all points, those over which the found pose leads least."""
+NEW_M, NEW_RAD = 0.3, math.radians(1.0)
+"""Chosen: few points that lead this close to another pose end with all points where it does."""
 SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
 """Chosen: poses closer to each other than this are the same."""
 
@@ -28,18 +34,14 @@ def rivals_of(found: Found, known: Sequence[Found], trial: Trial) -> list[Found]
     near the prior. `known`: poses that are not searched again.
     """
     free = trial._replace(gate=anywhere)
-    least_ratio = trial.table.least_ratio_of_rivals(found.agreement.counts, trial.least_odds)
-    passed: list[Found] = []
-    for led in _starts(found, free, least_ratio):
-        done = [pose.T_target_source for pose in (*known, *passed)]
-        if is_near(led.T_target_source, [found.T_target_source], within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD):
-            continue
-        if is_near(led.T_target_source, done, within_m=EQUAL_M, within_rad=EQUAL_RAD):
-            continue
-        rival = free.refined(led, led.T_target_source)
-        if isinstance(rival, Found):
-            passed.append(rival)
-    return passed
+    done = [pose.T_target_source for pose in known]
+    starts: list[_Start] = []
+    for start in sorted(_starts(found, free), key=lambda start: start.lead):
+        if not is_near(start.coarse.T_target_source, done, within_m=NEW_M, within_rad=NEW_RAD):
+            done.append(start.coarse.T_target_source)
+            starts.append(start)
+    refined = [free.refined(start.coarse, start.coarse.T_target_source) for start in starts[:MOST_RIVALS]]
+    return [rival for rival in refined if isinstance(rival, Found)]
 
 
 def differs(pose: Found, other: Found) -> bool:
@@ -48,36 +50,55 @@ def differs(pose: Found, other: Found) -> bool:
     return not is_near(pose.T_target_source, near, within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
 
 
-def _starts(found: Found, trial: Trial, least_ratio: float) -> Iterator[Registration]:
+class _Start(NamedTuple):
+    """A pose to which few points lead."""
+
+    coarse: Registration
+    lead: float
+    """Of the found pose over this one, by the patches of the source."""
+
+
+def _starts(found: Found, trial: Trial) -> list[_Start]:
     """Poses to which few points lead from shifts along the weak direction, and from floor plans."""
     weakest = refinement.weakest_level(found.fine.information)
-    for sign in (-1.0, 1.0):
-        yield from _shifted(found, sign * weakest, trial, least_ratio)
-    for coarse in plans_near(trial, num_poses=trial.config.verify.max_rivals):
-        led = _led(coarse, found, trial, least_ratio)
-        if led is not None:
-            yield led
+    shifted = [start for sign in (-1.0, 1.0) for start in _shifted(found, sign * weakest, trial)]
+    plans = [_led(coarse, found, trial) for coarse in plans_near(trial, num_poses=trial.config.verify.max_rivals)]
+    return [start for start in (*shifted, *plans) if start is not None and not _is_found(start.coarse, found)]
 
 
-def _led(coarse: Registration, found: Found, trial: Trial, least_ratio: float) -> Registration | None:
-    """Where few points lead; None if the pose is the found one or hopeless, mostly after the first iterations."""
+def _is_found(coarse: Registration, found: Found) -> bool:
+    near = [found.T_target_source]
+    return is_near(coarse.T_target_source, near, within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
+
+
+def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
+    """Where few points lead; None if the pose is hopeless, mostly after the first iterations."""
     surfaces = few_points(trial.source, trial.config.refine), trial.target.surface
     if min(map(len, surfaces)) < trial.config.refine.min_points:
         return None
     with trial.watch("refine"):
         T_begun = refinement.approach(*surfaces, coarse.T_target_source, config=trial.config.refine)
-    if is_near(T_begun, [found.T_target_source], within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD):
-        return replace(coarse, T_target_source=T_begun)
-    if trial.first_ratio(T_begun) < least_ratio - APPROACH_RATIO:
+    begun = replace(coarse, T_target_source=T_begun)
+    if _is_found(begun, found):
+        return _Start(begun, 0.0)
+    most = trial.table.most_lead(trial.least_odds)
+    if _lead(found, T_begun, trial) > most + APPROACH_LEAD:
         return None
     with trial.watch("refine"):
         fine = refinement.refine(*surfaces, T_begun, config=trial.config.refine, must_converge=False)
-    if isinstance(fine, Rejected) or trial.first_ratio(fine.T_target_source) < least_ratio - FEW_RATIO:
+    if isinstance(fine, Rejected):
         return None
-    return replace(coarse, T_target_source=fine.T_target_source)
+    lead = _lead(found, fine.T_target_source, trial)
+    return None if lead > most + FEW_LEAD else _Start(replace(coarse, T_target_source=fine.T_target_source), lead)
 
 
-def _shifted(found: Found, direction: Direction, trial: Trial, least_ratio: float) -> Iterator[Registration]:
+def _lead(found: Found, T_target_source: Transform, trial: Trial) -> float:
+    """Lead of the found pose over another, by the patches of the source."""
+    shown = trial.first_look(T_target_source)
+    return score.paired_lead(trial.table.ratios, [(found.agreement.of_source, shown)])
+
+
+def _shifted(found: Found, direction: Direction, trial: Trial) -> Iterator[_Start]:
     """Poses led to from shifts in one direction, the farthest first.
 
     Shifts between the start and the end of a refinement are not tried: they would lead to the same pose.
@@ -87,7 +108,7 @@ def _shifted(found: Found, direction: Direction, trial: Trial, least_ratio: floa
         if shift_m >= nearest_m:
             continue
         T_shifted: Transform = T_found @ geometry.transform(np.eye(3), shift_m * direction)
-        led = _led(replace(found.fine, T_target_source=T_shifted), found, trial, least_ratio)
-        if led is not None:
-            yield led
-            nearest_m = float((geometry.inverse(T_found) @ led.T_target_source)[:3, 3] @ direction)
+        start = _led(replace(found.fine, T_target_source=T_shifted), found, trial)
+        if start is not None:
+            yield start
+            nearest_m = float((geometry.inverse(T_found) @ start.coarse.T_target_source)[:3, 3] @ direction)

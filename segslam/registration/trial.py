@@ -78,11 +78,11 @@ class Trial(NamedTuple):
         """Mean log ratio of the patches that an accepted pose has at least (nats)."""
         return (self.least_odds - self.table.match[1]) / self.table.match[0]
 
-    def begin(self, coarse: Registration, *, least_ratio: float | None = None) -> Transform | Rejected:
+    def begin(self, coarse: Registration) -> Transform | Rejected:
         """The pose to which few points of the source lead from a hypothesis; `Rejected` if it is hopeless with all.
 
-        It is if a first look at its patches shows a mean ratio far below `least_ratio`, by default that of an accepted
-        pose. Takes a third of the time of a refinement with all points, which most wrong hypotheses do not need.
+        It is if a first look at its patches shows a mean ratio far below that of an accepted pose. Takes a third of the
+        time of a refinement with all points, which most wrong hypotheses do not need.
         """
         config = self.config
         if coarse.num_inliers < config.verify.min_inliers:
@@ -104,17 +104,17 @@ class Trial(NamedTuple):
         most_m = config.verify.max_coarse_fine_m + FEW_OFF_M
         if moved_m > most_m:
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m with few points")
-        ratio = self.first_ratio(led.T_target_source)
-        least = (self.least_ratio if least_ratio is None else least_ratio) - FEW_RATIO
+        ratio = self.table.mean_ratio(patches.counted(self.first_look(led.T_target_source)))
+        least = self.least_ratio - FEW_RATIO
         if ratio < least:
             return Rejected(RejectReason.IMPROBABLE, f"{ratio:.2f} < {least:.2f} nats a patch with few points")
         return led.T_target_source
 
-    def first_ratio(self, T_target_source: Transform) -> float:
-        """Mean log ratio of the patches of the source at this pose (nats); takes 2 ms."""
+    def first_look(self, T_target_source: Transform) -> patches.Shown:
+        """What the patches of the source show at this pose; takes 2 ms."""
         scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            return self.table.mean_ratio(patches.first_look(*scans, T_target_source, config=self.config.verify))
+            return patches.first_look(*scans, T_target_source, config=self.config.verify)
 
     def refined(self, coarse: Registration, T_begun: Transform) -> Found | Rejected:
         """A hypothesis refined with all points from `T_begun`, and what the scans show there."""

@@ -1,26 +1,29 @@
 """What the patches of two scans show at a pose: on a surface of the other scan, on none, or where it saw free space.
 
-A patch has the standing points of a cube of `PATCH_M` whose normals have the same largest component, seen from the
-other scan. The residuals of its points have a cause in common, so it counts once, however many points it has. Ground
-does not count, because it fits the ground of any street.
+A patch has the standing points of a scan in a cube of `PATCH_M` whose normals have the same largest component. The
+residuals of its points have a cause in common, so it counts once, however many points it has. Ground does not count,
+because it fits the ground of any street.
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int8
 
 from segslam import geometry
 from segslam.config import VerifyConfig
 from segslam.points import cell_keys, within_range
 from segslam.refinement import Surface
-from segslam.types import Points, Transform, Vector
+from segslam.types import Indices, Points, Transform, Vector
 from segslam.verification.free_space import FreeSpace, fates, violation
 
 Observed = tuple[Surface, FreeSpace]
 """A scan as verification sees it."""
 
+NUM_SCANS = 16
+"""Number of scans whose patches are in memory, about 0.4 MB each."""
 PATCH_M = 1.5
 """Edge of the cube of a patch."""
 RESIDUALS = (0.6, 1.0, 1.6)
@@ -44,6 +47,18 @@ BINS = (
 
 Counts = Float[np.ndarray, "18"]
 """Number of patches in each of `BINS`."""
+Shown = Int8[np.ndarray, "_"]
+"""Bin of each patch of a scan, -1 for patches of which nothing is known."""
+
+
+class Patches(NamedTuple):
+    """The standing points of a scan in its frame, and the patch of each."""
+
+    points: Points
+    normals: Points
+    patch: Indices
+    size: Vector
+    """Number of points of each patch."""
 
 
 class Agreement(NamedTuple):
@@ -53,17 +68,27 @@ class Agreement(NamedTuple):
     """Share of the standing points within reach of the other scan that lie within `inlier_m` of it."""
     rms_m: float
     """Root mean square distance of these points to the planes of the other surface (m); infinite if there are none."""
-    roughness_m: float
-    """The larger roughness of the two surfaces."""
     free_space_violation: float
     """Share of the points that violate the free space of the other scan, of those in directions with a return."""
-    counts: Counts
-    """Of both directions."""
+    of_source: Shown
+    of_target: Shown
+    """Empty if only the patches of the source were looked at."""
 
     @property
-    def num_patches(self) -> float:
-        """Mean number of patches of a scan."""
-        return float(self.counts.sum()) / 2.0
+    def counts(self) -> Counts:
+        """Of both scans."""
+        return counted(self.of_source) + counted(self.of_target)
+
+
+@lru_cache(NUM_SCANS)
+def patches_of(surface: Surface) -> Patches:
+    """The patches of a scan."""
+    points, normals = surface.standing_with_normals
+    if not len(points):
+        return Patches(points, normals, np.empty(0, np.int64), np.empty(0))
+    keys, _ = cell_keys(points, PATCH_M)
+    _, patch = np.unique(3 * keys + np.abs(normals).argmax(axis=1), return_inverse=True)
+    return Patches(points, normals, patch, np.bincount(patch).astype(np.float64))
 
 
 def agreement(source: Observed, target: Observed, T_target_source: Transform, *, config: VerifyConfig) -> Agreement:
@@ -73,65 +98,52 @@ def agreement(source: Observed, target: Observed, T_target_source: Transform, *,
         (*_seen_from(b, a, T_b_a, roughness_m, config), violation(a[0].points, b[1], T_b_a, config=config))
         for a, b, T_b_a in ((source, target, T_target_source), (target, source, geometry.inverse(T_target_source)))
     ]
-    overlaps, residuals_m, counts, violations = zip(*ways, strict=True)
-    return Agreement(min(overlaps), max(residuals_m), roughness_m, max(violations), counts[0] + counts[1])
+    overlaps, residuals_m, shown, violations = zip(*ways, strict=True)
+    return Agreement(min(overlaps), max(residuals_m), max(violations), *shown)
 
 
-def first_look(source: Observed, target: Observed, T_target_source: Transform, *, config: VerifyConfig) -> Counts:
-    """Twice the patches of the source alone, in half of the time: a first look at a pose that may still be refined."""
+def first_look(source: Observed, target: Observed, T_target_source: Transform, *, config: VerifyConfig) -> Shown:
+    """The patches of the source alone, in half of the time: a first look at a pose that may still be refined."""
     roughness_m = max(source[0].roughness_m, target[0].roughness_m)
-    return 2.0 * _seen_from(target, source, T_target_source, roughness_m, config)[2]
+    return _seen_from(target, source, T_target_source, roughness_m, config)[2]
+
+
+def counted(shown: Shown) -> Counts:
+    """Number of patches in each bin."""
+    return np.bincount(shown[shown >= 0], minlength=len(BINS)).astype(np.float64)
 
 
 def _seen_from(
     b: Observed, a: Observed, T_b_a: Transform, roughness_m: float, config: VerifyConfig
-) -> tuple[float, float, Counts]:
+) -> tuple[float, float, Shown]:
     """Overlap, residual (m) and patches of a's standing points in the view of b."""
-    surface = b[0]
-    standing, turned = a[0].standing_with_normals
-    moved = geometry.apply(T_b_a, standing)
+    surface, standing = b[0], patches_of(a[0])
+    moved = geometry.apply(T_b_a, standing.points)
     within = within_range(moved, 0.0, config.max_range_m)
-    points, normals = moved[within], turned[within] @ T_b_a[:3, :3].T
+    points, normals = moved[within], standing.normals[within] @ T_b_a[:3, :3].T
     if not len(points):
-        return 0.0, math.inf, np.zeros(len(BINS))
+        return 0.0, math.inf, np.full(len(standing.size), -1, np.int8)
     rows, apart_m = surface.nearest(points)
     there = surface.normals[rows]
     to_plane_m = np.einsum("ij,ij->i", points - surface.points[rows], there)
     is_near = apart_m < config.inlier_m
     rms_m = float(np.sqrt(np.mean(to_plane_m[is_near] ** 2))) if is_near.any() else math.inf
     is_same = np.abs(np.einsum("ij,ij->i", normals, there)) > SAME_NORMAL
-    keys, _ = cell_keys(points, PATCH_M)
-    _, patch = np.unique(3 * keys + np.abs(normals).argmax(axis=1), return_inverse=True)
-    counts = _binned(patch, points, is_near, to_plane_m / roughness_m, is_same, b[1], config)
-    return float(np.mean(is_near)), rms_m, counts
-
-
-def _binned(
-    patch: np.ndarray,
-    points: Points,
-    is_near: np.ndarray,
-    residual: Vector,
-    is_same: np.ndarray,
-    seen: FreeSpace,
-    config: VerifyConfig,
-) -> Counts:
-    """Patches in each bin; `patch`: the number of the patch of each point."""
-    violates, is_beyond = fates(points, seen, config=config)
-    is_known = is_near | violates | ~is_beyond
-    size = np.bincount(patch)
+    violates, is_beyond = fates(points, b[1], config=config)
     known, near, same, squared, violating, range_m = (
-        np.bincount(patch, weights)
+        np.bincount(standing.patch[within], weights, minlength=len(standing.size))
         for weights in (
-            is_known,
+            is_near | violates | ~is_beyond,
             is_near,
             is_near & is_same,
-            is_near * residual**2,
+            is_near * (to_plane_m / roughness_m) ** 2,
             violates,
             np.linalg.norm(points, axis=1),
         )
     )
     level = np.digitize(np.sqrt(squared / np.maximum(near, 1.0)), RESIDUALS)
-    level += (len(RESIDUALS) + 1) * ((same <= 0.5 * near) + 2 * (range_m >= FAR_M * size))
+    level += (len(RESIDUALS) + 1) * ((same <= 0.5 * near) + 2 * (range_m >= FAR_M * standing.size))
     shown = np.where(near > KNOWN * known, 2 + level, 1)
-    shown[violating > VIOLATING * size] = 0
-    return np.bincount(shown[known >= KNOWN * size], minlength=len(BINS)).astype(np.float64)
+    shown[violating > VIOLATING * standing.size] = 0
+    shown[known < KNOWN * standing.size] = -1
+    return float(np.mean(is_near)), rms_m, shown.astype(np.int8)

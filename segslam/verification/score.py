@@ -18,12 +18,12 @@ import numpy as np
 
 from segslam.config import VerifyConfig
 from segslam.types import Vector
-from segslam.verification.patches import BINS, Agreement, Counts
+from segslam.verification.patches import BINS, Agreement, Counts, Shown
 
-TYPICAL_PATCHES = 300.0
-"""Number of patches in whose unit the scatter of a mean ratio counts; it falls with the root of the number."""
-NO_OTHER = 1.0
-"""Lead of a pose (nats a patch) if no other pose was found."""
+NO_OTHER = 12.0
+"""Lead of a pose (standard deviations) if no other pose was found, and at most."""
+LEAST_SCATTER = 1.0
+"""Least standard deviation of the sum over all patches (nats), of poses that show the same."""
 PARTS = {"surfaces": slice(2, None), "no_surface": slice(1, 2), "free_space": slice(0, 1)}
 
 
@@ -50,7 +50,7 @@ class Table:
     match: tuple[float, float]
     """Slope and offset of the log odds that a pose is no chance fit, by its mean ratio."""
     lead: tuple[float, float]
-    """The same that no other pose is as good, by the lead over the best other pose."""
+    """The same that no other pose is as good, by the least lead over another pose."""
 
     def mean_ratio(self, counts: Counts) -> float:
         """Mean log ratio of a patch (nats); 0 without patches."""
@@ -60,31 +60,44 @@ class Table:
         """Log odds that a pose is no chance fit; another pose can only lower them."""
         return self.match[0] * self.mean_ratio(counts) + self.match[1]
 
-    def lead_odds(self, lead: float, num_patches: float) -> float:
-        """Log odds that no other pose is as good; `lead`: difference of two mean ratios."""
-        return self.lead[0] * lead * math.sqrt(num_patches / TYPICAL_PATCHES) + self.lead[1]
+    def lead_of(self, found: Agreement, other: Agreement) -> float:
+        """How much more likely the patches are at one pose than at another, in standard deviations of the difference.
+
+        Patches of which nothing is known at either pose do not count; nor do those of the target if the other pose
+        has none.
+        """
+        pairs = [(found.of_source, other.of_source)]
+        if len(other.of_target):
+            pairs.append((found.of_target, other.of_target))
+        return paired_lead(self.ratios, pairs)
 
     def judge(self, found: Agreement, others: Sequence[Agreement] | None = None) -> Judged:
         """A pose that shows `found`, where other poses that were tried show `others`.
 
         None for a pose that is known beforehand, so that no others were tried: it is judged by its patches alone.
         """
-        match = self.match_odds(found.counts)
+        counts = found.counts
+        match = self.match_odds(counts)
         log_odds = match
         if others is not None:
-            best = max((self.mean_ratio(other.counts) for other in others), default=-math.inf)
-            lead = min(self.mean_ratio(found.counts) - best, NO_OTHER)
-            log_odds = -float(np.logaddexp(-match, -self.lead_odds(lead, found.num_patches)))
-        share = self.match[0] * found.counts * self.ratios / max(found.counts.sum(), 1.0)
+            lead = min((self.lead_of(found, other) for other in others), default=NO_OTHER)
+            log_odds = -float(np.logaddexp(-match, -(self.lead[0] * min(lead, NO_OTHER) + self.lead[1])))
+        share = self.match[0] * counts * self.ratios / max(counts.sum(), 1.0)
         evidence = {name: float(share[bins].sum()) for name, bins in PARTS.items()} | {"usual": self.match[1]}
         return Judged(log_odds, evidence if others is None else evidence | {"other_pose": log_odds - match})
 
-    def least_ratio_of_rivals(self, found: Counts, least_odds: float) -> float:
-        """Mean ratio that another pose needs at least to lower the odds of a pose below `least_odds` (nats)."""
-        lead = (least_odds + RIVAL_NATS - self.lead[1]) / (
-            self.lead[0] * math.sqrt(max(found.sum(), 1.0) / 2.0 / TYPICAL_PATCHES)
-        )
-        return self.mean_ratio(found) - lead
+    def most_lead(self, least_odds: float) -> float:
+        """Lead over another pose beyond which it cannot lower the odds of a pose below `least_odds`."""
+        return (least_odds + RIVAL_NATS - self.lead[1]) / self.lead[0]
+
+
+def paired_lead(ratios: Vector, pairs: Sequence[tuple[Shown, Shown]]) -> float:
+    """Sum of the differences of the log ratios of the same patches, in standard deviations of this sum."""
+    differences = [
+        ratios[here[both]] - ratios[there[both]] for here, there in pairs for both in [(here >= 0) & (there >= 0)]
+    ]
+    each = np.concatenate(differences)
+    return float(each.sum() / math.sqrt(float(each @ each) + LEAST_SCATTER**2))
 
 
 RIVAL_NATS = 3.0

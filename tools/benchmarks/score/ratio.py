@@ -15,8 +15,8 @@ from scipy.optimize import minimize
 from segslam.registration.rivals import SAME_POSE_M, SAME_POSE_RAD
 from segslam.registration.trial import is_near
 from segslam.types import Transform, Vector
-from segslam.verification.patches import BINS, Counts
-from segslam.verification.score import NO_OTHER, TYPICAL_PATCHES, Table
+from segslam.verification.patches import BINS, Counts, Shown, counted
+from segslam.verification.score import NO_OTHER, Table, paired_lead
 
 PRIOR_COUNT = 0.5
 """Jeffreys': pseudo-counts of a bin that was never seen."""
@@ -32,10 +32,16 @@ class Pose:
     """A pose that was tried, and what the scans show there."""
 
     T_target_source: Transform
-    counts: Counts
+    of_source: Shown
+    of_target: Shown
     is_right: bool
     is_allowed: bool
     """By the prior."""
+
+    @property
+    def counts(self) -> Counts:
+        """Patches of both scans in each bin."""
+        return counted(self.of_source) + counted(self.of_target)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +68,7 @@ class Best(NamedTuple):
     pose: Pose
     ratio: float
     lead: float
-    """In units of the scatter of `TYPICAL_PATCHES` patches."""
+    """Standard deviations."""
 
 
 def log_ratios(pairs: Sequence[Pair]) -> Vector:
@@ -97,13 +103,12 @@ def best_of(pair: Pair, table: Table) -> Best | None:
         return None
     first = max(allowed, key=ratios.__getitem__)
     best = pair.poses[first]
-    others = [
-        ratio
-        for ratio, pose in zip(ratios, pair.poses, strict=True)
+    leads = [
+        paired_lead(table.ratios, [(best.of_source, pose.of_source), (best.of_target, pose.of_target)])
+        for pose in pair.poses
         if not is_near(pose.T_target_source, [best.T_target_source], within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
     ]
-    lead = min(ratios[first] - max(others, default=-np.inf), NO_OTHER)
-    return Best(pair, best, ratios[first], lead * np.sqrt(best.counts.sum() / 2.0 / TYPICAL_PATCHES))
+    return Best(pair, best, ratios[first], min([*leads, NO_OTHER]))
 
 
 def bests(pairs: Sequence[Pair], table: Table) -> list[Best]:

@@ -12,17 +12,16 @@ from segslam.registration import (
     PreparedScan,
     Stopwatch,
     anywhere,
-    may_match,
     prepare_scan,
     register,
     register_near,
     register_prepared,
 )
+from segslam.registration import rivals
 from segslam.registration.hypotheses import coarse_poses
-from segslam.registration.rivals import Searched, _shifted, sparsely_refined
 from segslam.registration.trial import Found, Trial
 from segslam.types import Alignment, Label, Registration, Rejected, RejectReason
-from segslam.verification import gates
+from segslam.verification import score
 from segslam.verification.free_space import observe_free_space
 
 CONFIG = Config()
@@ -105,10 +104,7 @@ def test_poses_that_the_prior_excludes_do_not_use_up_the_attempts(monkeypatch: p
     assert isinstance(register_prepared(source, target, config=config, gate=gate), Alignment)
 
 
-@pytest.mark.parametrize(("is_certain", "reason"), [(False, RejectReason.AMBIGUOUS), (True, None)])
-def test_a_pose_that_fits_badly_has_rivals_that_the_prior_excludes(
-    is_certain: bool, reason: RejectReason | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_that_the_prior_excludes_are_rivals() -> None:
     """A yard that looks the same turned by 180 degrees; the prior excludes the pose that is turned."""
     points, labels = ground_and_walls()
     rng = np.random.default_rng(0)
@@ -116,25 +112,31 @@ def test_a_pose_that_fits_badly_has_rivals_that_the_prior_excludes(
         prepare_scan((points + rng.normal(0.0, 0.03, points.shape)).astype(np.float32), labels, config=CONFIG)
         for _ in range(2)
     )
-    monkeypatch.setattr(gates, "is_certain", lambda *_: is_certain)
 
     def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
         return Rejected(RejectReason.FAR_FROM_PRIOR) if geometry.angle(pose) > 0.5 else None
 
     found = register_prepared(source, target, config=CONFIG, gate=gate)
-    assert (found.reason if isinstance(found, Rejected) else None) is reason
+    assert isinstance(found, Rejected)
+    assert found.reason is RejectReason.AMBIGUOUS
+    assert found.probability is not None
+    assert found.probability < 0.999
+    assert found.evidence["other_pose"] < -5.0
 
 
-def test_shifts_that_others_led_past_are_not_tried() -> None:
+def test_shifts_that_others_led_past_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Refinement that leads to the next multiple of 3 m below: 6 from 8 m, 3 from 5 m, 0 from 2 m."""
     tried: list[float] = []
 
-    def lead(coarse: Registration) -> Registration:
+    def led(coarse: Registration, *_: object) -> rivals._Start:
         tried.append(float(coarse.T_target_source[0, 3]))
-        return replace(coarse, T_target_source=geometry.transform(np.eye(3), [tried[-1] // 3 * 3.0, 0.0, 0.0]))
+        T_led = geometry.transform(np.eye(3), [tried[-1] // 3 * 3.0, 0.0, 0.0])
+        return rivals._Start(replace(coarse, T_target_source=T_led), 0.0)
 
-    pose = Registration(np.eye(4), 1, 1, 0.1, np.eye(6))
-    ends = [led.T_target_source[0, 3] for led in _shifted(pose, np.array([1.0, 0.0, 0.0]), lead)]
+    monkeypatch.setattr(rivals, "_led", led)
+    trial, found = _found_pose()
+    found = found._replace(fine=Registration(np.eye(4), 1, 1, 0.1, np.eye(6)))
+    ends = [start.coarse.T_target_source[0, 3] for start in rivals._shifted(found, np.array([1.0, 0.0, 0.0]), trial)]
     assert tried == [8.0, 5.0, 2.0]
     assert ends == [6.0, 3.0, 0.0]
 
@@ -143,55 +145,37 @@ def test_shifts_that_others_led_past_are_not_tried() -> None:
 def test_near_a_known_pose_no_others_are_tried(off_m: float, is_found: bool) -> None:
     source, target, T_target_source = _round_pair()
     T_known = T_target_source @ geometry.transform(np.eye(3), [off_m, 0.0, 0.0])
-    found = register_near(source, target, T_known, config=CONFIG, floor=gates.SINGLE_PAIR, watch=Stopwatch())
+    found = register_near(source, target, T_known, config=CONFIG, watch=Stopwatch())
     assert isinstance(found, Alignment) == is_found
     if isinstance(found, Alignment):
         assert _error(T_target_source, found.fine.T_target_source)[0] < 0.05
+        assert "other_pose" not in found.evidence
 
 
-def test_a_few_points_decide_whether_a_place_can_fit_as_well_as_another() -> None:
-    source, target, _ = _round_pair()
-    aligned = register_prepared(source, target, config=CONFIG)
-    assert isinstance(aligned, Alignment)
-    roughness_m = max(source.surface.roughness_m, target.surface.roughness_m)
-    mismatch = gates.mismatch(aligned.overlap, aligned.rms_m / roughness_m)
-    answers = [
-        may_match(
-            source,
-            target,
-            config=CONFIG,
-            gate=anywhere,
-            floor=gates.SINGLE_PAIR,
-            mismatch=factor * mismatch,
-            watch=Stopwatch(),
-        )
-        for factor in (1.0, 0.3)
-    ]
-    assert answers == [True, False]
-
-
-@pytest.mark.parametrize(
-    ("factor", "is_found", "num_refined", "leads"),
-    [(1.0, False, 1, True), (0.3, False, 0, False), (1.0, True, 0, True), (0.3, True, 0, True)],
-    ids=["fits", "fits badly", "found already", "found already, fits badly"],
-)
-def test_the_first_iterations_decide_whether_a_pose_is_refined(
-    factor: float, is_found: bool, num_refined: int, leads: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("beside_m", "least", "num_refined", "leads"), [(0.9, 0, 1, True), (0.9, 99, 0, False)])
+def test_the_first_iterations_decide_whether_a_rival_is_refined(
+    beside_m: float, least: int, num_refined: int, leads: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The pose from which refinement starts is beside the one to which it leads."""
-    source, target, _ = _round_pair()
-    allowed = gates.limits(gates.SINGLE_PAIR, config=CONFIG.verify)
-    trial = Trial(source, target, CONFIG, anywhere, gates.SINGLE_PAIR, allowed, Stopwatch())
-    (coarse, *_) = (one for one in coarse_poses(trial) if isinstance(one, Registration))
-    found = trial.refined(coarse, coarse.T_target_source)
-    assert isinstance(found, Found)
-    searched = Searched(factor * found.agreement.mismatch, (found,) if is_found else ())
-    beside = found.alignment.fine.T_target_source @ geometry.transform(np.eye(3), [0.6, 0.0, 0.0])
+    """The pose from which refinement starts is beside the one to which it leads; `least` is added to its lead."""
+    trial, found = _found_pose()
+    monkeypatch.setattr(rivals, "_is_found", lambda *_: False)
+    lead = rivals._lead
+    monkeypatch.setattr(rivals, "_lead", lambda *given: lead(*given) + least)
     refined = []
     refine = refinement.refine
     monkeypatch.setattr(refinement, "refine", lambda *given, **named: refined.append(1) or refine(*given, **named))
-    led = sparsely_refined(trial, replace(coarse, T_target_source=beside), searched)
+    T_beside = found.T_target_source @ geometry.transform(np.eye(3), [beside_m, 0.0, 0.0])
+    led = rivals._led(replace(found.coarse, T_target_source=T_beside), found, trial)
     assert (led is not None, len(refined)) == (leads, num_refined)
+
+
+def _found_pose() -> tuple[Trial, Found]:
+    source, target, _ = _round_pair()
+    trial = Trial(source, target, CONFIG, anywhere, Stopwatch(), score.shipped())
+    (coarse, *_) = (one for one in coarse_poses(trial) if isinstance(one, Registration))
+    found = trial.refined(coarse, coarse.T_target_source)
+    assert isinstance(found, Found)
+    return trial, found
 
 
 def test_moving_classes_are_in_neither_surface_nor_free_space() -> None:

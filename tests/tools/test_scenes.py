@@ -12,7 +12,6 @@ from segslam.registration import PreparedScan, pair, prepare_scan, register_prep
 from segslam.simulation.scene_sensors import SENSORS, scan_points
 from segslam.simulation.scenes import SCENES, corridor
 from segslam.types import Alignment, Registration, Rejected
-from segslam.verification.gates import NoiseFloor, weak_support
 from tools.benchmarks import scenes
 
 CONFIG = Config()
@@ -39,23 +38,6 @@ def _from(T_target_source: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> Align
 def test_a_pose_slid_along_a_corridor_is_not_accepted(slid_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
     found = _from(geometry.transform(np.eye(3), [SOURCE_X - TARGET_X + slid_m, 0.0, 0.0]), monkeypatch)
     assert not _is_wrong(found), found
-
-
-def test_along_a_corridor_the_doors_must_match() -> None:
-    """The walls match at any shift; the recesses of the doors, 3 m apart, at the true one only."""
-    source, target = _corridor_scan(SOURCE_X).surface, _corridor_scan(TARGET_X).surface
-    support = {
-        slid_m: weak_support(
-            source,
-            target,
-            geometry.transform(np.eye(3), [SOURCE_X - TARGET_X + slid_m, 0.0, 0.0]),
-            np.array([1.0, 0.0, 0.0]),
-            config=CONFIG.verify,
-        ).whole
-        for slid_m in (0.0, 1.26, -1.26)
-    }
-    assert support[0.0] > 0.4
-    assert max(support[1.26], support[-1.26]) < 0.15
 
 
 def test_a_pose_turned_round_in_a_corridor_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,8 +72,7 @@ def test_two_places_of_which_a_part_has_the_same_shape_are_not_taken_for_one(
         scenes.Place(SCENES[scene](seed), sensor, 0.03, seed, CONFIG).prepared(row, visit)
         for seed, row, visit in (source, target)
     )
-    floor = NoiseFloor(overlap=0.87, residual_ratio=0.71, free_space_violation=0.006 if sensor == "32" else 0.0)
-    found = register_prepared(one, other, config=CONFIG, floor=floor)
+    found = register_prepared(one, other, config=CONFIG)
     assert isinstance(found, Rejected), found
 
 
@@ -108,8 +89,7 @@ def test_among_equal_cars_free_places_decide_which_pose_is_right() -> None:
 def test_noise_does_not_hide_that_the_doors_are_elsewhere(source: tuple[int, int], target: tuple[int, int]) -> None:
     """Two places of a corridor, seen with 10 cm of noise; poses of which the doors lay in walls were accepted."""
     place = scenes.Place(SCENES["corridor"](2), "64", 0.1, 2, CONFIG)
-    floor = NoiseFloor(overlap=0.89, residual_ratio=0.79, free_space_violation=0.0054)
-    found = register_prepared(place.prepared(*source), place.prepared(*target), config=CONFIG, floor=floor)
+    found = register_prepared(place.prepared(*source), place.prepared(*target), config=CONFIG)
     assert isinstance(found, Rejected), found
 
 
@@ -117,16 +97,14 @@ def test_noise_does_not_hide_that_the_doors_are_elsewhere(source: tuple[int, int
 def test_one_side_of_a_place_is_not_enough_where_free_space_is_violated(noise_m: float) -> None:
     """The ends of a corridor, seen by 70 degrees of view: two walls and a door match, another door does not."""
     place = scenes.Place(SCENES["corridor"](2), "70 wide", noise_m, 2, CONFIG)
-    floor = NoiseFloor(overlap=0.77, residual_ratio=0.82, free_space_violation=0.0004)
-    found = register_prepared(place.prepared(15, 1), place.prepared(86, 2), config=CONFIG, floor=floor)
+    found = register_prepared(place.prepared(15, 1), place.prepared(86, 2), config=CONFIG)
     assert isinstance(found, Rejected), found
 
 
 def test_where_a_direction_is_badly_observed_little_free_space_may_be_violated() -> None:
     """Two places between equal cars: a third of the points match, and others lie where the view was free."""
     lot = scenes.Place(SCENES["parking lot"](5), "90 high", 0.03, 5, CONFIG)
-    floor = NoiseFloor(overlap=0.93, residual_ratio=0.78, free_space_violation=0.002)
-    found = register_prepared(lot.prepared(72, 1), lot.prepared(195, 2), config=CONFIG, floor=floor)
+    found = register_prepared(lot.prepared(72, 1), lot.prepared(195, 2), config=CONFIG)
     assert isinstance(found, Rejected), found
 
 

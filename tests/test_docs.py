@@ -23,9 +23,9 @@ from typer.main import get_command
 import segslam
 from segslam import cli
 from segslam.cli import commands
-from segslam.config import Config
-from segslam.datasets import open_dataset
-from segslam.trajectory import read_poses
+from segslam.core.config import Config
+from segslam.core.trajectory import read_poses
+from segslam.scans import open_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"

@@ -12,7 +12,7 @@ from segslam.cli import commands
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples" / "api.py"
 BENCH_GROUP = "Paper"
-RECORDS = "segslam.types"
+RECORDS = "segslam.core.types"
 INTRODUCTION = """# Python
 
 `import segslam` gives these names. Each has an example; together they are
@@ -49,7 +49,7 @@ def commands_page() -> str:
 
 
 def api_page() -> str:
-    """Public functions and classes, and the records of `segslam.types`."""
+    """Public functions and classes, and the records of `segslam.core.types`."""
     parts = [INTRODUCTION]
     examples = api_examples()
     for name in examples:

@@ -13,15 +13,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Information, Motion, MotionState, Points, Scan, Transform
+from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan, displacement_m
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual
 from segslam.odometry.search import PoseSearch, Recover, as_likely
 from segslam.odometry.sweep import Odometry, OdometryResult
-from segslam.pose_graph.noise import odometry_information
-from segslam.types import Information, Motion, MotionState, Points, Scan, Transform
 
 RESOLUTION = math.sqrt(1.0 / 20.0)
 """Distance between points in KISS-ICP's map, in voxels: at most 20 points a voxel."""

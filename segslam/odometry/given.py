@@ -5,10 +5,10 @@ from typing import Literal
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import OdometryConfig
+from segslam.core import geometry
+from segslam.core.config import OdometryConfig
+from segslam.core.types import BadScan, Points, Scan, Trajectory, Transform
 from segslam.odometry.sweep import OdometryResult, deskew_scan
-from segslam.types import BadScan, Points, Scan, Trajectory, Transform
 
 
 class GivenOdometry:

@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from segslam import geometry
+from segslam.core import geometry
+from segslam.core.types import Alignment, Information, Points, Rejected, Transform
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan, displacement_m
 from segslam.odometry.nudge import SEARCH_VOXELS
-from segslam.types import Alignment, Information, Points, Rejected, Transform
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
 """Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""

@@ -3,14 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from segslam import refinement, segregator
-from segslam.config import Config
-from segslam.semantics import geometric_labels
-from segslam.types import Description, Label, Labels, Points
-from segslam.verification import gates
-from segslam.verification.free_space import FreeSpace, observe_free_space
+from segslam.core.config import Config
+from segslam.core.types import Description, Label, Labels, Points
+from segslam.labels import geometric_labels
+from segslam.registration import refinement, segregator
+from segslam.registration.free_space import FreeSpace, observe_free_space
 
 Labeller = Callable[[Points], Labels]
+Observed = tuple[refinement.Surface, FreeSpace]
+"""What a scan saw: sufficient to judge a pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,8 +23,8 @@ class PreparedScan:
     free_space: FreeSpace
 
     @property
-    def observed(self) -> gates.Observed:
-        """Input of the gates: surface and free space."""
+    def observed(self) -> Observed:
+        """Surface and free space: what verification compares."""
         return self.surface, self.free_space
 
 
@@ -46,7 +47,7 @@ def prepare_scan(
 
 def prepare_observed(
     points: Points, labels: Labels, *, config: Config, seen_from_here: Points | None = None
-) -> gates.Observed:
+) -> Observed:
     """Surface and free space as in `prepare_scan`: sufficient to refine and verify a pose that is nearly known."""
     still = points.compress(labels < Label.MOVING_CAR, axis=0)
     surface = refinement.make_surface(refinement.downsample(still, config=config.refine), config=config.refine)

@@ -9,19 +9,28 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike
 
-from segslam.config import Config
-from segslam.keyframes import Clouds, downsample_keyframe
-from segslam.log import read_log
-from segslam.points import within_range
-from segslam.recognition import MAX_PLACES, Recognised, recognise
-from segslam.registration import PreparedScan, prepare_scan, shape_labels
-from segslam.retrieval import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
-from segslam.run.finished import read_run
-from segslam.run.folder import log_of
-from segslam.submaps import Submaps
-from segslam.system.short_repr import Record
-from segslam.system.threads import at_once
-from segslam.types import Alignment, Keyframe, Labels, Points, Rejected, RejectReason, Transform, as_points
+from segslam.candidates import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
+from segslam.core.config import Config
+from segslam.core.points import within_range
+from segslam.core.short_repr import Record
+from segslam.core.threads import at_once
+from segslam.core.types import (
+    Alignment,
+    Keyframe,
+    Labels,
+    Points,
+    Rejected,
+    RejectReason,
+    Transform,
+    as_points,
+)
+from segslam.keyframes.keyframes import Clouds, downsample_keyframe
+from segslam.keyframes.submaps import Submaps
+from segslam.output.finished import read_run
+from segslam.output.folder import log_of
+from segslam.output.log import read_log
+from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.slam.recognition import MAX_PLACES, Recognised, recognise
 from segslam.verification import gates
 from segslam.verification.noise_floor import NeighbourNoise
 

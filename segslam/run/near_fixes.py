@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from segslam.config import ProximityConfig
-from segslam.loop_edits import Pair
-from segslam.run.finished import read_run
-from segslam.run.folder import folder_of
-from segslam.run.georeferenced import FILE, read_globe
-from segslam.trajectory import travelled_m
-from segslam.types import LoopClosure, SegslamError, Vector
+from segslam.core.config import ProximityConfig
+from segslam.core.trajectory import travelled_m
+from segslam.core.types import LoopClosure, SegslamError, Vector
+from segslam.output.finished import read_run
+from segslam.output.folder import folder_of
+from segslam.output.georeferenced import FILE, read_globe
+from segslam.slam.loop_edits import Pair
 
 
 def pairs_near_fixes(run_or_log: Path) -> frozenset[Pair]:

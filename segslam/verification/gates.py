@@ -13,15 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import VerifyConfig
-from segslam.points import within_range
-from segslam.refinement import Surface
-from segslam.types import Direction, Mask, Points, Rejected, RejectReason, Transform, Vector
-from segslam.verification.free_space import FreeSpace, violation
+from segslam.core import geometry
+from segslam.core.config import VerifyConfig
+from segslam.core.points import within_range
+from segslam.core.types import Direction, Mask, Points, Rejected, RejectReason, Transform, Vector
+from segslam.registration.free_space import violation
+from segslam.registration.prepared import Observed
+from segslam.registration.refinement import Surface
 from segslam.verification.patches import PATCH_M, common_residual_m
-
-Observed = tuple[Surface, FreeSpace]
 
 
 @dataclass(frozen=True, slots=True)

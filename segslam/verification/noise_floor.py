@@ -8,9 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from segslam import geometry, refinement
-from segslam.config import Config
-from segslam.types import Rejected, Transform
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Rejected, Transform
+from segslam.registration import refinement
+from segslam.registration.prepared import Observed
 from segslam.verification import gates
 
 NUM_FIRST = 5
@@ -29,7 +31,7 @@ class NeighbourNoise:
 
     def __init__(
         self,
-        seen: Callable[[int], gates.Observed],
+        seen: Callable[[int], Observed],
         T_odom_keyframe: Callable[[int], Transform],
         lag: Callable[[int], int] = lambda keyframe_id: 1,
         *,

@@ -6,8 +6,8 @@ however noisy the sensor: the recess of a door coincides with a wall.
 
 import numpy as np
 
-from segslam.points import cell_keys
-from segslam.types import Points, Vector
+from segslam.core.points import cell_keys
+from segslam.core.types import Points, Vector
 
 PATCH_M = 1.5
 """Chosen on simulated corridors, seed 2: of patches of 0.6, 1.0, 1.5 and 2.0 m these separate wrong poses best."""

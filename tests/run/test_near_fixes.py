@@ -7,7 +7,7 @@ import pytest
 from helpers.commands import run
 from helpers.finished_run import make_run
 
-from segslam.config import ProximityConfig
+from segslam.core.config import ProximityConfig
 from segslam.run.near_fixes import pairs_near
 
 SPACING_M = 2.0

@@ -6,12 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.registration import PreparedScan, pair, prepare_scan, register_prepared, shape_labels
-from segslam.simulation.scene_sensors import SENSORS, scan_points
-from segslam.simulation.scenes import SCENES, corridor
-from segslam.types import Alignment, Registration, Rejected
+from segslam.bench.simulation.scene_sensors import SENSORS, scan_points
+from segslam.bench.simulation.scenes import SCENES, corridor
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Alignment, Registration, Rejected
+from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.verification import pair, register_prepared
 from segslam.verification.gates import NoiseFloor, weak_support
 from tools.benchmarks import scenes
 

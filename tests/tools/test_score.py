@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from segslam import geometry
-from segslam.config import Config
+from segslam.core import geometry
+from segslam.core.config import Config
 from segslam.registration.prepared import prepare_observed
 from segslam.verification.gates import Observed
 from tools.benchmarks.score.evidence import BINS, evidence

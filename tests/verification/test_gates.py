@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from helpers.streets import corner
 
-from segslam import geometry, refinement
-from segslam.config import RefineConfig, VerifyConfig
-from segslam.types import RejectReason
-from segslam.verification.free_space import observe_free_space
+from segslam.core import geometry
+from segslam.core.config import RefineConfig, VerifyConfig
+from segslam.core.types import RejectReason
+from segslam.registration import refinement
+from segslam.registration.free_space import observe_free_space
 from segslam.verification.gates import (
     NARROW_VIEW,
     SINGLE_PAIR,

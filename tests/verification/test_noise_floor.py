@@ -1,10 +1,10 @@
 import numpy as np
 from helpers.streets import corner
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.registration import prepare_scan
-from segslam.types import Label, Transform
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Label, Transform
+from segslam.registration.prepared import prepare_scan
 from segslam.verification.gates import SINGLE_PAIR, Observed
 from segslam.verification.noise_floor import EVERY, MIN_PAIRS, NUM_FIRST, NeighbourNoise
 

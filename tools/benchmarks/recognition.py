@@ -13,12 +13,12 @@ from time import process_time
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import load_config
-from segslam.evaluation import PoseError
-from segslam.recognition import MAX_PLACES, recognise
-from segslam.retrieval import Places, signature_of, signatures_around
-from segslam.types import Rejected
+from segslam.candidates import Places, signature_of, signatures_around
+from segslam.core import geometry
+from segslam.core.config import load_config
+from segslam.core.evaluation import PoseError
+from segslam.core.types import Rejected
+from segslam.slam.recognition import MAX_PLACES, recognise
 from tools.benchmarks import common
 from tools.benchmarks.submaps import Submaps
 

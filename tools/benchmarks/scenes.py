@@ -17,16 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config, load_config
-from segslam.keyframes import downsample_keyframe
-from segslam.registration import PreparedScan, prepare_scan, register_prepared, shape_labels
-from segslam.simulation.scene_sensors import SENSORS, scan_points
-from segslam.simulation.scenes import SCENES, Scene, pose
-from segslam.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
+from segslam.bench.simulation.scene_sensors import SENSORS, scan_points
+from segslam.bench.simulation.scenes import SCENES, Scene, pose
+from segslam.candidates.prior import far_from_prior
+from segslam.core import geometry
+from segslam.core.config import Config, load_config
+from segslam.core.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
+from segslam.keyframes.keyframes import downsample_keyframe
+from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.verification import register_prepared
 from segslam.verification.gates import NoiseFloor, agreement
 from segslam.verification.noise_floor import NeighbourNoise
-from segslam.verification.prior import far_from_prior
 from tools.benchmarks import common
 
 DRIFT_M, DRIFT_DEG, HEIGHT_M = 1.5, 3.0, 0.3

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config, load_config
-from segslam.datasets import open_dataset
-from segslam.registration import PreparedScan, prepare_scan, register_prepared, shape_labels
-from segslam.types import Alignment, Points, Transform
+from segslam.core import geometry
+from segslam.core.config import Config, load_config
+from segslam.core.types import Alignment, Points, Transform
+from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.scans import open_dataset
+from segslam.verification import register_prepared
 from tools.benchmarks import common
 
 NUM_BESIDE = 5

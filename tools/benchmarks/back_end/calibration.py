@@ -4,10 +4,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from segslam import geometry
-from segslam.pose_graph.closure_pairs import adjoints
-from segslam.pose_graph.noise import DEGREES_OF_FREEDOM, closure_information, odometry_information
-from segslam.types import LoopClosure
+from segslam.core import geometry
+from segslam.core.types import LoopClosure
+from segslam.graph.closure_pairs import adjoints
+from segslam.graph.noise import DEGREES_OF_FREEDOM, closure_information, odometry_information
 from tools.benchmarks.back_end.drives import CONFIG, Drive
 
 LENGTHS = (1, 10, 100)

@@ -10,9 +10,9 @@ were chosen on those scans and pairs of KITTI. KISS-Matcher needs the extra `ben
 from pathlib import Path
 from typing import Any
 
-from segslam.config import load_config
-from segslam.datasets import open_dataset
-from segslam.experiments.methods import find_method
+from segslam.bench.experiments.methods import find_method
+from segslam.core.config import load_config
+from segslam.scans import open_dataset
 from tools.benchmarks import common
 from tools.benchmarks.labels.courtyard import courtyard
 from tools.benchmarks.labels.kitti import class_agreement, pairs_by_labels, speed

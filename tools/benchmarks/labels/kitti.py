@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from segslam.config import Config
-from segslam.datasets import open_dataset
-from segslam.experiments.rows import Row
-from segslam.experiments.summary import figures, grouped
-from segslam.semantics import geometric_labels
-from segslam.semantics.late import computed
-from segslam.types import GROUND_LABELS, Label, Points
+from segslam.bench.experiments.rows import Row
+from segslam.bench.experiments.summary import figures, grouped
+from segslam.core.config import Config
+from segslam.core.types import GROUND_LABELS, Label, Points
+from segslam.labels import geometric_labels
+from segslam.labels.late import computed
+from segslam.scans import open_dataset
 from tools.benchmarks import real_pairs
 
 CLASSES = {

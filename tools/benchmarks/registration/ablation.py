@@ -5,10 +5,10 @@ from functools import cache
 
 import numpy as np
 
-from segslam import segregator
-from segslam.config import Config, load_config
-from segslam.experiments.trials import Trial
-from segslam.types import Description, Label
+from segslam.bench.experiments.trials import Trial
+from segslam.core.config import Config, load_config
+from segslam.core.types import Description, Label
+from segslam.registration import segregator
 from tools.benchmarks.common import Row
 from tools.benchmarks.registration.attempts import error_of, percent
 from tools.benchmarks.registration.scans import Labelled

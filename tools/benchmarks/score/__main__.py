@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from segslam.config import Config, load_config
-from segslam.simulation.scenes import SCENES
+from segslam.bench.simulation.scenes import SCENES
+from segslam.core.config import Config, load_config
 from tools.benchmarks import common, score
 from tools.benchmarks.score.pairs import Task, described, of_drive, of_scene
 from tools.benchmarks.score.ratio import Pair, Score, Scored

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from segslam import geometry
-from segslam.config import VerifyConfig
-from segslam.points import cell_keys, within_range
-from segslam.refinement import STANDING_NORMAL_Z
-from segslam.types import Mask, Points, Transform, Vector
-from segslam.verification.free_space import MIN_MARGIN_M, NUM_COLUMNS, SHARE_OF_PATH, FreeSpace
+from segslam.core import geometry
+from segslam.core.config import VerifyConfig
+from segslam.core.points import cell_keys, within_range
+from segslam.core.types import Mask, Points, Transform, Vector
+from segslam.registration.free_space import MIN_MARGIN_M, NUM_COLUMNS, SHARE_OF_PATH, FreeSpace
+from segslam.registration.refinement import STANDING_NORMAL_Z
 from segslam.verification.gates import SAME_NORMAL, Observed
 from segslam.verification.patches import PATCH_M
 

@@ -8,18 +8,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam import geometry, refinement
-from segslam.config import Config
-from segslam.datasets import open_dataset
-from segslam.evaluation import PoseError
-from segslam.keyframes import downsample_keyframe
-from segslam.registration import Gate, PreparedScan, Stopwatch, anywhere, prepare_scan, register_prepared, shape_labels
-from segslam.registration.trial import Trial
-from segslam.simulation.scenes import SCENES
-from segslam.types import Alignment, LoopCandidate, Points, Rejected, Rotation, Transform
-from segslam.verification import gates
+from segslam.bench.simulation.scenes import SCENES
+from segslam.candidates.prior import far_from_prior
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.evaluation import PoseError
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import Alignment, LoopCandidate, Points, Rejected, Rotation, Transform
+from segslam.keyframes.keyframes import downsample_keyframe
+from segslam.registration import refinement
+from segslam.registration.hypotheses import Gate, anywhere
+from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.scans import open_dataset
+from segslam.verification import gates, register_prepared
 from segslam.verification.noise_floor import NeighbourNoise
-from segslam.verification.prior import far_from_prior
+from segslam.verification.trial import Trial
 from tools.benchmarks import common, scenes
 from tools.benchmarks.registration.scans import courtyard_points
 from tools.benchmarks.score.evidence import Counts, evidence

@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam import geometry, refinement
+from segslam.core import geometry
+from segslam.core.types import Registration, Rejected, Transform
+from segslam.registration import refinement
 from segslam.registration.hypotheses import coarse_poses
-from segslam.registration.trial import Trial, few_points, is_near
-from segslam.types import Registration, Rejected, Transform
+from segslam.verification.trial import Trial, few_points, is_near
 
 NUM_REFINED, NUM_SLIDES = 3, 2
 """Chosen: poses refined with all points of those to which few points lead, by their mismatch."""
@@ -34,7 +35,7 @@ def tried(trial: Trial) -> list[Transform]:
         trial.config.refine.min_points
     ):
         return []
-    coarse = (one.T_target_source for one in coarse_poses(trial) if isinstance(one, Registration))
+    coarse = (one.T_target_source for one in coarse_poses(trial.pair) if isinstance(one, Registration))
     found = _refined(trial, _led(trial, coarse, [])[:NUM_REFINED], [])
     if not found:
         return []

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from segslam.registration.rivals import SAME_POSE_M, SAME_POSE_RAD
-from segslam.registration.trial import is_near
-from segslam.types import Transform, Vector
+from segslam.core.types import Transform, Vector
+from segslam.verification.rivals import SAME_POSE_M, SAME_POSE_RAD
+from segslam.verification.trial import is_near
 from tools.benchmarks.score.evidence import BINS, Counts
 
 PRIOR_COUNT = 0.5

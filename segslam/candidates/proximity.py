@@ -17,6 +17,15 @@ from segslam.core import geometry
 from segslam.core.config import ProximityConfig
 from segslam.core.types import REJECTED_WEIGHT, IndexPairs, Indices, LoopCandidate, LoopClosure, Vector
 
+BREAK_RADIUS_M = 60.0
+"""Chosen: search radius across a break of the odometry (m)."""
+MAX_CANDIDATES = 2
+"""Chosen: number of candidates per keyframe."""
+SPREAD_M = 8.0
+"""Chosen: smallest distance travelled between two candidates of one keyframe (m)."""
+MIN_GAP_M = 8.0
+"""Chosen: distance travelled after an accepted loop before the next search (m)."""
+
 BREAK_TRAVEL_M = 1e5
 """Travel assigned to a break of the odometry, because the relative pose across it is unknown."""
 NO_CLOSURES: IndexPairs = np.empty((0, 2), dtype=np.int64)
@@ -71,11 +80,11 @@ class ProximityDetector:
         distance_m = np.hypot(offset[:, 0], offset[:, 1])
         eligible = (
             (distance_m <= radius_m)
-            & (np.abs(offset[:, 2]) <= height_bounds_m(chain_m, config=config))
+            & (np.abs(offset[:, 2]) <= height_bounds_m(chain_m))
             & ~self._is_closed(source_id, within_reach, travel_m, radius_m)
         )
         nearest_first = np.flatnonzero(eligible)[np.argsort(distance_m[eligible], kind="stable")]
-        rows = _spread_out(nearest_first, travel_m[within_reach], config.spread_m, config.max_candidates)
+        rows = _spread_out(nearest_first, travel_m[within_reach], SPREAD_M, MAX_CANDIDATES)
         T_source_world = geometry.inverse(T_world_keyframes[source_id])
         return tuple(
             LoopCandidate(
@@ -94,16 +103,16 @@ class ProximityDetector:
         config = self._config
         num_far = np.searchsorted(travel_m, travel_m[source_id] - config.min_travel_m, side="right")
         x, y = T_world_keyframes[: min(num_far, source_id), :2, 3].T - T_world_keyframes[source_id, :2, 3, None]
-        largest_m = max(config.max_radius_m, config.break_radius_m) if _has_break(travel_m) else config.max_radius_m
+        largest_m = max(config.max_radius_m, BREAK_RADIUS_M) if _has_break(travel_m) else config.max_radius_m
         return np.flatnonzero(np.hypot(x, y) <= largest_m)
 
     def _is_closed(self, source_id: int, ids: Indices, travel_m: Vector, radius_m: Vector) -> Bool[np.ndarray, " k"]:
         """True for targets near a loop closed within the last `min_gap_m`: closer to its target, in travel, than
         `min_gap_m` plus the search radius."""
         sources, targets = self._closures[self._kept].T
-        recent = targets[np.abs(travel_m[sources] - travel_m[source_id]) < self._config.min_gap_m]
+        recent = targets[np.abs(travel_m[sources] - travel_m[source_id]) < MIN_GAP_M]
         apart_m = np.abs(travel_m[ids, None] - travel_m[recent])
-        return (apart_m < self._config.min_gap_m + radius_m[:, None]).any(axis=1)
+        return (apart_m < MIN_GAP_M + radius_m[:, None]).any(axis=1)
 
 
 class Chains:
@@ -154,7 +163,7 @@ def search_radius_m(chain_m: Vector, *, config: ProximityConfig) -> Vector:
     A chain across a break of the odometry is longer than any drive (`BREAK_TRAVEL_M`).
     """
     radius_m = np.minimum(config.base_radius_m + config.drift_ratio * chain_m, config.max_radius_m)
-    return np.where(chain_m >= BREAK_TRAVEL_M, max(config.break_radius_m, config.max_radius_m), radius_m)
+    return np.where(chain_m >= BREAK_TRAVEL_M, max(BREAK_RADIUS_M, config.max_radius_m), radius_m)
 
 
 def _has_break(travel_m: Vector) -> bool:

@@ -15,10 +15,10 @@ from jaxtyping import Float, UInt8
 from scipy.fft import rfft2
 from scipy.ndimage import map_coordinates
 
-from segslam.core.config import GeometricLabelsConfig
 from segslam.core.points import hash_keys, voxel_first
 from segslam.core.short_repr import Record
 from segslam.core.types import Label, Labels, Points, SegslamError
+from segslam.labels.geometric import GROUND_CELL_M, MAX_RANGE_M, MAX_SLOPE
 from segslam.labels.ground_surface import heights_above_ground, rotated, upright
 
 CELL_M = 0.4
@@ -64,24 +64,24 @@ class PlaceSignature(Record):
         return PlaceSignature(np.frombuffer(data, np.uint8).reshape(NUM_RADII, NUM_ANGLES))
 
 
-def signature_of(points: Points, labels: Labels, *, config: GeometricLabelsConfig) -> PlaceSignature:
+def signature_of(points: Points, labels: Labels) -> PlaceSignature:
     """The signature of a scan in its sensor's frame. Labels are used to remove points of moving classes only.
 
     The sensor may be tilted: the ground is estimated and removed.
     """
-    return signature_of_standing(_standing(points, labels, config, reach_m=REACH_M))
+    return signature_of_standing(_standing(points, labels, reach_m=REACH_M))
 
 
-def signatures_around(points: Points, labels: Labels, *, config: GeometricLabelsConfig) -> tuple[PlaceSignature, ...]:
+def signatures_around(points: Points, labels: Labels) -> tuple[PlaceSignature, ...]:
     """The signatures of a scan seen from 16 points around its sensor: one of them may be near the path of a map.
 
     The weight of a point decreases with its distance, so the signature changes over 10 m.
     """
-    standing = _standing(points, labels, config, reach_m=REACH_M + CIRCLES[-1][0])
+    standing = _standing(points, labels, reach_m=REACH_M + CIRCLES[-1][0])
     return tuple(signature_of_standing(standing - centre) for centre in _centres())
 
 
-def _standing(points: Points, labels: Labels, config: GeometricLabelsConfig, *, reach_m: float) -> Points:
+def _standing(points: Points, labels: Labels, *, reach_m: float) -> Points:
     """Static points above the ground in a level frame, all of those with x and y below `reach_m`.
 
     The ground is followed outwards from the sensor, so points two cells farther do not change the heights of these.
@@ -91,13 +91,13 @@ def _standing(points: Points, labels: Labels, config: GeometricLabelsConfig, *, 
     if not len(thinned):
         return thinned
     level = rotated(thinned, upright(thinned))
-    edge_m = reach_m + 2 * config.ground_cell_m
+    edge_m = reach_m + 2 * GROUND_CELL_M
     near = level.compress((np.abs(level[:, 0]) <= edge_m) & (np.abs(level[:, 1]) <= edge_m), axis=0)
     heights = heights_above_ground(
         near,
-        cell_m=config.ground_cell_m,
-        max_range_m=min(config.max_range_m, edge_m + config.ground_cell_m),
-        max_slope=config.max_slope,
+        cell_m=GROUND_CELL_M,
+        max_range_m=min(MAX_RANGE_M, edge_m + GROUND_CELL_M),
+        max_slope=MAX_SLOPE,
     )
     return near[heights > GROUND_M]
 

@@ -24,7 +24,6 @@ from segslam.cli.console import (
 from segslam.cli.overwriting import OverwriteOption
 
 if TYPE_CHECKING:
-    from segslam.core.config import Config
     from segslam.core.types import Labels, Scan
     from segslam.labels.encodings import Encoding
     from segslam.scans import Dataset
@@ -93,7 +92,7 @@ def label(
     true_scans = _open_truth(truth, truth_encoding, opened) if truth else None
     folder = out if overwrite and out.is_dir() else new_folder(out)
     tally = Tally(scans, folder, write_as=write_as, num_pictures=pictures)
-    found = _labelled(scans, true_scans, settings_now)
+    found = _labelled(scans, true_scans)
     for one in progress(found, total=len(scans), title="label", quiet=quiet):
         if one is not None:
             tally.add(one)
@@ -119,14 +118,14 @@ def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Data
     return scans
 
 
-def _labelled(scans: "Dataset", true_scans: "Dataset | None", config: "Config") -> Iterator[Labelled | None]:
+def _labelled(scans: "Dataset", true_scans: "Dataset | None") -> Iterator[Labelled | None]:
     """Each scan with its labels; None, with a warning, for an unusable scan."""
     import logging
     from time import perf_counter
 
     from segslam.core.types import BadScan
+    from segslam.labels import geometric_labels
     from segslam.labels.late import computed
-    from segslam.registration.prepared import shape_labels
 
     for row in range(len(scans)):
         try:
@@ -139,7 +138,7 @@ def _labelled(scans: "Dataset", true_scans: "Dataset | None", config: "Config") 
         started = perf_counter()
         labels = computed(scan.labels)
         if scans.labels.geometric and not labels.any():
-            labels = shape_labels(scan.points, config=config)
+            labels = geometric_labels(scan.points)
         yield Labelled(row, scan, labels, truth, perf_counter() - started)
 
 

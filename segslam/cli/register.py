@@ -118,9 +118,9 @@ def _read(
 ) -> list[tuple["Points", "Labels"]]:
     """Points and labels of the two scans."""
     from segslam.core.types import SegslamError
+    from segslam.labels import geometric_labels
     from segslam.labels.label_files import encoding_of, open_labels, read_labels
     from segslam.labels.late import computed
-    from segslam.registration.prepared import shape_labels
     from segslam.scans.clouds import read_cloud, read_intensities
     from segslam.scans.dataset import make_scan
     from segslam.scans.kitti import VERTICAL_ANGLE_DEG
@@ -156,7 +156,7 @@ def _read(
         return [
             (
                 scan.points,
-                shape_labels(scan.points, config=config) if words[0] == "geometric" else computed(scan.labels),
+                geometric_labels(scan.points) if words[0] == "geometric" else computed(scan.labels),
             )
             for scan in scans
         ]

@@ -25,6 +25,7 @@ from segslam.graph.final import Measured, solve_consistent, solve_gnc
 from segslam.graph.g2o import G2oGraph, write_g2o
 from segslam.graph.levenberg_marquardt import Search, Unsolvable, search
 from segslam.graph.motions import MotionSolution, without
+from segslam.graph.noise import INLIER_PROBABILITY
 from segslam.graph.rows import Rows
 from segslam.graph.steady_drift import noise_factor, steady_drift, turned
 
@@ -62,7 +63,7 @@ class PoseGraph:
         """The factors of the closures, without robust kernel."""
         self._robust = gtsam.NonlinearFactorGraph()
         """The same factors with the robust kernel."""
-        self._inlier_bound = noise.inlier_bound(config.inlier_probability, error_allowance=config.error_allowance)
+        self._inlier_bound = noise.inlier_bound(INLIER_PROBABILITY, error_allowance=config.error_allowance)
         self._kernel = noise.robust_kernel(config.robust, self._inlier_bound)
         self._values = gtsam.Values()
         self._T_world = Rows(np.empty((0, 4, 4)))
@@ -240,7 +241,7 @@ class PoseGraph:
             self._closures,
             self.travel_m,
             self._inlier_bound,
-            noise.inlier_bound(self._config.inlier_probability),
+            noise.inlier_bound(INLIER_PROBABILITY),
         )
         if self._config.final == "gnc":
             final = solve_gnc(measured, self._values)
@@ -287,7 +288,7 @@ class PoseGraph:
     def _edge(self, closure: LoopClosure) -> Edge:
         for keyframe_id in (closure.target_id, closure.source_id):
             self.T_world_keyframe(keyframe_id)
-        information = noise.closure_information(closure.information, self._config)
+        information = noise.closure_information(closure.information)
         return Edge(
             closure.target_id, closure.source_id, geometry.nearest_transform(closure.T_target_source), information
         )

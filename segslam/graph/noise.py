@@ -11,6 +11,16 @@ from segslam.core.config import GraphConfig
 from segslam.core.types import Information, Transform
 from segslam.graph.edges import Kernel
 
+TURN_M = 5.0
+"""Measured (simulated streets): distance whose noise equals that of a rotation by one radian (m)."""
+CLOSURE_SIGMA_M = 0.04
+"""Measured (simulated 06): smallest translation noise of a closure (m)."""
+CLOSURE_SIGMA_DEG = 0.08
+"""Measured (simulated 06): smallest rotation noise of a closure (degrees)."""
+INLIER_PROBABILITY = 0.99
+"""Statistics: a closure is an inlier if its squared error is below this quantile of the chi-square distribution (6
+degrees of freedom)."""
+
 DEGREES_OF_FREEDOM = 6
 FIRST_POSE_SIGMA = 1e-4  # chosen (rad, m): holds the world in place, far below any other noise and above rounding
 LEAST_STEP_M = 0.1  # chosen: odometry between two scans of a standing sensor jitters by centimetres
@@ -31,12 +41,12 @@ def first_pose() -> gtsam.noiseModel.Base:
 def odometry_information(travel_m: float, T_a_b: Transform, config: GraphConfig) -> Information:
     """Information of the motion between two keyframes: variances grow with the distance travelled and the rotation.
 
-    One radian counts as much as `config.turn_m` metres. The defaults are calibrated on KISS-ICP in simulated streets,
+    One radian counts as much as `TURN_M` metres. The defaults are calibrated on KISS-ICP in simulated streets,
     for single edges and for chains of a hundred. For chains of ten they overestimate the variance two to three times:
     part of the error of an edge does not accumulate, part is correlated over hundreds of metres, and independent edges
     can match this growth at two chain lengths only.
     """
-    way_m = max(travel_m, geometry.distance(T_a_b)) + config.turn_m * geometry.angle(T_a_b)
+    way_m = max(travel_m, geometry.distance(T_a_b)) + TURN_M * geometry.angle(T_a_b)
     growth = math.sqrt(max(way_m, LEAST_STEP_M))
     sigmas = geometry.tangent(
         rotation_rad=math.radians(config.odometry_sigma_deg) * growth, translation_m=config.odometry_sigma_m * growth
@@ -55,7 +65,7 @@ def motion_information(information: Information) -> Information:
     return (information + information.T) / 2 + UNKNOWN_MOTION
 
 
-def closure_information(information: Information, config: GraphConfig) -> Information:
+def closure_information(information: Information) -> Information:
     """A closure's information after the smallest noise of any closure is added to its covariance.
 
     The registration gives the shape of the uncertainty. The smallest noise covers errors that it cannot observe, like
@@ -66,7 +76,7 @@ def closure_information(information: Information, config: GraphConfig) -> Inform
     """
     if not is_positive_semidefinite(information):
         raise ValueError("the information of a closure must be finite, symmetric and positive semidefinite")
-    sigmas = geometry.tangent(rotation_rad=math.radians(config.closure_sigma_deg), translation_m=config.closure_sigma_m)
+    sigmas = geometry.tangent(rotation_rad=math.radians(CLOSURE_SIGMA_DEG), translation_m=CLOSURE_SIGMA_M)
     least = np.diag(sigmas**-2.0)
     total = information @ np.linalg.solve(information + least, least)  # inverse(inverse(I) + inverse(L)), I may be flat
     return (total + total.T) / 2 + 1e-10 * least

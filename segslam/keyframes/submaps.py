@@ -13,6 +13,12 @@ from segslam.keyframes.keyframes import Clouds
 from segslam.registration import refinement
 from segslam.registration.prepared import Labeller, PreparedScan, prepare_scan
 
+DENSE_VOXELS = 3000
+"""Chosen on KITTI, courtyard, NCLT: a keyframe with fewer voxels (refine.voxel_m) is matched together with its
+neighbours' points."""
+MAX_GATHERED = 10
+"""Chosen: largest number of neighbouring keyframes whose points are merged."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Submap:
@@ -70,16 +76,16 @@ class Submaps:
 
     def lag(self, keyframe_id: int) -> int:
         """Number of keyframes back to the nearest one whose submap shares no scan with this one's."""
-        return 1 if self._is_dense([self._clouds().cloud(keyframe_id)[0]]) else self._config.keyframes.max_gathered + 1
+        return 1 if self._is_dense([self._clouds().cloud(keyframe_id)[0]]) else MAX_GATHERED + 1
 
     def _is_dense(self, clouds: list[Points]) -> bool:
         downsampled = refinement.downsample(np.vstack(clouds), config=self._config.refine)
-        return len(downsampled) >= self._config.keyframes.dense_voxels
+        return len(downsampled) >= DENSE_VOXELS
 
     def _neighbours(self, keyframe_id: int, newest_id: int) -> Iterator[int]:
         """Keyframes around one, nearest first, that odometry connects to it without a break."""
         travel_m = self._travel_m()
-        for step in range(1, self._config.keyframes.max_gathered // 2 + 1):
+        for step in range(1, MAX_GATHERED // 2 + 1):
             for neighbour in (keyframe_id - step, keyframe_id + step):
                 if 0 <= neighbour <= newest_id and abs(travel_m[neighbour] - travel_m[keyframe_id]) < BREAK_TRAVEL_M:
                     yield neighbour

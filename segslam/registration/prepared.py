@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 from segslam.core.config import Config
 from segslam.core.types import Description, Label, Labels, Points
-from segslam.labels import geometric_labels
 from segslam.registration import refinement, segregator
 from segslam.registration.free_space import FreeSpace, observe_free_space
 
@@ -26,11 +25,6 @@ class PreparedScan:
     def observed(self) -> Observed:
         """Surface and free space: what verification compares."""
         return self.surface, self.free_space
-
-
-def shape_labels(points: Points, *, config: Config) -> Labels:
-    """Labels computed from geometry alone."""
-    return geometric_labels(points, config=config.geometric)
 
 
 def prepare_scan(

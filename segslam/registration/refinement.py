@@ -26,6 +26,20 @@ from segslam.core.types import (
     Transform,
 )
 
+MAX_ITERATIONS = 20
+"""As small_gicp: largest number of iterations in each stage."""
+MAX_RANGE_M = 60.0
+"""Chosen: points farther away are dropped (m)."""
+MIN_POINTS = 100
+"""Chosen on KITTI 00: smallest number of points, and of point pairs, for a registration."""
+INFORMATION_SCALE = 0.05
+"""Measured (simulated truth): factor from the Hessian to the information matrix; below 1: errors of neighbours are
+correlated."""
+SHARED_NOISE_M = 0.026
+"""Measured (simulated truth): translation noise common to all points, for example from sensor calibration (m)."""
+SHARED_NOISE_DEG = 0.067
+"""Measured (simulated truth): rotation noise common to all points (degrees)."""
+
 NUM_NEIGHBOURS = 10
 """Number of neighbours for the covariance of a point; small_gicp's default."""
 STANDING_NORMAL_Z = math.cos(math.radians(45.0))
@@ -120,7 +134,7 @@ class LightSurface:
 
 def downsample(points: Points, *, config: RefineConfig) -> Points:
     """The mean point of each voxel within `max_range_m`, float32; about 100 KB per scan."""
-    return voxel_means(points, config.voxel_m, beyond_m=0.0, within_m=config.max_range_m).astype(np.float32)
+    return voxel_means(points, config.voxel_m, beyond_m=0.0, within_m=MAX_RANGE_M).astype(np.float32)
 
 
 def merge_clouds(clouds: Sequence[Points], *, config: RefineConfig) -> Points:
@@ -132,7 +146,7 @@ def make_surface(downsampled: Points, *, config: RefineConfig) -> Surface:
     """The surface through downsampled points. It may be empty; `refine` then rejects."""
     cloud = small_gicp.PointCloud(downsampled.astype(np.float64))
     tree = small_gicp.KdTree(cloud)
-    if len(downsampled) < config.min_points:
+    if len(downsampled) < MIN_POINTS:
         return Surface(cloud, tree, LEAST_ROUGHNESS * config.voxel_m)
     small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, 1)
     return Surface(cloud, tree, _roughness(cloud, tree, config.voxel_m))
@@ -179,20 +193,20 @@ def refine(
     to plane. Rejects TOO_FEW_POINTS, and REFINEMENT_DIVERGED if no pairs remain or, with `must_converge`, if the last
     stage does not converge and as many iterations again move the pose by more than `SETTLED_M` or `SETTLED_RAD`.
     """
-    if min(len(source), len(target)) < config.min_points:
-        sizes = f"{len(source)} and {len(target)} points, {config.min_points} needed"
+    if min(len(source), len(target)) < MIN_POINTS:
+        sizes = f"{len(source)} and {len(target)} points, {MIN_POINTS} needed"
         return Rejected(RejectReason.TOO_FEW_POINTS, sizes)
     for correspondence_m in config.correspondence_m:
-        result = _aligned(source, target, T_target_source, correspondence_m, config)
+        result = _aligned(source, target, T_target_source, correspondence_m, MAX_ITERATIONS)
         T_target_source = result.T_target_source
-        if result.num_inliers < config.min_points or not np.isfinite(T_target_source).all():
+        if result.num_inliers < MIN_POINTS or not np.isfinite(T_target_source).all():
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"{result.num_inliers} pairs at {correspondence_m} m")
     if must_converge and not result.converged:
-        result = _aligned(source, target, T_target_source, correspondence_m, config)
+        result = _aligned(source, target, T_target_source, correspondence_m, MAX_ITERATIONS)
         moved = geometry.inverse(T_target_source) @ result.T_target_source
         T_target_source = result.T_target_source
         if not (geometry.distance(moved) < SETTLED_M and geometry.angle(moved) < SETTLED_RAD):
-            detail = f"still moving after {config.max_iterations} iterations at {correspondence_m} m"
+            detail = f"still moving after {MAX_ITERATIONS} iterations at {correspondence_m} m"
             return Rejected(RejectReason.REFINEMENT_DIVERGED, detail)
     to_point, to_plane = target.distances_m(geometry.apply(T_target_source, source.points))
     paired = to_plane[to_point < config.correspondence_m[-1]]
@@ -201,13 +215,13 @@ def refine(
         num_correspondences=len(source),
         num_inliers=int(result.num_inliers),
         rms_m=float(np.sqrt(np.mean(paired**2))),
-        information=limited_information((result.H + result.H.T) / 2 * config.information_scale, config=config),
+        information=limited_information((result.H + result.H.T) / 2 * INFORMATION_SCALE, config=config),
     )
 
 
 def approach(source: Surface, target: Surface, T_target_source: Transform, *, config: RefineConfig) -> Transform:
     """The pose after the first `NUM_APPROACH` iterations of `refine`; both surfaces have points."""
-    begun = _aligned(source, target, T_target_source, config.correspondence_m[0], config, NUM_APPROACH)
+    begun = _aligned(source, target, T_target_source, config.correspondence_m[0], NUM_APPROACH)
     return begun.T_target_source
 
 
@@ -216,8 +230,7 @@ def _aligned(
     target: Surface,
     T_target_source: Transform,
     within_m: float,
-    config: RefineConfig,
-    max_iterations: int | None = None,
+    max_iterations: int,
 ) -> Any:
     return small_gicp.align(
         target.cloud,
@@ -225,12 +238,12 @@ def _aligned(
         target.tree,
         T_target_source,
         max_correspondence_distance=within_m,
-        max_iterations=max_iterations or config.max_iterations,
+        max_iterations=max_iterations,
         num_threads=1,
     )
 
 
-def observability(information: Information, *, config: RefineConfig) -> tuple[float, Direction]:
+def observability(information: Information) -> tuple[float, Direction]:
     """Smallest divided by largest variance of the translation, and the direction of the largest variance.
 
     The ratio is 0 to 1, without the noise common to all points; 0 if the information is singular. The direction has
@@ -240,7 +253,7 @@ def observability(information: Information, *, config: RefineConfig) -> tuple[fl
         covariance = np.linalg.inv(information)
     except np.linalg.LinAlgError:
         return 0.0, np.array([1.0, 0.0, 0.0])
-    variances, directions = np.linalg.eigh(covariance[3:, 3:] - config.shared_noise_m**2 * np.eye(3))
+    variances, directions = np.linalg.eigh(covariance[3:, 3:] - SHARED_NOISE_M**2 * np.eye(3))
     return float(max(variances[0], 0.0) / variances[2]), directions[:, 2]
 
 
@@ -262,9 +275,9 @@ def limited_information(hessian: Information, *, config: RefineConfig) -> Inform
     It has no spurious information along smooth surfaces.
     """
     information = geometry.with_noise(
-        hessian, rotation_rad=math.radians(config.shared_noise_deg), translation_m=config.shared_noise_m
+        hessian, rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M
     )
-    ratio, direction = observability(information, config=config)
+    ratio, direction = observability(information)
     if ratio >= UNOBSERVED:
         return information
     wide = np.zeros((6, 6))

@@ -77,7 +77,7 @@ class LoopCloser:
             return None
         if recorded is None:
             made = self.submaps.gathered(newest_id)
-            signature = signature_of(made.points, made.labels, config=self._config.geometric)
+            signature = signature_of(made.points, made.labels)
         else:
             signature = PlaceSignature.from_bytes(recorded)
         self._far.add(newest_id, signature)

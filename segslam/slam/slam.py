@@ -6,7 +6,6 @@ It uses no files and no viewers; these consume the Steps that it returns.
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from time import monotonic
 
 import numpy as np
@@ -31,10 +30,11 @@ from segslam.core.types import (
 )
 from segslam.graph import Graph, PoseGraph
 from segslam.keyframes.keyframes import Clouds, CloudStore, downsample_keyframe
+from segslam.labels import geometric_labels
 from segslam.labels.late import computed
 from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
 from segslam.odometry import Tracked as Tracked
-from segslam.registration.prepared import Labeller, shape_labels
+from segslam.registration.prepared import Labeller
 from segslam.slam.adjustment import Adjusted, Progress, adjust, no_progress
 from segslam.slam.loop_edits import LoopEdits
 from segslam.slam.loops import NO_EDITS, ROUNDS, LoopCloser
@@ -61,7 +61,7 @@ class Slam:
         `edits` forbids loops between keyframes, or has them tried.
         """
         self.config = config or Config()
-        by_shape = partial(shape_labels, config=self.config)
+        by_shape = geometric_labels
         self._tracker = Tracker(self.config, odometry=odometry)
         self._labeller = labeller or by_shape
         self._labels_by_shape = labeller is None

@@ -10,9 +10,10 @@ from segslam.core.config import Config
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.threads import at_once
 from segslam.core.types import Alignment, Labels, Registration, Rejected, RejectReason, Transform, as_points
+from segslam.labels import geometric_labels
 from segslam.registration import refinement
 from segslam.registration.hypotheses import Gate, anywhere, coarse_poses
-from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import gates
 from segslam.verification.rivals import SPARSE_MARGIN, Searched, sparsely_refined, unless_ambiguous
 from segslam.verification.trial import EQUAL_M, EQUAL_RAD, Found, Trial, is_near
@@ -39,7 +40,7 @@ def register(
 
     def prepared(given: ArrayLike, labels: Labels | None) -> PreparedScan:
         points = as_points(given)
-        return prepare_scan(points, shape_labels(points, config=config) if labels is None else labels, config=config)
+        return prepare_scan(points, geometric_labels(points) if labels is None else labels, config=config)
 
     source, target = at_once(
         lambda: prepared(source_points, source_labels), lambda: prepared(target_points, target_labels)

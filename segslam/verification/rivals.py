@@ -12,6 +12,7 @@ from segslam.core.threads import at_once
 from segslam.core.types import Alignment, Direction, Registration, Rejected, RejectReason, Transform
 from segslam.registration import refinement
 from segslam.registration.hypotheses import anywhere, plans_near
+from segslam.registration.refinement import MIN_POINTS
 from segslam.verification import gates
 from segslam.verification.trial import EQUAL_M, EQUAL_RAD, Found, Trial, few_points, is_near
 
@@ -110,7 +111,7 @@ def sparsely_refined(trial: Trial, coarse: Registration, searched: Searched) -> 
     if trial.gate(coarse.T_target_source, slack_m=trial.config.verify.max_coarse_fine_m) is not None:
         return None
     few = few_points(trial.source, trial.config.refine)
-    if min(map(len, (few.surface, trial.target.surface))) < trial.config.refine.min_points:
+    if min(map(len, (few.surface, trial.target.surface))) < MIN_POINTS:
         return None
     if trial.free_space_rejection(coarse.T_target_source) is not None:
         return None

@@ -159,7 +159,7 @@ class Trial(NamedTuple):
         if far is not None:
             return far
         found = gates.agreement(self.source.observed, self.target.observed, fine.T_target_source, config=config)
-        observability, _ = refinement.observability(fine.information, config=self.config.refine)
+        observability, _ = refinement.observability(fine.information)
         alignment = Alignment(
             coarse, fine, found.overlap, found.rms_m, found.free_space_violation, observability=observability
         )

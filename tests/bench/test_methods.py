@@ -81,11 +81,11 @@ def test_quatro_turns_about_the_vertical_alone(parts: tuple[dict[str, Any], dict
 
 
 def test_settings_of_a_method_leave_all_else_as_it_was() -> None:
-    changed = CONFIG.segregator.model_copy(update={"certain_inliers": 9})
+    changed = CONFIG.segregator.model_copy(update={"min_clique": 9})
     config = CONFIG.model_copy(update={"segregator": changed})
     segator = method_config(config, "segator")
     assert segator.segregator.gate == "lengths"
-    assert segator.segregator.certain_inliers == 9
+    assert segator.segregator.min_clique == 9
     assert method_config(config, "gicp") == config
 
 

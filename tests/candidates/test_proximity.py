@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from segslam.candidates import proximity
 from segslam.candidates.proximity import NO_CLOSURES, Chains, ProximityDetector, search_radius_m
 from segslam.core import geometry
 from segslam.core.config import ProximityConfig
@@ -13,14 +14,17 @@ CONFIG = ProximityConfig(
     base_radius_m=6.0,
     drift_ratio=0.01,
     max_radius_m=20.0,
-    base_height_m=1.0,
-    height_ratio=0.008,
-    max_candidates=3,
-    spread_m=6.0,
-    min_gap_m=4.0,
 )
 ROUND = 100
 """Keyframes in one round of the square below, 2 m apart."""
+
+
+@pytest.fixture(autouse=True)
+def _dense_square(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More candidates, nearer to each other, than in a drive."""
+    monkeypatch.setattr(proximity, "MAX_CANDIDATES", 3)
+    monkeypatch.setattr(proximity, "SPREAD_M", 6.0)
+    monkeypatch.setattr(proximity, "MIN_GAP_M", 4.0)
 
 
 def square(num: int) -> tuple[np.ndarray, np.ndarray]:

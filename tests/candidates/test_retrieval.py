@@ -7,7 +7,6 @@ import pytest
 
 from segslam.candidates import Places, PlaceSignature, signature_of, signature_of_standing
 from segslam.core import geometry
-from segslam.core.config import Config
 from segslam.core.types import Label, SegslamError
 
 
@@ -67,26 +66,24 @@ def test_a_signature_is_small_and_comes_back_from_its_bytes() -> None:
 
 
 def test_ground_tilt_and_moving_objects_do_not_change_a_signature() -> None:
-    config = Config().geometric
     x, y = np.meshgrid(np.arange(-30, 30, 0.4), np.arange(-30, 30, 0.4))
     ground = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.8)])
     standing = street(3) - [0.0, 0.0, 1.8]
     points = np.vstack([ground, standing])
     labels = np.zeros(len(points), np.uint8)
     index = places(30)
-    plain = index.shortlist(signature_of(points, labels, config=config))[0]
+    plain = index.shortlist(signature_of(points, labels))[0]
     assert plain.place_id == 3
     lean = geometry.exp(geometry.tangent(rotation_rad=np.array([0.1, -0.15, 0.0]), translation_m=0.0))
-    leaning = index.shortlist(signature_of(geometry.apply(lean, points), labels, config=config))[0]
+    leaning = index.shortlist(signature_of(geometry.apply(lean, points), labels))[0]
     assert leaning.place_id == 3
     assert leaning.score > 0.9 * plain.score
     truck = np.random.default_rng(0).uniform([3, -2, -1.5], [12, 2, 2], (20_000, 3))
     passing = signature_of(
         np.vstack([points, truck]),
         np.append(labels, np.full(len(truck), Label.MOVING_TRUCK, np.uint8)),
-        config=config,
     )
-    assert (passing.spectrum == signature_of(points, labels, config=config).spectrum).all()
+    assert (passing.spectrum == signature_of(points, labels).spectrum).all()
 
 
 def test_points_outside_the_image_do_not_change_a_signature() -> None:
@@ -94,13 +91,12 @@ def test_points_outside_the_image_do_not_change_a_signature() -> None:
     ground = np.column_stack([rng.uniform(-60, 60, (40_000, 2)), rng.normal(-1.7, 0.02, 40_000)])
     points = np.vstack([street(3), ground]).astype(np.float32)
     near = points[np.abs(points[:, :2]).max(axis=1) < 33.0]
-    config = Config().geometric
-    whole, cut = (signature_of(some, np.zeros(len(some), np.uint8), config=config) for some in (points, near))
+    whole, cut = (signature_of(some, np.zeros(len(some), np.uint8)) for some in (points, near))
     assert whole.to_bytes() == cut.to_bytes()
 
 
 def test_scans_without_points_have_a_signature() -> None:
     empty = np.empty((0, 3), np.float32)
-    signature = signature_of(empty, np.empty(0, np.uint8), config=Config().geometric)
+    signature = signature_of(empty, np.empty(0, np.uint8))
     assert not signature.spectrum.any()
     assert len(places(3).shortlist(signature)) == 3

@@ -26,13 +26,13 @@ def test_settings_of_an_older_version_are_read_without_removed_ones(caplog: pyte
 
 def test_a_setting_that_was_removed_is_dropped_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / "config.yaml"
-    file.write_text("graph: {systematic_drift: never, turn_m: 4.0}\n")
+    file.write_text("graph: {systematic_drift: never, odometry_sigma_m: 0.4}\n")
     config = load_config(file)
-    assert config == load_config(None, ["graph.turn_m=4.0"])
+    assert config == load_config(None, ["graph.odometry_sigma_m=0.4"])
     assert [record.getMessage() for record in caplog.records] == [
         f"{file}: graph.systematic_drift no longer exists and is ignored"
     ]
-    assert load_config(None, ["graph.systematic_drift=auto"]) == Config()
+    assert load_config(None, ["graph.systematic_drift=auto", "geometric.max_things=9"]) == Config()
     assert config_from_yaml(file.read_text(), "log.mcap") == config
 
 

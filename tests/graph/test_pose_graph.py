@@ -13,7 +13,7 @@ from scipy.stats import chi2, kstest
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
 from segslam.core.types import Alignment, GraphEstimate, LoopClosure, Registration, SegslamError
-from segslam.graph import PoseGraph, read_g2o
+from segslam.graph import PoseGraph, noise, read_g2o
 from segslam.graph.edges import Edge, factor_graph, squared_errors
 from segslam.graph.levenberg_marquardt import Unsolvable
 from segslam.graph.noise import closure_information, inlier_bound, odometry_information
@@ -109,9 +109,10 @@ def test_closures_pull_the_drift_back(robust: str) -> None:
     assert greatest_error_m(TRUTH, graph.finish()) < 0.2 * before
 
 
-def test_a_closure_points_from_source_to_target() -> None:
+def test_a_closure_points_from_source_to_target(monkeypatch: pytest.MonkeyPatch) -> None:
     """A closure on a chain without information determines the pose: T_world_source = T_world_target T_target_source."""
-    loose = GraphConfig(odometry_sigma_m=100.0, odometry_sigma_deg=90.0, robust="none", closure_sigma_m=1e-3)
+    loose = GraphConfig(odometry_sigma_m=100.0, odometry_sigma_deg=90.0, robust="none")
+    monkeypatch.setattr(noise, "CLOSURE_SIGMA_M", 1e-3)
     T_target_source = geometry.transform(geometry.yaw(0.7), [1.0, 2.0, 0.3])
     graph = graph_of(circle(5, rounds=0.1), [closure(4, 0, T_target_source)], loose)
     graph.optimize()
@@ -298,21 +299,21 @@ def test_a_closure_with_an_unknown_keyframe_is_refused() -> None:
 @pytest.mark.parametrize("value", [np.nan, -1.0])
 def test_an_information_that_is_none_is_refused(value: float) -> None:
     with pytest.raises(ValueError, match="positive semidefinite"):
-        closure_information(np.diag([1.0, 1.0, 1.0, 1.0, 1.0, value]), CONFIG)
+        closure_information(np.diag([1.0, 1.0, 1.0, 1.0, 1.0, value]))
 
 
 def test_the_least_noise_is_added_to_a_closures_covariance() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
     covariance = 1e-3 * (root @ root.T + np.eye(6))
-    sigmas = noise_of(CONFIG.closure_sigma_m, CONFIG.closure_sigma_deg)
-    found = closure_information(np.linalg.inv(covariance), CONFIG)
+    sigmas = noise_of(noise.CLOSURE_SIGMA_M, noise.CLOSURE_SIGMA_DEG)
+    found = closure_information(np.linalg.inv(covariance))
     np.testing.assert_allclose(np.linalg.inv(found), covariance + np.diag(sigmas**2), rtol=1e-4)
 
 
 def test_a_closure_without_information_in_one_direction_constrains_the_others() -> None:
     information = np.diag([1e6, 1e6, 1e6, 0.0, 1e4, 1e4])  # a corridor along x
-    found = closure_information(information, CONFIG)
+    found = closure_information(information)
     assert np.linalg.eigvalsh(found).min() > 0.0
     assert found[3, 3] < 1e-3 < 10.0 < found[4, 4]
 
@@ -380,7 +381,7 @@ def test_odometry_noise_grows_with_the_way_and_with_turns() -> None:
     ways = ((2.0, ahead), (8.0, ahead), (2.0, around))
     sigmas = [np.diag(odometry_information(travel, T, CONFIG)) ** -0.5 for travel, T in ways]
     np.testing.assert_allclose(sigmas[1], 2.0 * sigmas[0], rtol=1e-9)
-    np.testing.assert_allclose(sigmas[2] / sigmas[0], np.sqrt((2.0 + CONFIG.turn_m) / 2.0), rtol=1e-9)
+    np.testing.assert_allclose(sigmas[2] / sigmas[0], np.sqrt((2.0 + noise.TURN_M) / 2.0), rtol=1e-9)
     expected = geometry.tangent(
         rotation_rad=np.radians(CONFIG.odometry_sigma_deg), translation_m=CONFIG.odometry_sigma_m
     )
@@ -422,7 +423,7 @@ def test_gnc_agrees_with_gtsams_own(tmp_path: Path) -> None:
     parameters = gtsam.GncLMParams()
     parameters.setKnownInliers(list(range(120)))
     optimizer = gtsam.GncLMOptimizer(factors, values, parameters)
-    bound = inlier_bound(CONFIG.inlier_probability, error_allowance=CONFIG.error_allowance)
+    bound = inlier_bound(noise.INLIER_PROBABILITY, error_allowance=CONFIG.error_allowance)
     optimizer.setInlierCostThresholds(0.5 * bound)  # GTSAM bounds the error
     found = optimizer.optimize()
     weights = graph.finish().closure_weights
@@ -450,10 +451,10 @@ def test_errors_of_true_edges_match_their_information(tmp_path: Path) -> None:
     """Odometry and closures drawn from their noise: at the truth each has a chi-square of 6 degrees of freedom."""
     rng = np.random.default_rng(0)
     T_odom = [TRUTH[0]]
-    least = noise_of(CONFIG.closure_sigma_m, CONFIG.closure_sigma_deg)
+    least = noise_of(noise.CLOSURE_SIGMA_M, noise.CLOSURE_SIGMA_DEG)
     for T_a, T_b in itertools.pairwise(TRUTH):
         T_a_b = geometry.inverse(T_a) @ T_b
-        way = geometry.distance(T_a_b) + CONFIG.turn_m * geometry.angle(T_a_b)
+        way = geometry.distance(T_a_b) + noise.TURN_M * geometry.angle(T_a_b)
         sigmas = np.sqrt(way) * noise_of(CONFIG.odometry_sigma_m, CONFIG.odometry_sigma_deg)
         T_odom.append(T_odom[-1] @ T_a_b @ geometry.exp(sigmas * rng.normal(size=6)))
     sigmas = np.hypot(CLOSURE_SIGMAS, least)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pose_graph.test_pose_graph import closure, noise_of, travel_m
+from graph.test_pose_graph import closure, noise_of, travel_m
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig

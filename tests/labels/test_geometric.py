@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from segslam.core.config import GeometricLabelsConfig
 from segslam.core.geometry import yaw
 from segslam.core.types import GROUND_LABELS, Label
-from segslam.labels import geometric_labels
+from segslam.labels import geometric, geometric_labels
 from segslam.scans import open_dataset
 
-CONFIG = GeometricLabelsConfig()
 SENSOR_HEIGHT_M = 1.7
 BAND_M = (0.7, 2.3)
 """Heights of the points that are judged: well within the band of the labels."""
@@ -66,7 +64,7 @@ def _shares(labels, truth, points):
 def test_the_objects_of_a_small_world_are_classified_from_any_side(yaw_deg):
     points, truth = _world()
     turned = points @ yaw(np.radians(yaw_deg)).T
-    shares = _shares(geometric_labels(turned, config=CONFIG), truth, points)
+    shares = _shares(geometric_labels(turned), truth, points)
     assert min(shares.values()) > 0.9, shares
 
 
@@ -74,14 +72,14 @@ def test_a_tilted_sensor_gives_the_same_labels():
     points, truth = _world()
     c, s = np.cos(0.3), np.sin(0.3)
     leaning = points @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).T
-    shares = _shares(geometric_labels(leaning, config=CONFIG), truth, points)
+    shares = _shares(geometric_labels(leaning), truth, points)
     assert min(shares.values()) > 0.9, shares
 
 
 @pytest.mark.parametrize("mount_m", [0.5, 1.2, 3.0])
 def test_the_sensor_may_be_mounted_at_any_height(mount_m):
     points, truth = _world()
-    labels = geometric_labels(points + np.array([0, 0, SENSOR_HEIGHT_M - mount_m]), config=CONFIG)
+    labels = geometric_labels(points + np.array([0, 0, SENSOR_HEIGHT_M - mount_m]))
     shares = _shares(labels, truth, points)
     assert min(shares.values()) > 0.9, shares
 
@@ -89,30 +87,30 @@ def test_the_sensor_may_be_mounted_at_any_height(mount_m):
 def test_permuting_the_points_permutes_the_labels():
     points, _ = _world()
     order = np.random.default_rng(3).permutation(len(points))
-    labels = geometric_labels(points, config=CONFIG)
-    np.testing.assert_array_equal(geometric_labels(points[order], config=CONFIG), labels[order])
+    labels = geometric_labels(points)
+    np.testing.assert_array_equal(geometric_labels(points[order]), labels[order])
 
 
-def test_of_many_poles_the_most_seen_are_kept():
+def test_of_many_poles_the_most_seen_are_kept(monkeypatch):
     posts = [_post(6.0 + 2 * k, y, height_m) for k in range(5) for y, height_m in ((4.0, 2.5), (-4.0, 1.5))]
     points = np.vstack([_world()[0][:40_000], *(post - [0, 0, SENSOR_HEIGHT_M] for post in posts)])
-    few = CONFIG.model_copy(update={"max_things": 5})
-    poles = points[geometric_labels(points, config=few) == Label.POLE]
+    monkeypatch.setattr(geometric, "MAX_THINGS", 5)
+    poles = points[geometric_labels(points) == Label.POLE]
     assert {int(np.sign(y)) for y in poles[:, 1]} == {1}  # the taller row
 
 
 @pytest.mark.parametrize("num_points", [0, 1, 2, 9, 50])
 def test_tiny_clouds_get_labels(num_points):
     points = np.random.default_rng(num_points).normal(size=(num_points, 3)) * 5
-    assert geometric_labels(points, config=CONFIG).shape == (num_points,)
+    assert geometric_labels(points).shape == (num_points,)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e6])
 def test_points_that_are_not_finite_or_far_stay_unlabelled(value):
     points, _ = _world()
-    labels = geometric_labels(np.vstack([points, np.full((5, 3), value)]), config=CONFIG)
+    labels = geometric_labels(np.vstack([points, np.full((5, 3), value)]))
     assert not labels[-5:].any()
-    np.testing.assert_array_equal(labels[:-5], geometric_labels(points, config=CONFIG))
+    np.testing.assert_array_equal(labels[:-5], geometric_labels(points))
 
 
 @pytest.mark.parametrize(
@@ -121,13 +119,13 @@ def test_points_that_are_not_finite_or_far_stay_unlabelled(value):
     ids=["one place", "the origin", "a line", "nan"],
 )
 def test_degenerate_clouds_get_labels(points):
-    assert geometric_labels(points, config=CONFIG).shape == (len(points),)
+    assert geometric_labels(points).shape == (len(points),)
 
 
 def test_single_precision_gives_the_same_labels():
     points = _world()[0].astype(np.float32)
-    labels = geometric_labels(points.astype(np.float64), config=CONFIG)
-    np.testing.assert_array_equal(geometric_labels(points, config=CONFIG), labels)
+    labels = geometric_labels(points.astype(np.float64))
+    np.testing.assert_array_equal(geometric_labels(points), labels)
 
 
 def _iou(labels, truth, classes):
@@ -138,7 +136,7 @@ def _iou(labels, truth, classes):
 @pytest.mark.data
 def test_real_scans_agree_with_their_ground_truth(data_dir):
     scans = list(open_dataset(data_dir / "kitti", sequence="00", frames="0:3"))
-    labels = np.concatenate([geometric_labels(scan.points, config=CONFIG) for scan in scans])
+    labels = np.concatenate([geometric_labels(scan.points) for scan in scans])
     truth = np.concatenate([scan.labels for scan in scans])
     known = truth != Label.UNLABELLED
     floors = {  # measured 0.92, 0.83, 0.68, 0.64, 0.52
@@ -155,13 +153,7 @@ def test_real_scans_agree_with_their_ground_truth(data_dir):
 @pytest.mark.data
 def test_turning_a_real_scan_changes_few_labels(real_pairs):
     points = real_pairs.points(0)
-    labels = geometric_labels(points, config=CONFIG)
+    labels = geometric_labels(points)
     for yaw_deg, share in ((90, 0.001), (30, 0.07)):  # measured 0.0000 and 0.041: grids do not turn with the points
-        turned = geometric_labels(points @ yaw(np.radians(yaw_deg)).T, config=CONFIG)
+        turned = geometric_labels(points @ yaw(np.radians(yaw_deg)).T)
         assert (turned != labels).mean() < share
-
-
-@pytest.mark.parametrize("bounds", [(2.4, 0.4), (-1.0, 2.0), (1.0, 1.0)])
-def test_bounds_that_do_not_rise_are_refused(bounds):
-    with pytest.raises(ValueError, match="band_m"):
-        GeometricLabelsConfig(band_m=bounds)

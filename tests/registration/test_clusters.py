@@ -11,6 +11,7 @@ from segslam.core import geometry
 from segslam.core.config import SegregatorConfig, load_config
 from segslam.core.types import Label
 from segslam.registration.segregator.clusters import (
+    DCVC_AZIMUTH_DEG,
     Clusters,
     curved_voxel_clusters,
     gaussians,
@@ -171,7 +172,7 @@ def test_a_trunk_is_one_cluster_however_far_apart_the_beams_are(beam_deg: float)
 def test_turning_the_scan_by_whole_bins_turns_its_clusters(data_dir, bins: int) -> None:
     """By other angles the voxels fall elsewhere and a few clusters differ: DCVC is not invariant to yaw."""
     points, labels = raw_scan(data_dir, 0)
-    R = geometry.yaw(np.radians(CONFIG.dcvc_azimuth_deg * bins))
+    R = geometry.yaw(np.radians(DCVC_AZIMUTH_DEG * bins))
     before = semantic_clusters(points.astype(float), labels, config=CONFIG)
     turned = semantic_clusters(points.astype(float) @ R.T, labels, config=CONFIG)
     assert turned.sizes.tolist() == before.sizes.tolist()

@@ -1,6 +1,7 @@
 """Descriptions of whole scans: when features are made, size, symmetries, bad input."""
 
 import dataclasses
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -26,11 +27,14 @@ def test_a_description_takes_at_most_200_kilobytes(data_dir, scan: int) -> None:
 
 
 @pytest.mark.data
-def test_features_are_made_when_clusters_are_few_and_never_when_not_wanted(data_dir) -> None:
+def test_features_are_made_when_clusters_are_few_and_never_when_not_wanted(data_dir, monkeypatch) -> None:
     points, labels = raw_scan(data_dir, 0)
     enough = describe(points, labels, config=SegregatorConfig())
-    few = describe(points, labels, config=SegregatorConfig(few_clusters=len(enough.sizes) + 1))
-    never = describe(points, labels, config=SegregatorConfig(features="never", few_clusters=1000))
+    monkeypatch.setattr(
+        import_module("segslam.registration.segregator.describe"), "FEW_CLUSTERS", len(enough.sizes) + 1
+    )
+    few = describe(points, labels, config=SegregatorConfig())
+    never = describe(points, labels, config=SegregatorConfig(features="never"))
     assert len(enough.feature_points) == 0
     assert len(few.feature_points) > 0
     assert len(never.feature_points) == 0

@@ -6,6 +6,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Label, RejectReason, Transform
+from segslam.registration.segregator import gaussians
 from segslam.registration.segregator.correspondences import cluster_correspondences
 from segslam.registration.segregator.gaussians import align_gaussians, nearest_pairs, nearest_planes
 from segslam.registration.segregator.pose_solver import PoseFit
@@ -69,17 +70,17 @@ def test_each_cluster_is_paired_at_most_once_and_with_the_nearest() -> None:
     source = scan(np.array([[0.0, 0, 0], [0.3, 0, 0], [9.0, 0, 0]]), NO_GROUND)
     target = scan(np.array([[0.1, 0, 0], [9.2, 0, 0], [9.1, 0, 0], [50.0, 0, 0]]), NO_GROUND)
     correspondences = cluster_correspondences(source, target)
-    rows = nearest_pairs(correspondences, np.eye(4), config=CONFIG)
+    rows = nearest_pairs(correspondences, np.eye(4))
     pairs = list(zip(correspondences.source_index[rows], correspondences.target_index[rows], strict=True))
     assert pairs == [(0, 0), (2, 2)]
 
 
 def test_pairs_beyond_the_gate_are_none() -> None:
-    sigma = np.sqrt(2 * CONFIG.centroid_noise_m**2 + 2 * (CONFIG.centroid_noise_share * 0.3) ** 2)
+    sigma = np.sqrt(2 * gaussians.CENTROID_NOISE_M**2 + 2 * (gaussians.CENTROID_NOISE_SHARE * 0.3) ** 2)
     source = scan(np.zeros((1, 3)), NO_GROUND)
     for sigmas, expected in [(3.3, 1), (3.4, 0)]:  # the gate is at sqrt(11.345) = 3.37
         target = scan(np.array([[sigmas * sigma, 0, 0]]), NO_GROUND)
-        assert len(nearest_pairs(cluster_correspondences(source, target), np.eye(4), config=CONFIG)) == expected
+        assert len(nearest_pairs(cluster_correspondences(source, target), np.eye(4))) == expected
 
 
 def test_ground_is_paired_with_the_nearest_patch_within_reach() -> None:
@@ -113,11 +114,14 @@ def test_ground_levels_what_clusters_of_uncertain_height_tilt() -> None:
     assert errors[1] < 0.3 * errors[0]
 
 
-def test_shared_noise_bounds_what_the_information_claims_of_the_translation() -> None:
+def test_shared_noise_bounds_what_the_information_claims_of_the_translation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     source = scan(trees(4, count=60), flat_ground())
     sigma = {}
     for noise_m in (0.0, 0.5):
-        fit = align(source, source, np.eye(4), SegregatorConfig(shared_noise_m=noise_m))
+        monkeypatch.setattr(gaussians, "SHARED_NOISE_M", noise_m)
+        fit = align(source, source, np.eye(4), SegregatorConfig())
         sigma[noise_m] = np.sqrt(np.diagonal(np.linalg.inv(fit.information)))
     assert np.allclose(sigma[0.5][:3], sigma[0.0][:3], rtol=1e-6)
     assert np.allclose(sigma[0.5][3:], np.hypot(sigma[0.0][3:], 0.5), rtol=1e-6)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -10,7 +11,11 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Label, Registration, Rejected, RejectReason, Transform
+from segslam.registration.segregator import gaussians
 from segslam.registration.segregator.match import hypotheses, match, vertical
+
+MATCH = import_module("segslam.registration.segregator.match")
+"""The module; the package has a function of this name."""
 
 NO_ROWS = np.empty((0, 3))
 T_IDENTITY = np.eye(4)
@@ -92,10 +97,10 @@ def seen_again(scan: Description, seed: int, noise_m: float = 0.05, lost: int = 
     )
 
 
-def disturbed(scan: Description, rng: np.random.Generator, config: SegregatorConfig) -> Description:
+def disturbed(scan: Description, rng: np.random.Generator) -> Description:
     extents = np.linalg.cholesky(scan.covariances + 1e-12 * np.eye(3))
-    shifts = config.centroid_noise_m * rng.normal(size=scan.means.shape)
-    shifts += config.centroid_noise_share * np.einsum("nij,nj->ni", extents, rng.normal(size=scan.means.shape))
+    shifts = gaussians.CENTROID_NOISE_M * rng.normal(size=scan.means.shape)
+    shifts += gaussians.CENTROID_NOISE_SHARE * np.einsum("nij,nj->ni", extents, rng.normal(size=scan.means.shape))
     return description(scan.means + shifts, scan.covariances, scan.classes)
 
 
@@ -177,15 +182,17 @@ def test_first_hypothesis_is_the_match() -> None:
     assert np.array_equal(ranked[0].T_target_source, best.T_target_source)
 
 
-def test_information_predicts_the_scatter_of_the_pose() -> None:
+def test_information_predicts_the_scatter_of_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     """Centroids of both scans are moved by the noise that the model claims; xi^T information xi is then chi-square."""
-    config = SegregatorConfig(shared_noise_m=0.0, shared_noise_deg=0.0)
+    monkeypatch.setattr(gaussians, "SHARED_NOISE_M", 0.0)
+    monkeypatch.setattr(gaussians, "SHARED_NOISE_DEG", 0.0)
+    config = SegregatorConfig()
     scan = street(8)
     moved_scan = moved(T_TRUE, scan)
     errors = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        registration = match(disturbed(scan, rng, config), disturbed(moved_scan, rng, config), config=config)
+        registration = match(disturbed(scan, rng), disturbed(moved_scan, rng), config=config)
         xi = geometry.log(geometry.inverse(T_TRUE) @ registration.T_target_source)
         errors.append(xi @ registration.information @ xi)
     # 6 for least squares; Cauchy's weights give away some information, and a few clusters fail the gate.
@@ -235,21 +242,25 @@ def test_clusters_on_a_line_are_degenerate_but_for_the_ground() -> None:
     assert np.allclose(registration.T_target_source, T_TRUE, atol=1e-6)
 
 
-def test_ground_keeps_a_level_scene_from_being_turned_over() -> None:
+def test_ground_keeps_a_level_scene_from_being_turned_over(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clusters on one level fit their mirror image upside down as well as themselves."""
     scan = street(13)
     level = grounded(description(scan.means * [1.0, 1.0, 0.0], scan.covariances, scan.classes), slope=0.0)
-    for registration in hypotheses(level, moved(T_TRUE, level), config=SegregatorConfig(certain_inliers=1000)):
+    monkeypatch.setattr(MATCH, "CERTAIN_INLIERS", 1000)
+    for registration in hypotheses(level, moved(T_TRUE, level), config=SegregatorConfig()):
         assert (registration.T_target_source @ geometry.inverse(T_TRUE))[2, 2] > 0.9
 
 
-def test_repeated_structure_gives_several_different_hypotheses_with_the_truth_first() -> None:
+def test_repeated_structure_gives_several_different_hypotheses_with_the_truth_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A row of identical trees matches itself when shifted by one tree; one more object makes the pose unique."""
     trees = np.array(
         [[8.0 * k, 0.0, 0.0] for k in range(6)] + [[8.0 * k, 9.0, 0.0] for k in range(6)] + [[3.0, 4.0, 0.0]]
     )
     scan = grounded(description(trees, np.tile(0.01 * np.eye(3), (13, 1, 1)), np.full(13, Label.TRUNK)), slope=0.0)
-    ranked = hypotheses(scan, moved(T_TRUE, scan), config=SegregatorConfig(certain_inliers=1000))
+    monkeypatch.setattr(MATCH, "CERTAIN_INLIERS", 1000)
+    ranked = hypotheses(scan, moved(T_TRUE, scan), config=SegregatorConfig())
     assert np.allclose(ranked[0].T_target_source, T_TRUE, atol=1e-6)
     for k, one in enumerate(ranked):
         for other in ranked[:k]:

@@ -6,6 +6,7 @@ from helpers.streets import corner, small_move
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.types import Registration, Rejected, RejectReason
+from segslam.registration import refinement
 from segslam.registration.refinement import (
     UNOBSERVED,
     LightSurface,
@@ -72,11 +73,14 @@ def test_scans_that_do_not_overlap_are_rejected() -> None:
 
 
 @pytest.mark.parametrize(("coarse_m", "is_settled"), [(0.2, True), (0.6, False)])
-def test_a_last_stage_that_does_not_converge_is_rejected_if_it_still_moves(coarse_m: float, is_settled: bool) -> None:
+def test_a_last_stage_that_does_not_converge_is_rejected_if_it_still_moves(
+    coarse_m: float, is_settled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One iteration is never enough to converge; from near by the next one moves by millimetres."""
     rng = np.random.default_rng(0)
     T_coarse = geometry.transform(geometry.yaw(np.radians(0.7)), [coarse_m, 0.0, 0.0])
-    config = RefineConfig(max_iterations=1, correspondence_m=(0.5,))
+    monkeypatch.setattr(refinement, "MAX_ITERATIONS", 1)
+    config = RefineConfig(correspondence_m=(0.5,))
     found = refine(surface(corner(rng)), surface(corner(rng)), T_coarse, config=config)
     if is_settled:
         assert isinstance(found, Registration)
@@ -112,7 +116,7 @@ def test_along_a_smooth_tunnel_the_information_is_that_of_the_search(yaw_deg: fl
     sigma_m = np.sqrt(np.einsum("ik,ij,jk->k", axes, covariance, axes))
     assert sigma_m[0] >= CONFIG.correspondence_m[-1]
     assert sigma_m[1] < 0.1
-    ratio, direction = observability(found.information, config=CONFIG)
+    ratio, direction = observability(found.information)
     assert ratio < UNOBSERVED
     assert abs(direction @ axes[:, 0]) > 0.99
 
@@ -121,7 +125,7 @@ def test_a_corner_is_held_in_all_directions() -> None:
     rng = np.random.default_rng(0)
     found = refine(surface(corner(rng)), surface(corner(rng)), np.eye(4), config=CONFIG)
     assert isinstance(found, Registration)
-    assert observability(found.information, config=CONFIG)[0] > UNOBSERVED
+    assert observability(found.information)[0] > UNOBSERVED
     assert np.sqrt(np.diag(np.linalg.inv(found.information))[3:]).max() < 0.1
 
 
@@ -150,7 +154,7 @@ def test_a_light_surface_has_the_normals_of_a_surface() -> None:
 
 def test_a_thinned_cloud_has_the_mean_point_of_each_voxel_in_range() -> None:
     points = np.random.default_rng(0).uniform(-80, 80, (20_000, 3)).astype(np.float32)
-    near = points[np.linalg.norm(points, axis=1) < CONFIG.max_range_m].astype(np.float64)
+    near = points[np.linalg.norm(points, axis=1) < refinement.MAX_RANGE_M].astype(np.float64)
     expected = small_gicp.voxelgrid_sampling(near, CONFIG.voxel_m, 1).points()[:, :3]
     found = downsample(points, config=CONFIG)
     np.testing.assert_allclose(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], atol=1e-5)

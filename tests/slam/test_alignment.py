@@ -6,7 +6,7 @@ from helpers.yards import seen
 
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
-from segslam.core.config import AdjustmentConfig, RefineConfig
+from segslam.core.config import RefineConfig
 from segslam.slam.adjustment.alignment import _normal_equations, align
 from segslam.slam.adjustment.submaps import Submap, Submaps, members
 
@@ -16,9 +16,7 @@ WAY_M = 12.0
 def submap(x_m: float, *, low_deg: float = 0.0, pitch_deg: float = 0.0, seed: int = 0) -> Submap:
     """One scan."""
     points = seen(x_m, low_deg=low_deg, pitch_deg=pitch_deg, seed=seed).astype(np.float32)
-    made = Submaps(
-        lambda _: points, np.eye(4)[None], np.zeros(1), config=AdjustmentConfig(reach=0), refine=RefineConfig()
-    )
+    made = Submaps(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())
     return made.submap(0)
 
 

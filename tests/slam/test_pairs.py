@@ -1,10 +1,18 @@
 import numpy as np
+import pytest
 
 from segslam.candidates.proximity import BREAK_TRAVEL_M
-from segslam.core.config import AdjustmentConfig
+from segslam.slam.adjustment import pairs
 from segslam.slam.adjustment.pairs import all_pairs, pairs_along, pairs_between_passes
 
-CONFIG = AdjustmentConfig(every=2, steps=(3, 6), radius_m=5.0)
+RADIUS_M = 5.0
+
+
+@pytest.fixture(autouse=True)
+def _short_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Distances that suit the drives of these tests."""
+    monkeypatch.setattr(pairs, "STEPS", (3, 6))
+    monkeypatch.setattr(pairs, "RADIUS_M", RADIUS_M)
 
 
 def poses(places: np.ndarray) -> np.ndarray:
@@ -23,7 +31,7 @@ def there_and_back(*, height_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 def test_pairs_along_the_drive_have_the_configured_distances_and_no_break_between() -> None:
     travel_m = np.arange(12) * 2.0
-    assert pairs_along(travel_m, config=CONFIG).tolist() == [
+    assert pairs_along(travel_m).tolist() == [
         [0, 3],
         [2, 5],
         [4, 7],
@@ -34,26 +42,26 @@ def test_pairs_along_the_drive_have_the_configured_distances_and_no_break_betwee
         [4, 10],
     ]
     travel_m[5:] += BREAK_TRAVEL_M
-    assert pairs_along(travel_m, config=CONFIG).tolist() == [[0, 3], [6, 9], [8, 11]]
+    assert pairs_along(travel_m).tolist() == [[0, 3], [6, 9], [8, 11]]
 
 
 def test_each_node_is_paired_with_the_nearest_of_another_pass() -> None:
     T_world, travel_m = there_and_back()
-    pairs = pairs_between_passes(T_world, travel_m, config=CONFIG, min_travel_m=50.0)
+    pairs = pairs_between_passes(T_world, travel_m, min_travel_m=50.0)
     assert len(pairs)
     assert (travel_m[pairs[:, 1]] - travel_m[pairs[:, 0]] >= 50.0).all()
     apart_m = np.linalg.norm(T_world[pairs[:, 0], :3, 3] - T_world[pairs[:, 1], :3, 3], axis=1)
-    assert apart_m.max() < CONFIG.radius_m
+    assert apart_m.max() < RADIUS_M
     assert len(np.unique(pairs[:, 1])) == len(pairs)
 
 
 def test_passes_on_two_storeys_are_not_paired() -> None:
     T_world, travel_m = there_and_back(height_m=2.6)
-    assert not len(pairs_between_passes(T_world, travel_m, config=CONFIG, min_travel_m=50.0))
+    assert not len(pairs_between_passes(T_world, travel_m, min_travel_m=50.0))
 
 
 def test_pairs_are_sorted_by_source_and_too_short_a_drive_has_none() -> None:
     T_world, travel_m = there_and_back()
-    pairs = all_pairs(T_world, travel_m, config=CONFIG, min_travel_m=50.0)
+    pairs = all_pairs(T_world, travel_m, min_travel_m=50.0)
     assert (np.diff(pairs[:, 1]) >= 0).all()
-    assert all_pairs(T_world[:2], travel_m[:2], config=CONFIG, min_travel_m=50.0).shape == (0, 2)
+    assert all_pairs(T_world[:2], travel_m[:2], min_travel_m=50.0).shape == (0, 2)

@@ -11,7 +11,8 @@ from segslam.bench.simulation.scenes import SCENES, corridor
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Alignment, Registration, Rejected
-from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.labels import geometric_labels
+from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import pair, register_prepared
 from segslam.verification.gates import NoiseFloor, weak_support
 from tools.benchmarks import scenes
@@ -26,7 +27,7 @@ def _corridor_scan(x: float) -> PreparedScan:
     rng = np.random.default_rng(int(x))
     T_world_lidar = geometry.transform(np.eye(3), [x, 0.0, 1.0])
     points = scan_points(corridor(0, regular=True), "64", T_world_lidar, noise_m=0.02, rng=rng)
-    return prepare_scan(points, shape_labels(points, config=CONFIG), config=CONFIG)
+    return prepare_scan(points, geometric_labels(points), config=CONFIG)
 
 
 def _from(T_target_source: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> Alignment | Rejected:

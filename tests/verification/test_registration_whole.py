@@ -15,7 +15,8 @@ from segslam.verification import register
 DIGEST = """
 import hashlib, sys
 import numpy as np
-from segslam.registration import register_prepared, prepare_scan
+from segslam.registration.prepared import prepare_scan
+from segslam.verification import register_prepared
 from segslam.core.config import Config, SegregatorConfig
 config = Config(segregator=SegregatorConfig(features="always"))
 stored = np.load(sys.argv[1])

@@ -24,7 +24,8 @@ from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
 from segslam.keyframes.keyframes import downsample_keyframe
-from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.labels import geometric_labels
+from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register_prepared
 from segslam.verification.gates import NoiseFloor, agreement
 from segslam.verification.noise_floor import NeighbourNoise
@@ -61,7 +62,7 @@ class Place:
     def _prepare(self, row: int, visit: int) -> PreparedScan:
         rng = np.random.default_rng([self._seed, row, visit, 1])
         points = scan_points(self.scene, self._sensor, self.pose(row, visit), noise_m=self._noise_m, rng=rng)
-        labels = shape_labels(points, config=self._config)
+        labels = geometric_labels(points)
         classes = tuple(self._config.segregator.cluster_min_points)
         points, labels, _ = downsample_keyframe(points, labels, config=self._config.keyframes, whole_classes=classes)
         return prepare_scan(points, labels, config=self._config)

@@ -15,7 +15,7 @@ from segslam.core.config import Config
 from segslam.core.evaluation import PoseError
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.types import BadScan, Points, Rejected
-from segslam.registration.prepared import shape_labels
+from segslam.labels import geometric_labels
 from segslam.scans import Dataset, DataSource
 
 logger = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ def shared_scan(job: Job, variant: ScanVariant) -> SharedScan:
             labels = labels()
     elif dataset.labels.geometric and not labels.any():
         with measured() as labelling:
-            labels = shape_labels(points, config=job.config)
+            labels = geometric_labels(points)
     parts = prepare_parts(points, variant.remaining(labels), methods=job.methods, config=job.config)
     return SharedScan(parts, labelling)
 

@@ -14,25 +14,33 @@ from segslam.core.errors import SegslamError, brief
 
 logger = logging.getLogger(__name__)
 
-REMOVED = (
-    "graph.systematic_drift",
-    *(
-        f"health.{name}"
-        for name in (
-            "tolerance_m",
-            "tolerance_deg",
-            "watch_scans",
-            "map_scans",
-            "map_spacing_m",
-            "map_spacing_deg",
-            "correspondence_m",
-            "inlier_m",
-            "min_overlap",
-            "max_rms",
-        )
+REMOVED = {
+    "adjustment": "every steps radius_m reach min_overlap",
+    "geometric": (
+        "band_m car_length_m car_max_width_m car_top_m ground_cell_m ground_height_m max_range_m max_slope "
+        "max_things min_points pole_clear_m pole_core_m pole_min_m pole_min_share trunk_max_m trunk_min_m "
+        "wall_min_top_m wall_thickness_m"
     ),
-)
-"""Settings of older versions that are ignored with a warning, also in files and `--set`."""
+    "graph": "systematic_drift turn_m closure_sigma_m closure_sigma_deg inlier_probability",
+    "health": (
+        "tolerance_m tolerance_deg watch_scans map_scans map_spacing_m map_spacing_deg correspondence_m "
+        "inlier_m min_overlap max_rms"
+    ),
+    "keyframes": "dense_voxels max_gathered",
+    "map": "view_margin_m view_margin_ratio min_views moved_radius_m cell_m min_obstacle_voxels obstacle_m",
+    "odometry": "stamp_tolerance_s",
+    "proximity": (
+        "base_height_m height_ratio base_turn_deg turn_ratio_deg break_radius_m max_candidates spread_m min_gap_m"
+    ),
+    "refine": "max_iterations max_range_m min_points information_scale shared_noise_m shared_noise_deg",
+    "segregator": (
+        "foot_max_distance_m few_clusters dcvc_start_radius_m dcvc_radius_step_m dcvc_azimuth_deg min_range_m "
+        "max_range_m tuple_similarity tuple_trials_per_pair tuple_seed clique_max_nodes certain_inliers "
+        "centroid_noise_m centroid_noise_share shared_noise_m shared_noise_deg ground_noise_m ground_weight "
+        "gnc_factor gnc_max_iterations gnc_cost_tolerance"
+    ),
+}
+"""Settings of older versions, by section: they are ignored with a warning, also in files and `--set`."""
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
@@ -82,11 +90,17 @@ def config_from_yaml(text: str, source: str) -> Config:
 
 def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
     """The values without settings of older versions that no longer exist."""
-    for key in REMOVED:
-        section, _, name = key.partition(".")
-        if isinstance(values.get(section), dict) and name in values[section]:
-            logger.warning("%s: %s no longer exists and is ignored", source, key)
-            values = values | {section: {k: v for k, v in values[section].items() if k != name}}
+    for section, names in REMOVED.items():
+        given = values.get(section)
+        if not isinstance(given, dict):
+            continue
+        gone = [name for name in given if name in names.split()]
+        for name in gone:
+            logger.warning("%s: %s.%s no longer exists and is ignored", source, section, name)
+        kept = {name: value for name, value in given.items() if name not in gone}
+        values = {name: value for name, value in values.items() if name != section}
+        if kept or section in Config.model_fields:
+            values[section] = kept
     return values
 
 

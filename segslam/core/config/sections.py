@@ -95,9 +95,6 @@ class OdometryConfig(Section):
         ge=0,
         description="threads of KISS-ICP; 0: all cores, poses repeat to 1e-9 m; 1: poses repeat exactly [KISS-ICP]",
     )
-    stamp_tolerance_s: float = Field(
-        0.01, ge=0, description="largest time difference between a scan and its pose in a given trajectory (s) [chosen]"
-    )
 
     @model_validator(mode="after")
     def _has_a_range(self) -> "OdometryConfig":
@@ -130,15 +127,6 @@ class KeyframeConfig(Section):
         le=180,
         description="rotation after which a keyframe is made before that distance is reached (degrees) [chosen]",
     )
-    dense_voxels: int = Field(
-        3000,
-        ge=0,
-        description="a keyframe with fewer voxels (refine.voxel_m) is matched together with its neighbours' points "
-        "[chosen on KITTI, courtyard, NCLT]",
-    )
-    max_gathered: int = Field(
-        10, ge=0, description="largest number of neighbouring keyframes whose points are merged [chosen]"
-    )
     resolution_m: float = Field(
         0.004, gt=0, description="grid to which the coordinates of keyframes are rounded (m) [chosen]"
     )
@@ -158,33 +146,6 @@ class ProximityConfig(Section):
         description="increase of the search radius per metre travelled between the two keyframes "
         "[chosen on KISS-ICP's drift in simulated drives]",
     )
-    break_radius_m: float = Field(60.0, gt=0, description="search radius across a break of the odometry (m) [chosen]")
-    base_height_m: float = Field(
-        1.0,
-        gt=0,
-        description="largest height difference of two visits without drift (m) [chosen: storeys are 3 m apart]",
-    )
-    height_ratio: float = Field(
-        0.008,
-        ge=0,
-        description="increase of that height difference per metre travelled between the two keyframes "
-        "[chosen: ramps of 100 to 150 m]",
-    )
-    base_turn_deg: float = Field(
-        15.0, gt=0, le=180, description="largest rotation between a loop and its prior without drift (degrees) [chosen]"
-    )
-    turn_ratio_deg: float = Field(
-        0.02,
-        ge=0,
-        description="increase of that rotation per metre travelled between the two keyframes (degrees) [chosen]",
-    )
-    max_candidates: int = Field(2, ge=1, description="number of candidates per keyframe [chosen]")
-    spread_m: float = Field(
-        8.0, ge=0, description="smallest distance travelled between two candidates of one keyframe (m) [chosen]"
-    )
-    min_gap_m: float = Field(
-        8.0, ge=0, description="distance travelled after an accepted loop before the next search (m) [chosen]"
-    )
 
 
 class RetrievalConfig(Section):
@@ -202,43 +163,6 @@ def _check_rising(bounds: tuple[float, float]) -> tuple[float, float]:
 
 
 Bounds = Annotated[tuple[float, float], AfterValidator(_check_rising)]
-
-
-class GeometricLabelsConfig(Section):
-    """Labels from geometry alone. Heights are above the ground."""
-
-    max_range_m: float = Field(70.0, gt=0, le=200, description="points farther away remain unlabelled (m) [chosen]")
-    ground_cell_m: float = Field(1.0, ge=0.2, description="cell size of the ground surface (m) [chosen]")
-    max_slope: float = Field(0.2, gt=0, description="largest slope of the ground between cells [chosen]")
-    ground_height_m: float = Field(0.15, gt=0, description="points lower than this are ground (m) [chosen]")
-    band_m: Bounds = Field(
-        (0.4, 2.6), description="lowest and highest height in which poles and small solids are searched (m) [chosen]"
-    )
-    min_points: int = Field(
-        4, ge=1, description="smallest number of points of a pole, small solid or car within the band [chosen]"
-    )
-    max_things: int = Field(
-        30, ge=1, description="largest number of objects per class; those with most points are kept [chosen]"
-    )
-    pole_core_m: float = Field(0.4, gt=0, description="largest radius of a pole (m) [chosen]")
-    pole_clear_m: float = Field(0.8, gt=0, description="radius around a pole without other points (m) [chosen]")
-    pole_min_m: float = Field(1.0, gt=0, description="smallest height of a pole within the band (m) [chosen]")
-    pole_min_share: float = Field(
-        0.7, gt=0, le=1, description="smallest share of the heights of a pole without other points nearby [chosen]"
-    )
-    trunk_max_m: float = Field(
-        1.6, gt=0, description="largest length of a small solid: young trees, bushes, signs (m) [chosen]"
-    )
-    trunk_min_m: float = Field(1.6, gt=0, description="smallest height of the top of a small solid (m) [chosen]")
-    car_top_m: Bounds = Field((1.0, 2.1), description="lowest and highest top of a car (m) [chosen]")
-    car_length_m: Bounds = Field((1.0, 6.0), description="shortest and longest visible side of a car (m) [chosen]")
-    car_max_width_m: float = Field(2.4, gt=0, description="largest width of a car (m) [chosen]")
-    wall_thickness_m: float = Field(
-        0.16, gt=0, description="standard deviation of a wall's points across it (m) [chosen]"
-    )
-    wall_min_top_m: float = Field(
-        1.8, gt=0, description="smallest height of the top of a wall; hedges are lower (m) [chosen]"
-    )
 
 
 class SegregatorConfig(Section):
@@ -265,20 +189,12 @@ class SegregatorConfig(Section):
         (Label.TRUNK, Label.POLE, Label.TRAFFIC_SIGN),
         description="classes of upright objects: the position of their clusters is the foot on the ground [chosen]",
     )
-    foot_max_distance_m: float = Field(
-        10.0, gt=0, description="largest distance to the ground patch below such a cluster (m) [chosen]"
-    )
-    dcvc_start_radius_m: float = Field(0.35, ge=0.01, description="first radial bin of DCVC (m) [authors]")
-    dcvc_radius_step_m: float = Field(0.0004, ge=0, description="shrinking of each further radial bin (m) [authors]")
     dcvc_pitch_deg: float = Field(
         2.0,
         ge=0.1,
         le=90,
         description="pitch bin of DCVC, at least the spacing of the beams (degrees) [authors: 1.2; chosen]",
     )
-    dcvc_azimuth_deg: float = Field(1.2, ge=0.1, le=90, description="azimuth bin of DCVC (degrees) [authors]")
-    min_range_m: float = Field(0.5, ge=0, description="nearest point clustered (m) [authors]")
-    max_range_m: float = Field(120.0, gt=0, le=1000, description="farthest point clustered (m) [authors]")
     feature_classes: tuple[StaticLabel, ...] = Field(
         (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points [paper: L_F]"
     )
@@ -298,14 +214,8 @@ class SegregatorConfig(Section):
         description="largest number of key points per class; those with most neighbours are kept; 1,500 take 175 kB "
         "[chosen]",
     )
-    tuple_similarity: float = Field(0.95, gt=0, lt=1, description="edge ratio of the tuple test [authors]")
-    tuple_trials_per_pair: int = Field(100, ge=1, description="random triples drawn for each mutual pair [authors]")
-    tuple_seed: int = Field(0, ge=0, description="random seed of these triples [chosen]")
     features: Literal["always", "when_few_clusters", "never"] = Field(
         "when_few_clusters", description="when FPFH key points are computed for a scan [chosen]"
-    )
-    few_clusters: int = Field(
-        24, ge=0, description="number of clusters below which a scan has few clusters [chosen on simulated 00 and 08]"
     )
     gate: Literal["published", "invariant", "lengths"] = Field(
         "invariant",
@@ -324,16 +234,7 @@ class SegregatorConfig(Section):
     min_clique: int = Field(
         3, ge=3, description="size of the smallest clique of inliers that is accepted [chosen on simulated 00 and 08]"
     )
-    clique_max_nodes: int = Field(
-        200_000, ge=1, description="search nodes after which the search stops with the best clique found [chosen]"
-    )
     max_cliques: int = Field(8, ge=1, description="largest number of maximum cliques tried at each bound [chosen]")
-    certain_inliers: int = Field(
-        12,
-        ge=1,
-        description="number of inliers above which a pose is certain and no other is tried "
-        "[chosen on simulated 00 and 08]",
-    )
     solver: Literal["gaussians", "joint", "decoupled"] = Field(
         "gaussians",
         description="joint: rotation and translation together; decoupled: one after the other; gaussians: joint, then "
@@ -342,46 +243,6 @@ class SegregatorConfig(Section):
     rotation: Literal["full", "yaw"] = Field(
         "full", description="degrees of freedom of the rotation (yaw: Quatro) [chosen]"
     )
-    centroid_noise_m: float = Field(
-        0.07, gt=0, description="noise of a centroid in each direction (m) [measured: simulated truth]"
-    )
-    centroid_noise_share: float = Field(
-        0.35,
-        ge=0,
-        description="additional noise of a centroid, as a share of its cluster's standard deviation "
-        "[measured: simulated truth]",
-    )
-    shared_noise_m: float = Field(
-        0.045,
-        ge=0,
-        description="noise common to all centroids, in the information matrix only (m) [measured: simulated truth]",
-    )
-    shared_noise_deg: float = Field(
-        0.05,
-        ge=0,
-        description="rotation noise common to all centroids, for example from sensor calibration (degrees) "
-        "[measured: simulated truth]",
-    )
-    ground_noise_m: float = Field(
-        0.1, gt=0, description="noise of the distance between two ground patches (m) [chosen]"
-    )
-    ground_weight: float = Field(
-        0.3,
-        ge=0,
-        description="weight of such a distance; below 1 because the errors of neighbours are correlated [chosen]",
-    )
-    gnc_factor: float = Field(1.4, gt=1, description="growth of GNC's control parameter [authors]")
-    gnc_max_iterations: int = Field(100, ge=1, description="largest number of iterations of GNC [authors]")
-    gnc_cost_tolerance: float = Field(1e-6, gt=0, description="change of cost at which GNC stops [authors]")
-
-    @model_validator(mode="after")
-    def _radial_bins_reach_the_range(self) -> "SegregatorConfig":
-        reach_m = self.dcvc_start_radius_m**2 / max(2.0 * self.dcvc_radius_step_m, 1e-12)  # where a bin is 0 deep
-        if reach_m < self.max_range_m:
-            raise ValueError(
-                f"DCVC's radial bins shrink to nothing at {reach_m:.0f} m: lower dcvc_radius_step_m or max_range_m"
-            )
-        return self
 
 
 class RefineConfig(Section):
@@ -390,26 +251,6 @@ class RefineConfig(Section):
     voxel_m: float = Field(0.5, gt=0, description="voxel size of the registered clouds (m) [chosen on KITTI 00]")
     correspondence_m: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         (1.0, 0.5), min_length=1, description="search distance of each stage (m) [chosen on KITTI 00]"
-    )
-    max_iterations: int = Field(20, ge=1, description="largest number of iterations in each stage [small_gicp]")
-    max_range_m: float = Field(60.0, gt=0, description="points farther away are dropped (m) [chosen]")
-    min_points: int = Field(
-        100, ge=10, description="smallest number of points, and of point pairs, for a registration [chosen on KITTI 00]"
-    )
-    information_scale: float = Field(
-        0.05,
-        gt=0,
-        description="factor from the Hessian to the information matrix; below 1: errors of neighbours are correlated "
-        "[measured: simulated truth]",
-    )
-    shared_noise_m: float = Field(
-        0.026,
-        ge=0,
-        description="translation noise common to all points, for example from sensor calibration (m) "
-        "[measured: simulated truth]",
-    )
-    shared_noise_deg: float = Field(
-        0.067, ge=0, description="rotation noise common to all points (degrees) [measured: simulated truth]"
     )
 
 
@@ -534,26 +375,8 @@ class GraphConfig(Section):
         gt=0,
         description="rotation noise of the odometry per square root of a metre travelled [measured: simulated streets]",
     )
-    turn_m: float = Field(
-        5.0,
-        ge=0,
-        description="distance whose noise equals that of a rotation by one radian (m) [measured: simulated streets]",
-    )
-    closure_sigma_m: float = Field(
-        0.04, gt=0, description="smallest translation noise of a closure (m) [measured: simulated 06]"
-    )
-    closure_sigma_deg: float = Field(
-        0.08, gt=0, description="smallest rotation noise of a closure (degrees) [measured: simulated 06]"
-    )
     robust: Literal["none", "huber", "cauchy", "geman-mcclure"] = Field(
         "cauchy", description="robust kernel of the closures before the final optimisation [chosen]"
-    )
-    inlier_probability: float = Field(
-        0.99,
-        gt=0,
-        lt=1,
-        description="a closure is an inlier if its squared error is below this quantile of the chi-square distribution "
-        "(6 degrees of freedom) [statistics]",
     )
 
 
@@ -565,24 +388,6 @@ class AdjustmentConfig(Section):
     )
     rounds: int = Field(
         2, ge=1, le=5, description="number of times that submaps are built and registered [chosen on KITTI 00]"
-    )
-    every: int = Field(2, ge=1, description="a submap is registered for every n-th keyframe [chosen on KITTI 00]")
-    reach: int = Field(
-        2, ge=0, description="number of keyframes before and after one that are in its submap [chosen on KITTI 00]"
-    )
-    steps: tuple[Annotated[int, Field(ge=1)], ...] = Field(
-        (5, 10),
-        min_length=1,
-        description="distances of registered submaps along the drive, in keyframes [chosen on KITTI 00]",
-    )
-    radius_m: float = Field(
-        10.0, ge=0, description="largest distance of registered submaps of two passes (m) [chosen on KITTI 00]"
-    )
-    min_overlap: float = Field(
-        0.1,
-        ge=0,
-        le=1,
-        description="smallest share of a submap's points that lie on the other [chosen on KITTI 00]",
     )
 
 
@@ -611,23 +416,6 @@ class MapConfig(Section):
         ge=0,
         description="distance within which keyframes can see through a voxel; 0: no voxel is removed (m) [chosen]",
     )
-    view_margin_m: float = Field(
-        0.3,
-        gt=0,
-        description="distance by which a return must lie behind a voxel to have passed through it (m) [chosen]",
-    )
-    view_margin_ratio: float = Field(0.01, ge=0, description="increase of that distance per metre of range [chosen]")
-    min_views: int = Field(
-        3, ge=1, description="smallest number of keyframes that see through a removed voxel [chosen]"
-    )
-    moved_radius_m: float = Field(
-        0.8, ge=0, description="voxels with mostly removed neighbours within this radius are removed too (m) [chosen]"
-    )
-    cell_m: float = Field(0.2, ge=0.05, le=4, description="cell size of the occupancy grid (m) [chosen]")
-    obstacle_m: Bounds = Field(
-        (0.3, 2.0), description="heights above the ground where a voxel is an obstacle (m) [chosen]"
-    )
-    min_obstacle_voxels: int = Field(2, ge=1, description="smallest number of such voxels in an occupied cell [chosen]")
 
 
 class Config(Section):
@@ -651,7 +439,6 @@ class Config(Section):
     keyframes: KeyframeConfig = KeyframeConfig()
     proximity: ProximityConfig = ProximityConfig()
     retrieval: RetrievalConfig = RetrievalConfig()
-    geometric: GeometricLabelsConfig = GeometricLabelsConfig()
     segregator: SegregatorConfig = SegregatorConfig()
     refine: RefineConfig = RefineConfig()
     verify: VerifyConfig = VerifyConfig()

@@ -9,6 +9,15 @@ from segslam.core.config import MapConfig
 from segslam.core.types import GROUND_LABELS, Labels, Mask, Points, Transform
 from segslam.output.map.views import count_votes
 
+VIEW_MARGIN_M = 0.3
+"""Chosen: distance by which a return must lie behind a voxel to have passed through it (m)."""
+VIEW_MARGIN_RATIO = 0.01
+"""Chosen: increase of that distance per metre of range."""
+MIN_VIEWS = 3
+"""Chosen: smallest number of keyframes that see through a removed voxel."""
+MOVED_RADIUS_M = 0.8
+"""Chosen: voxels with mostly removed neighbours within this radius are removed too (m)."""
+
 
 def moved(points: Points, labels: Labels, views: Iterable[tuple[np.ndarray, Transform]], *, config: MapConfig) -> Mask:
     """(n,) bool: whether each point belongs to an object that has moved.
@@ -19,12 +28,12 @@ def moved(points: Points, labels: Labels, views: Iterable[tuple[np.ndarray, Tran
     """
     stays = np.isin(labels, np.array(GROUND_LABELS, np.uint8))
     votes = np.zeros((len(points), 2), np.uint32)
-    limits = np.array([config.view_range_m, config.view_margin_m, config.view_margin_ratio])
+    limits = np.array([config.view_range_m, VIEW_MARGIN_M, VIEW_MARGIN_RATIO])
     for nearest, T_view_points in views:
         count_votes(points, T_view_points, nearest, limits, votes)
     confirmed, seen_through = votes.T
-    has_moved = (seen_through >= config.min_views) & (seen_through > confirmed) & ~stays
-    return has_moved | _among_moved(points, has_moved, stays, config.moved_radius_m)
+    has_moved = (seen_through >= MIN_VIEWS) & (seen_through > confirmed) & ~stays
+    return has_moved | _among_moved(points, has_moved, stays, MOVED_RADIUS_M)
 
 
 def _among_moved(points: Points, has_moved: Mask, stays: Mask, radius_m: float) -> Mask:

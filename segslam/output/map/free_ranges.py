@@ -8,9 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from segslam.core.config import MapConfig
 from segslam.core.types import GROUND_LABELS, Label, Labels, Points, Vector
-from segslam.output.map.lowest_ground import lowest_ground
+from segslam.output.map.lowest_ground import OBSTACLE_M, lowest_ground
 from segslam.output.map.tiles import Tile, distance_m
 
 NUM_DIRECTIONS = 720
@@ -22,15 +21,14 @@ REACH_M = 40.0
 class FreeRanges:
     """The free range of each keyframe, by direction in the world."""
 
-    def __init__(self, config: MapConfig) -> None:
-        self._low_m, self._high_m = config.obstacle_m
+    def __init__(self) -> None:
         self._places: list[Vector] = []
         self._free_m: list[Vector] = []
 
     def add(self, points: Points, labels: Labels, place: Vector) -> None:
         """Add a keyframe: its points (n, 3) in the world, and its position."""
         self._places.append(place[:2])
-        self._free_m.append(free_range_m(points - place, labels, low_m=self._low_m, high_m=self._high_m))
+        self._free_m.append(free_range_m(points - place, labels, low_m=OBSTACLE_M[0], high_m=OBSTACLE_M[1]))
 
     def free(self, tile: Tile, places: Float[np.ndarray, "_ 2"]) -> Iterator[np.ndarray]:
         """For each keyframe near a tile: whether each of the places (n, 2) is within its free range."""

@@ -12,9 +12,14 @@ import yaml
 
 from segslam.core.config import MapConfig
 from segslam.core.types import GROUND_LABELS
-from segslam.output.map.lowest_ground import lowest_ground
+from segslam.output.map.lowest_ground import OBSTACLE_M, lowest_ground
 from segslam.output.map.part import Extent, Part
 from segslam.output.map.tiles import TILE_M, corner
+
+CELL_M = 0.2
+"""Chosen: cell size of the occupancy grid (m)."""
+MIN_OBSTACLE_VOXELS = 2
+"""Chosen: smallest number of such voxels in an occupied cell."""
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 """Values of the mode `trinary` of map_server; 205 lies between its two thresholds."""
@@ -28,7 +33,7 @@ class Grid:
         self._file = file
         self._extent = extent
         self._config = config
-        self._cells = round(TILE_M / config.cell_m)  # along the edge of a tile
+        self._cells = round(TILE_M / CELL_M)  # along the edge of a tile
         columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
         self._band = np.full((self._cells, columns * self._cells), UNKNOWN, np.uint8)
         self._row = extent.north
@@ -67,13 +72,13 @@ class Grid:
         is_ground = np.isin(part.labels, np.array(GROUND_LABELS, np.uint8))
         height_m = within[:, 2] - lowest_ground(within, within[is_ground] if is_ground.any() else within, TILE_M)
         column, row = np.clip((within[:, :2] / TILE_M * self._cells).astype(np.int64), 0, self._cells - 1).T
-        low_m, high_m = self._config.obstacle_m
+        low_m, high_m = OBSTACLE_M
         cell = row * self._cells + column
         obstacles, ground = (
             np.bincount(cell[chosen], minlength=self._cells**2).reshape(self._cells, self._cells)
             for chosen in ((height_m >= low_m) & (height_m <= high_m) & ~is_ground, is_ground | (height_m < low_m))
         )
-        occupied = obstacles >= self._config.min_obstacle_voxels
+        occupied = obstacles >= MIN_OBSTACLE_VOXELS
         seen = np.select([occupied, ground > 0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
         return self._filled_along_rays(seen, part)
 

@@ -5,6 +5,9 @@ from scipy.ndimage import distance_transform_edt
 
 from segslam.core.types import Points, Vector
 
+OBSTACLE_M = (0.3, 2.0)
+"""Chosen: heights above the ground where a voxel is an obstacle (m)."""
+
 GROUND_CELL_M = 2.0
 
 

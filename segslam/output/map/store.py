@@ -27,7 +27,7 @@ class MapStore:
         self._config = config
         self._tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
         self._views = Views(scratch / "views", spread_m=config.voxel_m)
-        self._free_ranges = FreeRanges(config)
+        self._free_ranges = FreeRanges()
         self._T_keyframe_world: list[Transform] = []
         self._places: list[np.ndarray] = []
         self._has_intensities = True

@@ -21,6 +21,17 @@ from segslam.core.kernels import kernel
 from segslam.core.points import EMPTY, canonical_order, find_key, group_means, hash_keys, within_range
 from segslam.core.types import Covariances, Indices, Label, Labels, Points, Vector
 
+DCVC_START_RADIUS_M = 0.35
+"""Authors: first radial bin of DCVC (m)."""
+DCVC_RADIUS_STEP_M = 0.0004
+"""Authors: shrinking of each further radial bin (m)."""
+DCVC_AZIMUTH_DEG = 1.2
+"""Authors: azimuth bin of DCVC (degrees)."""
+MIN_RANGE_M = 0.5
+"""Authors: nearest point clustered (m)."""
+MAX_RANGE_M = 120.0
+"""Authors: farthest point clustered (m)."""
+
 FIRST_RADIUS_M = 5.0
 """Start of the first radial bin, or the nearest point of the class if that is nearer (the authors' program) (m)."""
 
@@ -46,7 +57,7 @@ def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfi
     The result does not depend on the order of the points.
     """
     chosen = np.flatnonzero(np.isin(labels, [int(label) for label in config.cluster_min_points]))
-    chosen = chosen[within_range(points[chosen], config.min_range_m, config.max_range_m)]
+    chosen = chosen[within_range(points[chosen], MIN_RANGE_M, MAX_RANGE_M)]
     chosen = chosen[canonical_order(points[chosen])]
     points, labels = points[chosen].astype(np.float64), labels[chosen]
     parts = [
@@ -87,10 +98,10 @@ def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, 
 def _class_clusters(points: Points, label: Label, min_points: int, config: SegregatorConfig) -> Clusters:
     cluster = curved_voxel_clusters(
         points,
-        start_m=config.dcvc_start_radius_m,
-        step_m=config.dcvc_radius_step_m,
+        start_m=DCVC_START_RADIUS_M,
+        step_m=DCVC_RADIUS_STEP_M,
         pitch_deg=config.dcvc_pitch_deg,
-        azimuth_deg=config.dcvc_azimuth_deg,
+        azimuth_deg=DCVC_AZIMUTH_DEG,
     )
     sizes = np.bincount(cluster)
     large = sizes >= min_points

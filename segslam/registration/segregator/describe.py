@@ -4,10 +4,15 @@ import numpy as np
 
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Labels, Points
-from segslam.registration.segregator.clusters import Clusters, semantic_clusters
+from segslam.registration.segregator.clusters import MAX_RANGE_M, Clusters, semantic_clusters
 from segslam.registration.segregator.features import NO_FEATURES, point_features
 from segslam.registration.segregator.feet import ground_cells, stand_on_ground
 from segslam.registration.segregator.ground_patches import ground_patches
+
+FOOT_MAX_DISTANCE_M = 10.0
+"""Chosen: largest distance to the ground patch below such a cluster (m)."""
+FEW_CLUSTERS = 24
+"""Chosen on simulated 00 and 08: number of clusters below which a scan has few clusters."""
 
 
 def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
@@ -22,7 +27,7 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
         raise ValueError(f"{len(points)} points but {len(labels)} labels; give one label for each point")
     clusters = _grounded(semantic_clusters(points, labels, config=config), points, labels, config)
     wanted = config.features == "always" or (
-        config.features == "when_few_clusters" and len(clusters.sizes) < config.few_clusters
+        config.features == "when_few_clusters" and len(clusters.sizes) < FEW_CLUSTERS
     )
     features = point_features(points, labels, config=config) if wanted else NO_FEATURES
     ground = ground_patches(points, labels)
@@ -44,5 +49,5 @@ def _grounded(clusters: Clusters, points: Points, labels: Labels, config: Segreg
     upright = np.isin(clusters.classes, [int(label) for label in config.foot_classes])
     if not upright.any():
         return clusters
-    ground = ground_cells(points, labels, reach_m=config.max_range_m)
-    return stand_on_ground(clusters, upright, ground, max_distance_m=config.foot_max_distance_m)
+    ground = ground_cells(points, labels, reach_m=MAX_RANGE_M)
+    return stand_on_ground(clusters, upright, ground, max_distance_m=FOOT_MAX_DISTANCE_M)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from segslam.core.config import SegregatorConfig
 from segslam.core.points import normals, patch_covariances, radius_neighbours, voxel_means, within_range
 from segslam.core.types import Covariances, Labels, Points
+from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M
 from segslam.registration.segregator.fpfh import fpfh
 
 MIN_PATCH_POINTS = 4
@@ -50,7 +51,7 @@ def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) 
     parts = []
     for label in config.feature_classes:
         cloud = points[labels == label]
-        cloud = cloud[within_range(cloud, config.min_range_m, config.max_range_m)].astype(np.float32)
+        cloud = cloud[within_range(cloud, MIN_RANGE_M, MAX_RANGE_M)].astype(np.float32)
         parts.append(_class_features(_voxelised(cloud, config.feature_voxel_m), int(label), config))
     return Features(*(np.concatenate(columns) for columns in zip(NO_FEATURES, *parts, strict=True)))
 

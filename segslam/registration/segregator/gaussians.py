@@ -33,6 +33,19 @@ from segslam.registration.segregator.correspondences import Correspondences
 from segslam.registration.segregator.descent import GATE, least_cost, squared_distances
 from segslam.registration.segregator.pose_solver import PoseFit
 
+CENTROID_NOISE_M = 0.07
+"""Measured (simulated truth): noise of a centroid in each direction (m)."""
+CENTROID_NOISE_SHARE = 0.35
+"""Measured (simulated truth): additional noise of a centroid, as a share of its cluster's standard deviation."""
+SHARED_NOISE_M = 0.045
+"""Measured (simulated truth): noise common to all centroids, in the information matrix only (m)."""
+SHARED_NOISE_DEG = 0.05
+"""Measured (simulated truth): rotation noise common to all centroids, for example from sensor calibration (degrees)."""
+GROUND_NOISE_M = 0.1
+"""Chosen: noise of the distance between two ground patches (m)."""
+GROUND_WEIGHT = 0.3
+"""Chosen: weight of such a distance; below 1 because the errors of neighbours are correlated."""
+
 MAX_ROUNDS = 8
 GROUND_REACH_M = 4.0
 """Chosen: largest distance of compared patches: the next cell of `ground_patches` (m)."""
@@ -62,13 +75,13 @@ def align_gaussians(
     """
     rows: Indices = np.empty(0, np.int64)
     for _ in range(MAX_ROUNDS):
-        previous, rows = rows, nearest_pairs(correspondences, T_target_source, config=config)
+        previous, rows = rows, nearest_pairs(correspondences, T_target_source)
         if len(rows) < config.min_clique:
             return Rejected(RejectReason.TOO_FEW_INLIERS, f"{len(rows)} < {config.min_clique}")
         if np.array_equal(rows, previous):
             break
         pairs = correspondences.take(rows)
-        T_target_source, information = descend(pairs, source, target, T_target_source, config=config)
+        T_target_source, information = descend(pairs, source, target, T_target_source)
         if _leaves_open(information):
             return Rejected(RejectReason.DEGENERATE, "clusters and ground leave the pose open")
     gaps = pairs.target - geometry.apply(T_target_source, pairs.source)
@@ -76,18 +89,18 @@ def align_gaussians(
         T_target_source=T_target_source,
         inliers=np.isin(np.arange(len(correspondences)), rows),
         rms_m=float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))),
-        score=float(np.sum(1.0 - np.minimum(_squared(pairs, T_target_source, config) / GATE, 1.0))),
+        score=float(np.sum(1.0 - np.minimum(_squared(pairs, T_target_source) / GATE, 1.0))),
         information=geometry.with_noise(
             information,
-            rotation_rad=math.radians(config.shared_noise_deg),
-            translation_m=config.shared_noise_m,
+            rotation_rad=math.radians(SHARED_NOISE_DEG),
+            translation_m=SHARED_NOISE_M,
         ),
     )
 
 
-def nearest_pairs(correspondences: Correspondences, T_target_source: Transform, *, config: SegregatorConfig) -> Indices:
+def nearest_pairs(correspondences: Correspondences, T_target_source: Transform) -> Indices:
     """Rows, ascending, within the gate that have the smallest distance among all rows sharing one of their ends."""
-    squared = _squared(correspondences, T_target_source, config)
+    squared = _squared(correspondences, T_target_source)
     return _least_at_both_ends(squared, correspondences.source_index, correspondences.target_index)
 
 
@@ -105,8 +118,6 @@ def descend(
     source: Description,
     target: Description,
     T_target_source: Transform,
-    *,
-    config: SegregatorConfig,
 ) -> tuple[Transform, Information]:
     """The pose of least cost for these pairs and the current pairs of ground patches, and the Hessian there."""
     return least_cost(
@@ -117,22 +128,22 @@ def descend(
         *nearest_planes(source, target, T_target_source),
         *nearest_planes(target, source, geometry.inverse(T_target_source)),
         T_target_source,
-        config.centroid_noise_m,
-        config.centroid_noise_share,
-        config.ground_noise_m,
-        config.ground_weight,
+        CENTROID_NOISE_M,
+        CENTROID_NOISE_SHARE,
+        GROUND_NOISE_M,
+        GROUND_WEIGHT,
     )
 
 
-def _squared(correspondences: Correspondences, T_target_source: Transform, config: SegregatorConfig) -> Vector:
+def _squared(correspondences: Correspondences, T_target_source: Transform) -> Vector:
     return squared_distances(
         correspondences.source,
         correspondences.target,
         correspondences.source_covariances,
         correspondences.target_covariances,
         T_target_source,
-        config.centroid_noise_m,
-        config.centroid_noise_share,
+        CENTROID_NOISE_M,
+        CENTROID_NOISE_SHARE,
     )
 
 

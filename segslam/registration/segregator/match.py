@@ -35,6 +35,17 @@ from segslam.registration.segregator.correspondences import (
 from segslam.registration.segregator.gaussians import align_gaussians
 from segslam.registration.segregator.pose_solver import PoseFit, solve_level, solve_pose
 
+TUPLE_SIMILARITY = 0.95
+"""Authors: edge ratio of the tuple test."""
+TUPLE_TRIALS_PER_PAIR = 100
+"""Authors: random triples drawn for each mutual pair."""
+TUPLE_SEED = 0
+"""Chosen: random seed of these triples."""
+CLIQUE_MAX_NODES = 200_000
+"""Chosen: search nodes after which the search stops with the best clique found."""
+CERTAIN_INLIERS = 12
+"""Chosen on simulated 00 and 08: number of inliers above which a pose is certain and no other is tried."""
+
 SAME_PLACE_M, SAME_TURN_RAD = 0.5, np.radians(2.0)
 """Chosen: closer poses are one hypothesis, because refinement leads to the same pose."""
 MIN_GROUND_PATCHES = 5
@@ -67,7 +78,7 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
             rejections.append(attempt)
             continue
         found.append(attempt)
-        if attempt.fit.inliers.sum() >= config.certain_inliers:
+        if attempt.fit.inliers.sum() >= CERTAIN_INLIERS:
             break
     if not found:
         return rejections[0]
@@ -102,7 +113,7 @@ def _attempts(source: Description, target: Description, config: SegregatorConfig
             continue
         for bound_m in config.noise_bounds_m:
             graph = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
-            search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=config.clique_max_nodes)
+            search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=CLIQUE_MAX_NODES)
             size = len(search.cliques[0])
             if size < config.min_clique:
                 yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} consistent correspondences")
@@ -126,9 +137,9 @@ def putative(source: Description, target: Description, *, config: SegregatorConf
         features = feature_correspondences(
             source,
             target,
-            similarity=config.tuple_similarity,
-            trials_per_pair=config.tuple_trials_per_pair,
-            seed=config.tuple_seed,
+            similarity=TUPLE_SIMILARITY,
+            trials_per_pair=TUPLE_TRIALS_PER_PAIR,
+            seed=TUPLE_SEED,
         )
         yield concatenate(clusters, features)
 

@@ -32,6 +32,13 @@ from segslam.core.types import (
     Vector,
 )
 
+GNC_FACTOR = 1.4
+"""Authors: growth of GNC's control parameter."""
+GNC_MAX_ITERATIONS = 100
+"""Authors: largest number of iterations of GNC."""
+GNC_COST_TOLERANCE = 1e-6
+"""Authors: change of cost at which GNC stops."""
+
 Fitted = TypeVar("Fitted")
 AlignRotation = Callable[[Points, Points, Vector], Rotation]
 """The rotation R that minimises sum w |b - R a|^2 over rows a, b, w."""
@@ -61,7 +68,7 @@ def solve_pose(source: Points, target: Points, *, bound_m: float, config: Segreg
     if not _fixes_rotation(source, bound_m, config):
         return _degenerate(len(source))
     solve = solve_decoupled if config.solver == "decoupled" else solve_joint
-    T_target_source = solve(source, target, align, bound_m=bound_m, config=config)
+    T_target_source = solve(source, target, align, bound_m=bound_m)
     squared = _squared_distances(source, target, T_target_source)
     inliers = squared <= bound_m**2
     if not _fixes_rotation(source[inliers], bound_m, config):
@@ -75,21 +82,17 @@ def solve_pose(source: Points, target: Points, *, bound_m: float, config: Segreg
     )
 
 
-def solve_joint(
-    source: Points, target: Points, align: AlignRotation, *, bound_m: float, config: SegregatorConfig
-) -> Transform:
+def solve_joint(source: Points, target: Points, align: AlignRotation, *, bound_m: float) -> Transform:
     """Minimises sum min(|b - R a - t|^2, bound^2) over rotation and translation together."""
 
     def fit(weights: Vector) -> tuple[Transform, Vector]:
         T_target_source = weighted_pose(source, target, weights, align)
         return T_target_source, _squared_distances(source, target, T_target_source)
 
-    return graduated_non_convexity(fit, len(source), bound_m=bound_m, config=config)
+    return graduated_non_convexity(fit, len(source), bound_m=bound_m)
 
 
-def solve_decoupled(
-    source: Points, target: Points, align: AlignRotation, *, bound_m: float, config: SegregatorConfig
-) -> Transform:
+def solve_decoupled(source: Points, target: Points, align: AlignRotation, *, bound_m: float) -> Transform:
     """Rotation from the differences of rows that follow each other, then the translation, one axis at a time.
 
     The last row is followed by the first. A difference carries two measurements, hence twice the bound.
@@ -100,7 +103,7 @@ def solve_decoupled(
         R = align(source_steps, target_steps, weights)
         return R, np.sum((target_steps - source_steps @ R.T) ** 2, axis=1)
 
-    R = graduated_non_convexity(fit, len(source), bound_m=2 * bound_m, config=config)
+    R = graduated_non_convexity(fit, len(source), bound_m=2 * bound_m)
     offsets = target - source @ R.T
     return geometry.transform(R, np.array([vote(axis, bound_m=bound_m) for axis in offsets.T]))
 
@@ -122,7 +125,7 @@ def solve_level(
     R_level_source, R_level_target = geometry.level(source_up), geometry.level(target_up)
     source_level, target_level = source @ R_level_source.T, target @ R_level_target.T
     source_plan, target_plan = source_level * [1.0, 1.0, 0.0], target_level * [1.0, 1.0, 0.0]
-    T_plan = solve_joint(source_plan, target_plan, yaw_between, bound_m=bound_m, config=config)
+    T_plan = solve_joint(source_plan, target_plan, yaw_between, bound_m=bound_m)
     inliers = _squared_distances(source_plan, target_plan, T_plan) <= bound_m**2
     places = source_plan[inliers]
     if len(places) < 2 or np.linalg.norm(places - places.mean(axis=0), axis=1).max() <= bound_m:
@@ -132,9 +135,7 @@ def solve_level(
     return geometry.transform(R_level_target.T, 0.0) @ T_level @ geometry.transform(R_level_source, 0.0)
 
 
-def graduated_non_convexity(
-    fit: Callable[[Vector], tuple[Fitted, Vector]], num_rows: int, *, bound_m: float, config: SegregatorConfig
-) -> Fitted:
+def graduated_non_convexity(fit: Callable[[Vector], tuple[Fitted, Vector]], num_rows: int, *, bound_m: float) -> Fitted:
     """The solution after the weights change gradually from 1 to those of truncated least squares.
 
     `fit` gives, for weights of the rows, the weighted least-squares solution and every row's squared residual.
@@ -145,16 +146,16 @@ def graduated_non_convexity(
     if control == 0.0:
         return fitted
     previous_cost = weights @ squared
-    for _ in range(config.gnc_max_iterations):
+    for _ in range(GNC_MAX_ITERATIONS):
         weights = tls_weights(squared, control, bound_m**2)
         if not weights.any():  # all rows became outliers: no consistent pose
             break
         fitted, squared = fit(weights)
         cost = weights @ squared
-        if abs(cost - previous_cost) < config.gnc_cost_tolerance:
+        if abs(cost - previous_cost) < GNC_COST_TOLERANCE:
             break
         previous_cost = cost
-        control *= config.gnc_factor
+        control *= GNC_FACTOR
     return fitted
 
 

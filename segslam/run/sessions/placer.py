@@ -140,7 +140,7 @@ class Placer:
         rejected = gates.rejection(found, self._allowed)
         if rejected is not None:
             return rejected
-        observability, _ = refinement.observability(fine.information, config=self._config.refine)
+        observability, _ = refinement.observability(fine.information)
         coarse = replace(fine, T_target_source=T_target_predicted, num_inliers=0, num_correspondences=0)
         alignment = Alignment(
             coarse, fine, found.overlap, found.rms_m, found.free_space_violation, observability=observability

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +23,11 @@ from segslam.core.types import (
     Vector,
 )
 from segslam.keyframes.submaps import Submaps
+from segslam.labels import geometric_labels
 from segslam.odometry import information_of
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import folder_of, log_of
 from segslam.output.log import RunLog, read_log
-from segslam.registration.prepared import shape_labels
 
 GAP_NS = 1_000_000_000
 """Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
@@ -164,7 +163,7 @@ def next_shift(before: Shift, session: Session, T_new_old: Transform, following:
 def submaps(session: Session, config: Config) -> Callable[[int], tuple[Points, Labels]]:
     """Function from a keyframe's id to its points and labels; sparse keyframes are merged with their neighbours."""
     recorded = session.log.keyframes()
-    made = Submaps(config, lambda: recorded, partial(shape_labels, config=config), lambda: session.travel_m)
+    made = Submaps(config, lambda: recorded, geometric_labels, lambda: session.travel_m)
     for number in range(len(recorded)):
         made.add(session.T_odom_keyframe[number], labelled_by_shape=bool(recorded[number].labelled_by_shape))
 

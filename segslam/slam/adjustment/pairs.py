@@ -6,39 +6,43 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from segslam.candidates.proximity import BREAK_TRAVEL_M
-from segslam.core.config import AdjustmentConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Vector
+
+EVERY = 2
+"""Chosen on KITTI 00: a submap is registered for every n-th keyframe."""
+STEPS = (5, 10)
+"""Chosen on KITTI 00: distances of registered submaps along the drive, in keyframes."""
+RADIUS_M = 10.0
+"""Chosen on KITTI 00: largest distance of registered submaps of two passes (m)."""
 
 STOREY_M = 2.0
 """Chosen: keyframes of two passes with a larger difference of heights may be on two storeys."""
 
 
-def all_pairs(T_world: Poses, travel_m: Vector, *, config: AdjustmentConfig, min_travel_m: float) -> IndexPairs:
+def all_pairs(T_world: Poses, travel_m: Vector, *, min_travel_m: float) -> IndexPairs:
     """(k, 2) target (older) and source of all pairs, sorted by source, so that near rows share submaps."""
-    passes = pairs_between_passes(T_world, travel_m, config=config, min_travel_m=min_travel_m)
-    pairs = np.vstack([pairs_along(travel_m, config=config), passes])
+    passes = pairs_between_passes(T_world, travel_m, min_travel_m=min_travel_m)
+    pairs = np.vstack([pairs_along(travel_m), passes])
     return pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
 
 
-def pairs_along(travel_m: Vector, *, config: AdjustmentConfig) -> IndexPairs:
+def pairs_along(travel_m: Vector) -> IndexPairs:
     """(k, 2) target (older) and source of pairs along the drive, without those across a break."""
-    nodes = _nodes(travel_m, config)
-    pairs = np.vstack([np.column_stack([nodes, nodes + step]) for step in config.steps])
+    nodes = _nodes(travel_m)
+    pairs = np.vstack([np.column_stack([nodes, nodes + step]) for step in STEPS])
     pairs = pairs[pairs[:, 1] < len(travel_m)]
     return pairs[travel_m[pairs[:, 1]] - travel_m[pairs[:, 0]] < BREAK_TRAVEL_M]
 
 
-def pairs_between_passes(
-    T_world: Poses, travel_m: Vector, *, config: AdjustmentConfig, min_travel_m: float
-) -> IndexPairs:
+def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: float) -> IndexPairs:
     """(k, 2) target (older) and source of pairs of two passes of one place, at least `min_travel_m` of travel apart.
 
     Each node is paired with the nearest node of each earlier pass within the radius.
     """
-    nodes = _nodes(travel_m, config)
+    nodes = _nodes(travel_m)
     places = T_world[nodes, :3, 3]
-    near = cKDTree(places[:, :2]).query_ball_point(places[:, :2], config.radius_m)
+    near = cKDTree(places[:, :2]).query_ball_point(places[:, :2], RADIUS_M)
     pairs = []
     for row, rows in enumerate(near):
         older = np.array(sorted(rows))
@@ -50,8 +54,8 @@ def pairs_between_passes(
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _nodes(travel_m: Vector, config: AdjustmentConfig) -> Indices:
-    return np.arange(0, len(travel_m), config.every)
+def _nodes(travel_m: Vector) -> Indices:
+    return np.arange(0, len(travel_m), EVERY)
 
 
 def _passes(rows: Indices, travel_m: Vector, min_travel_m: float) -> Iterator[Indices]:

@@ -14,11 +14,11 @@ from segslam.core.config import Config
 from segslam.core.types import GraphEstimate, IndexPairs, Mask, Points, Vector
 from segslam.graph import PoseGraph
 from segslam.odometry.calibration import measure_vertical_angle
-from segslam.slam.adjustment.pairs import all_pairs
+from segslam.slam.adjustment.pairs import EVERY, all_pairs
 from segslam.slam.adjustment.progress import Progress, no_progress
 from segslam.slam.adjustment.record import Adjustment
 from segslam.slam.adjustment.registrations import RegisteredPair, register_pairs
-from segslam.slam.adjustment.submaps import PointsOf, Submaps
+from segslam.slam.adjustment.submaps import REACH, PointsOf, Submaps
 from segslam.slam.adjustment.thickness import map_thickness_m
 
 
@@ -101,16 +101,15 @@ def _round(
     show: Callable[[Iterable[Any], int], Iterator[Any]],
 ) -> _Round | None:
     """Register submaps by the current poses, and solve the graph; None if no pair could be registered."""
-    settings = config.adjustment
     T_world, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
-    pairs = all_pairs(T_world, travel_m, config=settings, min_travel_m=config.proximity.min_travel_m)
-    submaps = Submaps(points_of, T_world, travel_m, config=settings, refine=config.refine)
-    in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, submaps, T_world, config=config))
+    pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
+    submaps = Submaps(points_of, T_world, travel_m, config=config.refine)
+    in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, submaps, T_world, config=config.refine))
     tried = list(show(in_time, len(pairs)))
     registered = [one for one in tried if one is not None]
     if not registered:
         return None
-    share = min(1.0, settings.every / (2 * settings.reach + 1))  # so that every scan counts once
+    share = min(1.0, EVERY / (2 * REACH + 1))  # so that every scan counts once
     estimate, noise_factors = graph.adjust([one.edge(share=share) for one in registered])
     return _Round(len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
 

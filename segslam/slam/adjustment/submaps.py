@@ -8,11 +8,15 @@ import numpy as np
 
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
-from segslam.core.config import AdjustmentConfig, RefineConfig
+from segslam.core.config import RefineConfig
 from segslam.core.points import cell_keys, group_means, hash_keys
 from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Vector
 from segslam.registration.refinement import Surface, downsample, make_surface
+from segslam.slam.adjustment.pairs import EVERY
+
+REACH = 2
+"""Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
 
 PointsOf = Callable[[int], Points]
 """Returns the points of a keyframe, by id, in its own frame."""
@@ -39,12 +43,11 @@ class Submaps:
         T_world: Poses,
         travel_m: Vector,
         *,
-        config: AdjustmentConfig,
-        refine: RefineConfig,
+        config: RefineConfig,
     ) -> None:
         self._points_of, self._T_world, self._travel_m = points_of, T_world, travel_m
-        self._config, self._refine = config, refine
-        self._scan = lru_cache(4 * config.reach + config.every + 2)(self._scan_of)
+        self._refine = config
+        self._scan = lru_cache(4 * REACH + EVERY + 2)(self._scan_of)
         self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
 
     def _scan_of(self, keyframe_id: int) -> Points:
@@ -52,7 +55,7 @@ class Submaps:
 
     def _submap(self, keyframe_id: int) -> Submap:
         T_keyframe_world = geometry.inverse(self._T_world[keyframe_id])
-        near = members(keyframe_id, self._travel_m, reach=self._config.reach)
+        near = members(keyframe_id, self._travel_m, reach=REACH)
         points = np.vstack([geometry.apply(T_keyframe_world @ self._T_world[one], self._scan(one)) for one in near])
         keys, _ = cell_keys(points, self._refine.voxel_m)
         voxels, group = np.unique(hash_keys(keys)[1], return_inverse=True)

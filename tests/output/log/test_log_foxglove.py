@@ -172,7 +172,7 @@ def test_all_versions_of_the_odometry_path_together_stay_linear_in_its_length(tm
     assert sum(lengths) < 30 * 400  # a path in each keyframe's message would be 200 * 400
 
 
-LAYOUT = json.loads((Path(__file__).parents[2] / "configs" / "foxglove_layout.json").read_text())
+LAYOUT = json.loads((Path(__file__).parents[3] / "configs" / "foxglove_layout.json").read_text())
 
 
 def _panels(node: str | dict[str, Any]) -> list[str]:
@@ -198,9 +198,9 @@ def test_the_layout_draws_all_that_the_log_has_to_draw(whole: Path) -> None:
 def test_the_layout_plots_the_stages_that_a_scan_has() -> None:
     """Those that the pipeline times: a stage of another name would never show."""
     paths = [path["value"] for path in LAYOUT["configById"]["Plot!stages"]["paths"]]
-    package = Path(schema.__file__).parents[1]
+    package = Path(schema.__file__).parents[2]
     files = [package / name for name in ("odometry/tracker.py", "slam/slam.py", "slam/loops.py")]
-    files += sorted((package / "registration").glob("*.py"))
+    files += [file for room in ("registration", "verification") for file in sorted((package / room).glob("*.py"))]
     source = "".join(file.read_text() for file in files)
     stages = {*re.findall(r'(?:watch|own)\("(\w+)"\)', source)}
     assert {path.rpartition(".")[2] for path in paths} == stages

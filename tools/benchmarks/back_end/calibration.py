@@ -38,7 +38,7 @@ def closure_calibration(drive: Drive, closures: Iterable[LoopClosure]) -> float 
         _chi2(
             loop.T_target_source,
             geometry.inverse(drive.truth[loop.target_id]) @ drive.truth[loop.source_id],
-            closure_information(loop.information, CONFIG.graph),
+            closure_information(loop.information),
         )
         for loop in closures
     ]

@@ -3,7 +3,7 @@
     python -m tools.benchmarks.labels DATA [--set verify.max_plan_hypotheses=0] [--pictures FOLDER] --out FILE.json
 
 DATA is the folder of real data: `kitti/` with ground-truth labels of scans 0-2, predicted ones, and
-`reference_pairs.json`, and `courtyard/`. Writes JSON, and the tables as FILE.md. The numbers of `GeometricLabelsConfig`
+`reference_pairs.json`, and `courtyard/`. Writes JSON, and the tables as FILE.md. The numbers of `labels/geometric.py`
 were chosen on those scans and pairs of KITTI. KISS-Matcher needs the extra `bench`.
 """
 

@@ -16,7 +16,7 @@ from segslam.bench.experiments.variations import pair_trials
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Label, Trajectory
-from segslam.registration.prepared import shape_labels
+from segslam.labels import geometric_labels
 from segslam.scans import DataSource
 from tools.benchmarks import real_pairs
 
@@ -81,7 +81,7 @@ def draw_pair(file: Path, trial: Trial, row: Row, source: DataSource, config: Co
         (trial.source, trial.T_target_source, "tab:orange", "source, at its true pose"),
     ):
         points = points_of(source, scan)
-        labels = shape_labels(points, config=config)
+        labels = geometric_labels(points)
         points = points[(labels != Label.ROAD) & (labels != Label.UNLABELLED)]
         x, y, _ = geometry.apply(T_target_scan, points.astype(np.float64)).T
         at, label = T_target_scan[:2, 3], f"{scan.index}: {role}"

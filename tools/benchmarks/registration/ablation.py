@@ -24,7 +24,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "cars and trunks of the authors' sizes": ("segregator.cluster_min_points={car: 30, trunk: 15}",),
     "things at their centres, not feet": ("segregator.foot_classes=[]",),
     "one noise for all (joint solver)": ("segregator.solver=joint",),
-    "ground without weight": ("segregator.ground_weight=0",),
     "features never": ("segregator.features=never",),
     "features always": ("segregator.features=always",),
 }

@@ -149,6 +149,6 @@ def by_shape(points_of: Callable[[int], Points], config: Config) -> Callable[[in
 
     def scan(index: int) -> Labelled:
         points = points_of(index)
-        return points, geometric_labels(points, config=config.geometric)
+        return points, geometric_labels(points)
 
     return scan

@@ -16,9 +16,10 @@ from segslam.core.evaluation import PoseError
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.types import Alignment, LoopCandidate, Points, Rejected, Rotation, Transform
 from segslam.keyframes.keyframes import downsample_keyframe
+from segslam.labels import geometric_labels
 from segslam.registration import refinement
 from segslam.registration.hypotheses import Gate, anywhere
-from segslam.registration.prepared import PreparedScan, prepare_scan, shape_labels
+from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import open_dataset
 from segslam.verification import gates, register_prepared
 from segslam.verification.noise_floor import NeighbourNoise
@@ -167,7 +168,7 @@ def _drive(part: str, data: Path, config: Config) -> tuple[Callable[[int], Prepa
 def _preparer(points_of: Callable[[int], Points], config: Config) -> Callable[[int], PreparedScan]:
     def prepared(row: int) -> PreparedScan:
         points = points_of(row)
-        labels = shape_labels(points, config=config)
+        labels = geometric_labels(points)
         classes = tuple(config.segregator.cluster_min_points)
         points, labels, _ = downsample_keyframe(points, labels, config=config.keyframes, whole_classes=classes)
         return prepare_scan(points, labels, config=config)

@@ -32,7 +32,7 @@ class _Led(NamedTuple):
 def tried(trial: Trial) -> list[Transform]:
     """Refined poses, each different from the others; of the gates only that of the prior applies."""
     if min(len(few_points(trial.source, trial.config.refine).surface), len(trial.target.surface)) < (
-        trial.config.refine.min_points
+        refinement.MIN_POINTS
     ):
         return []
     coarse = (one.T_target_source for one in coarse_poses(trial.pair) if isinstance(one, Registration))

@@ -11,9 +11,10 @@ from typing import Any
 from pydantic.fields import FieldInfo
 
 from segslam.core.config import Config, Section, changed_settings
-from segslam.core.types import Rejected
+from segslam.core.types import Rejected, RejectReason
 from segslam.odometry.calibration import vertical_angle_advice
 from segslam.output.finished import COMPARED, FIGURES, FinishedRun
+from segslam.output.words import REASONS, WORDS
 
 FILES = {
     "map.png": "the map in top view",
@@ -28,7 +29,7 @@ FILES = {
     "georeference.json": "place of the map on the globe",
     "gnss.csv": "position fixes: kept, or why not",
     "poses_geodetic.csv": "latitude, longitude, height and heading of every scan",
-    "loops.csv": "all loop candidates and their outcomes",
+    "loops.csv": 'all loop candidates and their outcomes (<a href="#words">words</a>)',
     "graph.g2o": "the pose graph",
     "metrics.json": "the figures of this page",
     "config.yaml": "the settings",
@@ -204,7 +205,19 @@ def _outcomes(run: FinishedRun) -> str:
         return "<p>No place was visited twice, according to the estimate.</p>"
     outcomes = (attempt.outcome for attempt in run.result.attempts)
     names = Counter(outcome.reason.value if isinstance(outcome, Rejected) else "accepted" for outcome in outcomes)
-    return _table(("", "attempts"), ((name.replace("_", " "), count) for name, count in names.most_common()))
+    rows = ((_outcome(name), count) for name, count in names.most_common())
+    return _table(("", "attempts"), rows) + _words()
+
+
+def _outcome(name: str) -> str:
+    """An outcome as in `loops.csv`, with what it means."""
+    meaning = "" if name == "accepted" else f'<div class="soft">{REASONS[RejectReason(name)]}</div>'
+    return f"{name.replace('_', ' ')}{meaning}"
+
+
+def _words() -> str:
+    rows = (f"<tr><td>{word}</td><td>{escape(meaning)}</td></tr>" for word, meaning in WORDS.items())
+    return f'<details id="words"><summary>What the words mean</summary><table>{"".join(rows)}</table></details>'
 
 
 def settings_tables(config: Config) -> str:

@@ -10,24 +10,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from segslam.config import Config, load_config
-    from segslam.datasets import open_dataset
-    from segslam.fleets import fleet
-    from segslam.registration import register
-    from segslam.retrieval import Places
+    from segslam.candidates import Places
+    from segslam.core.config import Config, load_config
+    from segslam.core.memory import keep_freed_memory
+    from segslam.core.types import Alignment, BadScan, Rejected, Scan, SegslamError
+    from segslam.output.export import export
+    from segslam.output.finished import read_run
+    from segslam.output.georeferenced import georeference
+    from segslam.output.report import write_report as report
     from segslam.run.evaluate import evaluate
-    from segslam.run.export import export
-    from segslam.run.finished import read_run
-    from segslam.run.georeferenced import georeference
+    from segslam.run.fleets import fleet
     from segslam.run.locator import Located, Locator, locate
     from segslam.run.map_folder import map_folder
     from segslam.run.replay import replay
-    from segslam.run.report import write_report as report
-    from segslam.sessions.localise import localise
-    from segslam.sessions.merge import merge
-    from segslam.slam import Slam
-    from segslam.system.memory import keep_freed_memory
-    from segslam.types import Alignment, BadScan, Rejected, Scan, SegslamError
+    from segslam.run.sessions.localise import localise
+    from segslam.run.sessions.merge import merge
+    from segslam.scans import open_dataset
+    from segslam.slam.slam import Slam
+    from segslam.verification import register
 
     __version__: str
 
@@ -60,31 +60,31 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Alignment": "types",
-    "BadScan": "errors",
-    "Config": "config",
+    "Alignment": "core.types",
+    "BadScan": "core.errors",
+    "Config": "core.config",
     "Located": "run.locator",
     "Locator": "run.locator",
-    "Places": "retrieval",
-    "Rejected": "types",
-    "Scan": "types",
-    "SegslamError": "errors",
-    "Slam": "slam",
+    "Places": "candidates",
+    "Rejected": "core.types",
+    "Scan": "core.types",
+    "SegslamError": "core.errors",
+    "Slam": "slam.slam",
     "evaluate": "run.evaluate",
-    "export": "run.export",
-    "fleet": "fleets",
-    "georeference": "run.georeferenced",
-    "keep_freed_memory": "system.memory",
-    "load_config": "config",
+    "export": "output.export",
+    "fleet": "run.fleets",
+    "georeference": "output.georeferenced",
+    "keep_freed_memory": "core.memory",
+    "load_config": "core.config",
     "locate": "run.locator",
-    "localise": "sessions.localise",
+    "localise": "run.sessions.localise",
     "map_folder": "run.map_folder",
-    "merge": "sessions.merge",
-    "open_dataset": "datasets",
-    "read_run": "run.finished",
-    "register": "registration",
+    "merge": "run.sessions.merge",
+    "open_dataset": "scans",
+    "read_run": "output.finished",
+    "register": "verification",
     "replay": "run.replay",
-    "report": "run.report",
+    "report": "output.report",
 }
 
 _NAMES = {"report": "write_report"}

@@ -3,7 +3,7 @@
 
 def main() -> None:
     """Handle Ctrl-C before anything else is imported, then run the command."""
-    from segslam.system.interrupts import ctrl_c_in_order
+    from segslam.core.interrupts import ctrl_c_in_order
 
     with ctrl_c_in_order():
         from segslam import cli

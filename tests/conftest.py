@@ -61,7 +61,7 @@ def short_runs() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("segslam.odometry.OdometryApart", OdometryHere)
-        patch.setattr("segslam.run.report.write_report", write_blank_report)
+        patch.setattr("segslam.output.report.write_report", write_blank_report)
         yield
 
 

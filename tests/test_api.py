@@ -12,8 +12,8 @@ from helpers.drives import round_drive, write_kitti_sequence
 from helpers.finished_run import MadeRun, make_run
 
 import segslam
-from segslam.run.finished import FinishedRun
-from segslam.trajectory import read_poses, write_tum
+from segslam.core.trajectory import read_poses, write_tum
+from segslam.output.finished import FinishedRun
 
 
 @pytest.fixture(scope="module")

@@ -23,9 +23,10 @@ from typer.main import get_command
 import segslam
 from segslam import cli
 from segslam.cli import commands
-from segslam.config import Config
-from segslam.datasets import open_dataset
-from segslam.trajectory import read_poses
+from segslam.core.config import Config
+from segslam.core.trajectory import read_poses
+from segslam.core.types import RejectReason
+from segslam.scans import open_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
@@ -191,6 +192,12 @@ def test_the_site_has_a_page_for_every_command_and_public_name() -> None:
         shown = [parameter for parameter in command.params if not getattr(parameter, "hidden", False)]
         assert all(f"`{option}`" in page for one in shown for option in one.opts if "-" in option)
     assert all(f"## {name}\n" in pages["api_page"]() for name in segslam.__all__ if callable(getattr(segslam, name)))
+
+
+def test_the_glossary_has_every_reason_and_the_page_is_that_of_the_program() -> None:
+    page = runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))["glossary_page"]()
+    assert (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8") == page
+    assert all(f"| `{reason}` |" in page for reason in RejectReason)
 
 
 @pytest.mark.slow

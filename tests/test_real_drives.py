@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from helpers.commands import run
 
-from segslam.config import Config
-from segslam.datasets import open_dataset
-from segslam.evaluation import trajectory_metrics
+from segslam.core.config import Config
+from segslam.core.evaluation import trajectory_metrics
 from segslam.odometry import CheckedOdometry, KissOdometry
-from segslam.registration import register
-from segslam.run.finished import read_run
+from segslam.output.finished import read_run
+from segslam.scans import open_dataset
+from segslam.verification import register
 
 FIRST_SLIP = range(80)  # KISS-ICP loses 20 degrees of a turn at scan 67, if it began at scan 0
 EVERY_THIRD = range(0, 100, 3)  # turns of up to 95 degrees between scans

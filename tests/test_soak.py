@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from helpers.drives import round_drive
 
-from segslam.config import load_config
-from segslam.log import read_log, schema
-from segslam.log.container import messages
+from segslam.core.config import load_config
+from segslam.core.types import Scan, Step, Trajectory
+from segslam.labels.label_files import open_labels
 from segslam.odometry import GivenOdometry
+from segslam.output.log import read_log, schema
+from segslam.output.log.container import messages
 from segslam.run.run import Run
-from segslam.semantics.label_files import open_labels
-from segslam.slam import Slam
-from segslam.types import Scan, Step, Trajectory
+from segslam.slam.slam import Slam
 
 UNLABELLED = open_labels("none", beside=Path(), scan_names=[], encoding=None)
 SECONDS = float(os.environ.get("SEGSLAM_SOAK_S", "300"))

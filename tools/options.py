@@ -1,4 +1,4 @@
-"""Writes docs/options.md: every setting with unit, default, range and meaning, from the classes of segslam/config.py.
+"""Writes docs/options.md: every setting (unit, default, range, meaning), from segslam/core/config.py.
 
 python tools/options.py
 """
@@ -12,12 +12,12 @@ import yaml
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic.fields import FieldInfo
 
-from segslam.config import USER_SETTINGS, Config, Section
+from segslam.core.config import USER_SETTINGS, Config, Section
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "options.md"
 INTRODUCTION = """# Every setting
 
-Generated from `segslam/config/sections.py` by `python tools/options.py`; do not edit this page.
+Generated from `segslam/core/config/sections.py` by `python tools/options.py`; do not edit this page.
 
 Change settings with a YAML file that contains the differences from the defaults, `--config strict.yaml`, or one by one,
 `--set verify.min_overlap=0.4 --set map.color=height`. Unknown keys and values out of range are reported as errors. Each

@@ -1,4 +1,7 @@
-"""Writes docs/commands.md and docs/api.md from the commands and the public names of the package, for the site."""
+"""Writes docs/commands.md and docs/api.md from the commands and the public names of the package, for the site.
+
+python tools/reference_pages.py    # writes docs/glossary.md, which the checkout has
+"""
 
 import inspect
 from pathlib import Path
@@ -9,10 +12,11 @@ from typer.main import get_command
 import segslam
 from segslam import cli
 from segslam.cli import commands
+from segslam.output.words import REASONS, WORDS
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples" / "api.py"
 BENCH_GROUP = "Paper"
-RECORDS = "segslam.types"
+RECORDS = "segslam.core.types"
 INTRODUCTION = """# Python
 
 `import segslam` gives these names. Each has an example; together they are
@@ -27,6 +31,19 @@ def write(docs: Path) -> None:
     """Write both pages into a folder."""
     (docs / "commands.md").write_text(commands_page(), encoding="utf-8")
     (docs / "api.md").write_text(api_page(), encoding="utf-8")
+
+
+def glossary_page() -> str:
+    """The words of reports and of `loops.csv`."""
+    words = "\n".join(f"| {word} | {meaning} |" for word, meaning in WORDS.items())
+    reasons = "\n".join(f"| `{reason}` | {meaning} |" for reason, meaning in REASONS.items())
+    return (
+        "# Glossary\n\nThe words of reports, messages and `loops.csv` that are not everyday words of the field. "
+        "Written by `python tools/reference_pages.py`.\n\n"
+        f"| word | meaning |\n|---|---|\n{words}\n\n"
+        "## Why a loop candidate was rejected\n\nThe column `outcome` of `loops.csv`; `detail` has the figures.\n\n"
+        f"| outcome | meaning |\n|---|---|\n{reasons}\n"
+    )
 
 
 def commands_page() -> str:
@@ -49,7 +66,7 @@ def commands_page() -> str:
 
 
 def api_page() -> str:
-    """Public functions and classes, and the records of `segslam.types`."""
+    """Public functions and classes, and the records of `segslam.core.types`."""
     parts = [INTRODUCTION]
     examples = api_examples()
     for name in examples:
@@ -100,3 +117,7 @@ def _leaves(command: Any, name: str = "") -> list[tuple[str, Any]]:
     if not children:
         return [(name, command)]
     return [leaf for key, child in children.items() for leaf in _leaves(child, f"{name} {key}".strip())]
+
+
+if __name__ == "__main__":
+    (EXAMPLES.parents[1] / "glossary.md").write_text(glossary_page(), encoding="utf-8")

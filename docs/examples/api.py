@@ -3,7 +3,7 @@
 import numpy as np
 
 import segslam
-from segslam import retrieval
+from segslam import candidates
 
 # %% open_dataset
 dataset = segslam.open_dataset("monday", frames="0:12")
@@ -103,8 +103,8 @@ city = segslam.fleet(["monday", "tuesday"], "city", num_workers=1)
 places = segslam.Places()
 for number, scan in enumerate(scans):
     standing = scan.points[scan.points[:, 2] > -1.0]  # without the ground
-    places.add(number, retrieval.signature_of_standing(standing))
-print(places.shortlist(retrieval.signature_of_standing(standing), most=3))
+    places.add(number, candidates.signature_of_standing(standing))
+print(places.shortlist(candidates.signature_of_standing(standing), most=3))
 
 # %% georeference
 placed = segslam.georeference("runs/monday", "fixes.csv")

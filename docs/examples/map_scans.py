@@ -6,7 +6,7 @@ python docs/examples/map_scans.py FOLDER poses.txt
 import sys
 
 import segslam
-from segslam.types import LoopClosure
+from segslam.core.types import LoopClosure
 
 if len(sys.argv) != 3:
     sys.exit(__doc__)

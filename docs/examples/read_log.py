@@ -7,9 +7,9 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from segslam import geometry
-from segslam.log import read_log
-from segslam.types import Rejected
+from segslam.core import geometry
+from segslam.core.types import Rejected
+from segslam.output.log import read_log
 
 if len(sys.argv) != 2:
     sys.exit(__doc__)

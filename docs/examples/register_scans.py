@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 import segslam
-from segslam.types import Rejected
+from segslam.core.types import Rejected
 
 if len(sys.argv) != 3:
     sys.exit(__doc__)

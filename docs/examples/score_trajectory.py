@@ -6,8 +6,8 @@ python docs/examples/score_trajectory.py poses_kitti.txt kitti/poses/00.txt
 import sys
 from pathlib import Path
 
-from segslam.evaluation import UP, trajectory_metrics, upward_axis
-from segslam.trajectory import read_poses
+from segslam.core.evaluation import UP, trajectory_metrics, upward_axis
+from segslam.core.trajectory import read_poses
 
 if len(sys.argv) != 3:
     sys.exit(__doc__)

@@ -11,9 +11,9 @@ import typer
 
 from segslam.cli.groups import GroupedCommands
 from segslam.cli.warn import FirstOfEachKind
-from segslam.errors import SegslamError, reason
-from segslam.system.interrupts import EXIT_STATUS, ctrl_c_in_order, stop_line
-from segslam.system.memory import keep_freed_memory
+from segslam.core.errors import SegslamError, reason
+from segslam.core.interrupts import EXIT_STATUS, ctrl_c_in_order, stop_line
+from segslam.core.memory import keep_freed_memory
 
 BAD_INPUT = 2
 

@@ -18,10 +18,10 @@ from segslam.cli.console import JsonOption, QuietOption, announce, print_json, p
 from segslam.cli.shared_options import with_options
 
 if TYPE_CHECKING:
-    from segslam.experiments.job import Job
-    from segslam.experiments.pairs import PairList
-    from segslam.experiments.rows import Row
-    from segslam.experiments.trials import Trial
+    from segslam.bench.experiments.job import Job
+    from segslam.bench.experiments.pairs import PairList
+    from segslam.bench.experiments.rows import Row
+    from segslam.bench.experiments.trials import Trial
 
 app = typer.Typer(
     help="Repeat the experiments of the Segregator paper; every method gets the same scans.", no_args_is_help=True
@@ -64,7 +64,7 @@ def yaw(
     Example: segslam bench yaw kitti --sequence 05 --step-deg 5 --out yaw05
     """
     job = make_job(data, options)
-    from segslam.experiments.variations import PAPER_PAIR, turned_trials
+    from segslam.bench.experiments.variations import PAPER_PAIR, turned_trials
 
     reference = reference_of(job)
     lists = read_lists(options, reference, default=PAPER_PAIR)
@@ -90,7 +90,7 @@ def deterioration(
     Example: segslam bench deterioration kitti --sequence 05 --labels predictions --clouds one --out lost05
     """
     job = make_job(data, options)
-    from segslam.experiments.variations import PAPER_PAIR, unlabelled_trials
+    from segslam.bench.experiments.variations import PAPER_PAIR, unlabelled_trials
 
     reference = reference_of(job)
     lists = read_lists(options, reference, default=PAPER_PAIR)
@@ -117,7 +117,7 @@ def places(
 
     Example: segslam bench places kitti_00.npz --database 0:3000 --queries 3200:
     """
-    from segslam.experiments.places import PlacesBench, parse_range, read_places
+    from segslam.bench.experiments.places import PlacesBench, parse_range, read_places
 
     announce(f"bench places: reading {file}", quiet=quiet)
     seen = read_places(file)
@@ -144,7 +144,7 @@ def places(
 def _run_pairs(experiment: str, data: Path, options: Options) -> None:
     # as in `yaw`, what loads scipy is imported after the first message, which is that of make_job
     job = make_job(data, options)
-    from segslam.experiments.variations import pair_trials
+    from segslam.bench.experiments.variations import pair_trials
 
     reference = reference_of(job)
     lists = read_lists(options, reference)
@@ -163,10 +163,10 @@ def _run(
     **settings: Any,
 ) -> None:
     """Register the pairs, print the results, and write the report if a folder is given."""
-    from segslam.experiments.paper import with_paper_values
-    from segslam.experiments.provenance import account
-    from segslam.experiments.report_tables import overall, plain
-    from segslam.experiments.summary import results
+    from segslam.bench.experiments.paper import with_paper_values
+    from segslam.bench.experiments.provenance import account
+    from segslam.bench.experiments.report_tables import overall, plain
+    from segslam.bench.experiments.summary import results
 
     rows = run_trials(job, trials, options)
     found = with_paper_values(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
@@ -183,8 +183,8 @@ def _run(
 
 def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes], *, quiet: bool) -> None:
     """Write the report, and the pictures as separate files."""
-    from segslam.experiments.report import write_bench_report
-    from segslam.system.whole_files import write_whole
+    from segslam.bench.experiments.report import write_bench_report
+    from segslam.core.whole_files import write_whole
 
     write_bench_report(out, report, pictures=pictures)
     for number, png in enumerate(pictures.values()):
@@ -194,9 +194,9 @@ def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes],
 
 def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) -> dict[str, bytes]:
     """Pictures of the worst failures, by caption."""
-    from segslam.experiments.job import BAD_SCAN, points_of
-    from segslam.experiments.summary import worst_failures
-    from segslam.run.report.pairs import draw_pair
+    from segslam.bench.experiments.job import BAD_SCAN, points_of
+    from segslam.bench.experiments.summary import worst_failures
+    from segslam.output.report.pairs import draw_pair
 
     trial_of = {trial.key: trial for trial in trials}
     pictures = {}

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.cli.compiling import compile_kernels
 from segslam.cli.completion import METHODS
 from segslam.cli.console import (
@@ -22,17 +23,16 @@ from segslam.cli.console import (
     progress,
     say,
 )
-from segslam.errors import SegslamError
-from segslam.experiments.method_settings import METHOD_NAMES
-from segslam.system.interrupts import EXIT_STATUS, when_stopped
-from segslam.system.whole_files import check_target
+from segslam.core.errors import SegslamError
+from segslam.core.interrupts import EXIT_STATUS, when_stopped
+from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
-    from segslam.experiments.job import Job
-    from segslam.experiments.pairs import PairList
-    from segslam.experiments.rows import Row
-    from segslam.experiments.trials import Trial
-    from segslam.types import Trajectory
+    from segslam.bench.experiments.job import Job
+    from segslam.bench.experiments.pairs import PairList
+    from segslam.bench.experiments.rows import Row
+    from segslam.bench.experiments.trials import Trial
+    from segslam.core.types import Trajectory
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -100,10 +100,10 @@ def make_job(data: Path, options: Options) -> "Job":
     """The job that the options describe. By default, methods that are not installed are skipped with a message."""
     announce(f"bench: opening {data}", quiet=options.quiet)
     _one_thread_each()
-    from segslam.config import load_config
-    from segslam.datasets import DataSource
-    from segslam.experiments.job import Job
-    from segslam.experiments.methods import find_method
+    from segslam.bench.experiments.job import Job
+    from segslam.bench.experiments.methods import find_method
+    from segslam.core.config import load_config
+    from segslam.scans import DataSource
 
     if options.details is not None:
         check_target(options.details)
@@ -133,7 +133,7 @@ def make_job(data: Path, options: Options) -> "Job":
 
 def reference_of(job: "Job") -> "Trajectory | None":
     """The true poses of the data set."""
-    from segslam.experiments.job import open_once
+    from segslam.bench.experiments.job import open_once
 
     dataset, _ = open_once(job.source)
     return dataset.reference
@@ -143,7 +143,7 @@ def read_lists(
     options: Options, reference: "Trajectory | None", *, default: "PairList | None" = None
 ) -> list["PairList"]:
     """The lists from files, or the list selected by distance, or the default; sampled if requested."""
-    from segslam.experiments.pairs import cut_pairs, read_pairs, sample_pairs
+    from segslam.bench.experiments.pairs import cut_pairs, read_pairs, sample_pairs
 
     cuts = options.min_m is not None or options.max_m is not None
     if options.pairs and cuts:
@@ -163,8 +163,8 @@ def read_lists(
 
 def run_trials(job: "Job", trials: list["Trial"], options: Options) -> list["Row"]:
     """All rows in the order of the trials. After Ctrl-C, finished rows remain in the folder of `--out`."""
-    from segslam.experiments.benchmark import Pool, in_order, run
-    from segslam.experiments.rows import write_rows
+    from segslam.bench.experiments.benchmark import Pool, in_order, run
+    from segslam.bench.experiments.rows import write_rows
 
     compile_kernels(quiet=options.quiet)
     rows: list[Row] = []

@@ -23,8 +23,8 @@ from segslam.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from segslam.calibration import Calibrator, VerticalAngle
-    from segslam.datasets import Dataset
+    from segslam.odometry.calibration import Calibrator, VerticalAngle
+    from segslam.scans import Dataset
 
 logger = logging.getLogger(__name__)
 
@@ -49,13 +49,13 @@ def calibrate(
     the value of the setting that corrects it is printed as well.
     Example: segslam calibrate kitti --sequence 00 --set sensor.vertical_angle_deg=0
     """
-    from segslam.config import load_config
+    from segslam.core.config import load_config
 
     check_exists(data, "give the folder with sequences/ or with the scans")
     settings_now = load_config(config, settings or ())
     announce(f"calibrate: opening {data}", quiet=quiet)
-    from segslam.calibration import Calibrator
-    from segslam.datasets import open_dataset
+    from segslam.odometry.calibration import Calibrator
+    from segslam.scans import open_dataset
 
     scans = open_dataset(
         data,
@@ -79,7 +79,7 @@ def calibrate(
 
 def _driven(calibrator: "Calibrator", scans: "Dataset", distance_m: float) -> "Iterator[None]":
     """Yields after each usable scan, until the drive is long enough."""
-    from segslam.types import BadScan
+    from segslam.core.types import BadScan
 
     for scan in scans:
         try:
@@ -104,7 +104,7 @@ def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, obj
 
 
 def _summary(found: "VerticalAngle | None", applied_deg: float, travel_m: float) -> str:
-    from segslam.calibration import MIN_PAIRS, described
+    from segslam.odometry.calibration import MIN_PAIRS, described
 
     if found is None:
         return (

@@ -5,12 +5,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
-    from segslam.config import Config
-    from segslam.datasets import Dataset
-    from segslam.log import RunLog
+    from segslam.core.config import Config
+    from segslam.output.log import RunLog
+    from segslam.scans import Dataset
 
 
 def check_exists(path: Path, hint: str) -> None:
@@ -31,7 +31,7 @@ def check_links(folder: Path) -> None:
 
 def check_intensities(scans: "Dataset") -> None:
     """Raises SegslamError if the first readable scan has no intensities."""
-    from segslam.errors import BadScan
+    from segslam.core.errors import BadScan
 
     for row in range(len(scans)):
         with suppress(BadScan):
@@ -42,8 +42,8 @@ def check_intensities(scans: "Dataset") -> None:
 
 def log_to_resume(folder: Path) -> "RunLog":
     """The log of the run in a folder. Raises SegslamError if there is none, or the run is still in progress."""
-    from segslam.log import is_being_written, read_log
-    from segslam.run.folder import LOG
+    from segslam.output.folder import LOG
+    from segslam.output.log import is_being_written, read_log
 
     check_links(folder)
     log = folder / LOG
@@ -58,7 +58,7 @@ def log_to_resume(folder: Path) -> "RunLog":
 
 def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options: Mapping[str, str]) -> None:
     """Raises SegslamError if a run would be resumed with other data, settings or options."""
-    from segslam.config import changed_settings
+    from segslam.core.config import changed_settings
 
     for key, before, now in changed_settings(recorded.config, settings):
         raise SegslamError(

@@ -9,7 +9,7 @@ from segslam.cli.checks import check_exists
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
 from segslam.cli.overwriting import OverwriteOption, check_free
 from segslam.cli.tables import CsvOption, LatexOption, figure, write_tables
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 COLUMN = 14
 """Smallest width of a column of the table, in characters."""
@@ -35,8 +35,8 @@ def compare(
     names = _names(runs)
     check_free([file for file in (plot, csv, latex) if file], overwrite=overwrite)
     announce(f"compare: reading {len(runs)} runs", quiet=quiet)
-    from segslam.run.finished import read_metrics, read_run
-    from segslam.run.report.comparison import check_picture, draw_runs
+    from segslam.output.finished import read_metrics, read_run
+    from segslam.output.report.comparison import check_picture, draw_runs
 
     if plot is not None:
         check_picture(plot)
@@ -61,7 +61,7 @@ def _names(runs: list[Path]) -> list[str]:
 
 def table(figures: dict[str, dict[str, Any]]) -> str:
     """A line for each figure of any run, and a column for each run; `-` for missing figures."""
-    from segslam.run.finished import FIGURES
+    from segslam.output.finished import FIGURES
 
     width = max(COLUMN, *(len(name) + 2 for name in figures))
     lines = ["".join(f"{name:>{width}}" for name in figures)]

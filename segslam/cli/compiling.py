@@ -12,7 +12,7 @@ def compile_kernels(*, quiet: bool) -> int:
 
     On failure, each kernel is compiled on its first call.
     """
-    from segslam.system import kernels
+    from segslam.core import kernels
 
     if kernels.are_built():
         return 0

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from segslam.experiments.method_settings import METHOD_NAMES
+from segslam.bench.experiments.method_settings import METHOD_NAMES
 
 LABELS = ("auto", "none", "geometric", "network:")
 SENSORS = ("hdl64", "os1-64", "vlp16")
@@ -36,28 +36,28 @@ def labels_or_files(incomplete: str) -> list[str]:
 
 def presets(incomplete: str) -> list[str]:
     """Names of the presets."""
-    from segslam.presets import SETTINGS
+    from segslam.scans.presets import SETTINGS
 
     return _starting(["auto", *SETTINGS], incomplete)
 
 
 def datasets(incomplete: str) -> list[str]:
     """Kinds of data."""
-    from segslam.datasets.recordings import known_kinds
+    from segslam.scans.recordings import known_kinds
 
     return _starting(known_kinds(), incomplete)
 
 
 def settings(incomplete: str) -> list[str]:
     """Keys `section.key=`; after the equals sign the values, if the setting has a fixed list of them."""
-    from segslam.config import Config
+    from segslam.core.config import Config
 
     return _settings(Config, incomplete)
 
 
 def simulation_settings(incomplete: str) -> list[str]:
     """As `settings`, of the simulation."""
-    from segslam.simulation import SimulationConfig
+    from segslam.bench.simulation import SimulationConfig
 
     return _settings(SimulationConfig, incomplete)
 

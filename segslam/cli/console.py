@@ -13,7 +13,7 @@ import typer
 
 from segslam.cli import completion
 from segslam.cli.warn import FirstOfEachKind
-from segslam.errors import WorkFailed, reason
+from segslam.core.errors import WorkFailed, reason
 
 Item = TypeVar("Item")
 

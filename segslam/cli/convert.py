@@ -42,7 +42,7 @@ def convert(
     check_exists(source, "give a trajectory")
     check_free([target], overwrite=overwrite)
     announce(f"convert: reading {source}", quiet=quiet)
-    from segslam.conversion import convert as convert_file
+    from segslam.output.conversion import convert as convert_file
 
     num_poses = convert_file(
         source,

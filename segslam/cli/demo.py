@@ -8,8 +8,8 @@ import typer
 from segslam.cli.console import JsonOption, QuietOption, announce, progress, say
 from segslam.cli.map import map_scans
 from segslam.cli.overwriting import OverwriteOption, make_room
-from segslam.errors import WorkFailed
-from segslam.system.interrupts import same_command_with, when_stopped
+from segslam.core.errors import WorkFailed
+from segslam.core.interrupts import same_command_with, when_stopped
 
 SEQUENCE = "00"
 SEED = 33
@@ -33,12 +33,12 @@ def demo(
     Example: segslam demo --out runs/demo
     """
     announce(f"demo: simulating a drive in {out}", quiet=quiet)
-    from segslam import simulation
-    from segslam.config import Config
-    from segslam.datasets import open_dataset
-    from segslam.run.folder import new_folder
-    from segslam.run.report import BEFORE_AFTER, write_before_after
-    from segslam.simulation.files import SETTINGS_FILE
+    from segslam.bench import simulation
+    from segslam.bench.simulation.files import SETTINGS_FILE
+    from segslam.core.config import Config
+    from segslam.output.folder import new_folder
+    from segslam.output.report import BEFORE_AFTER, write_before_after
+    from segslam.scans import open_dataset
 
     make_room(out, overwrite=overwrite, made_by=(f"data/sequences/{SEQUENCE}/{SETTINGS_FILE}",))
     data = new_folder(out) / "data"

@@ -40,7 +40,7 @@ def examine() -> dict[str, Any]:
     """All findings; `problems` has a line with the remedy for each missing item."""
     from importlib.metadata import version
 
-    from segslam.system import extras, kernels
+    from segslam.core import extras, kernels
 
     packages: dict[str, dict[str, str | None]] = defaultdict(dict)
     for package, _, _, extra in extras.requirements():

@@ -3,20 +3,20 @@
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from segslam.errors import BadScan, SegslamError
+from segslam.core.errors import BadScan, SegslamError
 
 if TYPE_CHECKING:
-    from segslam.config import Config
-    from segslam.datasets import Dataset
-    from segslam.types import Scan
+    from segslam.core.config import Config
+    from segslam.core.types import Scan
+    from segslam.scans import Dataset
 
 
 def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
     """Figures of the data set and of its first readable scan. Raises SegslamError if no scan is readable."""
     import numpy as np
 
-    from segslam import geometry
-    from segslam.config import Config, changed_settings
+    from segslam.core import geometry
+    from segslam.core.config import Config, changed_settings
 
     (first_row, first), (last_row, last) = _first_usable(scans), _first_usable(scans, backwards=True)
     seconds = (last.stamp_ns - first.stamp_ns) / 1e9

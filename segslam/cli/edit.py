@@ -20,11 +20,11 @@ from segslam.cli.console import (
 )
 from segslam.cli.overwriting import OverwriteOption
 from segslam.cli.replay import replay_log
-from segslam.errors import SegslamError
-from segslam.loop_edits import LoopEdits, Pair, pairs_of
+from segslam.core.errors import SegslamError
+from segslam.slam.loop_edits import LoopEdits, Pair, pairs_of
 
 if TYPE_CHECKING:
-    from segslam.slam_result import SlamResult
+    from segslam.slam.slam_result import SlamResult
 
 
 def edit(
@@ -101,8 +101,8 @@ def _check_keyframes(run: Path, edits: LoopEdits, *, quiet: bool) -> None:
 
     A pair that is forbidden but was never tried is reported: it may be a mistyped id.
     """
-    from segslam.log import read_log
-    from segslam.run.folder import log_of
+    from segslam.output.folder import log_of
+    from segslam.output.log import read_log
 
     recorded = read_log(log_of(run))
     if recorded.options.get("in_map"):
@@ -124,7 +124,7 @@ def _check_keyframes(run: Path, edits: LoopEdits, *, quiet: bool) -> None:
 
 def _outcomes(result: "SlamResult") -> dict[Pair, str]:
     """The outcome of each pair that was tried."""
-    from segslam.slam_result import outcome_text
+    from segslam.slam.slam_result import outcome_text
 
     return {
         (attempt.candidate.source_id, attempt.candidate.target_id): outcome_text(

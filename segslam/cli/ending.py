@@ -11,9 +11,9 @@ from segslam.cli.console import print_json, progress, say
 from segslam.cli.export import map_summary, write_maps
 
 if TYPE_CHECKING:
+    from segslam.core.types import Trajectory
     from segslam.run.run import Run
-    from segslam.slam_result import SlamResult
-    from segslam.types import Trajectory
+    from segslam.slam.slam_result import SlamResult
 
 
 def finish(
@@ -34,13 +34,13 @@ def finish(
     `stopped`: Ctrl-C ended the run, before the last scan if there is one. `place` georeferences the run before its maps
     are written, and returns what it found.
     """
-    from segslam.calibration import vertical_angle_advice
-    from segslam.log import read_log
-    from segslam.run.accuracy import accuracy
-    from segslam.run.finished import read_metrics
-    from segslam.run.folder import LOG, room_for, write_metrics
-    from segslam.run.report import write_report
-    from segslam.system.memory import peak_mb
+    from segslam.core.memory import peak_mb
+    from segslam.odometry.calibration import vertical_angle_advice
+    from segslam.output.accuracy import accuracy
+    from segslam.output.finished import read_metrics
+    from segslam.output.folder import LOG, room_for, write_metrics
+    from segslam.output.log import read_log
+    from segslam.output.report import write_report
 
     read = "Ctrl-C: stopped" if stopped else "all scans read"
     say(f"{read}; final optimisation ...", quiet=quiet)

@@ -13,10 +13,10 @@ from segslam.cli.overwriting import OverwriteOption, check_free
 from segslam.cli.tables import CsvOption, LatexOption, as_text, figure, write_tables
 
 if TYPE_CHECKING:
-    from segslam.evaluation import Up
-    from segslam.scores import Align
-    from segslam.trajectory import PoseFile, Poses
-    from segslam.types import IndexPairs
+    from segslam.core.evaluation import Up
+    from segslam.core.trajectory import PoseFile, Poses
+    from segslam.core.types import IndexPairs
+    from segslam.output.scores import Align
 
 
 def evaluate(
@@ -68,7 +68,7 @@ def evaluate(
     check_free([file for file in (plot, csv, latex) if file], overwrite=overwrite)
     if run is not None or estimate is not None:
         announce(f"eval: reading {run or estimate}", quiet=quiet)
-    from segslam.types import SegslamError
+    from segslam.core.types import SegslamError
 
     how = _How(align, rpe_distance)
     if run is not None and estimate is None:
@@ -102,8 +102,8 @@ def evaluate(
 
 def table(figures: dict[str, Any]) -> str:
     """The figures with their meaning, one per line."""
-    from segslam.run.finished import FIGURES
-    from segslam.scores import MEANINGS
+    from segslam.output.finished import FIGURES
+    from segslam.output.scores import MEANINGS
 
     meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
     return "\n".join(f"{figure(figures[key]):>10}  {meaning}" for key, meaning in meanings.items() if key in figures)
@@ -119,12 +119,12 @@ class _How(NamedTuple):
 def _score_run(
     folder: Path, reference_file: Path | None, plot: Path | None, how: _How, *, quiet: bool
 ) -> dict[str, Any]:
-    from segslam.run.accuracy import accuracy
-    from segslam.run.finished import ACCURACY, plain_name, read_run, true_poses
-    from segslam.run.folder import folder_of, write_metrics
-    from segslam.scores import scores
-    from segslam.trajectory import rows_of_same_scan
-    from segslam.types import SegslamError
+    from segslam.core.trajectory import rows_of_same_scan
+    from segslam.core.types import SegslamError
+    from segslam.output.accuracy import accuracy
+    from segslam.output.finished import ACCURACY, plain_name, read_run, true_poses
+    from segslam.output.folder import folder_of, write_metrics
+    from segslam.output.scores import scores
 
     folder = folder_of(folder)
     check_links(folder)
@@ -154,7 +154,7 @@ def _score_run(
 
 
 def _draw(file: Path, estimate: "Poses", reference: "Poses", up: "Up") -> None:
-    from segslam.run.report.comparison import check_picture, draw_scored
+    from segslam.output.report.comparison import check_picture, draw_scored
 
     check_picture(file)
     draw_scored(file, estimate, reference, up=up)
@@ -171,10 +171,10 @@ def _score_files(
     *,
     quiet: bool,
 ) -> dict[str, Any]:
-    from segslam.evaluation import UP
-    from segslam.scores import scores
-    from segslam.trajectory import read_poses
-    from segslam.types import SegslamError
+    from segslam.core.evaluation import UP
+    from segslam.core.trajectory import read_poses
+    from segslam.core.types import SegslamError
+    from segslam.output.scores import scores
 
     estimate, reference = (read_poses(file, format=format) for file in (estimate_file, reference_file))
     if (estimate.stamp_ns is None) != (reference.stamp_ns is None):
@@ -206,7 +206,7 @@ def _score_files(
 
 def _up(reference: "Poses", *, camera: bool) -> tuple["Up", str]:
     """The upward axis of the files, and how it is known."""
-    from segslam.evaluation import upward_axis
+    from segslam.core.evaluation import upward_axis
 
     found = upward_axis(reference)
     if found is not None:
@@ -218,7 +218,7 @@ def _matching_rows(estimate: "PoseFile", reference: "PoseFile", max_difference_n
     """Matching rows: by row in KITTI format, where rows are scans; by stamp in TUM format."""
     import numpy as np
 
-    from segslam.trajectory import rows_of_same_stamp
+    from segslam.core.trajectory import rows_of_same_stamp
 
     if estimate.stamp_ns is None or reference.stamp_ns is None:
         common = np.arange(min(len(estimate), len(reference)))

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 MEAN = "mean"
 

@@ -11,8 +11,8 @@ from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption
 from segslam.cli.overwriting import OverwriteOption, check_free
 
 if TYPE_CHECKING:
-    from segslam.config import MapConfig
-    from segslam.log import RunLog
+    from segslam.core.config import MapConfig
+    from segslam.output.log import RunLog
 
 WITH_MAP = ("map.ply", "map.png")
 """Files that `--map` writes into the run folder."""
@@ -41,9 +41,9 @@ def export(
     """
     check_free(files, overwrite=overwrite)
     announce(f"export: reading {run}", quiet=quiet)
-    from segslam.config import load_config
-    from segslam.log import read_log
-    from segslam.run.folder import log_of
+    from segslam.core.config import load_config
+    from segslam.output.folder import log_of
+    from segslam.output.log import read_log
 
     log = read_log(log_of(run))
     figures = write_maps(log, files, config=load_config(config, settings or (), base=log.config).map, quiet=quiet)
@@ -54,8 +54,8 @@ def export(
 
 
 def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", quiet: bool) -> dict[str, Any]:
-    """As `segslam.run.export.write_maps`, with progress bars."""
-    from segslam.run.export import write_maps as write
+    """As `segslam.output.export.write_maps`, with progress bars."""
+    from segslam.output.export import write_maps as write
 
     return write(log, files, config=config, show=partial(_shown, quiet=quiet))
 

@@ -9,8 +9,8 @@ import typer
 
 from segslam.cli.checks import check_exists
 from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, print_out, progress, say
-from segslam.errors import SegslamError
-from segslam.system.interrupts import when_stopped
+from segslam.core.errors import SegslamError
+from segslam.core.interrupts import when_stopped
 
 
 def fleet(
@@ -47,10 +47,10 @@ def fleet(
     for path in drives:
         check_exists(path, "give a list of drives in YAML, or recordings")
     announce("fleet: reading the list", quiet=quiet)
-    from segslam.config import load_config
-    from segslam.fleets import drives_of, read_drives
-    from segslam.fleets import fleet as run_fleet
-    from segslam.fleets.orchestrate import FILE
+    from segslam.core.config import load_config
+    from segslam.run.fleets import drives_of, read_drives
+    from segslam.run.fleets import fleet as run_fleet
+    from segslam.run.fleets.orchestrate import FILE
 
     load_config(config, settings or [])  # reports a wrong setting before anything is mapped
     if len(drives) == 1 and drives[0].suffix.lower() in (".yaml", ".yml"):

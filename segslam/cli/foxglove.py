@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from segslam.cli.console import say
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
-    from segslam.run.foxglove_server import FoxgloveServer
+    from segslam.output.foxglove_server import FoxgloveServer
 
 FoxgloveOption = Annotated[
     str | None,
@@ -29,9 +29,9 @@ def serve_foxglove(address: str | None, stack: ExitStack, *, quiet: bool) -> "Fo
     if address is None:
         return None
     try:
-        from segslam.run.foxglove_server import FoxgloveServer
+        from segslam.output.foxglove_server import FoxgloveServer
     except ImportError as error:
-        from segslam.system.extras import how_to_install
+        from segslam.core.extras import how_to_install
 
         raise SegslamError(f"--foxglove needs a package: {how_to_install('foxglove')}") from error
     server = stack.enter_context(FoxgloveServer(address))

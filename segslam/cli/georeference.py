@@ -8,7 +8,7 @@ import typer
 from segslam.cli.checks import check_exists
 from segslam.cli.console import JsonOption, QuietOption, announce, print_out, say
 from segslam.cli.gnss_options import GnssOffsetOption, GnssOption, GnssOptions, GnssUseOption
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 
 def georeference(
@@ -28,9 +28,9 @@ def georeference(
     """
     check_exists(run, "give the folder of a finished run")
     announce(f"georeference: reading {gnss}", quiet=quiet)
-    from segslam.run.folder import folder_of
-    from segslam.run.georeferenced import FILE
-    from segslam.run.report import write_report
+    from segslam.output.folder import folder_of
+    from segslam.output.georeferenced import FILE
+    from segslam.output.report import write_report
 
     folder = folder_of(run)
     place = GnssOptions(gnss, gnss_use, gnss_offset).placing(_recording_of(folder))
@@ -46,8 +46,8 @@ def georeference(
 
 def _recording_of(folder: Path) -> Path | None:
     """The data that a run was made from, which may have a topic with fixes."""
-    from segslam.log import read_log
-    from segslam.run.folder import log_of
+    from segslam.output.folder import log_of
+    from segslam.output.log import read_log
 
     data = read_log(log_of(folder)).options.get("data")
     return Path(data) if data else None

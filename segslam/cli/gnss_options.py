@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 USES = ("fuse", "align")
 GnssOption = Annotated[
@@ -41,7 +41,7 @@ class GnssOptions:
             return None
         self._check_use()
         from segslam.gnss.reading import read_fixes
-        from segslam.run.georeferenced import georeference, summary
+        from segslam.output.georeferenced import georeference, summary
 
         fixes = read_fixes(self.gnss, recording=recording)
         return lambda folder: summary(georeference(folder, fixes, use=self.gnss_use, offset_s=self.gnss_offset))
@@ -54,8 +54,8 @@ class GnssOptions:
         if self.gnss is None:
             return None
         self._check_use()
-        from segslam.live.ros import FixTopic
-        from segslam.run.georeferenced import georeference_if_possible
+        from segslam.output.georeferenced import georeference_if_possible
+        from segslam.run.live.ros import FixTopic
 
         name, topic = self.gnss, stack.enter_context(FixTopic(self.gnss))
         return lambda folder: georeference_if_possible(

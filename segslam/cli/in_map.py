@@ -15,7 +15,7 @@ def pipeline(in_map: Path | None) -> "SlamOf | None":
     from functools import partial
 
     from segslam.run.locator import Locator
-    from segslam.sessions.localiser import Localiser
+    from segslam.run.sessions.localiser import Localiser
 
     return partial(Localiser, Locator.from_run(in_map))
 
@@ -24,6 +24,6 @@ def placing_in(in_map: Path | None) -> Callable[[Path], str] | None:
     """Function that gives the place of a georeferenced map to a run localised in it; None without a map."""
     if in_map is None:
         return None
-    from segslam.run.georeferenced import GEODETIC, take_over
+    from segslam.output.georeferenced import GEODETIC, take_over
 
     return lambda folder: f"place on the globe: that of the map, see {GEODETIC}" if take_over(folder, in_map) else ""

@@ -10,7 +10,7 @@ from segslam.cli.console import JsonOption, QuietOption, announce, print_json, p
 from segslam.cli.tables import figure
 
 if TYPE_CHECKING:
-    from segslam.log import RunLog
+    from segslam.output.log import RunLog
 
 METRICS = "metrics.json"
 SHOWN = (
@@ -31,8 +31,8 @@ def info(
     """
     check_exists(run, "give a run folder, or its log.mcap")
     announce(f"info: reading {run}", quiet=quiet)
-    from segslam.log import read_log
-    from segslam.run.folder import log_of
+    from segslam.output.folder import log_of
+    from segslam.output.log import read_log
 
     found = found_in(read_log(log_of(run)))
     if json:
@@ -43,9 +43,9 @@ def info(
 
 def found_in(log: "RunLog") -> dict[str, Any]:
     """Data, state, figures, options, changed settings and files (bytes) of a run."""
-    from segslam.config import Config, changed_settings
-    from segslam.log import is_being_written
-    from segslam.run.finished import read_metrics
+    from segslam.core.config import Config, changed_settings
+    from segslam.output.finished import read_metrics
+    from segslam.output.log import is_being_written
 
     folder = log.path.parent
     state = "in progress" if is_being_written(log.path) else "finished" if log.result() else "interrupted"
@@ -65,7 +65,7 @@ def found_in(log: "RunLog") -> dict[str, Any]:
 
 def lines(found: dict[str, Any]) -> str:
     """The content as text, for 80 columns."""
-    from segslam.run.finished import FIGURES
+    from segslam.output.finished import FIGURES
 
     then = f"; continue with: segslam resume {found['run']}" if found["state"] == "interrupted" else ""
     text = [f"{found['run']}: {found['data']}, {found['state']}, {found['num_steps']} scans in the log{then}"]

@@ -24,10 +24,9 @@ from segslam.cli.console import (
 from segslam.cli.overwriting import OverwriteOption
 
 if TYPE_CHECKING:
-    from segslam.config import Config
-    from segslam.datasets import Dataset
-    from segslam.semantics.encodings import Encoding
-    from segslam.types import Labels, Scan
+    from segslam.core.types import Labels, Scan
+    from segslam.labels.encodings import Encoding
+    from segslam.scans import Dataset
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,10 +69,10 @@ def label(
     Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
     """
     announce(f"label: opening {data}", quiet=quiet)
-    from segslam.config import load_config
-    from segslam.datasets import open_dataset
-    from segslam.run.folder import new_folder
-    from segslam.types import SegslamError
+    from segslam.core.config import load_config
+    from segslam.core.types import SegslamError
+    from segslam.output.folder import new_folder
+    from segslam.scans import open_dataset
 
     settings_now = load_config(config, settings or ())
 
@@ -93,7 +92,7 @@ def label(
     true_scans = _open_truth(truth, truth_encoding, opened) if truth else None
     folder = out if overwrite and out.is_dir() else new_folder(out)
     tally = Tally(scans, folder, write_as=write_as, num_pictures=pictures)
-    found = _labelled(scans, true_scans, settings_now)
+    found = _labelled(scans, true_scans)
     for one in progress(found, total=len(scans), title="label", quiet=quiet):
         if one is not None:
             tally.add(one)
@@ -108,7 +107,7 @@ def label(
 
 def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Dataset":
     """The same scans with their true labels. A relative folder is searched here, then beside the scans."""
-    from segslam.types import SegslamError
+    from segslam.core.types import SegslamError
 
     try:
         scans: Dataset = opened(str(truth.expanduser().absolute() if truth.is_dir() else truth), numbering)
@@ -119,14 +118,14 @@ def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Data
     return scans
 
 
-def _labelled(scans: "Dataset", true_scans: "Dataset | None", config: "Config") -> Iterator[Labelled | None]:
+def _labelled(scans: "Dataset", true_scans: "Dataset | None") -> Iterator[Labelled | None]:
     """Each scan with its labels; None, with a warning, for an unusable scan."""
     import logging
     from time import perf_counter
 
-    from segslam.registration import shape_labels
-    from segslam.semantics.late import computed
-    from segslam.types import BadScan
+    from segslam.core.types import BadScan
+    from segslam.labels import geometric_labels
+    from segslam.labels.late import computed
 
     for row in range(len(scans)):
         try:
@@ -139,7 +138,7 @@ def _labelled(scans: "Dataset", true_scans: "Dataset | None", config: "Config") 
         started = perf_counter()
         labels = computed(scan.labels)
         if scans.labels.geometric and not labels.any():
-            labels = shape_labels(scan.points, config=config)
+            labels = geometric_labels(scan.points)
         yield Labelled(row, scan, labels, truth, perf_counter() - started)
 
 
@@ -149,8 +148,8 @@ class Tally:
     def __init__(self, scans: "Dataset", folder: Path, *, write_as: "Encoding", num_pictures: int) -> None:
         import numpy as np
 
-        from segslam.semantics.scores import NUM_CLASSES
-        from segslam.types import Label
+        from segslam.core.types import Label
+        from segslam.labels.scores import NUM_CLASSES
 
         self._scans = scans
         self._folder = folder
@@ -164,9 +163,9 @@ class Tally:
         """Write the labels, and the picture if the scan was selected for drawing."""
         import numpy as np
 
-        from segslam.semantics.label_files import write_labels
-        from segslam.semantics.scores import confusion
-        from segslam.system.whole_files import write_whole
+        from segslam.core.whole_files import write_whole
+        from segslam.labels.label_files import write_labels
+        from segslam.labels.scores import confusion
 
         self.seconds.append(one.seconds)
         self._num_points += np.bincount(one.labels, minlength=len(self._num_points))
@@ -183,8 +182,8 @@ class Tally:
 
         import numpy as np
 
-        from segslam.semantics.scores import class_scores, group_scores, largest_confusions
-        from segslam.types import Label
+        from segslam.core.types import Label
+        from segslam.labels.scores import class_scores, group_scores, largest_confusions
 
         shares = self._num_points / self._num_points.sum()
         most_first = np.argsort(-shares, kind="stable")
@@ -212,7 +211,7 @@ class Tally:
         }
 
     def _picture(self, one: Labelled) -> bytes:
-        from segslam.run.report.labels import draw_labels, fitting_image
+        from segslam.output.report.labels import draw_labels, fitting_image
 
         network = self._scans.labels.network
         image = network.settings if network else fitting_image(one.scan.points)
@@ -223,7 +222,7 @@ class Tally:
 def _write_confusion(file: Path, counts: Any) -> None:
     import csv
 
-    from segslam.types import Label
+    from segslam.core.types import Label
 
     names = [label.name.lower() for label in list(Label)[: len(counts)]]
     with file.open("w", newline="", encoding="utf-8") as stream:

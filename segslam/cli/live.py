@@ -23,20 +23,20 @@ from segslam.cli.preset import live_config
 from segslam.cli.run_options import OutputOptions, PresetOption
 from segslam.cli.shared_options import with_options
 from segslam.cli.view import check_display, close_scene, open_scene
-from segslam.errors import SegslamError, WorkFailed
-from segslam.system.extras import how_to_install
-from segslam.system.interrupts import stopped_by_signals, when_stopped
+from segslam.core.errors import SegslamError, WorkFailed
+from segslam.core.extras import how_to_install
+from segslam.core.interrupts import stopped_by_signals, when_stopped
 
 if TYPE_CHECKING:
-    from segslam.config import Config
-    from segslam.live import Front, LiveMap, Source
-    from segslam.live.live_map import Show
-    from segslam.live.ros import MappingPublisher
-    from segslam.registration import Labeller
-    from segslam.run.foxglove_server import FoxgloveServer
+    from segslam.core.config import Config
+    from segslam.core.types import BadScan, Step
+    from segslam.output.foxglove_server import FoxgloveServer
+    from segslam.output.viewer import Scene
+    from segslam.registration.prepared import Labeller
+    from segslam.run.live import Front, LiveMap, Source
+    from segslam.run.live.live_map import Show
+    from segslam.run.live.ros import MappingPublisher
     from segslam.run.run import Run
-    from segslam.run.viewer import Scene
-    from segslam.types import BadScan, Step
 
 MOST_BEHIND = 20
 """Chosen: largest number of keyframes that wait for loop closing, 2 MB each. Further keyframes are stored, but their
@@ -81,7 +81,7 @@ def live(
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
     announce("live: starting", quiet=quiet)
     settings = options.load_config(base=live_config(preset, folder, topic, quiet=quiet))
-    from segslam.run.folder import new_folder
+    from segslam.output.folder import new_folder
 
     map_names, map_files = options.maps(out)
     check_free([file for file in map_files if out not in file.parents], overwrite=options.overwrite)
@@ -139,9 +139,9 @@ def map_live(
 
     Raises SegslamError if the source cannot be opened or no scan arrived; the folder is then removed.
     """
-    from segslam.live import Front, LiveMap
+    from segslam.run.live import Front, LiveMap
     from segslam.run.run import Run
-    from segslam.slam import Slam
+    from segslam.slam.slam import Slam
 
     go_on = f"make the results from the log: segslam replay {shlex.quote(str(folder))} --out NEW"
     when_stopped(f"the log in {folder} is kept; {go_on}")
@@ -210,7 +210,7 @@ def _watch(
     run: "Run", scene: "Scene | None", live_map: "LiveMap", publisher: "MappingPublisher | None"
 ) -> "Callable[[Step | BadScan], None]":
     """A function that passes each step to all displays."""
-    from segslam.types import Step
+    from segslam.core.types import Step
 
     def watch(step: "Step | BadScan") -> None:
         if scene:
@@ -260,11 +260,11 @@ def _check_ros(option: str) -> None:
 
 def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertical_angle_deg: float) -> "Source":
     if folder is not None:
-        from segslam.live import FolderSource
+        from segslam.run.live import FolderSource
 
         return FolderSource(folder, intensities=intensities, vertical_angle_deg=vertical_angle_deg)
     try:
-        from segslam.live.ros import TopicSource
+        from segslam.run.live.ros import TopicSource
     except ImportError as error:
         raise SegslamError(
             f"--topic: ROS 2 cannot be loaded ({error}); source its setup script again, or: {how_to_install('ros')}"
@@ -274,12 +274,12 @@ def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertic
 
 def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublisher | None":
     """The publisher of path and map if the source is a topic; it also saves the map on request."""
-    from segslam.live import FolderSource
-    from segslam.live.saved_map import save_map
+    from segslam.run.live import FolderSource
+    from segslam.run.live.saved_map import save_map
 
     if isinstance(source, FolderSource):
         return None
-    from segslam.live.ros import MappingPublisher
+    from segslam.run.live.ros import MappingPublisher
 
     def save() -> str:
         file = run.folder / MAP_SO_FAR
@@ -290,7 +290,7 @@ def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublis
 
 
 def _unlabelled() -> "Labeller":
-    from segslam.semantics.label_files import unlabelled
+    from segslam.labels.label_files import unlabelled
 
     def labeller(points: Any) -> Any:
         return unlabelled(len(points))

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from segslam.live import Ended, Placed
+    from segslam.run.live import Ended, Placed
 
 LINE_EVERY_S, BAR_EVERY_S = 10.0, 0.2
 LATE_S = 5.0

@@ -12,8 +12,8 @@ from segslam.cli.compiling import compile_kernels
 from segslam.cli.console import EncodingOption, QuietOption, announce, print_out, progress, say
 
 if TYPE_CHECKING:
+    from segslam.core.types import Labels, Points, Rejected
     from segslam.run.locator import Located, Locator
-    from segslam.types import Labels, Points, Rejected
 
 
 def locate(
@@ -37,9 +37,9 @@ def locate(
     for scan in scans:
         check_exists(scan, "give scan files")
     announce(f"locate: reading {run}", quiet=quiet)
-    from segslam.run.folder import folder_of
+    from segslam.core.types import SegslamError
+    from segslam.output.folder import folder_of
     from segslam.run.locator import Locator
-    from segslam.types import SegslamError
 
     if dataset not in (None, "kitti"):
         raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; omit the option for other data")
@@ -75,11 +75,11 @@ def _read(
     """Points of a scan and their labels; None for labels if they are to be computed from geometry."""
     import numpy as np
 
-    from segslam.datasets.clouds import read_cloud
-    from segslam.datasets.kitti import VERTICAL_ANGLE_DEG
-    from segslam.datasets.scans import make_scan
-    from segslam.semantics.label_files import encoding_of, read_labels
-    from segslam.semantics.late import computed
+    from segslam.labels.label_files import encoding_of, read_labels
+    from segslam.labels.late import computed
+    from segslam.scans.clouds import read_cloud
+    from segslam.scans.dataset import make_scan
+    from segslam.scans.kitti import VERTICAL_ANGLE_DEG
 
     angle_deg = locator.config.sensor.vertical_angle_deg
     if angle_deg is None:
@@ -96,7 +96,7 @@ def _read(
 
 
 def _figures(found: "Located | Rejected") -> dict[str, Any]:
-    from segslam.types import Rejected
+    from segslam.core.types import Rejected
 
     if isinstance(found, Rejected):
         return _not_found(found.reason.value, found.detail, found.probability, found.evidence)

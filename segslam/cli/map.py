@@ -22,17 +22,17 @@ from segslam.cli.preset import check_preset, preset_config
 from segslam.cli.run_options import DataArgument, DryRunOption, OutputOptions, RunOptions
 from segslam.cli.shared_options import with_options
 from segslam.cli.view import check_display, close_scene, open_scene
-from segslam.errors import SegslamError
-from segslam.system.interrupts import EXIT_STATUS, when_stopped
+from segslam.core.errors import SegslamError
+from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
 if TYPE_CHECKING:
-    from segslam.config import Config, MapConfig
-    from segslam.datasets import Dataset
-    from segslam.log import Mirror, RunLog
+    from segslam.core.config import Config, MapConfig
+    from segslam.core.types import BadScan, Step
     from segslam.odometry import Odometry
+    from segslam.output.log import Mirror, RunLog
     from segslam.run.map_folder import SlamOf
     from segslam.run.run import Run
-    from segslam.types import BadScan, Step
+    from segslam.scans import Dataset
 
 FREE_OPTIONS = ("data", "dataset", "sequence", "map_files", "gnss", "gnss_use", "gnss_offset")
 """Options in the log that may be others when the run is resumed, as long as the data is the same."""
@@ -144,7 +144,7 @@ def _show_dry_run(scans: "Dataset", settings: "Config", *, json: bool, quiet: bo
 
 def _complete(recorded: "RunLog", map_files: Sequence[Path], *, config: "MapConfig", json: bool, quiet: bool) -> None:
     """Write the missing maps of a finished run, and show its figures."""
-    from segslam.run.finished import read_metrics
+    from segslam.output.finished import read_metrics
 
     folder = recorded.path.parent
     say(f"{folder}: the run is already complete; there is nothing to resume", quiet=quiet)
@@ -184,10 +184,10 @@ def map_scans(
     typer.Exit(130) if Ctrl-C ended the run early; `go_on`, the command that continues it, is then printed.
     """
     from segslam.odometry import OdometryApart
-    from segslam.run.folder import new_folder
+    from segslam.output.folder import new_folder
     from segslam.run.map_folder import in_effect, labeller_of
     from segslam.run.run import Run
-    from segslam.slam import Slam
+    from segslam.slam.slam import Slam
 
     settings = in_effect(settings, scans)
     folder = out if recorded else new_folder(out)

@@ -25,7 +25,7 @@ from segslam.cli.ending import finish
 from segslam.cli.export import WITH_MAP
 from segslam.cli.overwriting import OverwriteOption, make_room
 from segslam.cli.run_options import WithMapOption
-from segslam.system.interrupts import EXIT_STATUS, when_stopped
+from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
 
 def merge(
@@ -55,16 +55,16 @@ def merge(
     """
     for folder in runs:
         check_exists(folder, "give the folders of finished runs")
-    from segslam.config import load_config
-    from segslam.run.folder import check_new, new_folder
+    from segslam.core.config import load_config
+    from segslam.output.folder import check_new, new_folder
 
     if not overwrite:
         check_new(out)
     settings = with_minutes(settings, refine_minutes)
     load_config(config, settings)  # reports a wrong setting before the logs are read
     announce(f"merge: reading {len(runs)} runs", quiet=quiet)
-    from segslam.sessions.merge import plan, run_of
-    from segslam.sessions.recorded import read_sessions
+    from segslam.run.sessions.merge import plan, run_of
+    from segslam.run.sessions.recorded import read_sessions
 
     sessions = read_sessions(runs)
     compile_kernels(quiet=quiet)

@@ -8,11 +8,11 @@ import typer
 
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, say
 from segslam.cli.overwriting import OverwriteOption, check_free
-from segslam.errors import SegslamError
-from segslam.system.whole_files import check_target, whole_file
+from segslam.core.errors import SegslamError
+from segslam.core.whole_files import check_target, whole_file
 
 if TYPE_CHECKING:
-    from segslam.pose_graph import Optimized
+    from segslam.graph import Optimized
 
 
 def optimize(
@@ -40,7 +40,7 @@ def optimize(
     check_target(out)
     check_free([out], overwrite=overwrite or force)
     announce(f"optimize: reading {graph}", quiet=quiet)
-    from segslam.pose_graph import Unsolvable, optimize_graph, read_g2o, write_g2o
+    from segslam.graph import Unsolvable, optimize_graph, read_g2o, write_g2o
 
     try:
         result = optimize_graph(read_g2o(graph), robust=robust)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="Replace the run or the files that exist under this name.")
@@ -31,7 +31,7 @@ def make_room(
     Raises SegslamError for a folder that is no run (it has none of the files `made_by`), for a run in progress, and if
     the new run is made from files in it.
     """
-    from segslam.log import is_being_written
+    from segslam.output.log import is_being_written
 
     if not overwrite or not folder.is_dir() or not any(folder.iterdir()):
         return

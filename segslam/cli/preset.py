@@ -4,19 +4,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from segslam.cli.console import say
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
-    from segslam.config import Config
-    from segslam.datasets import Dataset
-    from segslam.presets import Preset
+    from segslam.core.config import Config
+    from segslam.scans import Dataset
+    from segslam.scans.presets import Preset
 
 
 def check_preset(name: str, *, resumes: bool) -> None:
     """Raises SegslamError for an unknown preset, and for any preset if a run is resumed."""
     if name == "auto":
         return
-    from segslam.presets import SETTINGS
+    from segslam.scans.presets import SETTINGS
 
     if name not in SETTINGS:
         raise SegslamError(f"--preset {name}: unknown preset; known: auto, {', '.join(SETTINGS)}")
@@ -26,7 +26,7 @@ def check_preset(name: str, *, resumes: bool) -> None:
 
 def preset_config(name: str, scans: "Dataset", *, quiet: bool) -> "Config":
     """The settings of a preset; with `auto`, of the preset that fits the scans, with a message."""
-    from segslam.presets import extent_m, preset
+    from segslam.scans.presets import extent_m, preset
 
     return preset(cast("Preset", name)) if name != "auto" else _fitting(extent_m(scans), quiet=quiet)
 
@@ -34,11 +34,11 @@ def preset_config(name: str, scans: "Dataset", *, quiet: bool) -> "Config":
 def live_config(name: str, folder: Path | None, topic: str | None, *, quiet: bool) -> "Config":
     """As `preset_config`; `auto` looks at the scans already in the folder, or at the first cloud of the topic."""
     check_preset(name, resumes=False)
-    from segslam.presets import preset
+    from segslam.scans.presets import preset
 
     if name != "auto":
         return preset(cast("Preset", name))
-    from segslam.live.look import extent_in_folder, extent_of_topic
+    from segslam.run.live.look import extent_in_folder, extent_of_topic
 
     extent = extent_in_folder(folder) if folder is not None else extent_of_topic(topic or "")
     if extent is None:
@@ -47,7 +47,7 @@ def live_config(name: str, folder: Path | None, topic: str | None, *, quiet: boo
 
 
 def _fitting(extent_m: float | None, *, quiet: bool) -> "Config":
-    from segslam.presets import preset, preset_for
+    from segslam.scans.presets import preset, preset_for
 
     chosen = preset_for(extent_m)
     if chosen != "driving":

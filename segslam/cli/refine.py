@@ -24,12 +24,12 @@ from segslam.cli.ending import finish
 from segslam.cli.export import WITH_MAP
 from segslam.cli.overwriting import OverwriteOption, make_room
 from segslam.cli.run_options import WithMapOption
-from segslam.errors import SegslamError
-from segslam.system.interrupts import EXIT_STATUS, when_stopped
+from segslam.core.errors import SegslamError
+from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
 if TYPE_CHECKING:
-    from segslam.log import RunLog
-    from segslam.types import Step
+    from segslam.core.types import Step
+    from segslam.output.log import RunLog
 
 
 def refine(
@@ -47,17 +47,17 @@ def refine(
 
     Example: segslam refine runs/00 --out runs/00-refined --set adjustment.rounds=2
     """
-    from segslam.config import load_config
+    from segslam.core.config import load_config
 
     check_exists(run, "give a run folder, or its log.mcap")
     settings = with_minutes(settings, refine_minutes)
     load_config(config, settings)  # reports a wrong setting before the log is read
     announce(f"refine: reading {run}", quiet=quiet)
-    from segslam.log import read_log
-    from segslam.run.folder import copy_alone, log_of, new_folder
+    from segslam.output.folder import copy_alone, log_of, new_folder
+    from segslam.output.log import read_log
     from segslam.run.replay import check_settings
     from segslam.run.run import Run
-    from segslam.slam import Slam
+    from segslam.slam.slam import Slam
 
     recorded = read_log(log_of(run))
     settings_now = load_config(config, settings, base=recorded.config)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from segslam.bench.experiments.method_settings import METHOD_NAMES, check_method
 from segslam.cli.checks import check_exists
 from segslam.cli.compiling import compile_kernels
 from segslam.cli.completion import METHODS, labels_or_files, one_of
@@ -20,13 +21,12 @@ from segslam.cli.console import (
     print_out,
     say,
 )
-from segslam.experiments.method_settings import METHOD_NAMES, check_method
 
 if TYPE_CHECKING:
-    from segslam.config import Config
-    from segslam.experiments.estimate import Estimate
-    from segslam.registration import Stopwatch
-    from segslam.types import Labels, Points, Rejected, ScanLabels
+    from segslam.bench.experiments.estimate import Estimate
+    from segslam.core.config import Config
+    from segslam.core.stopwatch import Stopwatch
+    from segslam.core.types import Labels, Points, Rejected, ScanLabels
 
 LABEL_WORDS = ("geometric", "none")
 
@@ -78,15 +78,15 @@ def register(
 
     Example: segslam register 000000.bin 004413.bin --dataset kitti --labels 000000.label 004413.label
     """
-    from segslam.config import load_config
+    from segslam.core.config import load_config
 
     for scan in (source, target):
         check_exists(scan, "give two scan files")
     check_method(method)
     settings_now = load_config(config, settings or ())
     announce(f"register: reading {source} and {target}", quiet=quiet)
-    from segslam.experiments.methods import find_method, prepare_parts
-    from segslam.registration import Stopwatch
+    from segslam.bench.experiments.methods import find_method, prepare_parts
+    from segslam.core.stopwatch import Stopwatch
 
     if method == "segregator-c2f" and not refine:
         method = "segregator"
@@ -117,13 +117,13 @@ def _read(
     watch: "Stopwatch",
 ) -> list[tuple["Points", "Labels"]]:
     """Points and labels of the two scans."""
-    from segslam.datasets.clouds import read_cloud, read_intensities
-    from segslam.datasets.kitti import VERTICAL_ANGLE_DEG
-    from segslam.datasets.scans import make_scan
-    from segslam.registration import shape_labels
-    from segslam.semantics.label_files import encoding_of, open_labels, read_labels
-    from segslam.semantics.late import computed
-    from segslam.types import SegslamError
+    from segslam.core.types import SegslamError
+    from segslam.labels import geometric_labels
+    from segslam.labels.label_files import encoding_of, open_labels, read_labels
+    from segslam.labels.late import computed
+    from segslam.scans.clouds import read_cloud, read_intensities
+    from segslam.scans.dataset import make_scan
+    from segslam.scans.kitti import VERTICAL_ANGLE_DEG
 
     if dataset not in (None, "kitti"):
         raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; omit the option for other data")
@@ -156,14 +156,14 @@ def _read(
         return [
             (
                 scan.points,
-                shape_labels(scan.points, config=config) if words[0] == "geometric" else computed(scan.labels),
+                geometric_labels(scan.points) if words[0] == "geometric" else computed(scan.labels),
             )
             for scan in scans
         ]
 
 
 def _figures(found: "Estimate | Rejected", watch: "Stopwatch") -> dict[str, Any]:
-    from segslam.types import Rejected
+    from segslam.core.types import Rejected
 
     reason, detail, pose = None, None, None
     if isinstance(found, Rejected):
@@ -179,7 +179,7 @@ def _figures(found: "Estimate | Rejected", watch: "Stopwatch") -> dict[str, Any]
 def _show(figures: dict[str, Any], *, json: bool, quiet: bool) -> None:
     import numpy as np
 
-    from segslam.types import probability_text
+    from segslam.core.types import probability_text
 
     if json:
         print_json(figures)

@@ -24,14 +24,14 @@ from segslam.cli.ending import finish
 from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
 from segslam.cli.in_map import pipeline
 from segslam.cli.overwriting import OverwriteOption, make_room
-from segslam.loop_edits import LoopEdits
-from segslam.system.interrupts import EXIT_STATUS, when_stopped
+from segslam.core.interrupts import EXIT_STATUS, when_stopped
+from segslam.slam.loop_edits import LoopEdits
 
 if TYPE_CHECKING:
-    from segslam.log import RunLog
+    from segslam.core.types import Step, Trajectory
+    from segslam.output.log import RunLog
     from segslam.run.run import Run
-    from segslam.slam_result import SlamResult
-    from segslam.types import Step, Trajectory
+    from segslam.slam.slam_result import SlamResult
 
 NO_EDITS = LoopEdits()
 
@@ -82,14 +82,14 @@ def replay_log(
 
     `after` returns further figures, from the result. Raises typer.Exit(130) if Ctrl-C ended it early.
     """
-    from segslam.config import load_config
+    from segslam.core.config import load_config
 
     load_config(config, settings)  # reports a wrong setting before the log is read
-    from segslam.log import read_log
-    from segslam.run.folder import copy_alone, log_of, new_folder
+    from segslam.output.folder import copy_alone, log_of, new_folder
+    from segslam.output.log import read_log
     from segslam.run.replay import check_settings
     from segslam.run.run import Run
-    from segslam.slam import Slam
+    from segslam.slam.slam import Slam
 
     recorded = read_log(log_of(log))
     settings_now = load_config(config, settings, base=recorded.config)
@@ -146,7 +146,7 @@ def _repeat(run: "Run", recorded: "RunLog", *, quiet: bool) -> tuple[dict[str, A
 
 
 def _closures(step: "Step") -> set[tuple[int, int]]:
-    from segslam.types import LoopClosure
+    from segslam.core.types import LoopClosure
 
     outcomes = (attempt.outcome for attempt in step.attempts)
     return {(outcome.source_id, outcome.target_id) for outcome in outcomes if isinstance(outcome, LoopClosure)}
@@ -154,7 +154,7 @@ def _closures(step: "Step") -> set[tuple[int, int]]:
 
 def _recorded_accuracy(recorded: "RunLog", reference: "Trajectory | None") -> dict[str, Any]:
     """The error of the replayed run, if it finished and has ground truth."""
-    from segslam.run.accuracy import trajectory_accuracy
+    from segslam.output.accuracy import trajectory_accuracy
 
     result = recorded.result()
     if reference is None or result is None:

@@ -19,8 +19,8 @@ def report(
     Example: segslam report runs/00
     """
     announce(f"report: reading {run}", quiet=quiet)
-    from segslam.run.folder import folder_of
-    from segslam.run.report import write_report
+    from segslam.output.folder import folder_of
+    from segslam.output.report import write_report
 
     check_links(folder_of(run))
     page = write_report(folder_of(run))

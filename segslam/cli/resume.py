@@ -11,7 +11,7 @@ from segslam.cli.console import JsonOption, QuietOption, announce, say
 from segslam.cli.gnss_options import GnssOptions
 from segslam.cli.map import map_data
 from segslam.cli.run_options import OutputOptions, RunOptions, ViewOption
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 
 def resume(
@@ -63,7 +63,7 @@ def resume(
 
 def _encoding(name: str, log: Path) -> Any:
     """The numbering of the label files that a log names. Raises SegslamError for an unknown one."""
-    from segslam.semantics.encodings import ENCODINGS
+    from segslam.labels.encodings import ENCODINGS
 
     if name and name not in ENCODINGS:
         raise SegslamError(f"{log}: --encoding {name}: unknown; resume with: segslam map DATA --out RUN --resume")

@@ -23,11 +23,11 @@ from segslam.cli.console import (
 from segslam.cli.export import WITH_MAP
 from segslam.cli.foxglove import FoxgloveOption
 from segslam.cli.overwriting import OverwriteOption
-from segslam.system.whole_files import check_target
+from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
-    from segslam.config import Config
-    from segslam.datasets import DataSource
+    from segslam.core.config import Config
+    from segslam.scans import DataSource
 
 DataArgument = Annotated[Path, typer.Argument(help="Folder of scans, recording, or KITTI folder (with sequences/).")]
 TopicOption = Annotated[
@@ -77,14 +77,14 @@ class OutputOptions:
     quiet: QuietOption = False
 
     def load_config(self, *, base: "Config | None" = None) -> "Config":
-        """The settings. Raises SegslamError as `segslam.config.load_config`."""
-        from segslam.config import load_config
+        """The settings. Raises SegslamError as `segslam.core.config.load_config`."""
+        from segslam.core.config import load_config
 
         return load_config(self.config, with_minutes(self.settings, self.refine_minutes), base=base)
 
     def maps(self, folder: Path) -> tuple[list[Path], list[Path]]:
         """Map files as given, and as paths in the run folder. Raises SegslamError if one cannot be written."""
-        from segslam.map import check_names
+        from segslam.output.map import check_names
 
         names = [*map(Path, WITH_MAP if self.with_map else ()), *(self.map_file or ())]
         files = [folder / name for name in names]
@@ -111,6 +111,6 @@ class RunOptions:
 
     def source(self, data: Path) -> "DataSource":
         """What opens the scans."""
-        from segslam.datasets import DataSource
+        from segslam.scans import DataSource
 
         return DataSource(data, self.sequence, self.dataset, self.labels, self.encoding, self.frames, self.topic)

@@ -7,8 +7,8 @@ import typer
 
 from segslam.cli.completion import SENSORS, one_of, simulation_settings
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
-from segslam.errors import WorkFailed
-from segslam.system.interrupts import EXIT_STATUS, interrupts_wait, same_command_with, when_stopped
+from segslam.core.errors import WorkFailed
+from segslam.core.interrupts import EXIT_STATUS, interrupts_wait, same_command_with, when_stopped
 
 
 def simulate(
@@ -58,7 +58,7 @@ def simulate(
     Example: segslam simulate streets --sequence 06 --poses kitti/poses/06.txt --frames 300 --seed 1
     """
     announce(f"simulate: making a drive in {out}", quiet=quiet)
-    from segslam import simulation
+    from segslam.bench import simulation
 
     config = simulation.simulation_config(sensor, settings or ())
     drive = simulation.example_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
@@ -93,8 +93,8 @@ def simulate(
 
 def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]:
     """Numbers of the scans in the lists. Raises SegslamError for a scan that the drive does not have."""
-    from segslam.experiments.pairs import read_pairs, sample_pairs, scans_named
-    from segslam.types import SegslamError
+    from segslam.bench.experiments.pairs import read_pairs, sample_pairs, scans_named
+    from segslam.core.types import SegslamError
 
     lists = [read_pairs(file) for file in files]
     only = scans_named(lists if sample is None else [sample_pairs(one, num_pairs=sample, seed=0) for one in lists])

@@ -12,8 +12,8 @@ from segslam.cli.checks import check_exists
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, progress, say
 from segslam.cli.overwriting import OverwriteOption, check_free
 from segslam.cli.tables import CsvOption, LatexOption, as_text, write_tables
-from segslam.errors import SegslamError, WorkFailed
-from segslam.system.interrupts import when_stopped
+from segslam.core.errors import SegslamError, WorkFailed
+from segslam.core.interrupts import when_stopped
 
 
 def sweep(
@@ -46,10 +46,10 @@ def sweep(
     grid = grid_of(settings)
     check_free([file for file in (csv, latex) if file], overwrite=overwrite)
     announce(f"sweep: reading {run}", quiet=quiet)
-    from segslam.config import load_config
-    from segslam.fleets.workers import workers as started
-    from segslam.log import read_log
-    from segslam.run.folder import log_of
+    from segslam.core.config import load_config
+    from segslam.output.folder import log_of
+    from segslam.output.log import read_log
+    from segslam.run.fleets.workers import workers as started
     from segslam.run.replay import check_settings
 
     recorded = read_log(log_of(run))
@@ -90,7 +90,7 @@ def replay_one(log: str, folder: str, settings: list[str]) -> dict[str, Any]:
     """The figures of one replay, which is not done again if its folder has them; runs in a worker process."""
     import shutil
 
-    from segslam.run.finished import read_metrics
+    from segslam.output.finished import read_metrics
     from segslam.run.replay import replay
 
     out = Path(folder)

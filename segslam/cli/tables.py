@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from segslam.system.whole_files import write_whole
+from segslam.core.whole_files import write_whole
 
 CsvOption = Annotated[Path | None, typer.Option("--csv", help="Write the table to this file, a row for each.")]
 LatexOption = Annotated[

@@ -10,11 +10,11 @@ import typer
 
 from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
 from segslam.cli.overwriting import OverwriteOption, check_free
-from segslam.errors import SegslamError, WorkFailed
-from segslam.system.extras import how_to_install
+from segslam.core.errors import SegslamError, WorkFailed
+from segslam.core.extras import how_to_install
 
 if TYPE_CHECKING:
-    from segslam.run.viewer import Scene
+    from segslam.output.viewer import Scene
 
 
 def view(
@@ -34,9 +34,9 @@ def view(
         check_display()
     check_free([save] if save else [], overwrite=overwrite)
     announce(f"view: reading {run}", quiet=quiet)
-    from segslam.log import read_log
-    from segslam.run.folder import log_of
-    from segslam.system.whole_files import whole_file
+    from segslam.core.whole_files import whole_file
+    from segslam.output.folder import log_of
+    from segslam.output.log import read_log
 
     log = read_log(log_of(run))
     with nullcontext() if save is None else whole_file(save) as part:
@@ -68,7 +68,7 @@ def open_scene(file: Path | None, *, view_every: int, named: Path | None = None)
     try:
         import rerun
 
-        from segslam.run.viewer import Scene
+        from segslam.output.viewer import Scene
     except ImportError as error:
         raise SegslamError(
             f"the viewer is an optional package: {how_to_install('viewer')} (or open log.mcap in Foxglove)"

@@ -4,7 +4,7 @@ from time import perf_counter
 
 from segslam.cli.compiling import compile_kernels
 from segslam.cli.console import JsonOption, QuietOption, print_json, say
-from segslam.system.interrupts import when_stopped
+from segslam.core.interrupts import when_stopped
 
 
 def warm_up(json: JsonOption = False, quiet: QuietOption = False) -> None:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from segslam import geometry
+from segslam.core import geometry
+from segslam.core.types import Mask, Points, SegslamError, Transform, Vector
 from segslam.gnss.chain import longest_chain
 from segslam.gnss.matching import Drive, Matched, Prepared
 from segslam.gnss.statistics import axis_sigma, correlated, horizontal_noise, horizontal_sigma, weight
-from segslam.types import Mask, Points, SegslamError, Transform, Vector
 
 NUM_GUESSES = 400
 """Chosen: pairs of fixes that propose a heading; half of the fixes may be wrong, and 100 good pairs are left."""

@@ -6,7 +6,7 @@ drive from a correct fix into the run, and out of it, contradicts them.
 
 import numpy as np
 
-from segslam.types import Mask, Points, Vector
+from segslam.core.types import Mask, Points, Vector
 
 DRIFT = 0.02
 """Chosen: share of the travel by which the drive may have drifted; odometry drifts by 1 or 2 %."""

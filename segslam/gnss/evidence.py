@@ -27,11 +27,11 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
-from segslam import geometry
+from segslam.core import geometry
+from segslam.core.trajectory import Poses
+from segslam.core.types import Information, Points, Transform, Vector
 from segslam.gnss.matching import Matched
-from segslam.pose_graph import Edge
-from segslam.trajectory import Poses
-from segslam.types import Information, Points, Transform, Vector
+from segslam.graph import Edge
 
 MOST_FIXES = 150
 """Chosen: fixes compared, spread over the drive; the result differs little from 100 on."""

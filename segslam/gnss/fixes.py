@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from segslam.core.types import Indices, Mask, Points, SegslamError
 from segslam.gnss.geodesy import Geodetic, Origin
-from segslam.types import Indices, Mask, Points, SegslamError
 
 MOST_NS = 2**63
 KEPT = ""

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from segslam.core.trajectory import Poses, travelled_m
+from segslam.core.types import Mask, Points, Vector
 from segslam.gnss.alignment import PRIOR, Placement, linearised, moved, refined
 from segslam.gnss.evidence import DriveCovariance, Estimate, Noise, estimated
 from segslam.gnss.matching import Drive, Matched, Prepared
 from segslam.gnss.robust_weights import KEPT_WEIGHT, robust_weights
 from segslam.gnss.statistics import Weights, axis_noise, axis_sigma, horizontal_noise, horizontal_sigma
-from segslam.pose_graph import Edge, PositionedGraph
-from segslam.trajectory import Poses, travelled_m
-from segslam.types import Mask, Points, Vector
+from segslam.graph import Edge, PositionedGraph
 
 NUM_WINDOWS = 6
 """Chosen: windows of fixes in a row that are held out, one at a time; a sixth of the fixes is longer than the errors of

@@ -6,6 +6,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from segslam.core.trajectory import Poses
+from segslam.core.types import Points, Transform, Vector
 from segslam.gnss.alignment import place
 from segslam.gnss.fixes import Fixes
 from segslam.gnss.fusion import RIGID_M, Constants, calibrate, fuse
@@ -13,9 +15,7 @@ from segslam.gnss.geodesy import Origin
 from segslam.gnss.matching import Drive, outside_reasons, prepare
 from segslam.gnss.robust_weights import KEPT_WEIGHT, robust_weights
 from segslam.gnss.statistics import Weights
-from segslam.pose_graph import Edge
-from segslam.trajectory import Poses
-from segslam.types import Points, Transform, Vector
+from segslam.graph import Edge
 
 CONTRADICTED = "contradicts_drive"
 """Reason for which a fix is not kept: the drive and other fixes contradict it."""

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
 
+from segslam.core.trajectory import Poses, travelled_m
+from segslam.core.types import Indices, Mask, Points, SegslamError, Vector
 from segslam.gnss.fixes import OUTSIDE, Fixes, origin_of
 from segslam.gnss.geodesy import Geodetic, Origin, enu_from_geodetic
-from segslam.trajectory import Poses, travelled_m
-from segslam.types import Indices, Mask, Points, SegslamError, Vector
 
 LONGEST_GAP_S = 2.0
 """Chosen: a fix between two scans farther apart than this, or so long before the first scan, has no pose."""

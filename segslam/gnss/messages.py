@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from segslam.errors import brief
+from segslam.core.errors import brief
+from segslam.core.extras import how_to_install
+from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row
-from segslam.system.extras import how_to_install
-from segslam.types import SegslamError
 
 MESSAGE = "sensor_msgs/msg/NavSatFix"
 UNKNOWN = 0

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
 
+from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row
 from segslam.gnss.text import bad_line, check_degrees, number_in
 from segslam.gnss.times import stamp_of
-from segslam.types import SegslamError
 
 NOTE = (
     "heights: altitude above the geoid and geoid separation, as the receiver gives them, added to ellipsoidal heights"

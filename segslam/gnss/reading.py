@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from segslam.core.types import SegslamError
 from segslam.gnss.csv_fixes import read_csv
 from segslam.gnss.fixes import Fixes, make_fixes
 from segslam.gnss.messages import read_messages
@@ -9,7 +10,6 @@ from segslam.gnss.nmea import is_nmea, read_nmea
 from segslam.gnss.oxts import read_oxts
 from segslam.gnss.rtklib import is_rtklib, read_rtklib
 from segslam.gnss.text import text_lines
-from segslam.types import SegslamError
 
 RECORDINGS = (".bag", ".mcap", ".db3")
 

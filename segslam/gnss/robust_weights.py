@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from segslam.core.types import Points, Vector
 from segslam.gnss.statistics import Weights, weight
-from segslam.types import Points, Vector
 
 RUN_S = 15.0
 """Chosen: the weight of a fix is at most that of the median residual within this time before and after it."""

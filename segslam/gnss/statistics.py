@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from segslam.types import Vector
+from segslam.core.types import Vector
 
 Weights = Float[np.ndarray, "_ 2"]
 """Robust weights of fixes, horizontally and in height."""

@@ -3,8 +3,8 @@
 import math
 from pathlib import Path
 
-from segslam.errors import brief
-from segslam.types import SegslamError
+from segslam.core.errors import brief
+from segslam.core.types import SegslamError
 
 MOST_BYTES = 2**30
 """Chosen: no log of fixes is larger than a gigabyte."""

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from segslam.config import OdometryConfig
+from segslam.core.config import OdometryConfig
+from segslam.core.memory import keep_freed_memory, note_peak_of
+from segslam.core.types import Points, SegslamError, Transform
 from segslam.odometry.kiss import KissAligner, KissOdometry
-from segslam.system.memory import keep_freed_memory, note_peak_of
-from segslam.types import Points, SegslamError, Transform
 
 MOST_SHARED = 2**18
 """Points that the two processes exchange in shared memory, 6 MB; larger sweeps are sent through the pipe."""

@@ -13,15 +13,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Information, Motion, MotionState, Points, Scan, Transform
+from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan, displacement_m
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual
 from segslam.odometry.search import PoseSearch, Recover, as_likely
 from segslam.odometry.sweep import Odometry, OdometryResult
-from segslam.pose_graph.noise import odometry_information
-from segslam.types import Information, Motion, MotionState, Points, Scan, Transform
+from segslam.registration.refinement import MIN_POINTS, SHARED_NOISE_DEG, SHARED_NOISE_M
 
 RESOLUTION = math.sqrt(1.0 / 20.0)
 """Distance between points in KISS-ICP's map, in voxels: at most 20 points a voxel."""
@@ -46,12 +47,10 @@ class CheckedOdometry:
         self._inner = inner
         self._config = config
         self._refine = config.refine
-        self._shared = geometry.tangent(
-            rotation_rad=math.radians(config.refine.shared_noise_deg), translation_m=config.refine.shared_noise_m
-        )
+        self._shared = geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
         self._tolerance_m = ACCURACY * RESOLUTION * math.hypot(config.odometry.voxel_size_m, config.refine.voxel_m)
         self._map = LocalMap(config.refine)
-        self._search = PoseSearch(recover, voxel_m=config.refine.voxel_m, dense_voxels=config.keyframes.dense_voxels)
+        self._search = PoseSearch(recover, voxel_m=config.refine.voxel_m)
         self._lost: tuple[LocalMap, int] | None = None
         """The map before a break, in which the next scans are tried, and the number of scans since then."""
         self._intervals = Intervals()
@@ -89,7 +88,7 @@ class CheckedOdometry:
         """As `Odometry.follow`; the scans have all their cropped points. What is usual on the drive is learnt again."""
         seen = [(T_odom_scan, SeenScan(points, self._refine)) for T_odom_scan, points in scans]
         for T_odom_scan, scan in seen:
-            if len(scan.thinned) >= self._refine.min_points:
+            if len(scan.thinned) >= MIN_POINTS:
                 self._map.add(T_odom_scan, scan)
         self._motion.restart(T_before_lidar)
         self._T_odom_last = T_odom_lidar
@@ -104,7 +103,7 @@ class CheckedOdometry:
             self._motion.T_step = geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_proposed, 1.0 / gap)
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
-        if len(scan.thinned) < self._refine.min_points:
+        if len(scan.thinned) < MIN_POINTS:
             return T_odom_proposed, Motion(MotionState.UNCHECKED)  # too sparse for a check
         if len(self._map) == 0:
             self._map.add(T_odom_proposed, scan)

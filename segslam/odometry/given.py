@@ -5,10 +5,13 @@ from typing import Literal
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import OdometryConfig
+from segslam.core import geometry
+from segslam.core.config import OdometryConfig
+from segslam.core.types import BadScan, Points, Scan, Trajectory, Transform
 from segslam.odometry.sweep import OdometryResult, deskew_scan
-from segslam.types import BadScan, Points, Scan, Trajectory, Transform
+
+STAMP_TOLERANCE_S = 0.01
+"""Chosen: largest time difference between a scan and its pose in a given trajectory (s)."""
 
 
 class GivenOdometry:
@@ -19,7 +22,7 @@ class GivenOdometry:
     def __init__(
         self, trajectory: Trajectory, config: OdometryConfig, *, match: Literal["scan_index", "stamp"] = "scan_index"
     ) -> None:
-        """`match`: find the row of a scan by its number, or by the nearest stamp within `config.stamp_tolerance_s`."""
+        """`match`: find the row of a scan by its number, or by the nearest stamp within `STAMP_TOLERANCE_S`."""
         self._config = config
         self._trajectory = trajectory
         self._rows = {int(scan_index): row for row, scan_index in enumerate(trajectory.scan_index)}
@@ -65,9 +68,9 @@ class GivenOdometry:
     def _row_of_stamp(self, scan: Scan) -> int:
         apart_ns = np.abs(self._trajectory.stamp_ns - scan.stamp_ns)
         row = int(np.argmin(apart_ns)) if len(apart_ns) else -1
-        if row < 0 or apart_ns[row] > self._config.stamp_tolerance_s * 1e9:
+        if row < 0 or apart_ns[row] > STAMP_TOLERANCE_S * 1e9:
             raise BadScan(
-                f"scan {scan.index}: the given odometry has no pose within {self._config.stamp_tolerance_s} s of its "
+                f"scan {scan.index}: the given odometry has no pose within {STAMP_TOLERANCE_S} s of its "
                 f"stamp {scan.stamp_ns} ns (it has {_span(self._trajectory.stamp_ns)}); "
                 "omit the scan, correct the stamps or raise odometry.stamp_tolerance_s"
             )

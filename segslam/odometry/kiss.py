@@ -9,10 +9,10 @@ from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingC
 from kiss_icp.config.parser import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
-from segslam import geometry
-from segslam.config import OdometryConfig
+from segslam.core import geometry
+from segslam.core.config import OdometryConfig
+from segslam.core.types import BadScan, Points, Scan, Transform
 from segslam.odometry.sweep import OdometryResult, deskew_scan
-from segslam.types import BadScan, Points, Scan, Transform
 
 
 @runtime_checkable

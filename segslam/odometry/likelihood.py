@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from segslam import geometry
-from segslam.refinement import LightSurface, Surface
-from segslam.types import Information, Points, Transform, Vector
+from segslam.core import geometry
+from segslam.core.types import Information, Points, Transform, Vector
+from segslam.registration.refinement import LightSurface, Surface
 
 OUTLIER_SHARE = 0.1
 """Chosen: share of points without a counterpart in the map."""

@@ -6,11 +6,12 @@ from functools import cached_property
 
 import numpy as np
 
-from segslam import geometry, refinement
-from segslam.config import RefineConfig
+from segslam.core import geometry
+from segslam.core.config import RefineConfig
+from segslam.core.types import Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.nudge import CHECK_VOXELS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
-from segslam.types import Points, Registration, Transform
+from segslam.registration import refinement
 
 MAP_SCANS = 40
 """Chosen: number of scans in the map. With 10 the poses drift farther (NCLT 0.7 m, with 40 0.5 m, with 80 0.5 m)."""

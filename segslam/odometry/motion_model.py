@@ -11,8 +11,8 @@ from statistics import median
 
 import numpy as np
 
-from segslam import geometry
-from segslam.types import Information, Motion, Transform
+from segslam.core import geometry
+from segslam.core.types import Information, Motion, Transform
 
 WINDOW = 30
 """Chosen: number of scans from which the usual values of a drive are learnt."""

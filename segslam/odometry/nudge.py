@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from segslam import geometry
-from segslam.refinement import LightSurface, Surface
-from segslam.system.kernels import kernel
-from segslam.types import Points, Transform
+from segslam.core import geometry
+from segslam.core.kernels import kernel
+from segslam.core.types import Points, Transform
+from segslam.registration.refinement import LightSurface, Surface
 
 NUM_POINTS, NUM_SEARCH = 1500, 400
 """Chosen: number of points. With all points the correction of KITTI's scans at 2 m changes by less than 5 mm; fewer are

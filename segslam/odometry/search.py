@@ -5,11 +5,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from segslam import geometry
+from segslam.core import geometry
+from segslam.core.types import Alignment, Information, Points, Rejected, Transform
+from segslam.keyframes.submaps import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan, displacement_m
 from segslam.odometry.nudge import SEARCH_VOXELS
-from segslam.types import Alignment, Information, Points, Rejected, Transform
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
 """Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
@@ -24,12 +25,11 @@ NUM_REGISTERED = 3
 class PoseSearch:
     """Registers scans with a local map from several proposals."""
 
-    def __init__(self, recover: Recover, *, voxel_m: float, dense_voxels: int) -> None:
-        """`recover` receives the newest scans of a map, as many as have `dense_voxels` voxels."""
+    def __init__(self, recover: Recover, *, voxel_m: float) -> None:
+        """`recover` receives the newest scans of a map, as many as have `DENSE_VOXELS`."""
         self._recover = recover
         self._same_m = SEARCH_VOXELS_GICP[-1] * voxel_m
         self._far_m = SEARCH_VOXELS[0] * voxel_m
-        self._dense_voxels = dense_voxels
 
     def is_same(self, scan: SeenScan, T_map_a: Transform, T_map_b: Transform) -> bool:
         """True if a registration from one of two poses reaches the other."""
@@ -60,7 +60,7 @@ class PoseSearch:
 
     def without_guess(self, local: LocalMap, scan: SeenScan) -> list[Fit]:
         """Poses reached from the one that place recognition finds and verifies; none if it finds none."""
-        alignment = self._recover(scan.points, local.cloud(self._dense_voxels))
+        alignment = self._recover(scan.points, local.cloud(DENSE_VOXELS))
         if isinstance(alignment, Rejected):
             return []
         return self._different(scan, local.register(scan, alignment.fine.T_target_source))

@@ -6,17 +6,18 @@ from functools import partial
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.keyframes import KeyframeSelector
+from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.trajectory import Poses
+from segslam.core.types import BadScan, Indices, Motion, MotionState, Scan, Step, Transform
+from segslam.keyframes.keyframes import KeyframeSelector
 from segslam.odometry.checked import CheckedOdometry
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.motion_model import Intervals
 from segslam.odometry.sweep import Odometry, OdometryResult, deskew_scan
-from segslam.proximity import BREAK_TRAVEL_M
-from segslam.registration import Stopwatch, register
-from segslam.trajectory import Poses
-from segslam.types import BadScan, Indices, Motion, MotionState, Scan, Step, Transform
+from segslam.verification import register
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,11 +3,13 @@
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import islice
+from typing import NamedTuple, Protocol, runtime_checkable
 
-from segslam import segregator
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import Registration, Rejected, Transform
+from segslam.registration import segregator
 from segslam.registration.prepared import PreparedScan
-from segslam.registration.trial import Trial
-from segslam.types import Registration, Rejected
 
 MOST_PLANS = 24
 """Chosen: floor-plan poses looked through for those near the prior, 1 ms each."""
@@ -16,31 +18,55 @@ NUM_FLOOR_PLANS = 4
 """Number of floor plans in memory: a scan is compared with several others in turn. A source has 12 MB of spectra."""
 
 
-def coarse_poses(trial: Trial) -> Iterator[Registration | Rejected]:
+@runtime_checkable
+class Gate(Protocol):
+    """Prior knowledge about the pose: a rejection for an impossible pose, None for all others."""
+
+    def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+        """`slack_m`: distance by which refinement may still move the pose."""
+        ...
+
+
+def anywhere(T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+    """The gate of scans without prior knowledge."""
+    return None
+
+
+class Pair(NamedTuple):
+    """Two scans, and what is known about the pose of the source in the target before they are compared."""
+
+    source: PreparedScan
+    target: PreparedScan
+    config: Config
+    gate: Gate
+    watch: Stopwatch
+
+
+def coarse_poses(pair: Pair) -> Iterator[Registration | Rejected]:
     """Hypotheses from clusters and features, then from floor plans.
 
     Poses that the prior excludes are skipped and not counted: in symmetric places, such as a corridor, most poses
     that fit are turned by 180 degrees or far along it.
     """
-    config = trial.config
-    with trial.watch("match"):
-        ranked = segregator.hypotheses(trial.source.description, trial.target.description, config=config.segregator)
+    config = pair.config
+    with pair.watch("match"):
+        ranked = segregator.hypotheses(pair.source.description, pair.target.description, config=config.segregator)
     if isinstance(ranked, Rejected):
         yield ranked
     else:
-        possible = [coarse for coarse in ranked if _is_possible(coarse, trial)]
+        possible = [coarse for coarse in ranked if _is_possible(coarse, pair)]
         yield from (possible or ranked[:1])[: config.verify.max_hypotheses]
-    yield from plans_near(trial, num_poses=config.verify.max_plan_hypotheses)
+    yield from plans_near(pair, num_poses=config.verify.max_plan_hypotheses)
 
 
-def plans_near(trial: Trial, *, num_poses: int) -> list[Registration]:
+def plans_near(pair: Pair, *, num_poses: int) -> list[Registration]:
     """Poses near the prior that align the two floor plans."""
     if num_poses == 0:
         return []
-    with trial.watch("match"):
-        plans = _floor_plan(trial.source), _floor_plan(trial.target)
+    with pair.watch("match"):
+        plans = _floor_plan(pair.source), _floor_plan(pair.target)
         ranked = segregator.plan_hypotheses(*plans, num_poses=max(MOST_PLANS, num_poses))
-        return list(islice((coarse for coarse in ranked if _is_possible(coarse, trial)), num_poses))
+        return list(islice((coarse for coarse in ranked if _is_possible(coarse, pair)), num_poses))
 
 
 @lru_cache(NUM_FLOOR_PLANS)
@@ -48,5 +74,5 @@ def _floor_plan(scan: PreparedScan) -> segregator.FloorPlan:
     return segregator.FloorPlan(scan.surface.standing, segregator.vertical(scan.description))
 
 
-def _is_possible(coarse: Registration, trial: Trial) -> bool:
-    return trial.gate(coarse.T_target_source, slack_m=trial.config.verify.max_coarse_fine_m) is None
+def _is_possible(coarse: Registration, pair: Pair) -> bool:
+    return pair.gate(coarse.T_target_source, slack_m=pair.config.verify.max_coarse_fine_m) is None

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from segslam import refinement, segregator
-from segslam.config import Config
-from segslam.semantics import geometric_labels
-from segslam.types import Description, Label, Labels, Points
-from segslam.verification.free_space import FreeSpace, observe_free_space
-from segslam.verification.patches import Observed
+from segslam.core.config import Config
+from segslam.core.types import Description, Label, Labels, Points
+from segslam.registration import refinement, segregator
+from segslam.registration.free_space import FreeSpace, observe_free_space
 
 Labeller = Callable[[Points], Labels]
+Observed = tuple[refinement.Surface, FreeSpace]
+"""What a scan saw: sufficient to judge a pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,13 +23,8 @@ class PreparedScan:
 
     @property
     def observed(self) -> Observed:
-        """Input of verification: surface and free space."""
+        """Surface and free space: what verification compares."""
         return self.surface, self.free_space
-
-
-def shape_labels(points: Points, *, config: Config) -> Labels:
-    """Labels computed from geometry alone."""
-    return geometric_labels(points, config=config.geometric)
 
 
 def prepare_scan(

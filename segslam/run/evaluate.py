@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.evaluation import Z_UP
-from segslam.run.finished import FinishedRun
-from segslam.scores import Align, scores
-from segslam.trajectory import PoseFile, Poses, read_poses, rows_of_same_scan, rows_of_same_stamp
-from segslam.types import IndexPairs, SegslamError, Trajectory
+from segslam.core.evaluation import Z_UP
+from segslam.core.trajectory import PoseFile, Poses, read_poses, rows_of_same_scan, rows_of_same_stamp
+from segslam.core.types import IndexPairs, SegslamError, Trajectory
+from segslam.output.finished import FinishedRun
+from segslam.output.scores import Align, scores
 
 STAMP_TOLERANCE_NS = 10_000_000
 Given = FinishedRun | Trajectory | Poses | str | Path

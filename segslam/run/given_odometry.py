@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
-    from segslam.config import OdometryConfig
-    from segslam.datasets import Dataset
+    from segslam.core.config import OdometryConfig
     from segslam.odometry import Odometry
+    from segslam.scans import Dataset
 
 
 def given_odometry(file: Path, scans: "Dataset", config: "OdometryConfig") -> "Odometry":
@@ -18,9 +18,9 @@ def given_odometry(file: Path, scans: "Dataset", config: "OdometryConfig") -> "O
     """
     import numpy as np
 
+    from segslam.core.trajectory import read_poses
+    from segslam.core.types import Trajectory
     from segslam.odometry import GivenOdometry
-    from segslam.trajectory import read_poses
-    from segslam.types import Trajectory
 
     poses = read_poses(file)
     if poses.stamp_ns is not None:

@@ -2,26 +2,36 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from segslam.config import Config
-from segslam.keyframes import Clouds, downsample_keyframe
-from segslam.log import read_log
-from segslam.points import within_range
-from segslam.recognition import MAX_PLACES, Recognised, recognise
-from segslam.registration import PreparedScan, prepare_scan, shape_labels
-from segslam.retrieval import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
-from segslam.run.finished import read_run
-from segslam.run.folder import log_of
-from segslam.submaps import Submaps
-from segslam.system.short_repr import Record
-from segslam.system.threads import at_once
-from segslam.types import Alignment, Keyframe, Labels, Points, Rejected, RejectReason, Transform, as_points
+from segslam.candidates import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
+from segslam.core.config import Config
+from segslam.core.points import within_range
+from segslam.core.short_repr import Record
+from segslam.core.threads import at_once
+from segslam.core.types import (
+    Alignment,
+    Keyframe,
+    Labels,
+    Points,
+    Rejected,
+    RejectReason,
+    Transform,
+    as_points,
+)
+from segslam.keyframes.keyframes import Clouds, downsample_keyframe
+from segslam.keyframes.submaps import Submaps
+from segslam.labels import geometric_labels
+from segslam.output.finished import read_run
+from segslam.output.folder import log_of
+from segslam.output.log import read_log
+from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.slam.recognition import MAX_PLACES, Recognised, recognise
 
 NUM_PREPARED = 256
 """Number of keyframes prepared for alignment in memory, about 2 MB each."""
@@ -72,7 +82,7 @@ class Locator:
         self.config = config
         self.T_world_keyframe = T_world_keyframe
         travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
-        self.submaps = Submaps(config, lambda: clouds, partial(shape_labels, config=config), lambda: travel_m)
+        self.submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: travel_m)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         """A keyframe by its id, prepared for alignment."""
         for keyframe in keyframes:
@@ -101,7 +111,7 @@ class Locator:
         near = as_points(points)
         usable = within_range(near, config.odometry.min_range_m, config.odometry.max_range_m)
         near = near.compress(usable, axis=0)
-        labels = shape_labels(near, config=config) if labels is None else labels[usable]
+        labels = geometric_labels(near) if labels is None else labels[usable]
         kept, kept_labels, _ = downsample_keyframe(
             near, labels, config=config.keyframes, whole_classes=tuple(config.segregator.cluster_min_points)
         )
@@ -110,7 +120,7 @@ class Locator:
         )
         found = self._recognised(scan, candidates, max_places=NUM_FIRST)
         if isinstance(found, Rejected) and found.reason != RejectReason.AMBIGUOUS:
-            around = signatures_around(kept, kept_labels, config=config.geometric)
+            around = signatures_around(kept, kept_labels)
             found = self._recognised(scan, self.places.shortlist_around((own, *around)), max_places=MAX_PLACES)
         if isinstance(found, Rejected):
             return found
@@ -118,7 +128,7 @@ class Locator:
 
     def _candidates(self, points: Points, labels: Labels) -> tuple[PlaceSignature, tuple[PlaceCandidate, ...]]:
         """Signature of a scan, and the most similar places; the first of them is prepared."""
-        own = signature_of(points, labels, config=self.config.geometric)
+        own = signature_of(points, labels)
         candidates = self.places.shortlist(own)
         if candidates:
             self.prepared(candidates[0].place_id)
@@ -140,7 +150,7 @@ class Locator:
         if keyframe.place is not None:
             return PlaceSignature.from_bytes(keyframe.place)
         made = self.submaps.gathered(keyframe.id, newest_id=keyframe.id)
-        return signature_of(made.points, made.labels, config=self.config.geometric)
+        return signature_of(made.points, made.labels)
 
 
 def locate(run: str | Path, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:

@@ -7,22 +7,22 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-from segslam.config import Config
-from segslam.datasets import Dataset, DataSource
+from segslam.core.config import Config
+from segslam.core.types import BadScan, SegslamError, Step
+from segslam.labels.label_files import unlabelled
 from segslam.odometry import KissOdometry
-from segslam.presets import extent_m, preset, preset_for
-from segslam.run.accuracy import accuracy
-from segslam.run.finished import FinishedRun, read_run
-from segslam.run.folder import new_folder, write_metrics
+from segslam.output.accuracy import accuracy
+from segslam.output.finished import FinishedRun, read_run
+from segslam.output.folder import new_folder, write_metrics
 from segslam.run.run import Run
-from segslam.semantics.label_files import unlabelled
-from segslam.slam import Slam
-from segslam.types import BadScan, SegslamError, Step
+from segslam.scans import Dataset, DataSource
+from segslam.scans.presets import extent_m, preset, preset_for
+from segslam.slam.slam import Slam
 
 if TYPE_CHECKING:
+    from segslam.labels.encodings import Encoding
     from segslam.odometry import Odometry
-    from segslam.registration import Labeller
-    from segslam.semantics.encodings import Encoding
+    from segslam.registration.prepared import Labeller
 
 
 @runtime_checkable
@@ -59,7 +59,7 @@ def map_folder(
     cannot be used are skipped with a warning. Raises SegslamError, naming the file and the remedy, also if no scan
     remains.
     """
-    from segslam.run.report import write_report
+    from segslam.output.report import write_report
 
     given, config = config, config or Config()
     source = DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic)

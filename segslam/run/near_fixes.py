@@ -7,13 +7,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from segslam.config import ProximityConfig
-from segslam.loop_edits import Pair
-from segslam.run.finished import read_run
-from segslam.run.folder import folder_of
-from segslam.run.georeferenced import FILE, read_globe
-from segslam.trajectory import travelled_m
-from segslam.types import LoopClosure, SegslamError, Vector
+from segslam.candidates.proximity import MIN_GAP_M
+from segslam.core.config import ProximityConfig
+from segslam.core.trajectory import travelled_m
+from segslam.core.types import LoopClosure, SegslamError, Vector
+from segslam.output.finished import read_run
+from segslam.output.folder import folder_of
+from segslam.output.georeferenced import FILE, read_globe
+from segslam.slam.loop_edits import Pair
 
 
 def pairs_near_fixes(run_or_log: Path) -> frozenset[Pair]:
@@ -46,10 +47,10 @@ def pairs_near(
     for newer, place in enumerate(east_north_m):
         near = np.array(tree.query_ball_point(place, config.base_radius_m), np.int64)
         near = near[travel_m[near] <= travel_m[newer] - config.min_travel_m]
-        if not len(near) or travel_m[newer] - last_m < config.min_gap_m:
+        if not len(near) or travel_m[newer] - last_m < MIN_GAP_M:
             continue
         older = int(near[np.linalg.norm(east_north_m[near] - place, axis=1).argmin()])
-        is_joined = (np.abs(ends_m - travel_m[[newer, older]]) < config.min_gap_m + config.base_radius_m).all(axis=1)
+        is_joined = (np.abs(ends_m - travel_m[[newer, older]]) < MIN_GAP_M + config.base_radius_m).all(axis=1)
         if not is_joined.any() and (newer, older) not in tried:
             pairs.add((newer, older))
             last_m = travel_m[newer]

@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from segslam.config import Config, changed_settings, load_config
-from segslam.log import RunLog, read_log
-from segslam.loop_edits import LoopEdits
-from segslam.run.accuracy import accuracy
-from segslam.run.finished import FinishedRun, read_run
-from segslam.run.folder import copy_alone, log_of, new_folder, write_metrics
+from segslam.core.config import Config, changed_settings, load_config
+from segslam.core.types import SegslamError
+from segslam.output.accuracy import accuracy
+from segslam.output.finished import FinishedRun, read_run
+from segslam.output.folder import copy_alone, log_of, new_folder, write_metrics
+from segslam.output.log import RunLog, read_log
 from segslam.run.run import Run
-from segslam.slam import Slam
-from segslam.types import SegslamError
+from segslam.slam.loop_edits import LoopEdits
+from segslam.slam.slam import Slam
 
 BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "keyframes", "geometric")
 """Sections of the settings that a replay cannot change, because the log contains their results."""
@@ -26,7 +26,7 @@ def replay(
     `run`: its folder or log.mcap. `settings`: changes such as `"verify.min_overlap=0.4"`; `edits` forbids and adds
     loops. Raises SegslamError for a setting that cannot be changed, and for a run localised in the map of another.
     """
-    from segslam.run.report import write_report
+    from segslam.output.report import write_report
 
     recorded = read_log(log_of(Path(run)))
     if recorded.options.get("in_map"):

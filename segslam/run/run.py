@@ -14,14 +14,24 @@ from typing import Any
 
 import numpy as np
 
-from segslam.adjustment import Progress, no_progress
-from segslam.calibration import measure_vertical_angle
-from segslam.config import config_to_yaml
-from segslam.datasets import Dataset
-from segslam.log import LogWriter, Mirror, RunLog
-from segslam.log.drawing import CloudOf
-from segslam.pose_graph import PoseGraph
-from segslam.run.folder import (
+from segslam.core.config import config_to_yaml
+from segslam.core.memory import peak_mb
+from segslam.core.threads import in_other_thread
+from segslam.core.trajectory import travelled_m
+from segslam.core.types import (
+    BadScan,
+    LoopClosure,
+    MotionState,
+    Scan,
+    SegslamError,
+    Step,
+    Trajectory,
+    Transform,
+)
+from segslam.core.whole_files import write_whole
+from segslam.graph import PoseGraph
+from segslam.odometry.calibration import measure_vertical_angle
+from segslam.output.folder import (
     ADJUSTED_GRAPH,
     LOG,
     UNFINISHED,
@@ -33,21 +43,11 @@ from segslam.run.folder import (
     write_loops,
     write_poses,
 )
-from segslam.slam import Slam, SlamResult, Tracked
-from segslam.system.memory import peak_mb
-from segslam.system.threads import in_other_thread
-from segslam.system.whole_files import write_whole
-from segslam.trajectory import travelled_m
-from segslam.types import (
-    BadScan,
-    LoopClosure,
-    MotionState,
-    Scan,
-    SegslamError,
-    Step,
-    Trajectory,
-    Transform,
-)
+from segslam.output.log import LogWriter, Mirror, RunLog
+from segslam.output.log.drawing import CloudOf
+from segslam.scans import Dataset
+from segslam.slam.adjustment import Progress, no_progress
+from segslam.slam.slam import Slam, SlamResult, Tracked
 
 logger = logging.getLogger(__name__)
 

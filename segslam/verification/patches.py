@@ -12,15 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int8
 
-from segslam import geometry
-from segslam.config import VerifyConfig
-from segslam.points import cell_keys, within_range
-from segslam.refinement import Surface
-from segslam.types import Indices, Points, Transform, Vector
-from segslam.verification.free_space import FreeSpace, fates, violation
-
-Observed = tuple[Surface, FreeSpace]
-"""A scan as verification sees it."""
+from segslam.core import geometry
+from segslam.core.config import VerifyConfig
+from segslam.core.points import cell_keys, within_range
+from segslam.core.types import Indices, Points, Transform, Vector
+from segslam.registration.free_space import fates, violation
+from segslam.registration.prepared import Observed
+from segslam.registration.refinement import Surface
 
 NUM_SCANS = 16
 """Number of scans whose patches are in memory, about 0.4 MB each."""

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam.config import VerifyConfig
-from segslam.types import Vector
+from segslam.core.config import VerifyConfig
+from segslam.core.types import Vector
 from segslam.verification.patches import BINS, Agreement, Counts, Shown
 
 NO_OTHER = 12.0

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from segslam import refinement
-from segslam.config import Config
-from segslam.types import Alignment, Registration, Rejected, RejectReason, probability_text
+from segslam.core.config import Config
+from segslam.core.types import Alignment, Registration, Rejected, RejectReason, probability_text
+from segslam.registration import refinement
 from segslam.verification import score
 from segslam.verification.patches import Agreement
 
@@ -30,7 +30,7 @@ def judged(
         reason = RejectReason.AMBIGUOUS if is_ambiguous else RejectReason.IMPROBABLE
         detail = probability_text(judgement.probability, judgement.evidence)
         return Rejected(reason, detail, judgement.probability, judgement.evidence)
-    observability, _ = refinement.observability(fine.information, config=config.refine)
+    observability, _ = refinement.observability(fine.information)
     return Alignment(
         coarse,
         fine,

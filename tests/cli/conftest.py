@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from helpers.drives import SLAM_CONFIG, drifting_slam, round_drive
 
-from segslam.log import LogWriter
+from segslam.output.log import LogWriter
 
 
 @pytest.fixture(scope="session")

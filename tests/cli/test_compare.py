@@ -10,10 +10,10 @@ from helpers.finished_run import make_run
 from matplotlib.image import imread
 
 from segslam.cli import doctor
-from segslam.run.finished import read_run
-from segslam.run.folder import write_metrics
-from segslam.run.report.comparison import by_data, draw_runs
-from segslam.trajectory import write_kitti
+from segslam.core.trajectory import write_kitti
+from segslam.output.finished import read_run
+from segslam.output.folder import write_metrics
+from segslam.output.report.comparison import by_data, draw_runs
 
 
 @pytest.fixture(scope="module")

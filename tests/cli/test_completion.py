@@ -6,7 +6,7 @@ import pytest
 
 from segslam.cli import completion
 from segslam.cli.completion import METHODS, datasets, labels_or_files, presets, settings, simulation_settings
-from segslam.config import Config
+from segslam.core.config import Config
 
 
 def test_keys_of_settings_and_their_values_are_completed() -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from helpers.commands import run
 
-from segslam.log import read_log
-from segslam.types import LoopClosure
+from segslam.core.types import LoopClosure
+from segslam.output.log import read_log
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

@@ -9,8 +9,8 @@ from helpers.commands import run
 from helpers.drives import drifting, round_drive
 from helpers.finished_run import make_run
 
-from segslam.scores import scores
-from segslam.trajectory import write_kitti
+from segslam.core.trajectory import write_kitti
+from segslam.output.scores import scores
 
 TRUTH = round_drive()[1]
 ESTIMATE = drifting(TRUTH).T_world_lidar

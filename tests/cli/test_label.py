@@ -10,12 +10,12 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.made_networks import class_network
 
-from segslam.datasets import open_dataset
-from segslam.semantics.class_colors import of_classes
-from segslam.semantics.encodings import RAW_OF_LABEL, Encoding, to_labels
-from segslam.semantics.label_files import read_ids, read_labels
-from segslam.semantics.scores import STILL, class_scores, confusion, group_scores, largest_confusions
-from segslam.types import Label
+from segslam.core.types import Label
+from segslam.labels.class_colors import of_classes
+from segslam.labels.encodings import RAW_OF_LABEL, Encoding, to_labels
+from segslam.labels.label_files import read_ids, read_labels
+from segslam.labels.scores import STILL, class_scores, confusion, group_scores, largest_confusions
+from segslam.scans import open_dataset
 
 NUM_SCANS = 3
 SENSOR = {"field_of_view_deg": [-22.8, 22.5], "height": 64, "width": 1024}

@@ -7,10 +7,10 @@ import pytest
 from helpers.commands import run
 from helpers.drives import round_drive, write_kitti_sequence
 
-from segslam.config import OdometryConfig
-from segslam.errors import SegslamError
-from segslam.log import read_log
-from segslam.trajectory import read_poses, travelled_m, write_kitti
+from segslam.core.config import OdometryConfig
+from segslam.core.errors import SegslamError
+from segslam.core.trajectory import read_poses, travelled_m, write_kitti
+from segslam.output.log import read_log
 
 RUN_FILES = {
     "config.yaml",

@@ -10,7 +10,7 @@ from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 from matplotlib.image import imread
 
-from segslam.types import WorkFailed
+from segslam.core.types import WorkFailed
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

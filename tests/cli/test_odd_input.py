@@ -18,14 +18,14 @@ from helpers.finished_run import make_run
 from helpers.made_logs import boundaries
 
 from segslam.cli import _with_home
-from segslam.config import Config
-from segslam.datasets import DataSource
-from segslam.log import LogWriter, read_log
-from segslam.run.finished import read_metrics
+from segslam.core.config import Config
+from segslam.core.types import SegslamError
+from segslam.output.finished import read_metrics
+from segslam.output.log import LogWriter, read_log
 from segslam.run.map_folder import map_folder, resume_options
 from segslam.run.run import Run
-from segslam.slam import Slam
-from segslam.types import SegslamError
+from segslam.scans import DataSource
+from segslam.slam.slam import Slam
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 
@@ -216,7 +216,7 @@ def test_a_scan_that_is_needed_and_gone_is_reported_with_the_log(
 SLOW_EXPORT = """
 import sys, time
 from segslam import cli
-from segslam.map.store import MapStore
+from segslam.output.map.store import MapStore
 MapStore.add = lambda *_: time.sleep(60)
 cli.main(["export", *sys.argv[1:]])
 """

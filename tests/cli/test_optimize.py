@@ -11,10 +11,10 @@ import pytest
 from helpers import commands
 from scipy.spatial.transform import Rotation
 
-from segslam import geometry
-from segslam.pose_graph import G2oGraph, optimize_graph, read_g2o, write_g2o
-from segslam.pose_graph.edges import Edge, factor_graph
-from segslam.types import SegslamError
+from segslam.core import geometry
+from segslam.core.types import SegslamError
+from segslam.graph import G2oGraph, optimize_graph, read_g2o, write_g2o
+from segslam.graph.edges import Edge, factor_graph
 
 TIGHT = np.diag(geometry.tangent(rotation_rad=0.01, translation_m=0.05) ** -2.0)
 

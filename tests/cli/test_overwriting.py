@@ -9,9 +9,9 @@ from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 
 from segslam.cli.overwriting import make_room
-from segslam.errors import SegslamError
-from segslam.log import read_log
-from segslam.log.output import Output
+from segslam.core.errors import SegslamError
+from segslam.output.log import read_log
+from segslam.output.log.output import Output
 
 GRAPH = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
 VERTEX_SE3:QUAT 1 1 0 0 0 0 0 1

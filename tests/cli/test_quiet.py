@@ -18,9 +18,10 @@ from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 from typer.main import get_command
 
-from segslam import cli, simulation
+from segslam import cli
+from segslam.bench import simulation
 from segslam.cli import commands
-from segslam.run import report
+from segslam.output import report
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 
@@ -118,7 +119,7 @@ def words(request: pytest.FixtureRequest, data: Path, tmp_path: Path, monkeypatc
     """A command with its arguments; `report` alone draws."""
     name, out = str(request.param), tmp_path / "out"
     if name == "report":
-        monkeypatch.setattr("segslam.run.report.write_report", WRITE_REPORT)
+        monkeypatch.setattr("segslam.output.report.write_report", WRITE_REPORT)
     if name in OF_MAPPED:
         return [*name.split(), *OF_MAPPED[name](data, request.getfixturevalue("mapped"), out)]
     return [*name.split(), *COMMANDS[name](data, request.getfixturevalue("finished"), out)]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.commands import run
 
-from segslam.log import read_log
-from segslam.run.finished import read_metrics
+from segslam.output.finished import read_metrics
+from segslam.output.log import read_log
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

@@ -6,8 +6,8 @@ import pytest
 from helpers.commands import run
 from helpers.drives import round_drive
 
-from segslam import geometry
-from segslam.semantics.encodings import RAW_OF_LABEL
+from segslam.core import geometry
+from segslam.labels.encodings import RAW_OF_LABEL
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import yaml
 from helpers.commands import run
 from helpers.drives import SLAM_CONFIG
 
-from segslam.log import read_log
-from segslam.types import LoopAttempt, LoopClosure
+from segslam.core.types import LoopAttempt, LoopClosure
+from segslam.output.log import read_log
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

@@ -8,7 +8,7 @@ import pytest
 from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 
-from segslam.log import read_log
+from segslam.output.log import read_log
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

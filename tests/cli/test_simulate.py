@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from segslam import cli
-from segslam.datasets import open_dataset
-from segslam.trajectory import write_kitti
+from segslam.core.trajectory import write_kitti
+from segslam.scans import open_dataset
 
 
 def simulate(*arguments: object) -> int:

@@ -8,8 +8,8 @@ import pytest
 from helpers.commands import run
 
 from segslam.cli.sweep import grid_of
-from segslam.errors import SegslamError
-from segslam.run.finished import read_run
+from segslam.core.errors import SegslamError
+from segslam.output.finished import read_run
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

@@ -1,7 +1,7 @@
 import pytest
 
 from segslam import cli
-from segslam.system import kernels
+from segslam.core import kernels
 
 
 def _warm_up() -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 from fuzz.children import Defect, defects
 from fuzz.mutation import mutate
 from fuzz.targets import Target, targets
-from segslam.types import SegslamError
+from segslam.core.types import SegslamError
 
 BATCH = 250
 FOUND = Path("build/fuzz")

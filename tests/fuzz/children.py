@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from segslam.errors import SegslamError
+from segslam.core.errors import SegslamError
 
 MAX_CPU_S = 1.0
 """Longest processor time for a file, the shorter of two readings; the clock on the wall would measure the other jobs of

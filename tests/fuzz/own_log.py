@@ -16,8 +16,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from fuzz.mutation import mutate, replaced
-from segslam.log import LogWriter, RunLog
-from segslam.types import LoopAttempt, Step, Trajectory
+from segslam.core.types import LoopAttempt, Step, Trajectory
+from segslam.output.log import LogWriter, RunLog
 
 VALUE = re.compile(rb'"[^"]*"|[^\s,:\[\]{}"]+')
 """A name or a value of JSON."""
@@ -69,7 +69,7 @@ class Read:
 @contextmanager
 def _warnings() -> Iterator[BufferingHandler]:
     """The warnings of the reader, though the long run disables all."""
-    handler, logger = BufferingHandler(capacity=1000), logging.getLogger("segslam.log.reader")
+    handler, logger = BufferingHandler(capacity=1000), logging.getLogger("segslam.output.log.reader")
     disabled = logging.root.manager.disable
     logging.disable(logging.NOTSET)
     logger.addHandler(handler)

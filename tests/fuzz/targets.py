@@ -14,20 +14,20 @@ import numpy as np
 from fuzz import own_log, seeds
 from fuzz.mutation import mutate
 from fuzz.rewriting import rewritten
-from segslam.config import load_config
-from segslam.datasets import open_dataset
-from segslam.datasets.clouds import read_file
-from segslam.datasets.kitti import read_calibration
-from segslam.datasets.point_cloud2 import CloudReader
-from segslam.datasets.scans import make_scan, read_stamps
+from segslam.core.config import load_config
+from segslam.core.trajectory import read_poses
+from segslam.core.types import BadScan, SegslamError
 from segslam.gnss.reading import read_fixes
-from segslam.log import read_log
-from segslam.pose_graph import Robust, optimize_graph, read_g2o
-from segslam.semantics.label_files import encoding_of, read_labels
-from segslam.semantics.network import open_network
-from segslam.semantics.network_settings import read_settings
-from segslam.trajectory import read_poses
-from segslam.types import BadScan, SegslamError
+from segslam.graph import Robust, optimize_graph, read_g2o
+from segslam.labels.label_files import encoding_of, read_labels
+from segslam.labels.network import open_network
+from segslam.labels.network_settings import read_settings
+from segslam.output.log import read_log
+from segslam.scans import open_dataset
+from segslam.scans.clouds import read_file
+from segslam.scans.dataset import make_scan, read_stamps
+from segslam.scans.kitti import read_calibration
+from segslam.scans.point_cloud2 import CloudReader
 
 ROBUST = get_args(Robust)
 

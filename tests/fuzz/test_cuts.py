@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from fuzz import seeds
-from segslam.datasets import open_dataset
-from segslam.datasets.clouds import read_file
-from segslam.types import BadScan, SegslamError
+from segslam.core.types import BadScan, SegslamError
+from segslam.scans import open_dataset
+from segslam.scans.clouds import read_file
 
 FEW = 6
 

@@ -8,8 +8,8 @@ from helpers.made_logs import made_steps, write_log
 
 from fuzz.children import defects
 from fuzz.own_log import Read, odd, write_whole
-from segslam.log import read_log
-from segslam.types import SegslamError
+from segslam.core.types import SegslamError
+from segslam.output.log import read_log
 
 NUM_CUTS = 60
 

@@ -9,12 +9,12 @@ import numpy as np
 from hypothesis import assume, given, settings
 
 from fuzz import seeds
-from segslam.config import Config, config_to_yaml, load_config
-from segslam.datasets.clouds import read_file
-from segslam.datasets.lzf import decompress
-from segslam.datasets.point_cloud2 import CloudReader
-from segslam.datasets.scans import read_stamps
-from segslam.trajectory import read_poses, write_kitti, write_tum
+from segslam.core.config import Config, config_to_yaml, load_config
+from segslam.core.trajectory import read_poses, write_kitti, write_tum
+from segslam.scans.clouds import read_file
+from segslam.scans.dataset import read_stamps
+from segslam.scans.lzf import decompress
+from segslam.scans.point_cloud2 import CloudReader
 
 steady = settings(derandomize=True, deadline=None, max_examples=60)
 KINDS = ("<f4", "<f8", "<i2", "<u2", "|u1", "<u4")

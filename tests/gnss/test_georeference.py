@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from helpers.gnss_drive import ORIGIN, SIGMA_M, T_ENU_MAP, motions
 
-from segslam import geometry
+from segslam.core import geometry
+from segslam.core.trajectory import Poses
+from segslam.core.types import Points, SegslamError
 from segslam.gnss import Drive, Fixes, Origin, Use, enu_from_geodetic, geodetic_from_enu, georeference, utm_epsg
 from segslam.gnss.alignment import place
 from segslam.gnss.fixes import Row, make_fixes
 from segslam.gnss.fusion import _Problem, _windows
 from segslam.gnss.matching import prepare
-from segslam.pose_graph import PositionedGraph
-from segslam.trajectory import Poses
-from segslam.types import Points, SegslamError
+from segslam.graph import PositionedGraph
 
 NUM, STEP_M, PERIOD_S = 240, 2.0, 1.0
 

@@ -13,12 +13,12 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from segslam.core.types import SegslamError
 from segslam.gnss.fixes import make_fixes
 from segslam.gnss.geodesy import Origin, ecef_from_geodetic, enu_from_geodetic
 from segslam.gnss.messages import row_of
 from segslam.gnss.reading import read_fixes
 from segslam.gnss.times import stamp_of
-from segslam.types import SegslamError
 
 MOMENT = datetime(2021, 5, 17, 2, 33, 17, 500000, tzinfo=UTC)
 STAMP_NS = stamp_of(MOMENT)

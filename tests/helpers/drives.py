@@ -7,19 +7,25 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import load_config
-from segslam.datasets.kitti import read_calibration
+from segslam.bench.simulation import (
+    SensorConfig,
+    SimulationConfig,
+    WorldConfig,
+    example_drive,
+    simulate_drive,
+)
+from segslam.bench.simulation.drive import drive_sweeps
+from segslam.bench.simulation.files import uncorrected
+from segslam.bench.simulation.sensor import Sweep
+from segslam.bench.simulation.world import build_world
+from segslam.core import geometry
+from segslam.core.config import load_config
+from segslam.core.trajectory import Poses, camera_from_lidar, write_kitti
+from segslam.core.types import Scan, Trajectory
+from segslam.labels.encodings import RAW_OF_LABEL
 from segslam.odometry import GivenOdometry
-from segslam.semantics.encodings import RAW_OF_LABEL
-from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, example_drive, simulate_drive
-from segslam.simulation.drive import drive_sweeps
-from segslam.simulation.files import uncorrected
-from segslam.simulation.sensor import Sweep
-from segslam.simulation.world import build_world
-from segslam.slam import Slam
-from segslam.trajectory import Poses, camera_from_lidar, write_kitti
-from segslam.types import Scan, Trajectory
+from segslam.scans.kitti import read_calibration
+from segslam.slam.slam import Slam
 
 NUM_SCANS = 72
 STEP_M = 2.2

@@ -5,13 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config, config_to_yaml
-from segslam.log import LogWriter
-from segslam.run.folder import write_metrics
-from segslam.slam import SlamResult
-from segslam.trajectory import corrected_poses
-from segslam.types import (
+from segslam.core import geometry
+from segslam.core.config import Config, config_to_yaml
+from segslam.core.trajectory import corrected_poses
+from segslam.core.types import (
     Alignment,
     GraphEstimate,
     Keyframe,
@@ -24,6 +21,9 @@ from segslam.types import (
     Step,
     Trajectory,
 )
+from segslam.output.folder import write_metrics
+from segslam.output.log import LogWriter
+from segslam.slam.slam import SlamResult
 
 FIRST_SCAN = 5
 NUM_SCANS = 120

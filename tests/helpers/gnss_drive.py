@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
+from segslam.core import geometry
+from segslam.core.trajectory import Poses
+from segslam.core.types import Points, Transform
 from segslam.gnss import Origin, geodetic_from_enu
-from segslam.pose_graph import Edge, G2oGraph, write_g2o
-from segslam.run.finished import read_run
-from segslam.run.folder import ADJUSTED_GRAPH
-from segslam.trajectory import Poses
-from segslam.types import Points, Transform
+from segslam.graph import Edge, G2oGraph, write_g2o
+from segslam.output.finished import read_run
+from segslam.output.folder import ADJUSTED_GRAPH
 
 ORIGIN = Origin(48.98, 8.39, 115.0)
 T_ENU_MAP = geometry.transform(geometry.yaw(0.7), [12.0, -7.0, 3.0])

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from threading import Event
 
-from segslam.live.waiting import Arrival, Waiting
-from segslam.types import Transform
+from segslam.core.types import Transform
+from segslam.run.live.waiting import Arrival, Waiting
 
 
 class HangingSource:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from segslam.types import Scan
+from segslam.core.types import Scan
 
 
 def _with_ctrl_c() -> None:

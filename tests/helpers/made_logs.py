@@ -13,10 +13,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.log import LogWriter
-from segslam.types import (
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import (
     Alignment,
     GraphEstimate,
     Keyframe,
@@ -29,6 +28,7 @@ from segslam.types import (
     Step,
     Trajectory,
 )
+from segslam.output.log import LogWriter
 
 CONFIG = Config()
 RESOLUTION_M = CONFIG.keyframes.resolution_m

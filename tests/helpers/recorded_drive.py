@@ -12,8 +12,8 @@ from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from helpers.drives import intensities, round_drive
-from segslam import geometry
-from segslam.types import Scan, Trajectory
+from segslam.core import geometry
+from segslam.core.types import Scan, Trajectory
 
 CLOUD = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4")])
 """An Ouster's point; `t` in ns since the start of the sweep."""

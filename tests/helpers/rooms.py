@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from segslam import geometry
-from segslam.types import Keyframe, Label, Transform
+from segslam.core import geometry
+from segslam.core.types import Keyframe, Label, Transform
 
 HALF_M = 12.0
 SENSOR_M = 1.7

@@ -6,10 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, example_drive, prepare_folder, write_drive
-from segslam.simulation.tracks import Drive, in_lane
-from segslam.trajectory import Poses
+from segslam.bench.simulation import (
+    SensorConfig,
+    SimulationConfig,
+    WorldConfig,
+    example_drive,
+    prepare_folder,
+    write_drive,
+)
+from segslam.bench.simulation.tracks import Drive, in_lane
+from segslam.core import geometry
+from segslam.core.trajectory import Poses
 
 STEP_M, RADIUS_M, NUM_POSES = 1.8, 18.0, 44
 

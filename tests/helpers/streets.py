@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segslam import geometry
+from segslam.core import geometry
 
 
 def corner(rng: np.random.Generator, *, num_points: int = 20_000) -> np.ndarray:

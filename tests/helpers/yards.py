@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from segslam import geometry
+from segslam.core import geometry
 
 HEIGHT_M = 1.7
 YARD_M = np.array([50.0, 18.0])

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from helpers.drives import STEP_M, round_drive, round_sweeps
 
-from segslam import geometry
-from segslam.config import Config, load_config
-from segslam.evaluation import trajectory_metrics
+from segslam.core import geometry
+from segslam.core.config import Config, load_config
+from segslam.core.evaluation import trajectory_metrics
+from segslam.core.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Trajectory
 from segslam.odometry import CheckedOdometry, GivenOdometry, KissOdometry, OdometryResult, Tracker, information_of
 from segslam.odometry.likelihood import fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import Intervals
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
-from segslam.refinement import refine as refined
-from segslam.registration import register
-from segslam.slam import Slam
-from segslam.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Trajectory
+from segslam.registration.refinement import refine as refined
+from segslam.slam.slam import Slam
+from segslam.verification import register
 
 CONFIG = load_config(None, ["proximity.min_travel_m=60"])
 SLIP_AT = 20

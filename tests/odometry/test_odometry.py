@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from segslam import geometry
-from segslam.config import OdometryConfig
+from segslam.core import geometry
+from segslam.core.config import OdometryConfig
+from segslam.core.types import BadScan, Scan, SegslamError, Trajectory
 from segslam.odometry import GivenOdometry, KissOdometry, OdometryApart
 from segslam.odometry.sweep import deskew_scan
-from segslam.types import BadScan, Scan, SegslamError, Trajectory
 
 CONFIG = OdometryConfig()
 ONE_THREAD = OdometryConfig(max_num_threads=1)  # the first odometry of a process sets how many all of it have
@@ -133,8 +133,9 @@ def test_a_process_that_was_killed_is_reported_with_the_remedy() -> None:
 def test_a_script_that_runs_again_when_imported_ends_with_the_remedy(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
-        "import numpy as np\nfrom segslam.config import OdometryConfig\nfrom segslam.odometry import OdometryApart\n"
-        "from segslam.types import Scan\nOdometryApart(OdometryConfig()).register(Scan(np.full((9, 3), 9.0), 0, 0))\n"
+        "import numpy as np\nfrom segslam.core.config import OdometryConfig\nfrom segslam.core.types import Scan\n"
+        "from segslam.odometry import OdometryApart\n"
+        "OdometryApart(OdometryConfig()).register(Scan(np.full((9, 3), 9.0), 0, 0))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
     assert done.returncode == 1

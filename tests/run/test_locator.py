@@ -9,12 +9,12 @@ from helpers import commands
 from helpers.drives import drifting, round_drive, round_sweeps, write_kitti_sequence
 
 import segslam
-from segslam import geometry
-from segslam.config import load_config
-from segslam.log import read_log
+from segslam.core import geometry
+from segslam.core.config import load_config
+from segslam.core.types import Rejected, SegslamError
 from segslam.odometry import GivenOdometry
+from segslam.output.log import read_log
 from segslam.run.locator import Locator
-from segslam.types import Rejected, SegslamError
 
 NUM_MAPPED = 50
 """A round of the drive; the scans after it see it again."""
@@ -60,7 +60,7 @@ def test_signatures_are_in_the_log_and_computed_if_it_has_none(run: Path, monkey
     recorded = read_log(run / "log.mcap").keyframes()
     stored = [recorded[number].place for number in range(len(recorded))]
     assert all(place is not None and len(place) == 1440 for place in stored)
-    monkeypatch.setattr("segslam.log.reader.place_of", lambda message: {"place": None})  # as in an older log
+    monkeypatch.setattr("segslam.output.log.reader.place_of", lambda message: {"place": None})  # as in an older log
     older = Locator.from_run(run)
     newer_spectra = [np.frombuffer(place or b"", np.uint8) for place in stored]
     for number, spectrum in enumerate(newer_spectra):

@@ -17,11 +17,11 @@ from helpers.drives import write_kitti_sequence
 from helpers.made_logs import boundaries, largest_file
 from mcap.reader import make_reader
 
-from segslam.log import LogWriter, RunLog, read_log
-from segslam.pose_graph import read_g2o
-from segslam.run.finished import read_run
-from segslam.run.folder import POSE_COLUMNS
-from segslam.types import LoopClosure
+from segslam.core.types import LoopClosure
+from segslam.graph import read_g2o
+from segslam.output.finished import read_run
+from segslam.output.folder import POSE_COLUMNS
+from segslam.output.log import LogWriter, RunLog, read_log
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 
@@ -187,7 +187,7 @@ def test_results_without_disk_space_end_with_status_2_and_the_run_is_resumed(
 
     out = _cut(whole, tmp_path / "run", log_bytes=boundaries(whole / "log.mcap")[-2])
     with monkeypatch.context() as patched:
-        patched.setattr("segslam.run.folder.write_kitti", full)
+        patched.setattr("segslam.output.folder.write_kitti", full)
         assert run("map", kitti, "--out", out, "--resume", *OPTIONS) == 2
     assert "cannot write the results (No space left on device)" in capsys.readouterr().err
     _resumed_as_whole(kitti, whole, out)

@@ -15,11 +15,11 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.experiments.pairs import PairList
-from segslam.simulation import example_drive
-from segslam.trajectory import camera_from_lidar, write_kitti
+from segslam.bench.experiments.pairs import PairList
+from segslam.bench.simulation import example_drive
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.trajectory import camera_from_lidar, write_kitti
 from tools.benchmarks import (
     label_maps,
     locate,

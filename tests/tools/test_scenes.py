@@ -6,12 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.registration import PreparedScan, pair, prepare_scan, register_prepared, shape_labels
-from segslam.simulation.scene_sensors import SENSORS, scan_points
-from segslam.simulation.scenes import SCENES, corridor
-from segslam.types import Alignment, Registration, Rejected
+from segslam.bench.simulation.scene_sensors import SENSORS, scan_points
+from segslam.bench.simulation.scenes import SCENES, corridor
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Alignment, Registration, Rejected
+from segslam.labels import geometric_labels
+from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.verification import pair, register_prepared
 from tools.benchmarks import scenes
 
 CONFIG = Config()
@@ -24,7 +26,7 @@ def _corridor_scan(x: float) -> PreparedScan:
     rng = np.random.default_rng(int(x))
     T_world_lidar = geometry.transform(np.eye(3), [x, 0.0, 1.0])
     points = scan_points(corridor(0, regular=True), "64", T_world_lidar, noise_m=0.02, rng=rng)
-    return prepare_scan(points, shape_labels(points, config=CONFIG), config=CONFIG)
+    return prepare_scan(points, geometric_labels(points), config=CONFIG)
 
 
 def _from(T_target_source: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> Alignment | Rejected:

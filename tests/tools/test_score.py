@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-
-from segslam import geometry
-from segslam.config import Config
-from segslam.registration.prepared import prepare_observed
 from segslam.verification.gates import Observed
 from tools.benchmarks.score.evidence import BINS, evidence
+
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.registration.prepared import prepare_observed
 from tools.benchmarks.score.ratio import Pair, Pose, Run, Score, log_ratios, mean_ratio
 
 CONFIG = Config()

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from segslam.config import Config
+from segslam.core.config import Config
 from tools.benchmarks import submaps
 
 

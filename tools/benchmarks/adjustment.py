@@ -14,8 +14,8 @@ from time import perf_counter
 from typing import Any
 
 from segslam.cli import main
-from segslam.run.accuracy import trajectory_accuracy
-from segslam.run.finished import read_metrics, read_run, true_poses
+from segslam.output.accuracy import trajectory_accuracy
+from segslam.output.finished import read_metrics, read_run, true_poses
 
 FIGURES = ("vertical_deg", "vertical_sigma_deg", "map_thickness_before_m", "map_thickness_m", "num_submap_pairs")
 

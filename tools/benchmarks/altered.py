@@ -15,12 +15,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from segslam import geometry
 from segslam.cli import main
-from segslam.datasets import open_dataset
-from segslam.run.finished import read_metrics
-from segslam.trajectory import read_poses
-from segslam.types import Points, Rotation
+from segslam.core import geometry
+from segslam.core.trajectory import read_poses
+from segslam.core.types import Points, Rotation
+from segslam.output.finished import read_metrics
+from segslam.scans import open_dataset
 from tools.benchmarks import common
 
 Rows = list[int]

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from segslam.evaluation import PoseError
-from segslam.experiments.provenance import commit, machine
-from segslam.types import Transform
+from segslam.bench.experiments.provenance import commit, machine
+from segslam.core.evaluation import PoseError
+from segslam.core.types import Transform
 
 RIGHT_M, RIGHT_DEG = 0.5, 2.0
 """Chosen: a refined pose with a larger error is in another minimum; correct ones have errors of centimetres."""

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.evaluation import align_positions, trajectory_metrics
+from segslam.core import geometry
+from segslam.core.evaluation import align_positions, trajectory_metrics
+from segslam.core.trajectory import rows_of_same_scan
+from segslam.core.types import Indices, Points, Transform
 from segslam.gnss import Fixes, Origin, enu_from_geodetic, geodetic_from_enu
 from segslam.gnss.reading import read_fixes
-from segslam.run.finished import FinishedRun, read_run
-from segslam.run.georeferenced import georeference, read_globe
-from segslam.trajectory import rows_of_same_scan
-from segslam.types import Indices, Points, Transform
+from segslam.output.finished import FinishedRun, read_run
+from segslam.output.georeferenced import georeference, read_globe
 from tools.benchmarks.common import Row, markdown, parser, write_report
 
 SEED = 3401

@@ -13,13 +13,13 @@ from time import perf_counter, process_time
 
 import numpy as np
 
-from segslam import geometry
-from segslam.datasets import open_dataset
-from segslam.evaluation import PoseError
-from segslam.run.finished import read_run
+from segslam.core import geometry
+from segslam.core.evaluation import PoseError
+from segslam.core.types import Rejected
+from segslam.labels.late import computed
+from segslam.output.finished import read_run
 from segslam.run.locator import Locator
-from segslam.semantics.late import computed
-from segslam.types import Rejected
+from segslam.scans import open_dataset
 from tools.benchmarks import common
 
 WITHIN_M = 10.0

@@ -19,12 +19,13 @@ import numpy as np
 from open3d.io import read_point_cloud
 from scipy.spatial import cKDTree
 
-from segslam import geometry, open_dataset
-from segslam.config import load_config
-from segslam.log import read_log
-from segslam.map import write_map
-from segslam.semantics.late import computed
-from segslam.types import Keyframe, Label, Transform
+from segslam import open_dataset
+from segslam.core import geometry
+from segslam.core.config import load_config
+from segslam.core.types import Keyframe, Label, Transform
+from segslam.labels.late import computed
+from segslam.output.log import read_log
+from segslam.output.map import write_map
 from tools.benchmarks import common
 
 STANDING = {

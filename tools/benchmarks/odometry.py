@@ -12,13 +12,13 @@ from typing import Protocol
 import numpy as np
 import small_gicp
 
-from segslam import geometry
-from segslam.config import OdometryConfig
-from segslam.datasets import Dataset, open_dataset
-from segslam.evaluation import trajectory_metrics
+from segslam.core import geometry
+from segslam.core.config import OdometryConfig
+from segslam.core.evaluation import trajectory_metrics
+from segslam.core.types import Points, SegslamError, Transform
 from segslam.odometry.kiss import KissAligner
 from segslam.odometry.sweep import deskew_scan
-from segslam.types import Points, SegslamError, Transform
+from segslam.scans import Dataset, open_dataset
 from tools.benchmarks import common
 
 GICP_VOXEL_M, THINNED_M, REACH_M = 1.0, 0.25, 2.0

@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from segslam.evaluation import trajectory_metrics
-from segslam.run.finished import FinishedRun, read_run
-from segslam.trajectory import lidar_from_camera
+from segslam.core.evaluation import trajectory_metrics
+from segslam.core.trajectory import lidar_from_camera
+from segslam.output.finished import FinishedRun, read_run
 from tools.benchmarks import common
 
 FIGURES = ("ate_m", "height_m", "kitti_translation_percent")

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from segslam import geometry
-from segslam.datasets import open_dataset
-from segslam.evaluation import align_positions, trajectory_metrics
-from segslam.log import read_log
+from segslam.core import geometry
+from segslam.core.evaluation import align_positions, trajectory_metrics
+from segslam.core.trajectory import Poses, rows_of_same_scan
+from segslam.core.types import Points
 from segslam.odometry import KissOdometry
-from segslam.run.finished import FinishedRun, read_run
-from segslam.run.folder import LOG
-from segslam.trajectory import Poses, rows_of_same_scan
-from segslam.types import Points
+from segslam.output.finished import FinishedRun, read_run
+from segslam.output.folder import LOG
+from segslam.output.log import read_log
+from segslam.scans import open_dataset
 from tools.benchmarks import common
 
 EXACT = ("num_loops_accepted", "num_loops_false", "num_motions_repaired", "num_motions_broken")

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.config import Config
-from segslam.datasets import DataSource
-from segslam.experiments import benchmark
-from segslam.experiments.job import Job
-from segslam.experiments.pairs import PairList, read_pairs
-from segslam.experiments.rows import Row
-from segslam.experiments.trials import Trial
-from segslam.experiments.variations import turned_trials
+from segslam.bench.experiments import benchmark
+from segslam.bench.experiments.job import Job
+from segslam.bench.experiments.pairs import PairList, read_pairs
+from segslam.bench.experiments.rows import Row
+from segslam.bench.experiments.trials import Trial
+from segslam.bench.experiments.variations import turned_trials
+from segslam.core.config import Config
+from segslam.scans import DataSource
 
 COARSE, REFINED = "segregator", "segregator-c2f"
 """Without and with refinement and verification."""

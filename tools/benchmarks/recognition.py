@@ -13,12 +13,12 @@ from time import process_time
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import load_config
-from segslam.evaluation import PoseError
-from segslam.recognition import MAX_PLACES, recognise
-from segslam.retrieval import Places, signature_of, signatures_around
-from segslam.types import Rejected
+from segslam.candidates import Places, signature_of, signatures_around
+from segslam.core import geometry
+from segslam.core.config import load_config
+from segslam.core.evaluation import PoseError
+from segslam.core.types import Rejected
+from segslam.slam.recognition import MAX_PLACES, recognise
 from tools.benchmarks import common
 from tools.benchmarks.submaps import Submaps
 
@@ -42,7 +42,7 @@ def main() -> None:
     index = Places()
     for row in range(end):
         points = submaps.cloud(row)
-        index.add(row, signature_of(points, np.zeros(len(points), np.uint8), config=config.geometric))
+        index.add(row, signature_of(points, np.zeros(len(points), np.uint8)))
     outcomes: Counter[str] = Counter()
     ranks, seconds = [], []
     for row in range(first, end, options.every):
@@ -52,7 +52,7 @@ def main() -> None:
         labels = np.zeros(len(points), np.uint8)
         query = submaps.prepared(row)
         started = process_time()
-        own = signature_of(points, labels, config=config.geometric)
+        own = signature_of(points, labels)
         shortlist = index.shortlist(own, below_id=num_old)
         ranks.append(
             next((k for k, one in enumerate(shortlist) if np.linalg.norm(at[one.place_id] - at[row]) < NEAR_M), None)
@@ -60,7 +60,7 @@ def main() -> None:
         world = submaps.T_world_lidar.__getitem__
         found = recognise(query, shortlist, submaps.prepared, world, config=config, max_places=3)
         if isinstance(found, Rejected):
-            around = signatures_around(points, labels, config=config.geometric)
+            around = signatures_around(points, labels)
             shortlist = index.shortlist_around((own, *around), below_id=num_old)
             found = recognise(query, shortlist, submaps.prepared, world, config=config, max_places=MAX_PLACES)
         seconds.append(process_time() - started)

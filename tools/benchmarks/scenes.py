@@ -17,15 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config, load_config
-from segslam.keyframes import downsample_keyframe
-from segslam.registration import PreparedScan, prepare_scan, register_prepared, shape_labels
-from segslam.simulation.scene_sensors import SENSORS, scan_points
-from segslam.simulation.scenes import SCENES, Scene, pose
-from segslam.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
+from segslam.bench.simulation.scene_sensors import SENSORS, scan_points
+from segslam.bench.simulation.scenes import SCENES, Scene, pose
+from segslam.candidates.prior import far_from_prior
+from segslam.core import geometry
+from segslam.core.config import Config, load_config
+from segslam.core.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
+from segslam.keyframes.keyframes import downsample_keyframe
+from segslam.labels import geometric_labels
+from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.verification import register_prepared
 from segslam.verification.patches import agreement
-from segslam.verification.prior import far_from_prior
 from tools.benchmarks import common
 
 DRIFT_M, DRIFT_DEG, HEIGHT_M = 1.5, 3.0, 0.3
@@ -49,7 +51,7 @@ class Place:
     def _prepare(self, row: int, visit: int) -> PreparedScan:
         rng = np.random.default_rng([self._seed, row, visit, 1])
         points = scan_points(self.scene, self._sensor, self.pose(row, visit), noise_m=self._noise_m, rng=rng)
-        labels = shape_labels(points, config=self._config)
+        labels = geometric_labels(points)
         classes = tuple(self._config.segregator.cluster_min_points)
         points, labels, _ = downsample_keyframe(points, labels, config=self._config.keyframes, whole_classes=classes)
         return prepare_scan(points, labels, config=self._config)

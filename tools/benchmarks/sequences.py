@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from segslam.evaluation import trajectory_metrics
-from segslam.pose_graph import PoseGraph
-from segslam.types import LoopClosure
+from segslam.core.evaluation import trajectory_metrics
+from segslam.core.types import LoopClosure
+from segslam.graph import PoseGraph
 from tools.benchmarks import common
 from tools.benchmarks.back_end.calibration import closure_calibration, odometry_calibration
 from tools.benchmarks.back_end.drives import CONFIG, exact

@@ -12,11 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config, load_config
-from segslam.datasets import open_dataset
-from segslam.registration import PreparedScan, prepare_scan, register_prepared, shape_labels
-from segslam.types import Alignment, Points, Transform
+from segslam.core import geometry
+from segslam.core.config import Config, load_config
+from segslam.core.types import Alignment, Points, Transform
+from segslam.labels import geometric_labels
+from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.scans import open_dataset
+from segslam.verification import register_prepared
 from tools.benchmarks import common
 
 NUM_BESIDE = 5
@@ -61,7 +63,7 @@ class Submaps:
 
     def _prepare(self, index: int) -> PreparedScan:
         points = self.cloud(index)
-        labels = shape_labels(points, config=self._config)
+        labels = geometric_labels(points)
         return prepare_scan(points, labels, config=self._config, seen_from_here=self._points(index))
 
 

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config, load_config
-from segslam.datasets import open_dataset
-from segslam.evaluation import trajectory_metrics
+from segslam.core import geometry
+from segslam.core.config import Config, load_config
+from segslam.core.evaluation import trajectory_metrics
+from segslam.core.types import Scan, Trajectory
+from segslam.labels.late import of_rows
 from segslam.odometry import GivenOdometry
-from segslam.run.accuracy import accuracy
-from segslam.semantics.late import of_rows
-from segslam.slam import Slam
-from segslam.types import Scan, Trajectory
+from segslam.output.accuracy import accuracy
+from segslam.scans import open_dataset
+from segslam.slam.slam import Slam
 from tools.benchmarks import common
 
 NEXT_BEAM_DEG = 180.0

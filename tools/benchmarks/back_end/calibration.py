@@ -4,10 +4,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from segslam import geometry
-from segslam.pose_graph.closure_pairs import adjoints
-from segslam.pose_graph.noise import DEGREES_OF_FREEDOM, closure_information, odometry_information
-from segslam.types import LoopClosure
+from segslam.core import geometry
+from segslam.core.types import LoopClosure
+from segslam.graph.closure_pairs import adjoints
+from segslam.graph.noise import DEGREES_OF_FREEDOM, closure_information, odometry_information
 from tools.benchmarks.back_end.drives import CONFIG, Drive
 
 LENGTHS = (1, 10, 100)
@@ -38,7 +38,7 @@ def closure_calibration(drive: Drive, closures: Iterable[LoopClosure]) -> float 
         _chi2(
             loop.T_target_source,
             geometry.inverse(drive.truth[loop.target_id]) @ drive.truth[loop.source_id],
-            closure_information(loop.information, CONFIG.graph),
+            closure_information(loop.information),
         )
         for loop in closures
     ]

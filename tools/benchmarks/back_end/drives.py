@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.datasets.kitti import read_calibration
-from segslam.evaluation import trajectory_metrics
-from segslam.keyframes import KeyframeSelector
-from segslam.pose_graph.noise import odometry_information
-from segslam.simulation import level_revisits, level_world
-from segslam.trajectory import lidar_from_camera, read_poses, travelled_m
-from segslam.types import Alignment, LoopClosure, Registration
+from segslam.bench.simulation import level_revisits, level_world
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.evaluation import trajectory_metrics
+from segslam.core.trajectory import lidar_from_camera, read_poses, travelled_m
+from segslam.core.types import Alignment, LoopClosure, Registration
+from segslam.graph.noise import odometry_information
+from segslam.keyframes.keyframes import KeyframeSelector
+from segslam.scans.kitti import read_calibration
 
 CONFIG = Config()
 CLOSURE_SIGMAS = geometry.tangent(rotation_rad=np.radians(0.1), translation_m=0.05)

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from segslam import geometry
-from segslam.pose_graph import PoseGraph
-from segslam.types import LoopClosure
+from segslam.core import geometry
+from segslam.core.types import LoopClosure
+from segslam.graph import PoseGraph
 from tools.benchmarks.back_end.drives import CONFIG, Drive, closure
 
 KINDS = ("random", "grouped", "nearby")

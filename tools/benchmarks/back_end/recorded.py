@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.evaluation import loop_metrics
-from segslam.log import read_log
-from segslam.types import Keyframe, LoopClosure, Points, SegslamError
+from segslam.core import geometry
+from segslam.core.evaluation import loop_metrics
+from segslam.core.types import Keyframe, LoopClosure, Points, SegslamError
+from segslam.output.log import read_log
 from tools.benchmarks.back_end.drives import Drive, exact_closure
 
 REACH_M = 6.0

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from segslam import geometry
-from segslam.evaluation import FOUND_WITHIN_M, REVISIT_MIN_TRAVEL_M
-from segslam.pose_graph import PoseGraph
-from segslam.proximity import ProximityDetector
-from segslam.types import LoopClosure
+from segslam.candidates.proximity import ProximityDetector
+from segslam.core import geometry
+from segslam.core.evaluation import FOUND_WITHIN_M, REVISIT_MIN_TRAVEL_M
+from segslam.core.types import LoopClosure
+from segslam.graph import PoseGraph
 from tools.benchmarks.back_end.drives import CONFIG, Drive
 
 REACH_M = 8.0

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from segslam.datasets import open_dataset
+from segslam.scans import open_dataset
 from tools.benchmarks import common
 from tools.benchmarks.faults.episodes import Outcome, disk_episode, live_episode, map_episode, topic_episode
 

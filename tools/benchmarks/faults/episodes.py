@@ -9,8 +9,8 @@ from time import sleep
 
 import numpy as np
 
-from segslam.log import read_log
-from segslam.types import SegslamError
+from segslam.core.types import SegslamError
+from segslam.output.log import read_log
 from tools.benchmarks.faults.commands import Command, kill, small_disk
 from tools.benchmarks.faults.files import LIVE, OFFLINE, write_whole
 

@@ -4,7 +4,7 @@ from time import process_time
 
 import numpy as np
 
-from segslam.retrieval import Places, PlaceSignature
+from segslam.candidates import Places, PlaceSignature
 from tools.benchmarks.common import Row
 
 NUM_QUERIES = 20

@@ -5,8 +5,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from segslam.simulation import SensorConfig, SimulationConfig, WorldConfig, in_lane, prepare_folder, write_drive
-from segslam.simulation.tracks import Drive, read_drive
+from segslam.bench.simulation import (
+    SensorConfig,
+    SimulationConfig,
+    WorldConfig,
+    in_lane,
+    prepare_folder,
+    write_drive,
+)
+from segslam.bench.simulation.tracks import Drive, read_drive
 
 TOWNS = ("00", "05", "06", "07", "02", "08")
 NUM_FRAMES = 240

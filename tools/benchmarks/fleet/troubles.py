@@ -17,7 +17,7 @@ from tools.benchmarks.common import Row
 from tools.benchmarks.fleet.towns import write_list
 
 STEPS = {"map_drive": "runs", "index_drive": "index", "propose": "proposals", "relate": "pairs", "join": "component_*"}
-"""The functions of `segslam.fleets.steps` and the folders that they fill."""
+"""The functions of `segslam.run.fleets.steps` and the folders that they fill."""
 COMPARED = ("poses_tum.txt", "graph.g2o")
 ADDRESS = "tcp://127.0.0.1:{}"
 FIRST_PORT, WAIT_S = 18700, 1800

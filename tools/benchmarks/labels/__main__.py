@@ -3,16 +3,16 @@
     python -m tools.benchmarks.labels DATA [--set verify.max_plan_hypotheses=0] [--pictures FOLDER] --out FILE.json
 
 DATA is the folder of real data: `kitti/` with ground-truth labels of scans 0-2, predicted ones, and
-`reference_pairs.json`, and `courtyard/`. Writes JSON, and the tables as FILE.md. The numbers of `GeometricLabelsConfig`
+`reference_pairs.json`, and `courtyard/`. Writes JSON, and the tables as FILE.md. The numbers of `labels/geometric.py`
 were chosen on those scans and pairs of KITTI. KISS-Matcher needs the extra `bench`.
 """
 
 from pathlib import Path
 from typing import Any
 
-from segslam.config import load_config
-from segslam.datasets import open_dataset
-from segslam.experiments.methods import find_method
+from segslam.bench.experiments.methods import find_method
+from segslam.core.config import load_config
+from segslam.scans import open_dataset
 from tools.benchmarks import common
 from tools.benchmarks.labels.courtyard import courtyard
 from tools.benchmarks.labels.kitti import class_agreement, pairs_by_labels, speed

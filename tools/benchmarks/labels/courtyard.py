@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.datasets import DataSource
-from segslam.experiments.job import open_once, points_of
-from segslam.experiments.pairs import PairList, cut_pairs
-from segslam.experiments.rows import Row
-from segslam.experiments.summary import figures, grouped
-from segslam.experiments.trials import Trial
-from segslam.experiments.variations import pair_trials
-from segslam.registration import shape_labels
-from segslam.types import Label, Trajectory
+from segslam.bench.experiments.job import open_once, points_of
+from segslam.bench.experiments.pairs import PairList, cut_pairs
+from segslam.bench.experiments.rows import Row
+from segslam.bench.experiments.summary import figures, grouped
+from segslam.bench.experiments.trials import Trial
+from segslam.bench.experiments.variations import pair_trials
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Label, Trajectory
+from segslam.labels import geometric_labels
+from segslam.scans import DataSource
 from tools.benchmarks import real_pairs
 
 BANDS_M = ((5.0, 10.0), (10.0, 15.0))
@@ -81,7 +81,7 @@ def draw_pair(file: Path, trial: Trial, row: Row, source: DataSource, config: Co
         (trial.source, trial.T_target_source, "tab:orange", "source, at its true pose"),
     ):
         points = points_of(source, scan)
-        labels = shape_labels(points, config=config)
+        labels = geometric_labels(points)
         points = points[(labels != Label.ROAD) & (labels != Label.UNLABELLED)]
         x, y, _ = geometry.apply(T_target_scan, points.astype(np.float64)).T
         at, label = T_target_scan[:2, 3], f"{scan.index}: {role}"

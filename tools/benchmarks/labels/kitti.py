@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from segslam.config import Config
-from segslam.datasets import open_dataset
-from segslam.experiments.rows import Row
-from segslam.experiments.summary import figures, grouped
-from segslam.semantics import geometric_labels
-from segslam.semantics.late import computed
-from segslam.types import GROUND_LABELS, Label, Points
+from segslam.bench.experiments.rows import Row
+from segslam.bench.experiments.summary import figures, grouped
+from segslam.core.config import Config
+from segslam.core.types import GROUND_LABELS, Label, Points
+from segslam.labels import geometric_labels
+from segslam.labels.late import computed
+from segslam.scans import open_dataset
 from tools.benchmarks import real_pairs
 
 CLASSES = {
@@ -32,7 +32,7 @@ def class_agreement(data: Path, config: Config) -> dict[str, dict[str, float]]:
     for scan in open_dataset(data / "kitti", sequence="00", frames="0:3"):
         true_labels = computed(scan.labels)
         known = true_labels != Label.UNLABELLED
-        labels, truth = geometric_labels(scan.points, config=config.geometric)[known], true_labels[known]
+        labels, truth = geometric_labels(scan.points)[known], true_labels[known]
         counts[f"scan {scan.index}"] = {}
         for name, members in CLASSES.items():
             ours, theirs = np.isin(labels, members), np.isin(truth, members)
@@ -49,10 +49,10 @@ def speed(points: Points, config: Config, repeats: int = 21) -> dict[str, float]
     """Milliseconds to label a scan: CPU time of the thread, wall time, and relative to sorting as many numbers."""
     keys = np.random.default_rng(0).random(len(points))
     clocks: dict[str, list[float]] = {"thread": [], "wall": [], "sort": []}
-    geometric_labels(points, config=config.geometric)
+    geometric_labels(points)
     for _ in range(repeats):
         wall, thread = time.perf_counter(), time.thread_time()
-        geometric_labels(points, config=config.geometric)
+        geometric_labels(points)
         clocks["wall"].append(time.perf_counter() - wall)
         clocks["thread"].append(time.thread_time() - thread)
         thread = time.thread_time()

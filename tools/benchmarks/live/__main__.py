@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from segslam import geometry
-from segslam.datasets import Dataset, open_dataset
-from segslam.log import read_log
-from segslam.run.finished import read_run
+from segslam.core import geometry
+from segslam.output.finished import read_run
+from segslam.output.log import read_log
+from segslam.scans import Dataset, open_dataset
 from tools.benchmarks import common
 from tools.benchmarks.live.sender import FolderSender, RosSender, Sender
 

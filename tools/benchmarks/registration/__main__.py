@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from segslam import keep_freed_memory
-from segslam.config import Config, load_config
-from segslam.experiments.variations import pair_trials
-from segslam.semantics.late import computed
+from segslam.bench.experiments.variations import pair_trials
+from segslam.core.config import Config, load_config
+from segslam.labels.late import computed
 from tools.benchmarks import common, real_pairs
 from tools.benchmarks.common import Row, markdown
 from tools.benchmarks.registration.ablation import Case, ablation

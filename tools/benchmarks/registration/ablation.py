@@ -5,10 +5,10 @@ from functools import cache
 
 import numpy as np
 
-from segslam import segregator
-from segslam.config import Config, load_config
-from segslam.experiments.trials import Trial
-from segslam.types import Description, Label
+from segslam.bench.experiments.trials import Trial
+from segslam.core.config import Config, load_config
+from segslam.core.types import Description, Label
+from segslam.registration import segregator
 from tools.benchmarks.common import Row
 from tools.benchmarks.registration.attempts import error_of, percent
 from tools.benchmarks.registration.scans import Labelled
@@ -24,7 +24,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "cars and trunks of the authors' sizes": ("segregator.cluster_min_points={car: 30, trunk: 15}",),
     "things at their centres, not feet": ("segregator.foot_classes=[]",),
     "one noise for all (joint solver)": ("segregator.solver=joint",),
-    "ground without weight": ("segregator.ground_weight=0",),
     "features never": ("segregator.features=never",),
     "features always": ("segregator.features=always",),
 }

@@ -7,12 +7,15 @@ from functools import cache
 
 import numpy as np
 
-from segslam import geometry, refinement, segregator
-from segslam.config import Config
-from segslam.evaluation import PoseError
-from segslam.experiments.trials import Trial
-from segslam.registration import PreparedScan, Stopwatch, prepare_scan, register_prepared
-from segslam.types import Alignment, Registration, Rejected, Transform
+from segslam.bench.experiments.trials import Trial
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.evaluation import PoseError
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import Alignment, Registration, Rejected, Transform
+from segslam.registration import refinement, segregator
+from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.verification import register_prepared
 from tools.benchmarks.common import RIGHT_DEG, RIGHT_M
 from tools.benchmarks.registration.scans import Labelled
 

@@ -5,10 +5,10 @@ from functools import partial
 from itertools import combinations, product
 from pathlib import Path
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.registration import register_prepared
-from segslam.types import Alignment
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Alignment
+from segslam.verification import register_prepared
 from tools.benchmarks.common import Row
 from tools.benchmarks.registration.attempts import error, preparer
 from tools.benchmarks.registration.scans import by_shape, courtyard_points, kitti_pose, real_indices, real_scan

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.config import Config
-from segslam.evaluation import PoseError
-from segslam.experiments import rows
-from segslam.experiments.summary import grouped
+from segslam.bench.experiments import rows
+from segslam.bench.experiments.summary import grouped
+from segslam.core.config import Config
+from segslam.core.evaluation import PoseError
 from tools.benchmarks import real_pairs
 from tools.benchmarks.common import Row
 

@@ -7,13 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.datasets.kitti import read_returns
-from segslam.experiments.job import open_once
-from segslam.experiments.trials import ScanVariant, Trial
-from segslam.semantics import geometric_labels
-from segslam.simulation import (
+from segslam.bench.experiments.job import open_once
+from segslam.bench.experiments.trials import ScanVariant, Trial
+from segslam.bench.simulation import (
     Drive,
     LabelErrorConfig,
     SimulationConfig,
@@ -26,9 +22,13 @@ from segslam.simulation import (
     sweep,
     sweep_errors,
 )
-from segslam.simulation.sensor import Sensor
-from segslam.simulation.world import World
-from segslam.types import Labels, Points, Scan, Transform
+from segslam.bench.simulation.sensor import Sensor
+from segslam.bench.simulation.world import World
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Labels, Points, Scan, Transform
+from segslam.labels import geometric_labels
+from segslam.scans.kitti import read_returns
 from tools.benchmarks import real_pairs
 
 Labelled = tuple[Points, Labels]
@@ -149,6 +149,6 @@ def by_shape(points_of: Callable[[int], Points], config: Config) -> Callable[[in
 
     def scan(index: int) -> Labelled:
         points = points_of(index)
-        return points, geometric_labels(points, config=config.geometric)
+        return points, geometric_labels(points)
 
     return scan

@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam.config import Config
-from segslam.registration import PreparedScan, register_prepared
-from segslam.types import Alignment
+from segslam.core.config import Config
+from segslam.core.types import Alignment
+from segslam.registration.prepared import PreparedScan
+from segslam.verification import register_prepared
 from tools.benchmarks.common import RIGHT_DEG, RIGHT_M, Row
 from tools.benchmarks.registration.attempts import Attempt, attempt, percent, preparer
 from tools.benchmarks.registration.scans import BANDS_M, Labelled, SimulatedPlace, by_shape

@@ -7,14 +7,15 @@ from time import perf_counter, process_time
 
 import numpy as np
 
-from segslam import refinement, segregator
-from segslam.config import Config
-from segslam.experiments.baselines import align_gicp, prepare_gicp
-from segslam.experiments.meter import measured
-from segslam.experiments.trials import Trial
-from segslam.registration import prepare_scan, register
-from segslam.types import Description, Label, Points, Registration
-from segslam.verification.free_space import observe_free_space
+from segslam.bench.experiments.baselines import align_gicp, prepare_gicp
+from segslam.bench.experiments.meter import measured
+from segslam.bench.experiments.trials import Trial
+from segslam.core.config import Config
+from segslam.core.types import Description, Label, Points, Registration
+from segslam.registration import refinement, segregator
+from segslam.registration.free_space import observe_free_space
+from segslam.registration.prepared import prepare_scan
+from segslam.verification import register
 from segslam.verification.patches import agreement
 from tools.benchmarks.common import Row
 from tools.benchmarks.registration.scans import Labelled

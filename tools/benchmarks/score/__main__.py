@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.config import Config, load_config
-from segslam.simulation.scenes import SCENES
+from segslam.bench.simulation.scenes import SCENES
+from segslam.core.config import Config, load_config
 from segslam.verification.patches import BINS
 from segslam.verification.score import Table, least_odds
 from tools.benchmarks import common, score

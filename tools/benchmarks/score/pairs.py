@@ -8,19 +8,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.datasets import Dataset, open_dataset
-from segslam.evaluation import PoseError
-from segslam.keyframes import downsample_keyframe
-from segslam.registration import Gate, PreparedScan, Stopwatch, anywhere, prepare_scan, register_prepared, shape_labels
-from segslam.registration.pair import tried_poses
-from segslam.registration.trial import Trial
-from segslam.simulation.scenes import SCENES
-from segslam.types import Alignment, LoopCandidate, Points, Rejected, Rotation, Transform
-from segslam.verification import score
+from segslam.bench.simulation.scenes import SCENES
+from segslam.candidates.prior import far_from_prior
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.evaluation import PoseError
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import Alignment, LoopCandidate, Points, Rejected, Rotation, Transform
+from segslam.keyframes.keyframes import downsample_keyframe
+from segslam.labels import geometric_labels
+from segslam.registration.hypotheses import Gate, anywhere
+from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.scans import Dataset, open_dataset
+from segslam.verification import register_prepared, score
+from segslam.verification.pair import tried_poses
 from segslam.verification.patches import agreement
-from segslam.verification.prior import far_from_prior
+from segslam.verification.trial import Trial
 from tools.benchmarks import common, scenes
 from tools.benchmarks.registration.scans import courtyard_points
 from tools.benchmarks.score.ratio import Pair, Pose
@@ -173,7 +176,7 @@ def _drive(part: str, data: Path, config: Config) -> tuple[Callable[[int], Prepa
 def _preparer(points_of: Callable[[int], Points], config: Config) -> Callable[[int], PreparedScan]:
     def prepared(row: int) -> PreparedScan:
         points = points_of(row)
-        labels = shape_labels(points, config=config)
+        labels = geometric_labels(points)
         classes = tuple(config.segregator.cluster_min_points)
         points, labels, _ = downsample_keyframe(points, labels, config=config.keyframes, whole_classes=classes)
         return prepare_scan(points, labels, config=config)

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from segslam.registration.rivals import SAME_POSE_M, SAME_POSE_RAD
-from segslam.registration.trial import is_near
-from segslam.types import Transform, Vector
+from segslam.core.types import Transform, Vector
 from segslam.verification.patches import BINS, Counts, Shown, counted
+from segslam.verification.rivals import SAME_POSE_M, SAME_POSE_RAD
 from segslam.verification.score import NO_OTHER, Table, paired_lead
+from segslam.verification.trial import is_near
 
 PRIOR_COUNT = 0.5
 """Jeffreys': pseudo-counts of a bin that was never seen."""

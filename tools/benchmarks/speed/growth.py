@@ -10,17 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from segslam import geometry
-from segslam.config import Config
-from segslam.log import LogWriter
-from segslam.log.drawing import Drawing
-from segslam.odometry import GivenOdometry
-from segslam.pose_graph import G2oGraph, optimize_graph
-from segslam.pose_graph.edges import Edge
-from segslam.proximity import ProximityDetector
-from segslam.registration import Stopwatch
-from segslam.slam import Slam
-from segslam.types import (
+from segslam.candidates.proximity import ProximityDetector
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import (
     Alignment,
     GraphEstimate,
     Keyframe,
@@ -31,6 +25,12 @@ from segslam.types import (
     Step,
     Trajectory,
 )
+from segslam.graph import G2oGraph, optimize_graph
+from segslam.graph.edges import Edge
+from segslam.odometry import GivenOdometry
+from segslam.output.log import LogWriter
+from segslam.output.log.drawing import Drawing
+from segslam.slam.slam import Slam
 
 STEP_M = 2.0
 LAP = 500

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from segslam import open_dataset
-from segslam.config import Config
-from segslam.slam import Slam
+from segslam.core.config import Config
+from segslam.slam.slam import Slam
 
 
 def latency(data: Path, sequence: str, frames: tuple[int, int], *, labels: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from mcap.reader import make_reader
 
-from segslam.log import schema
+from segslam.output.log import schema
 
 RIVALS = Path(__file__).with_name("rivals.py")
 

@@ -1,0 +1,96 @@
+"""Registration methods of other libraries, with the settings that their authors recommend for LiDAR scans.
+
+`prepare_*` computes the data of one scan that can be reused; `align_*` aligns two prepared scans. Methods run on one
+thread if the library allows it.
+"""
+
+from typing import Any
+
+import numpy as np
+import small_gicp
+
+from segslam.bench.experiments.estimate import Estimate
+from segslam.core import geometry
+from segslam.core.types import Points, Rejected, RejectReason
+
+GICP_VOXEL_M = 0.25
+GICP_DISTANCE_M = 1.0
+VGICP_VOXEL_M = 1.0
+GICP_NEIGHBOURS = 10
+"""small_gicp's defaults (Koide, JOSS 2024), for outdoor LiDAR."""
+GICP_ITERATIONS = 64
+"""Value of the author's fast_gicp, used in the paper.
+
+With small_gicp's 20, two of three pairs 4 m apart do not converge.
+"""
+KISS_MIN_POINTS = 100
+"""Chosen: KISS-Matcher 1.0.2 terminates the process with about a dozen points."""
+KISS_VOXEL_M = 0.3
+"""Voxel size that KISS-Matcher's authors use outdoors (Lim et al., ICRA 2025)."""
+
+
+class GicpScan:
+    """A downsampled cloud with covariances, search tree and voxel map. It is pickled as its points."""
+
+    def __init__(self, downsampled: Points) -> None:
+        self.cloud = small_gicp.PointCloud(downsampled)
+        self.tree = small_gicp.KdTree(self.cloud)
+        small_gicp.estimate_normals_covariances(self.cloud, self.tree, GICP_NEIGHBOURS, 1)
+        self.voxels = small_gicp.GaussianVoxelMap(VGICP_VOXEL_M)
+        self.voxels.insert(self.cloud)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return GicpScan, (self.cloud.points()[:, :3],)
+
+
+def prepare_gicp(points: Points) -> GicpScan:
+    """Preprocessing of small_gicp."""
+    return GicpScan(small_gicp.voxelgrid_sampling(points.astype(np.float64), GICP_VOXEL_M, 1).points()[:, :3])
+
+
+def align_gicp(source: GicpScan, target: GicpScan) -> Estimate | Rejected:
+    """GICP (Segal et al., RSS 2009) from the identity."""
+    found = small_gicp.align(
+        target.cloud,
+        source.cloud,
+        target.tree,
+        max_correspondence_distance=GICP_DISTANCE_M,
+        max_iterations=GICP_ITERATIONS,
+    )
+    return _small_gicp_outcome(found, source)
+
+
+def align_vgicp(source: GicpScan, target: GicpScan) -> Estimate | Rejected:
+    """Voxelised GICP (Koide et al., ICRA 2021) from the identity."""
+    found = small_gicp.align(
+        target.voxels, source.cloud, max_correspondence_distance=GICP_DISTANCE_M, max_iterations=GICP_ITERATIONS
+    )
+    return _small_gicp_outcome(found, source)
+
+
+def prepare_points(points: Points) -> Points:
+    """The points, unchanged, for methods without a preparation step."""
+    return points.astype(np.float32)
+
+
+def align_kiss_matcher(source: Points, target: Points) -> Estimate | Rejected:
+    """KISS-Matcher on the whole scans, including the ground."""
+    import kiss_matcher  # optional package: extra `bench`
+
+    if min(len(source), len(target)) < KISS_MIN_POINTS:
+        return Rejected(RejectReason.TOO_FEW_POINTS, f"{len(source)} and {len(target)} points")
+    found = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(KISS_VOXEL_M))
+    pose = found.estimate(source, target)
+    if not pose.valid:
+        return Rejected(RejectReason.TOO_FEW_INLIERS, f"{found.get_num_final_inliers()} inliers")
+    return Estimate(
+        geometry.transform(np.array(pose.rotation), np.array(pose.translation).ravel()),
+        num_correspondences=len(found.get_initial_correspondences()),
+        num_inliers=found.get_num_final_inliers(),
+    )
+
+
+def _small_gicp_outcome(found: Any, source: GicpScan) -> Estimate | Rejected:
+    if found.num_inliers == 0:
+        return Rejected(RejectReason.REFINEMENT_DIVERGED, "no point pairs")
+    return Estimate(found.T_target_source, num_correspondences=source.cloud.size(), num_inliers=int(found.num_inliers))

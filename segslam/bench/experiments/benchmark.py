@@ -1,0 +1,104 @@
+"""Runs the trials of a benchmark on one or several workers, stores each row at once, and resumes interrupted runs."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from segslam.bench.experiments.job import Job
+from segslam.bench.experiments.rows import Row, RowFile, read_rows
+from segslam.bench.experiments.summary import grouped
+from segslam.bench.experiments.trials import Trial
+from segslam.bench.experiments.workers import LOST_WORKER, run_here, run_on
+from segslam.core.cluster import cluster
+from segslam.core.errors import reason
+from segslam.core.types import SegslamError
+from segslam.core.whole_files import write_whole
+
+ROWS_FILE = "details.csv"
+IDENTITY_FILE = "asked.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """The workers: this process, several processes of this machine, or a Dask cluster."""
+
+    workers: int = 1
+    scheduler: str | None = None
+
+
+def run(job: Job, trials: Sequence[Trial], *, pool: Pool = Pool(), folder: Path | None = None) -> Iterator[list[Row]]:
+    """Yields the rows of each trial when it is finished, starting with those already in the folder.
+
+    With a folder, the rows of a trial are on the disk before the next trial is yielded. The same benchmark in the same
+    folder continues where it stopped; raises SegslamError if the folder contains another benchmark.
+    """
+    done = _rows_before(folder, job, trials) if folder else []
+    tried = grouped(done, lambda row: row.key[:3])
+    left = [trial for trial in trials if trial.key not in tried]
+    with RowFile(folder / ROWS_FILE, done) if folder else nullcontext() as file:
+        yield from tried.values()
+        for rows in _work(job, left, pool):
+            if file is not None:
+                file.write(rows)
+            yield rows
+
+
+def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row]:
+    """The rows in the order of a single process, whatever the order in which they were finished."""
+    place = {trial.key: number for number, trial in enumerate(trials)}
+    return sorted(rows, key=lambda row: (place[row.key[:3]], job.methods.index(row.method)))
+
+
+def _work(job: Job, trials: Sequence[Trial], pool: Pool) -> Iterator[list[Row]]:
+    if not trials:
+        return
+    if pool.workers == 1 and pool.scheduler is None:
+        yield from run_here(job, trials)
+        return
+    with cluster(workers=pool.workers, scheduler=pool.scheduler) as client:
+        yield from run_on(client, job, trials)
+
+
+def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
+    """The rows of finished trials; raises SegslamError if they belong to another benchmark."""
+    identity = _identity(job, trials)
+    file = folder / IDENTITY_FILE
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        if before is None:
+            write_whole(file, json.dumps(identity, indent=1) + "\n")
+    except OSError as error:
+        raise SegslamError(f"{file}: cannot be read or written ({reason(error)}); choose another --out") from error
+    except ValueError as error:
+        raise SegslamError(f"{file}: is not JSON ({error}); choose another --out") from error
+    if before is None:
+        return []
+    for key in identity:
+        if before.get(key) != identity[key]:
+            raise SegslamError(f"{folder}: contains a benchmark with other {key}; choose another --out, or delete it")
+    rows = read_rows(folder / ROWS_FILE) if (folder / ROWS_FILE).exists() else []
+    return _of_whole_trials([row for row in rows if row.reason != LOST_WORKER], job)
+
+
+def _of_whole_trials(rows: list[Row], job: Job) -> list[Row]:
+    """The rows of trials that every method has finished."""
+    trials = grouped(rows, lambda row: row.key[:3]).values()
+    return [row for some in trials if {one.method for one in some} == set(job.methods) for row in some]
+
+
+def _identity(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:
+    """Everything that identifies a benchmark, in readable form."""
+    digest = hashlib.sha256()
+    for trial in trials:
+        digest.update(repr((trial.key, trial.T_target_source.round(6).tolist())).encode())
+    return {
+        "methods": list(job.methods),
+        "settings": job.config.model_dump(mode="json"),
+        "labels": [job.source.labels, job.source.encoding],
+        "pairs": {"number": len(trials), "sha256": digest.hexdigest()},
+    }

@@ -1,0 +1,142 @@
+"""Data, methods and settings of a benchmark, and its two units of work: prepare a scan, register a pair."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+from segslam.bench.experiments.estimate import Estimate
+from segslam.bench.experiments.meter import Cost, measured
+from segslam.bench.experiments.methods import METHODS, Part, prepare_parts
+from segslam.bench.experiments.rows import Row
+from segslam.bench.experiments.trials import ScanVariant, Trial
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.evaluation import PoseError
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import BadScan, Points, Rejected
+from segslam.labels import geometric_labels
+from segslam.scans import Dataset, DataSource
+
+logger = logging.getLogger(__name__)
+
+BAD_SCAN = "bad_scan"
+"""Reject reason of a row whose scan cannot be read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Job:
+    """Everything that the trials of a benchmark have in common; sent to the workers."""
+
+    source: DataSource
+    methods: tuple[str, ...]
+    config: Config
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedScan:
+    """The data of one scan that the methods share; empty if the scan cannot be used."""
+
+    parts: Mapping[str, Part]
+    labelling: Cost | None = None
+    """Cost of labels by geometry or network; None for labels from files."""
+    unusable: bool = False
+
+
+def shared_scan(job: Job, variant: ScanVariant) -> SharedScan:
+    """Read, rotate, label and prepare a scan, and remove some labels. Geometric labels are those of rotated points."""
+    dataset, row_of_scan = open_once(job.source)
+    try:
+        scan = dataset[row_of_scan[variant.index]]
+    except BadScan as error:
+        logger.warning("scan %d skipped: %s", variant.index, error)
+        return SharedScan({}, unusable=True)
+    points, labels, labelling = variant.turned(scan.points), scan.labels, None
+    if callable(labels):
+        with measured() as labelling:
+            labels = labels()
+    elif dataset.labels.geometric and not labels.any():
+        with measured() as labelling:
+            labels = geometric_labels(points)
+    parts = prepare_parts(points, variant.remaining(labels), methods=job.methods, config=job.config)
+    return SharedScan(parts, labelling)
+
+
+def points_of(source: DataSource, variant: ScanVariant) -> Points:
+    """The points (n, 3) of a variant, as the methods receive them."""
+    dataset, row_of_scan = open_once(source)
+    scan = dataset[row_of_scan[variant.index]]
+    return variant.turned(scan.points)
+
+
+def register_trial(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> list[Row]:
+    """Rows of all methods of the job for one pair, from the same prepared scans."""
+    return [_register(method, job.config, trial, source, target) for method in job.methods]
+
+
+@lru_cache(maxsize=4)
+def open_once(source: DataSource) -> tuple[Dataset, dict[int, int]]:
+    """The data set, opened once per process, and the row of each scan."""
+    dataset = source.open()
+    return dataset, {int(index): row for row, index in enumerate(dataset.scan_index)}
+
+
+def _register(method: str, config: Config, trial: Trial, source: SharedScan, target: SharedScan) -> Row:
+    if source.unusable or target.unusable:
+        return failed_row(method, trial, BAD_SCAN)
+    scans = [{name: shared.parts[name] for name in METHODS[method].parts} for shared in (source, target)]
+    values = [{name: part.value for name, part in parts.items()} for parts in scans]
+    watch = Stopwatch()
+    with measured() as cost:
+        outcome = METHODS[method].align(values[0], values[1], config, watch)
+    costs = [part.cost for parts in scans for part in parts.values()]
+    labelled = [shared.labelling for shared in (source, target) if shared.labelling and _uses_labels(method)]
+    reason = outcome.reason.value if isinstance(outcome, Rejected) else ""
+    return failed_row(method, trial, reason).model_copy(
+        update=_times(cost, costs, labelled, watch) | ({} if isinstance(outcome, Rejected) else _found(outcome, trial))
+    )
+
+
+def _times(aligned: Cost, prepared: list[Cost], labelled: list[Cost], watch: Stopwatch) -> dict[str, float | None]:
+    """The columns of a row for time and memory."""
+    costs = [aligned, *prepared, *labelled]
+    return {
+        "ms": 1000 * sum(cost.seconds for cost in costs),
+        "cpu_ms": 1000 * sum(cost.cpu_seconds for cost in costs),
+        "label_ms": 1000 * sum(cost.seconds for cost in labelled) if labelled else None,
+        "prepare_ms": 1000 * sum(cost.seconds for cost in prepared),
+        "peak_mb": max((cost.peak_mb for cost in costs if cost.peak_mb is not None), default=None),
+    } | {f"{stage}_ms": 1000 * seconds for stage, seconds in watch.seconds.items()}
+
+
+def _found(estimate: Estimate, trial: Trial) -> dict[str, object]:
+    error = PoseError.of(estimate.T_target_source @ geometry.inverse(trial.T_target_source))
+    return {
+        "accepted": True,
+        "error_m": error.translation_m,
+        "error_deg": error.rotation_deg,
+        "num_correspondences": estimate.num_correspondences,
+        "num_edges": estimate.num_edges,
+        "num_inliers": estimate.num_inliers,
+        "T_target_source": " ".join(f"{value:.9g}" for value in estimate.T_target_source[:3].ravel()),
+    }
+
+
+def _uses_labels(method: str) -> bool:
+    return any(part.endswith("description") for part in METHODS[method].parts)
+
+
+def failed_row(method: str, trial: Trial, reason: str) -> Row:
+    """The row of a registration without pose."""
+    return Row(
+        pairs=trial.pairs,
+        source=trial.source.index,
+        target=trial.target.index,
+        source_yaw_deg=trial.source.yaw_deg,
+        source_lost=trial.source.lost,
+        target_lost=trial.target.lost,
+        draw=max(trial.source.draw, trial.target.draw),
+        method=method,
+        accepted=False,
+        reason=reason,
+    )

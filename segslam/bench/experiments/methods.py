@@ -1,0 +1,161 @@
+"""All registration methods behind one interface: the data they need per scan, and how they align two scans."""
+
+import importlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from segslam import verification as registration
+from segslam.bench.experiments import baselines
+from segslam.bench.experiments.estimate import Estimate
+from segslam.bench.experiments.meter import Cost, measured
+from segslam.bench.experiments.method_settings import check_method, method_config
+from segslam.core.config import Config, RefineConfig
+from segslam.core.extras import how_to_install
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import Alignment, Description, Labels, Points, Registration, Rejected, SegslamError
+from segslam.registration import refinement, segregator
+from segslam.registration.free_space import FreeSpace, observe_free_space
+from segslam.registration.prepared import PreparedScan
+
+Values = Mapping[str, Any]
+"""The parts of one scan by name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """Data computed from one scan, and its cost."""
+
+    value: Any
+    cost: Cost
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """Aligns two scans, given the parts of each that it names."""
+
+    parts: tuple[str, ...]
+    align: Callable[[Values, Values, Config, Stopwatch], Estimate | Rejected]
+    package: tuple[str, str] | None = None
+    """Module and extra, if the package is optional or slow to import."""
+
+
+class SurfaceScan:
+    """Surface and free space of a scan, for refinement and verification. It is pickled as its points."""
+
+    def __init__(self, downsampled: Points, free_space: FreeSpace, config: RefineConfig) -> None:
+        self.surface = refinement.make_surface(downsampled, config=config)
+        self.free_space = free_space
+        self._config = config
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SurfaceScan, (self.surface.points.astype("float32"), self.free_space, self._config)
+
+
+def _surface(points: Points, labels: Labels, config: Config) -> SurfaceScan:
+    return SurfaceScan(refinement.downsample(points, config=config.refine), observe_free_space(points), config.refine)
+
+
+def _description(points: Points, labels: Labels, config: Config) -> Description:
+    return segregator.describe(points, labels, config=config.segregator)
+
+
+def _fpfh_description(points: Points, labels: Labels, config: Config) -> Description:
+    return segregator.describe(points, labels, config=method_config(config, "teaser").segregator)
+
+
+def _of_points(make: Callable[[Points], Any]) -> Callable[[Points, Labels, Config], Any]:
+    """Wrapper for a part that depends on neither labels nor settings."""
+    return lambda points, labels, config: make(points)
+
+
+def _open3d(name: str) -> Callable[..., Any]:
+    """A function of `open3d_methods`, imported on the first call."""
+    return lambda *scans: getattr(importlib.import_module("segslam.bench.experiments.open3d_methods"), name)(*scans)
+
+
+PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
+    "description": _description,
+    "fpfh_description": _fpfh_description,
+    "surface": _surface,
+    "gicp": _of_points(baselines.prepare_gicp),
+    "fpfh": _of_points(_open3d("prepare_fpfh")),
+    "points": _of_points(baselines.prepare_points),
+}
+
+
+def prepare_parts(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> dict[str, Part]:
+    """All parts of a scan that these methods need, each computed once."""
+    parts = {}
+    for name in dict.fromkeys(part for method in methods for part in METHODS[method].parts):
+        with measured() as cost:
+            value = PARTS[name](points, labels, config)
+        parts[name] = Part(value, cost)
+    return parts
+
+
+def find_method(name: str) -> Method:
+    """The method of a name. Raises SegslamError if it is unknown or its package is not installed."""
+    check_method(name)
+    method = METHODS[name]
+    if method.package is not None:
+        module, extra = method.package
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise SegslamError(f"--method {name}: needs {module}: {how_to_install(extra)}") from error
+    return method
+
+
+def _match(source: Values, target: Values, config: Config, watch: Stopwatch, *, part: str) -> Estimate | Rejected:
+    with watch("match"):
+        found = segregator.match(source[part], target[part], config=config.segregator)
+    return found if isinstance(found, Rejected) else _estimate(found, found)
+
+
+def _segregator(name: str, part: str = "description") -> Method:
+    """Segregator's coarse pose with the settings of a method."""
+    return Method(
+        (part,),
+        lambda source, target, config, watch: _match(source, target, method_config(config, name), watch, part=part),
+    )
+
+
+def _align(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:
+    scans = (
+        PreparedScan(values["description"], values["surface"].surface, values["surface"].free_space)
+        for values in (source, target)
+    )
+    found = registration.register_prepared(*scans, config=config, watch=watch)
+    if isinstance(found, Alignment):
+        estimate = _estimate(found.coarse, found.fine)
+        return replace(estimate, probability=found.probability, evidence=found.evidence)
+    return found
+
+
+def _estimate(coarse: Registration, fine: Registration) -> Estimate:
+    return Estimate(fine.T_target_source, coarse.num_correspondences, coarse.num_inliers, coarse.num_edges)
+
+
+def _baseline(
+    part: str, align: Callable[[Any, Any], Estimate | Rejected], package: tuple[str, str] | None = None
+) -> Method:
+    def run(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:
+        with watch("match"):
+            return align(source[part], target[part])
+
+    return Method((part,), run, package)
+
+
+METHODS: dict[str, Method] = {
+    "segregator": _segregator("segregator"),
+    "segregator-c2f": Method(("description", "surface"), _align),
+    "segator": _segregator("segator"),
+    "teaser": _segregator("teaser", "fpfh_description"),
+    "quatro": _segregator("quatro", "fpfh_description"),
+    "vgicp": _baseline("gicp", baselines.align_vgicp),
+    "gicp": _baseline("gicp", baselines.align_gicp),
+    "kiss-matcher": _baseline("points", baselines.align_kiss_matcher, ("kiss_matcher", "bench")),
+    "ransac": _baseline("fpfh", _open3d("align_ransac"), ("open3d", "bench")),
+    "fgr": _baseline("fpfh", _open3d("align_fgr"), ("open3d", "bench")),
+}

@@ -1,0 +1,122 @@
+"""Lists of scan pairs, from files or selected by true poses as in the paper, and the true pose of each pair."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.trajectory import rows_of_same_scan
+from segslam.core.types import IndexPairs, SegslamError, Trajectory, Transform
+
+MIN_GAP = 50
+"""Smallest number of scans between the two of a pair, as in the paper's lists."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairList:
+    """Pairs of scans, `pairs` (n, 2): numbers of source and target."""
+
+    name: str
+    pairs: IndexPairs
+    num_whole: int
+    """Number of pairs before sampling."""
+    truth: Mapping[tuple[int, int], Transform] | None = None
+    """T_target_source of each pair if the list contains it; otherwise the data set's poses are used."""
+
+
+def read_pairs(file: Path) -> PairList:
+    """A list from a text file with `source target` per line, or from a JSON list of {source, target, T_target_source}.
+
+    Raises SegslamError, naming file and line, for another form.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(
+            f"{file}: cannot read the pairs ({error}); give a file with `source target` on each line"
+        ) from error
+    return _from_json(file, text) if file.suffix == ".json" else _from_text(file, text)
+
+
+def cut_pairs(reference: Trajectory, *, name: str, min_m: float, max_m: float, min_gap: int = MIN_GAP) -> PairList:
+    """All pairs, older scan first, that are `min_m` to `max_m` apart and at least `min_gap` scans apart in time."""
+    positions = reference.T_world_lidar[:, :3, 3]
+    found = [np.empty((0, 2), dtype=int)]
+    for row, index in enumerate(reference.scan_index):
+        later = np.flatnonzero(reference.scan_index >= index + min_gap)
+        distance_m = np.linalg.norm(positions[later] - positions[row], axis=1)
+        chosen = later[(distance_m >= min_m) & (distance_m < max_m)]
+        found.append(np.column_stack([np.full(len(chosen), index), reference.scan_index[chosen]]))
+    pairs = np.concatenate(found)
+    return PairList(name, pairs, len(pairs))
+
+
+def sample_pairs(whole: PairList, *, num_pairs: int, seed: int) -> PairList:
+    """A random sample of `num_pairs` pairs, in the order of the list; the whole list if it is not longer."""
+    if num_pairs >= len(whole.pairs):
+        return whole
+    rows = np.random.default_rng(seed).choice(len(whole.pairs), num_pairs, replace=False)
+    return replace(whole, pairs=whole.pairs[np.sort(rows)])
+
+
+def scans_named(lists: Sequence[PairList]) -> set[int]:
+    """Numbers of all scans in the lists."""
+    return set(chain.from_iterable(one.pairs.ravel().tolist() for one in lists))
+
+
+def true_poses(pairs: PairList, reference: Trajectory | None) -> dict[tuple[int, int], Transform]:
+    """T_target_source of each pair (source, target). Raises SegslamError for a pair without known true pose."""
+    keys = [(int(source), int(target)) for source, target in pairs.pairs]
+    if pairs.truth is not None:
+        return {key: pairs.truth[key] for key in keys}
+    if reference is None:
+        raise SegslamError(
+            f"{pairs.name}: the data has no true poses; put KITTI's poses/NN.txt there, or give a JSON list with poses"
+        )
+    numbers = np.array(sorted(scans_named([pairs])), dtype=int)
+    rows = rows_of_same_scan(numbers, reference.scan_index)
+    if len(rows) < len(numbers):
+        missing = np.setdiff1d(numbers, numbers[rows[:, 0]])
+        raise SegslamError(
+            f"{pairs.name}: scan {missing[0]} has no file or no true pose, nor have {len(missing) - 1} other scans; "
+            "put them there, or --sample pairs of a list whose scans are all there"
+        )
+    T_world = dict(zip(numbers[rows[:, 0]].tolist(), reference.T_world_lidar[rows[:, 1]], strict=True))
+    return {(source, target): geometry.inverse(T_world[target]) @ T_world[source] for source, target in keys}
+
+
+def _from_text(file: Path, text: str) -> PairList:
+    pairs = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) < 2 or not all(word.isdecimal() for word in words[:2]):
+            raise SegslamError(f"{file}:{number}: expected two scan numbers, source and target, found {line.strip()!r}")
+        pairs.append((int(words[0]), int(words[1])))
+    return _checked(file, PairList(file.stem, np.array(pairs, dtype=int).reshape(-1, 2), len(pairs)))
+
+
+def _from_json(file: Path, text: str) -> PairList:
+    try:
+        truth = {(int(row["source"]), int(row["target"])): _rigid(row["T_target_source"]) for row in json.loads(text)}
+    except (ValueError, KeyError, TypeError) as error:
+        raise SegslamError(
+            f"{file}: expected a list of objects with source, target and T_target_source (4x4): {error}"
+        ) from error
+    pairs = np.array(list(truth), dtype=int).reshape(-1, 2)
+    return _checked(file, PairList(file.stem, pairs, len(pairs), truth))
+
+
+def _rigid(rows: object) -> Transform:
+    return geometry.nearest_transform(np.array(rows, dtype=float).reshape(4, 4))
+
+
+def _checked(file: Path, pairs: PairList) -> PairList:
+    if len(pairs.pairs) == 0:
+        raise SegslamError(f"{file}: contains no pairs; write `source target` on each line")
+    return pairs

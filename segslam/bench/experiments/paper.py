@@ -1,0 +1,127 @@
+"""Values of the Segregator paper (Yin et al., ICRA 2023), for comparison with measurements on the same lists."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from segslam.bench.experiments.pairs import PairList
+
+LISTS = {"easy": "3to5", "medium": "8to10", "hard": "10to15"}
+"""Names of the lists in their file names, from the distance of the scans (m)."""
+NUM_PAIRS = {
+    "00": (8503, 7527, 21267),
+    "05": (5155, 5243, 11600),
+    "06": (1128, 1113, 2825),
+    "07": (1311, 1169, 2877),
+    "08": (2064, 2750, 9457),
+}
+"""Number of pairs in the easy, medium and hard list of each sequence."""
+SUCCESS_PERCENT = {
+    "vgicp": {
+        "00": (95.6, 34.1, 14.9),
+        "05": (82.6, 34.6, 25.3),
+        "06": (94.6, 66.7, 35.1),
+        "07": (80.0, 36.5, 0.8),
+        "08": (0.24, 0.0, 4.9),
+    },
+    "teaser": {
+        "00": (97.0, 65.4, 41.1),
+        "05": (96.4, 73.4, 48.0),
+        "06": (99.8, 94.3, 83.2),
+        "07": (91.1, 49.2, 30.7),
+        "08": (96.6, 74.8, 49.5),
+    },
+    "quatro": {
+        "00": (96.9, 66.2, 41.2),
+        "05": (96.3, 73.7, 48.1),
+        "06": (99.8, 93.9, 83.2),
+        "07": (91.3, 51.0, 31.9),
+        "08": (96.8, 75.2, 49.8),
+    },
+    "segator": {
+        "00": (98.6, 88.3, 75.4),
+        "05": (77.8, 72.2, 59.0),
+        "06": (91.0, 74.6, 63.8),
+        "07": (100.0, 95.5, 81.4),
+        "08": (90.3, 84.4, 78.2),
+    },
+    "segregator": {
+        "00": (99.7, 89.3, 80.7),
+        "05": (98.7, 93.2, 81.8),
+        "06": (100.0, 99.6, 98.3),
+        "07": (100.0, 98.1, 88.0),
+        "08": (96.9, 94.1, 88.8),
+    },
+}
+"""Success rate (error below 2 m and 5 degrees) on those lists."""
+TIMING_SEQUENCE = "06"
+TIMING = {
+    "vgicp": {"success_percent": 55.4, "translation_m": 0.07, "rotation_deg": 0.10, "mean_ms": 90.0},
+    "teaser": {
+        "success_percent": 89.0,
+        "translation_m": 0.36,
+        "rotation_deg": 0.67,
+        "mean_ms": 150.0,
+        "mean_edges": 3025.0,
+    },
+    "quatro": {"success_percent": 89.0, "translation_m": 0.36, "rotation_deg": 0.66, "mean_ms": 150.0},
+    "segregator": {
+        "success_percent": 99.0,
+        "translation_m": 0.09,
+        "rotation_deg": 0.27,
+        "mean_ms": 100.0,
+        "mean_edges": 2687.0,
+    },
+    "segregator-c2f": {"success_percent": 99.0, "translation_m": 0.07, "rotation_deg": 0.12, "mean_ms": 150.0},
+}
+"""Values over all three lists of 06; `mean_edges` is the paper's average inlier count, AIC."""
+DETERIORATION = {10: (0.09, 0.20), 30: (0.04, 0.22), 50: (0.31, 0.21), 70: (0.06, 1.70), 90: (0.27, 1.70)}
+"""Segregator's error (m, degrees) by percentage of lost labels, on scans 0 and 10 of 05."""
+
+
+def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
+    """The paper's value for a list of this name (kittiSS_LOtoHI) and number of pairs; None if the paper has none."""
+    name, _, band = pairs.removeprefix("kitti").partition("_")
+    if not pairs.startswith("kitti") or name not in NUM_PAIRS or band not in LISTS.values():
+        return None
+    place = list(LISTS.values()).index(band)
+    if NUM_PAIRS[name][place] != num_pairs or method not in SUCCESS_PERCENT:
+        return None
+    return SUCCESS_PERCENT[method][name][place]
+
+
+def with_paper_values(
+    results: dict[str, dict[str, Any]], *, experiment: str, sequence: str, lists: Sequence[PairList]
+) -> dict[str, dict[str, Any]]:
+    """The results with the paper's values for the same method and pairs under the key `paper`.
+
+    `pairs`: success by list. `timing`: all values if the lists are the paper's three lists of 06. `deterioration`:
+    errors if the pair is scans 0 and 10 of 05. The comparison also applies to lists that were sampled.
+    """
+    whole = {one.name: one.num_whole for one in lists}
+    timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and _are_all(whole, TIMING_SEQUENCE)
+    reduced = experiment == "deterioration" and sequence.zfill(2) == "05" and _is_paper_pair(lists)
+    return {
+        method: own
+        | ({"paper": TIMING[method]} if timed and method in TIMING else {})
+        | {"by": [one | _paper_of(method, one, whole, reduced=reduced) for one in own["by"]]}
+        for method, own in results.items()
+    }
+
+
+def _paper_of(method: str, one: dict[str, Any], whole: dict[str, int], *, reduced: bool) -> dict[str, Any]:
+    """`paper` for one value of the varied quantity, or an empty mapping."""
+    if reduced and method == "segregator" and one["lost_percent"] in DETERIORATION:
+        return {"paper": dict(zip(("translation_m", "rotation_deg"), DETERIORATION[one["lost_percent"]], strict=True))}
+    if "list" not in one:
+        return {}
+    value = success_percent(method, one["list"], whole[one["list"]])
+    return {} if value is None else {"paper": {"success_percent": value}}
+
+
+def _are_all(whole: dict[str, int], sequence: str) -> bool:
+    theirs = {f"kitti{sequence}_{band}": NUM_PAIRS[sequence][place] for place, band in enumerate(LISTS.values())}
+    return whole == theirs
+
+
+def _is_paper_pair(lists: Sequence[PairList]) -> bool:
+    return len(lists) == 1 and lists[0].pairs.tolist() == [[0, 10]]

@@ -1,0 +1,134 @@
+"""Model of a LiDAR: beam directions, returned points, and sensor errors."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from segslam.bench.simulation.drift import NO_ERROR, SweepError, distorted
+from segslam.bench.simulation.mesh import Instances
+from segslam.bench.simulation.world import Hits, World
+from segslam.bench.simulation.world_settings import SensorConfig, SensorName
+from segslam.core.types import Label, Labels, Points, Scan, Transform, Vector
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pattern:
+    """Beam directions of one sweep, and the maximum range."""
+
+    elevations_deg: Vector
+    num_azimuth: int
+    max_range_m: float
+    min_range_m: float
+
+
+PATTERNS: dict[SensorName, Pattern] = {
+    "hdl64": Pattern(np.concatenate([np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.8, 32)]), 2083, 80.0, 2.0),
+    "os1-64": Pattern(np.linspace(22.5, -22.5, 64), 1024, 120.0, 0.8),
+    "vlp16": Pattern(np.linspace(15.0, -15.0, 16), 1800, 100.0, 0.9),
+}
+# Mean and standard deviation of the intensity by class, from real HDL-64E scans of KITTI 00 with their true labels.
+INTENSITY = {
+    Label.UNLABELLED: (0.28, 0.16), Label.CAR: (0.15, 0.18), Label.TRUCK: (0.2, 0.18), Label.ROAD: (0.21, 0.11),
+    Label.PARKING: (0.30, 0.09), Label.SIDEWALK: (0.30, 0.08), Label.BUILDING: (0.43, 0.15), Label.FENCE: (0.29, 0.12),
+    Label.VEGETATION: (0.33, 0.13), Label.TRUNK: (0.31, 0.14), Label.TERRAIN: (0.31, 0.12), Label.POLE: (0.20, 0.17),
+    Label.TRAFFIC_SIGN: (0.6, 0.25), Label.MOVING_CAR: (0.15, 0.18),
+}  # fmt: skip
+SIGNAL = 35.0  # chosen: a road (reflectivity 0.2, normal incidence) is visible up to 50 m, as in real scans
+GLASS_PASSES = 0.6  # chosen: share of the rays that a car window does not return
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensor:
+    """One sensor with fixed errors. Its n rays are ordered by beam, the top beam first."""
+
+    pattern: Pattern
+    config: SensorConfig
+    directions: Points
+    """(n, 3) unit vectors of the true beam directions in the LiDAR frame."""
+    reported: Points
+    """(n, 3) reported beam directions."""
+    range_error_m: Vector
+    """(n,)"""
+    sweep_fraction: Vector
+    """(n,) time of each ray within the sweep: -0.5 at the start, behind the car, to 0.5 at the end."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """The points that one sweep returned, one row each. `points`: LiDAR frame, float64."""
+
+    points: Points
+    intensity: Vector
+    labels: Labels
+    instances: Instances
+
+    def scan(self, *, index: int, stamp_ns: int) -> Scan:
+        """The sweep as a `Scan`, without intensities and instances."""
+        return Scan(self.points, stamp_ns, index, self.labels)
+
+
+def make_sensor(config: SensorConfig, *, seed: int) -> Sensor:
+    """A sensor whose residual beam errors are drawn with the seed."""
+    pattern = PATTERNS[config.name]
+    beams = len(pattern.elevations_deg)
+    rng = np.random.default_rng([seed, 2])
+    angle_error = config.vertical_angle_error_deg + rng.normal(scale=config.beam_angle_sigma_deg, size=beams)
+    range_error = rng.normal(scale=config.beam_range_sigma_m, size=beams)
+    azimuth = np.arange(pattern.num_azimuth) * (2 * np.pi / pattern.num_azimuth)
+    return Sensor(
+        pattern,
+        config,
+        _directions(pattern.elevations_deg + angle_error, azimuth),
+        _directions(pattern.elevations_deg, azimuth),
+        np.repeat(range_error, pattern.num_azimuth),
+        np.tile((azimuth / (2 * np.pi) + 0.5) % 1.0 - 0.5, beams),
+    )
+
+
+def _directions(elevations_deg: Vector, azimuth_rad: Vector) -> Points:
+    elevation = np.radians(elevations_deg)[:, None]
+    flat, up = np.cos(elevation), np.sin(elevation)
+    rays = np.stack(np.broadcast_arrays(flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), up), axis=-1)
+    return rays.reshape(-1, 3)
+
+
+def sweep(
+    world: World,
+    sensor: Sensor,
+    T_world_lidar: Transform,
+    *,
+    rng: np.random.Generator,
+    time_s: float = 0.0,
+    error: SweepError = NO_ERROR,
+) -> Sweep:
+    """One sweep from one pose, with the sensor's fixed errors and the errors of this sweep."""
+    hits = world.cast(T_world_lidar, sensor.directions, time_s=time_s)
+    rows = np.flatnonzero(_returns(hits, sensor, rng))
+    labels = hits.labels[rows]
+    noise = rng.normal(scale=sensor.config.range_sigma_m, size=len(rows)) if sensor.config.range_sigma_m else 0.0
+    reported = sensor.reported[rows] * (hits.range_m[rows] + sensor.range_error_m[rows] + noise)[:, None]
+    points = distorted(reported, sensor.sweep_fraction[rows], error)
+    return Sweep(points, _intensity(labels, rng), labels, hits.instances[rows])
+
+
+def _returns(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """(n,) bool: whether enough light returns; more for bright and near surfaces and for small angles of incidence."""
+    pattern = sensor.pattern
+    seen = (hits.range_m > pattern.min_range_m) & (hits.range_m < pattern.max_range_m)
+    with np.errstate(divide="ignore", over="ignore"):
+        light = SIGNAL * MEAN_INTENSITY[hits.labels] * hits.cos_incidence * (pattern.max_range_m / hits.range_m) ** 2
+    share = (1.0 - np.exp(-light)) * (1.0 - sensor.config.dropout) * np.where(hits.glass, 1.0 - GLASS_PASSES, 1.0)
+    return seen & (rng.random(len(share), dtype=np.float32) < share)
+
+
+def _intensity(labels: Labels, rng: np.random.Generator) -> Vector:
+    """Intensities by class, 0 to 0.99 in steps of 0.01."""
+    drawn = MEAN_INTENSITY[labels] + SPREAD_INTENSITY[labels] * rng.standard_normal(len(labels), dtype=np.float32)
+    return np.round(np.clip(drawn, 0.0, 0.99), 2)
+
+
+def _table(column: int) -> Vector:
+    return np.array([INTENSITY.get(label, INTENSITY[Label.UNLABELLED])[column] for label in Label], dtype=np.float32)
+
+
+MEAN_INTENSITY, SPREAD_INTENSITY = _table(0), _table(1)

@@ -1,0 +1,62 @@
+"""Cars and trucks of varying shape; x points forward, the origin is on the ground below the centre."""
+
+import numpy as np
+
+from segslam.bench.simulation.mesh import Mesh, box, extruded, frustum, join_meshes
+from segslam.core.types import Label
+
+CAR_KINDS = (  # share; ranges of length, width, height (m); ranges of hood and boot as shares of the length
+    (0.40, (3.6, 4.1), (1.62, 1.75), (1.42, 1.55), (0.22, 0.28), (0.00, 0.04)),  # hatchback
+    (0.25, (4.3, 4.9), (1.70, 1.85), (1.38, 1.48), (0.24, 0.30), (0.14, 0.20)),  # saloon
+    (0.20, (4.4, 4.9), (1.72, 1.90), (1.45, 1.75), (0.22, 0.28), (0.00, 0.03)),  # estate
+    (0.15, (4.6, 5.6), (1.85, 2.00), (1.85, 2.10), (0.10, 0.18), (0.00, 0.02)),  # van
+)
+
+
+def car(rng: np.random.Generator, label: Label = Label.CAR) -> Mesh:
+    """A car with hood, glass windows and wheels, 3.6-5.6 m long; it depends on the state of `rng` only."""
+    shares = np.array([kind[0] for kind in CAR_KINDS])
+    _, *ranges = CAR_KINDS[rng.choice(len(CAR_KINDS), p=shares)]
+    length, width, height, hood, boot = (rng.uniform(*bounds) for bounds in ranges)
+    belt = height * rng.uniform(0.58, 0.64)
+    nose, tail = length / 2, -length / 2
+    body = np.array(
+        [[tail, 0.25], [nose, 0.25], [nose, belt * 0.72], [nose - 0.12, belt * 0.85], [nose - hood * length, belt],
+         [tail + 0.05, belt], [tail, belt * 0.8]]
+    )  # fmt: skip
+    front, back = nose - hood * length + 0.1, tail + boot * length + 0.03
+    middle, cabin = (front + back) / 2, front - back
+    roof = (cabin * rng.uniform(0.62, 0.74), width * 0.74, middle - cabin * 0.06)
+    glazed = frustum((cabin, width * 0.94, middle), roof, belt, height - 0.06, label, glass=True)
+    return join_meshes(
+        [
+            extruded(body, width, label),
+            glazed,
+            frustum(roof, roof, height - 0.06, height, label),
+            _wheels(length, width, label),
+        ]
+    )
+
+
+def truck(rng: np.random.Generator) -> Mesh:
+    """A lorry with cab and cargo box, 5.5-9 m long."""
+    length, width, height = rng.uniform(5.5, 9.0), rng.uniform(2.1, 2.5), rng.uniform(2.7, 3.5)
+    cab = rng.uniform(1.6, 2.1)
+    return join_meshes(
+        [
+            box(cab, width * 0.95, 0.45, min(height, 2.6), Label.TRUCK, at=(length / 2 - cab / 2, 0.0)),
+            box(length - cab - 0.25, width, 0.9, height, Label.TRUCK, at=(-cab / 2 - 0.12, 0.0)),
+            _wheels(length, width, Label.TRUCK),
+        ]
+    )
+
+
+def _wheels(length: float, width: float, label: Label) -> Mesh:
+    """Four short boxes, the visible parts of the wheels."""
+    return join_meshes(
+        [
+            box(0.6, 0.2, 0.0, 0.3, label, at=(sx * length * 0.31, sy * (width / 2 - 0.12)))
+            for sx in (-1, 1)
+            for sy in (-1, 1)
+        ]
+    )

@@ -1,0 +1,141 @@
+"""A labelled street world for ray casting: one static scene, and moving or parked cars."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import open3d as o3d
+
+from segslam.bench.simulation.mesh import Flags, Instances, Mesh, as_instance, join_meshes
+from segslam.bench.simulation.parking import ParkedCar, parked_cars
+from segslam.bench.simulation.path import Route, route_of, street_of
+from segslam.bench.simulation.site import Site, frontages
+from segslam.bench.simulation.streets import furnish
+from segslam.bench.simulation.terrain import Terrain, ground_mesh, ground_of
+from segslam.bench.simulation.traffic import MovingCar, meshes_at, moving_cars
+from segslam.bench.simulation.world_settings import WorldConfig
+from segslam.core.trajectory import Poses
+from segslam.core.types import Label, Labels, Points, Transform, Vector
+
+VIEW_M = 100.0  # chosen: moving and parked cars are visible up to this distance
+NUMBERED = (Label.CAR, Label.TRUCK, Label.TRUNK, Label.POLE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """The first hit of each ray. `range_m` is infinite for rays without a hit; their other fields are undefined."""
+
+    range_m: Vector
+    labels: Labels
+    instances: Instances
+    cos_incidence: Vector
+    """Cosine of the angle between the ray and the surface normal, 0 to 1."""
+    glass: Flags
+
+
+class World:
+    """Streets along one drive, made by `build_world`. Equal arguments make equal worlds."""
+
+    def __init__(
+        self, ground: Terrain, static: Mesh, route: Route, parked: list[ParkedCar], moving: list[MovingCar], day: int
+    ) -> None:
+        self.day = day
+        self.ground = ground
+        self.static = static
+        self._scene = scene_of(static)
+        self._route = route
+        self._parked = parked
+        self._moving = moving
+
+    def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
+        """The first hits of rays from the sensor's origin; `directions` (n, 3) are unit vectors in the LiDAR frame."""
+        rays = np.empty((len(directions), 6), dtype=np.float32)
+        rays[:, :3] = T_world_lidar[:3, 3]
+        R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
+        np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # faster than BLAS
+        hits = _relabelled(cast_mesh(self._scene, self.static, rays), self.ground, rays)
+        for thing in self._changing(time_s, T_world_lidar[:2, 3]):
+            _put_nearer(hits, thing, rays)
+        return hits
+
+    def _changing(self, time_s: float, near_xy: np.ndarray) -> Iterator[Mesh]:
+        for car in self._parked:
+            if car.start_s <= time_s < car.end_s and np.hypot(*(near_xy - car.at)) < VIEW_M:
+                yield car.mesh
+        yield from meshes_at(self._moving, self._route, time_s=time_s, near_xy=near_xy, view_m=VIEW_M)
+
+
+def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> World:
+    """Streets along a drive with level poses (`levelling.level_revisits`), z up; `time_s` (n,) ascending.
+
+    Every pose is `config.sensor_height_m` above the road, and no static object stands on the path. On another
+    `config.day` the streets are the same, but parked and moving cars differ.
+    """
+    rng = np.random.default_rng([seed, 1])
+    route = route_of(T_world_lidar, time_s, sensor_height_m=config.sensor_height_m)
+    street = street_of(route, T_world_lidar)
+    ground = ground_of(street, rng)
+    site = Site(ground)
+    sides = frontages(street)
+    today = np.random.default_rng([seed, 1, config.day]) if config.day else None
+    parked = _numbered_cars([car for side in sides for car in parked_cars(site, side, route, config, rng, today=today)])
+    things = [thing for side in sides for thing in furnish(site, side, config, rng)]
+    standing = [car.mesh for car in parked if not car.changes]
+    static = join_meshes([ground_mesh(ground), *standing, *_numbered(things)])
+    changing = [car for car in parked if car.changes]
+    return World(ground, static, route, changing, moving_cars(route, config, today or rng), config.day)
+
+
+def _numbered_cars(cars: list[ParkedCar]) -> list[ParkedCar]:
+    meshes = _numbered([car.mesh for car in cars])
+    return [replace(car, mesh=mesh) for car, mesh in zip(cars, meshes, strict=True)]
+
+
+def _numbered(things: list[Mesh]) -> list[Mesh]:
+    """Meshes with one instance number each, on triangles of the classes that have instances in SemanticKITTI."""
+    return [as_instance(thing, number, only=NUMBERED) for number, thing in enumerate(things, start=1)]
+
+
+def scene_of(part: Mesh) -> o3d.t.geometry.RaycastingScene:
+    """A ray casting scene of a mesh."""
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(_tensor(part.vertices, np.float32), _tensor(part.triangles, np.uint32))
+    return scene
+
+
+def _tensor(values: np.ndarray, dtype: type) -> o3d.core.Tensor:
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values, dtype=dtype))
+
+
+def cast_mesh(scene: o3d.t.geometry.RaycastingScene, part: Mesh, rays: np.ndarray) -> Hits:
+    """The first hits of rays (n, 6; float32 origin and direction) on a mesh; `scene` is `scene_of(part)`."""
+    answer = scene.cast_rays(_tensor(rays, np.float32))
+    range_m = answer["t_hit"].numpy()
+    hit = np.where(np.isfinite(range_m), answer["primitive_ids"].numpy(), 0)
+    cos = np.abs(np.einsum("ij,ij->i", answer["primitive_normals"].numpy(), rays[:, 3:]))
+    return Hits(range_m, part.labels[hit], part.instances[hit], cos, part.glass[hit])
+
+
+def _relabelled(hits: Hits, ground: Terrain, rays: np.ndarray) -> Hits:
+    """Hits of terrain with the class of the ground at each point: road, sidewalk, ..."""
+    rows = np.flatnonzero((hits.labels == Label.TERRAIN) & np.isfinite(hits.range_m))
+    at = rays[rows, :2] + hits.range_m[rows, None] * rays[rows, 3:5]
+    labels = hits.labels.copy()
+    labels[rows] = ground.label_at(at[:, 0], at[:, 1])
+    return replace(hits, labels=labels)
+
+
+def _put_nearer(hits: Hits, thing: Mesh, rays: np.ndarray) -> None:
+    """In place: replace hits by nearer hits on a mesh. Only rays that pass near it are cast."""
+    low, high = thing.vertices.min(axis=0), thing.vertices.max(axis=0)
+    away = (low + high) / 2 - rays[0, :3]
+    distance, radius = float(np.linalg.norm(away)), float(np.linalg.norm(high - low)) / 2
+    if distance <= radius:
+        rows = np.arange(len(rays))
+    else:
+        toward = (away / distance).astype(np.float32)
+        rows = np.flatnonzero(np.einsum("ij,j->i", rays[:, 3:], toward) > np.sqrt(1.0 - (radius / distance) ** 2))
+    found = cast_mesh(scene_of(thing), thing, rays[rows])
+    first = found.range_m < hits.range_m[rows]
+    for field in fields(Hits):
+        getattr(hits, field.name)[rows[first]] = getattr(found, field.name)[first]

@@ -1,0 +1,103 @@
+"""An index of places: signatures of keyframes, and search for those most similar to the signature of a scan."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.fft import irfft, rfft
+
+from segslam.candidates.signature import NUM_ANGLES, NUM_RADII, PlaceSignature
+from segslam.core.types import Indices, Vector
+
+NUM_HARMONICS = 12
+"""Chosen on the real places of KITTI 05: number of harmonics of each circle; their magnitudes are invariant to yaw."""
+NUM_TURNED = 40
+"""Chosen: number of the most similar places that are compared at every yaw."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceCandidate:
+    """A place at which a scan may have been taken."""
+
+    place_id: int
+    score: float
+    """Correlation of the two spectra at the best yaw, at most 1."""
+    yaw_rad: float
+    """Yaw of the scan in the frame of the place, 0 to pi; the yaw plus pi is equally likely."""
+
+
+class Places:
+    """Signatures of places, 2.6 kB each: the spectra and their magnitudes, which are searched."""
+
+    def __init__(self) -> None:
+        self._ids = np.empty(0, np.int64)
+        self._spectra: UInt8[np.ndarray, "n 24 60"] = np.empty((0, NUM_RADII, NUM_ANGLES), np.uint8)
+        self._invariants: Float[np.ndarray, "n 288"] = np.empty((0, NUM_RADII * NUM_HARMONICS), np.float32)
+        self._num = 0
+
+    def __len__(self) -> int:
+        return self._num
+
+    @property
+    def bytes_per_place(self) -> int:
+        """Memory per place in bytes."""
+        return self._ids.itemsize + self._spectra[:1].nbytes + self._invariants[:1].nbytes
+
+    def add(self, place_id: int, signature: PlaceSignature) -> None:
+        """Add a place. Ids may come in any order, each once."""
+        if self._num == len(self._ids):
+            more = max(self._num, 64)
+            self._ids, self._spectra, self._invariants = (
+                np.concatenate([kept, np.zeros((more, *kept.shape[1:]), kept.dtype)])
+                for kept in (self._ids, self._spectra, self._invariants)
+            )
+        self._ids[self._num] = place_id
+        self._spectra[self._num] = signature.spectrum
+        self._invariants[self._num] = _invariant(signature)
+        self._num += 1
+
+    def shortlist(
+        self, signature: PlaceSignature, *, most: int = 20, below_id: int | None = None
+    ) -> tuple[PlaceCandidate, ...]:
+        """The places most similar to a scan, best first; only ids below `below_id`, if given."""
+        rows = np.arange(self._num) if below_id is None else np.flatnonzero(self._ids[: self._num] < below_id)
+        if not len(rows):
+            return ()
+        similarity = np.einsum("ij,j->i", self._invariants[: self._num], _invariant(signature))  # uses one thread
+        kept = rows[np.argsort(-similarity[rows], kind="stable")[: max(NUM_TURNED, most)]]
+        scores, yaws = self._turned(signature, kept)
+        best = np.argsort(-scores, kind="stable")[:most]
+        return tuple(PlaceCandidate(int(self._ids[kept[k]]), float(scores[k]), float(yaws[k])) for k in best)
+
+    def shortlist_around(
+        self, signatures: Iterable[PlaceSignature], *, most: int = 20, below_id: int | None = None
+    ) -> tuple[PlaceCandidate, ...]:
+        """The same for several signatures of one scan (`signatures_around`): the best candidate of each place."""
+        best: dict[int, PlaceCandidate] = {}
+        for signature in signatures:
+            for candidate in self.shortlist(signature, most=most, below_id=below_id):
+                known = best.get(candidate.place_id)
+                if known is None or candidate.score > known.score:
+                    best[candidate.place_id] = candidate
+        return tuple(sorted(best.values(), key=lambda candidate: -candidate.score)[:most])
+
+    def _turned(self, signature: PlaceSignature, rows: Indices) -> tuple[Vector, Vector]:
+        """Largest correlation of the spectra of some places with the scan's, over all yaws, and the yaws."""
+        own, theirs = rfft(_centred(signature.spectrum[None]), axis=2), rfft(_centred(self._spectra[rows]), axis=2)
+        correlation = irfft((theirs * np.conj(own)).sum(axis=1), NUM_ANGLES, axis=1)
+        return correlation.max(axis=1), -correlation.argmax(axis=1) % NUM_ANGLES * math.pi / NUM_ANGLES
+
+
+def _centred(spectra: UInt8[np.ndarray, "n 24 60"]) -> Float[np.ndarray, "n 24 60"]:
+    """The spectra without the mean of each circle, scaled to unit length."""
+    values = spectra.astype(np.float32)
+    values -= values.mean(axis=2, keepdims=True)
+    return values / np.maximum(np.linalg.norm(values, axis=(1, 2), keepdims=True), 1e-9)
+
+
+def _invariant(signature: PlaceSignature) -> Float[np.ndarray, "288"]:
+    """Square roots of the magnitudes of the harmonics of each circle, scaled to unit length."""
+    harmonics = np.sqrt(np.abs(rfft(signature.spectrum.astype(np.float32), axis=1)[:, :NUM_HARMONICS])).ravel()
+    return harmonics / max(float(np.linalg.norm(harmonics)), 1e-9)

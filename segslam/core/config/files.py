@@ -1,0 +1,173 @@
+"""Settings from YAML files and from texts `section.key=value`, and the other way round."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from segslam.core.config.sections import Config, Section
+from segslam.core.config.yaml_text import parse_yaml, short
+from segslam.core.errors import SegslamError, brief
+
+logger = logging.getLogger(__name__)
+
+REMOVED = {
+    "adjustment": "every steps radius_m reach min_overlap",
+    "geometric": (
+        "band_m car_length_m car_max_width_m car_top_m ground_cell_m ground_height_m max_range_m max_slope "
+        "max_things min_points pole_clear_m pole_core_m pole_min_m pole_min_share trunk_max_m trunk_min_m "
+        "wall_min_top_m wall_thickness_m"
+    ),
+    "graph": "systematic_drift turn_m closure_sigma_m closure_sigma_deg inlier_probability",
+    "health": (
+        "tolerance_m tolerance_deg watch_scans map_scans map_spacing_m map_spacing_deg correspondence_m "
+        "inlier_m min_overlap max_rms"
+    ),
+    "keyframes": "dense_voxels max_gathered",
+    "map": "view_margin_m view_margin_ratio min_views moved_radius_m cell_m min_obstacle_voxels obstacle_m",
+    "odometry": "stamp_tolerance_s",
+    "proximity": (
+        "base_height_m height_ratio base_turn_deg turn_ratio_deg break_radius_m max_candidates spread_m min_gap_m"
+    ),
+    "refine": "max_iterations max_range_m min_points information_scale shared_noise_m shared_noise_deg",
+    "segregator": (
+        "foot_max_distance_m few_clusters dcvc_start_radius_m dcvc_radius_step_m dcvc_azimuth_deg min_range_m "
+        "max_range_m tuple_similarity tuple_trials_per_pair tuple_seed clique_max_nodes certain_inliers "
+        "centroid_noise_m centroid_noise_share shared_noise_m shared_noise_deg ground_noise_m ground_weight "
+        "gnc_factor gnc_max_iterations gnc_cost_tolerance"
+    ),
+    "verify": (
+        "min_overlap max_residual_ratio min_weak_support min_second_support max_free_space_violation "
+        "max_violation_ratio well_observed rival_ratio"
+    ),
+}
+"""Settings of older versions, by section: they are ignored with a warning, also in files and `--set`."""
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
+    """The defaults, or `base`, changed by a YAML file and then by `section.key=value` texts.
+
+    Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
+    """
+    values = _changed(base.model_dump(mode="json") if base else {}, _read_yaml(path) if path else {})
+    for text in overrides:
+        key, separator, value = text.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not separator or not dot or not name:
+            raise SegslamError(f"--set {brief(text)}: write section.key=value, for example keyframes.distance_m=1.5")
+        section_values = values.setdefault(section, {})
+        if not isinstance(section_values, dict):
+            raise SegslamError(f"{path}: {section}: expected a section with keys, found {short(section_values)}")
+        section_values[name] = parse_yaml(value, f"--set {brief(text)}")
+    source = str(path) if path is not None else "--set"
+    source = source if not (path and overrides) else f"{path} and --set"
+    return _validate(_without_removed(values, source), source)
+
+
+def config_to_yaml(config: Config) -> str:
+    """All settings as YAML, from which `load_config` makes an equal Config."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def changed_settings(before: Config, now: Config) -> Iterator[tuple[str, Any, Any]]:
+    """`section.key` and its two values, as in YAML, of each setting that differs."""
+    old, new = before.model_dump(mode="json"), now.model_dump(mode="json")
+    for section, values in new.items():
+        for key, value in values.items():
+            if value != old[section][key]:
+                yield f"{section}.{key}", old[section][key], value
+
+
+def config_from_yaml(text: str, source: str) -> Config:
+    """The Config in a text of this or an older version; `source` is its name in messages.
+
+    Settings that no longer exist are ignored with a warning. Raises SegslamError if the text is not a Config.
+    """
+    known, gone = _known(_parse_yaml(text, source))
+    if gone:
+        logger.warning("%s: ignored settings that this version does not have: %s", source, ", ".join(gone))
+    return _validate(known, source)
+
+
+def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
+    """The values without settings of older versions that no longer exist."""
+    for section, names in REMOVED.items():
+        given = values.get(section)
+        if not isinstance(given, dict):
+            continue
+        gone = [name for name in given if name in names.split()]
+        for name in gone:
+            logger.warning("%s: %s.%s no longer exists and is ignored", source, section, name)
+        kept = {name: value for name, value in given.items() if name not in gone}
+        values = {name: value for name, value in values.items() if name != section}
+        if kept or section in Config.model_fields:
+            values[section] = kept
+    return values
+
+
+def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """The settings of this version, and the names of the others."""
+    known: dict[str, Any] = {}
+    gone: list[str] = []
+    for name, section in values.items():
+        if name not in Config.model_fields:
+            gone.append(name)
+        elif isinstance(section, dict):
+            fields = type(getattr(Config(), name)).model_fields
+            gone += [f"{name}.{key}" for key in section if key not in fields]
+            known[name] = {key: value for key, value in section.items() if key in fields}
+        else:
+            known[name] = section
+    return known, gone
+
+
+def _changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """The values of all sections, with the changed keys replaced."""
+    keywise = {
+        name: values[name] | section
+        for name, section in changes.items()
+        if isinstance(section, dict) and isinstance(values.get(name), dict)
+    }
+    return values | changes | keywise
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
+    return _parse_yaml(text, str(path))
+
+
+def _parse_yaml(text: str, source: str) -> dict[str, Any]:
+    values = parse_yaml(text, source)
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise SegslamError(f"{source}: expected sections with keys, found {type(values).__name__}")
+    return values
+
+
+def _validate(values: dict[str, Any], source: str) -> Config:
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = brief(".".join(str(part) for part in first["loc"]))
+        if first["type"] == "extra_forbidden":
+            raise SegslamError(f"{source}: unknown key {key}; {_known_keys(first['loc'])}") from error
+        message = brief(first["msg"].removeprefix("Value error, "), 300)
+        got = "" if isinstance(first["input"], dict) else f", got {short(first['input'])}"
+        raise SegslamError(f"{source}: {key}: {message}{got}") from error
+
+
+def _known_keys(location: tuple[int | str, ...]) -> str:
+    fields = Config.model_fields
+    if len(location) > 1 and location[0] in fields:
+        section = fields[str(location[0])].annotation
+        if isinstance(section, type) and issubclass(section, Section):
+            fields = section.model_fields
+    return "known keys: " + (", ".join(fields) or "none")

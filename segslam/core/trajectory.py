@@ -1,0 +1,246 @@
+"""KITTI and TUM pose files, matching of their rows, and the poses of all scans from the poses of keyframes.
+
+A pose file does not name its frames: the reader returns T_a_b as stored in the lines.
+"""
+
+import re
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation as ScipyRotation
+
+from segslam.core import geometry
+from segslam.core.errors import brief
+from segslam.core.types import IndexPairs, Indices, Mask, SegslamError, Transform
+
+Poses = Float[np.ndarray, "_ 4 4"]
+"""Rigid transforms T_a_b, one per row."""
+PoseFormat = Literal["kitti", "tum"]
+COLUMNS: dict[PoseFormat, int] = {"kitti": 12, "tum": 8}
+LAYOUT: dict[PoseFormat, str] = {
+    "kitti": "KITTI format has 12 numbers per line, a 3x4 matrix by rows",
+    "tum": "TUM format has 8 numbers per line: seconds x y z qx qy qz qw",
+}
+ROTATION_TOLERANCE = 0.01  # chosen: above the rounding in files, far below the error of other matrices
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseFile:
+    """Content of a pose file, one row per pose, in the file's own frames."""
+
+    T_a_b: Poses
+    stamp_ns: Indices | None
+    """None in KITTI format, where the row is the number of the scan."""
+
+    def __len__(self) -> int:
+        return len(self.T_a_b)
+
+
+def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: bool = False) -> PoseFile:
+    """The poses of a KITTI or TUM file with exact rotations; by default the format is detected from the columns.
+
+    Empty lines, text after a #, and with `skips_names` a first line of column names, are ignored. Raises SegslamError,
+    naming the file and line, for another number of columns, numbers that are not finite, and matrices or quaternions
+    that are not rotations.
+    """
+    lines = _number_lines(path)
+    if skips_names and len(lines) > 1 and not re.match(r"[-+.\d]", lines[0][1][0]):
+        lines = lines[1:]
+    chosen = format or _format_of(path, *lines[0])
+    rows = np.array([_numbers(path, number, fields, chosen) for number, fields in lines])
+    poses = _poses_from_matrices(rows) if chosen == "kitti" else _poses_from_quaternions(rows)
+    _require_rotations(path, [number for number, _ in lines], rows, poses, chosen)
+    return PoseFile(poses, _stamps(path, lines) if chosen == "tum" else None)
+
+
+def write_kitti(path: Path, T_a_b: Poses) -> None:
+    """Write one pose per line, 12 numbers, as read by evo's `kitti`. The poses must be in the frame of the file."""
+    np.savetxt(path, T_a_b[:, :3].reshape(-1, 12), fmt="%.12g")
+
+
+def write_tum(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
+    """Write one pose per line, `seconds x y z qx qy qz qw`, with stamps to the nanosecond, as read by evo's `tum`."""
+    quaternions = ScipyRotation.from_matrix(T_a_b[:, :3, :3]).as_quat().reshape(-1, 4)
+    rows = np.hstack([T_a_b[:, :3, 3], quaternions])
+    lines = [
+        f"{Decimal(int(stamp)).scaleb(-9):f} " + " ".join(f"{value:.12g}" for value in row)
+        for stamp, row in zip(stamp_ns, rows, strict=True)
+    ]
+    path.write_text("".join(line + "\n" for line in lines), encoding="ascii")
+
+
+def nanoseconds(seconds: str) -> int:
+    """The stamp (ns) of a text, exactly; a double cannot represent it. Raises ValueError if it is not a time."""
+    try:
+        stamp_ns = int(Decimal(seconds).scaleb(9).to_integral_value())
+    except (ArithmeticError, ValueError) as error:
+        raise ValueError(f"{brief(seconds)} is not a time in seconds") from error
+    if abs(stamp_ns) >= 2**63:
+        raise ValueError(f"{brief(seconds)} s are more than 292 years")
+    return stamp_ns
+
+
+def camera_from_lidar(T_world_lidar: Poses, T_camera_lidar: Transform) -> Poses:
+    """LiDAR poses as KITTI stores them: poses of the camera in the frame of the first camera."""
+    return T_camera_lidar @ T_world_lidar @ geometry.inverse(T_camera_lidar)
+
+
+def lidar_from_camera(T_world_camera: Poses, T_camera_lidar: Transform) -> Poses:
+    """LiDAR poses in the frame of the first, from poses as KITTI stores them; undoes `camera_from_lidar`."""
+    return geometry.inverse(T_camera_lidar) @ T_world_camera @ T_camera_lidar
+
+
+def rows_of_same_stamp(stamp_ns_a: Indices, stamp_ns_b: Indices, *, max_difference_ns: int) -> IndexPairs:
+    """Rows (of a, of b) that are mutually nearest in time and at most `max_difference_ns` apart; ascending in a."""
+    if len(stamp_ns_a) == 0 or len(stamp_ns_b) == 0:
+        return np.empty((0, 2), dtype=np.int64)
+    nearest_b = _nearest(stamp_ns_b, stamp_ns_a)
+    nearest_a = _nearest(stamp_ns_a, stamp_ns_b)
+    rows_a = np.arange(len(stamp_ns_a))
+    mutual = nearest_a[nearest_b] == rows_a
+    close = np.abs(stamp_ns_b[nearest_b] - stamp_ns_a) <= max_difference_ns
+    return np.column_stack([rows_a, nearest_b])[mutual & close]
+
+
+def rows_of_same_scan(scan_index_a: Indices, scan_index_b: Indices) -> IndexPairs:
+    """Rows (of a, of b) of the same scan, ascending in the scan's number."""
+    _, rows_a, rows_b = np.intersect1d(scan_index_a, scan_index_b, return_indices=True)
+    return np.column_stack([rows_a, rows_b])
+
+
+def travelled_m(T_a_b: Poses) -> np.ndarray:
+    """(n,) length of the path from the first pose to each pose (m)."""
+    steps = np.linalg.norm(np.diff(T_a_b[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([np.zeros(min(1, len(T_a_b))), np.cumsum(steps)])
+
+
+def corrected_poses(
+    T_odom_lidar: Poses, keyframe_rows: Indices, T_world_keyframe: Poses, *, after_break: Mask | None = None
+) -> Poses:
+    """T_world_lidar of every scan, from the odometry of every scan and the corrected poses of the keyframes.
+
+    The keyframes before and after a scan each predict its pose by the odometry between them. The two predictions are
+    blended on SE(3) by the share of the way travelled. Only the nearest keyframe is used before the first and after the
+    last, and only the keyframe before if the next one follows a break (`after_break`, one value per keyframe).
+    `keyframe_rows` must ascend. Raises ValueError without keyframes, or for another number of poses.
+    """
+    if len(keyframe_rows) == 0 or len(keyframe_rows) != len(T_world_keyframe):
+        raise ValueError(f"{len(keyframe_rows)} keyframes and {len(T_world_keyframe)} poses of keyframes")
+    corrections = [
+        T_world_k @ geometry.inverse(T_odom_lidar[row])
+        for row, T_world_k in zip(keyframe_rows, T_world_keyframe, strict=True)
+    ]
+    before, after, share = _surroundings(keyframe_rows, travelled_m(T_odom_lidar))
+    if after_break is not None:
+        share = np.where(after_break[after], 0.0, share)
+    poses = [
+        geometry.interpolate(corrections[k] @ T_odom_s, corrections[m] @ T_odom_s, fraction)
+        for T_odom_s, k, m, fraction in zip(T_odom_lidar, before, after, share, strict=True)
+    ]
+    T_world_lidar = np.array(poses)
+    T_world_lidar[keyframe_rows] = T_world_keyframe
+    return T_world_lidar
+
+
+def _surroundings(keyframe_rows: Indices, travel_m: np.ndarray) -> tuple[Indices, Indices, np.ndarray]:
+    """For each scan: the keyframe before it, the one after it, and the share of the way between them, 0 to 1."""
+    rows = np.arange(len(travel_m))
+    last = len(keyframe_rows) - 1
+    position = np.searchsorted(keyframe_rows, rows, side="right")
+    before, after = np.clip(position - 1, 0, last), np.clip(position, 0, last)
+    standing = 1e-9 * rows  # where the sensor does not move, the share is that of the scans
+    progress = travel_m + standing
+    start, end = progress[keyframe_rows[before]], progress[keyframe_rows[after]]
+    share = (progress - start) / np.where(before == after, 1.0, end - start)
+    return before, after, np.clip(share, 0.0, 1.0)
+
+
+def _nearest(values: Indices, targets: Indices) -> Indices:
+    order = np.argsort(values, kind="stable")
+    ascending = values[order]
+    right = np.clip(np.searchsorted(ascending, targets), 1, max(len(values) - 1, 1))
+    right = np.minimum(right, len(values) - 1)
+    left = np.maximum(right - 1, 0)
+    closer_left = np.abs(ascending[left] - targets) <= np.abs(ascending[right] - targets)
+    return order[np.where(closer_left, left, right)]
+
+
+def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
+    """(line number, fields) of each line with content."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{path}: cannot read the poses ({error}); give a KITTI or TUM trajectory") from error
+    split = (
+        (number, re.split(r"[\s,]+", line.partition("#")[0].strip())) for number, line in enumerate(text.split("\n"), 1)
+    )
+    lines = [(number, fields) for number, fields in split if fields != [""]]
+    if not lines:
+        raise SegslamError(f"{path}: contains no pose; {LAYOUT['kitti']}, {LAYOUT['tum']}")
+    return lines
+
+
+def _format_of(path: Path, number: int, fields: list[str]) -> PoseFormat:
+    for name, columns in COLUMNS.items():
+        if len(fields) == columns:
+            return name
+    raise SegslamError(f"{path}:{number}: found {len(fields)} numbers; {LAYOUT['kitti']}, {LAYOUT['tum']}")
+
+
+def _numbers(path: Path, number: int, fields: list[str], format: PoseFormat) -> list[float]:
+    if len(fields) != COLUMNS[format]:
+        raise SegslamError(
+            f"{path}:{number}: found {len(fields)} numbers; {LAYOUT[format]}: correct or remove the line"
+        )
+    try:
+        values = [float(field) for field in fields]
+    except ValueError as error:
+        raise SegslamError(
+            f"{path}:{number}: {brief(str(error))}; {LAYOUT[format]}: correct or remove the line"
+        ) from error
+    if not np.isfinite(values).all():
+        raise SegslamError(f"{path}:{number}: {brief(' '.join(fields))}: every number must be finite")
+    return values
+
+
+def _stamps(path: Path, lines: list[tuple[int, list[str]]]) -> Indices:
+    stamps = []
+    for number, fields in lines:
+        try:
+            stamps.append(nanoseconds(fields[0]))
+        except ValueError as error:
+            raise SegslamError(f"{path}:{number}: {error}; correct or remove the line") from error
+    return np.array(stamps, dtype=np.int64)
+
+
+def _poses_from_matrices(rows: np.ndarray) -> Poses:
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    poses[:, :3, :3] = [geometry.nearest_rotation(matrix) for matrix in poses[:, :3, :3]]
+    return poses
+
+
+def _poses_from_quaternions(rows: np.ndarray) -> Poses:
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    norms = np.linalg.norm(rows[:, 4:], axis=1)
+    quaternions = np.where(norms[:, None] > 0, rows[:, 4:], [0.0, 0.0, 0.0, 1.0])  # zeros are rejected below
+    poses[:, :3, :3] = ScipyRotation.from_quat(quaternions).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return poses
+
+
+def _require_rotations(path: Path, numbers: list[int], rows: np.ndarray, poses: Poses, format: PoseFormat) -> None:
+    if format == "kitti":
+        off = np.abs(rows.reshape(-1, 3, 4)[:, :, :3] - poses[:, :3, :3]).max(axis=(1, 2))
+    else:
+        off = np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0)
+    worst = int(np.argmax(off))
+    if off[worst] > ROTATION_TOLERANCE:
+        what = "3x3 part" if format == "kitti" else "quaternion"
+        raise SegslamError(
+            f"{path}:{numbers[worst]}: the {what} is not a rotation (error {off[worst]:.3g}); correct the line"
+        )

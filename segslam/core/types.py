@@ -1,0 +1,438 @@
+"""The records that travel between stages, and the array aliases of their fields.
+
+Conventions. `T_a_b` is the pose of frame b in frame a: `p_a = T_a_b @ p_b`. Frames: world, odom, keyframe, lidar.
+Tangents are [rotation rad; translation m] with the perturbation on the right, GTSAM's convention.
+Stamps are integer nanoseconds. Labels are SemanticKITTI learning ids.
+Shapes are checked under pytest only.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from typing import NoReturn
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy.typing import ArrayLike
+
+from segslam.core.errors import BadScan as BadScan
+from segslam.core.errors import SegslamError as SegslamError
+from segslam.core.errors import WorkFailed as WorkFailed
+from segslam.core.short_repr import Record
+
+Points = Float[np.ndarray, "_ 3"]
+"""Points, a row each, in metres."""
+Labels = UInt8[np.ndarray, "_"]
+"""SemanticKITTI learning ids, one per point."""
+ScanLabels = Labels | Callable[[], Labels]
+"""The labels of a scan, or a function that computes them, as for a network."""
+Transform = Float[np.ndarray, "4 4"]
+"""A rigid transform T_a_b."""
+Rotation = Float[np.ndarray, "3 3"]
+Tangent = Float[np.ndarray, "6"]
+"""[rotation rad; translation m], right perturbation."""
+Covariances = Float[np.ndarray, "_ 3 3"]
+Direction = Float[np.ndarray, "3"]
+Information = Float[np.ndarray, "6 6"]
+"""Inverse covariance of a tangent, in the same order."""
+Indices = Int[np.ndarray, "_"]
+IndexPairs = Int[np.ndarray, "_ 2"]
+Vector = Float[np.ndarray, "_"]
+Mask = Bool[np.ndarray, "_"]
+
+
+def as_points(points: ArrayLike) -> Points:
+    """The first three columns of an array-like object; float32 stays float32, all else becomes float64.
+
+    Raises SegslamError for another shape, or if it holds no numbers.
+    """
+    try:
+        array = np.asarray(points)
+        array = array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise SegslamError(f"points: not an array of numbers ({error}); give rows of x, y, z") from error
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise SegslamError(f"points: an array of shape {array.shape}; give rows of x, y, z, as of shape (n, 3)")
+    return array[:, :3]
+
+
+class Label(IntEnum):
+    """SemanticKITTI learning ids; the moving classes are those of its multi-scan task."""
+
+    UNLABELLED = 0
+    CAR = 1
+    BICYCLE = 2
+    MOTORCYCLE = 3
+    TRUCK = 4
+    OTHER_VEHICLE = 5
+    PERSON = 6
+    BICYCLIST = 7
+    MOTORCYCLIST = 8
+    ROAD = 9
+    PARKING = 10
+    SIDEWALK = 11
+    OTHER_GROUND = 12
+    BUILDING = 13
+    FENCE = 14
+    VEGETATION = 15
+    TRUNK = 16
+    TERRAIN = 17
+    POLE = 18
+    TRAFFIC_SIGN = 19
+    MOVING_CAR = 20
+    MOVING_BICYCLIST = 21
+    MOVING_PERSON = 22
+    MOVING_MOTORCYCLIST = 23
+    MOVING_OTHER_VEHICLE = 24
+    MOVING_TRUCK = 25
+
+
+GROUND_LABELS = (Label.ROAD, Label.PARKING, Label.SIDEWALK, Label.OTHER_GROUND, Label.TERRAIN)
+
+
+class RejectReason(StrEnum):
+    """Reason of a rejected registration or loop, in the order of the pipeline."""
+
+    TOO_FEW_POINTS = "too_few_points"
+    TOO_FEW_CORRESPONDENCES = "too_few_correspondences"
+    SMALL_CLIQUE = "small_clique"
+    DEGENERATE = "degenerate"
+    TOO_FEW_INLIERS = "too_few_inliers"
+    FAR_FROM_PRIOR = "far_from_prior"
+    REFINEMENT_DIVERGED = "refinement_diverged"
+    LOW_OVERLAP = "low_overlap"
+    HIGH_RESIDUAL = "high_residual"
+    FREE_SPACE_VIOLATED = "free_space_violated"
+    IMPROBABLE = "improbable"
+    AMBIGUOUS = "ambiguous"
+    NO_PLACE = "no_place"
+    UNCONFIRMED = "unconfirmed"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False, init=False)
+class Scan(Record):
+    """One sweep: points in the LiDAR frame (x ahead, y left, z up; m) and the stamp are enough.
+
+    A network labels a scan when it becomes a keyframe; until then `labels` is a function without arguments that
+    returns the labels.
+    """
+
+    points: Points
+    stamp_ns: int
+    index: int | None
+    """Number of the scan in the drive; if None, `Slam` counts."""
+    labels: ScanLabels
+    """A row for each point, all UNLABELLED if unknown."""
+    times: Vector
+    """Per point, 0 at the sweep's start to 1 at its end; empty if unknown or already motion-compensated."""
+    intensities: Vector | None
+    """Per point, in the sensor's own unit; None if unknown or not requested."""
+    kept: Mask | None
+    """Rows of the file that the points were read from; None for all rows."""
+
+    def __init__(
+        self,
+        points: ArrayLike,
+        stamp_ns: int,
+        index: int | None = None,
+        labels: ScanLabels | None = None,
+        times: Vector | None = None,
+        intensities: Vector | None = None,
+        kept: Mask | None = None,
+    ) -> None:
+        """`points`: array-like with at least 3 columns; the first 3 are used."""
+        xyz = as_points(points)
+        values = {
+            "points": xyz,
+            "stamp_ns": stamp_ns,
+            "index": index,
+            "labels": np.zeros(len(xyz), np.uint8) if labels is None else labels,
+            "times": np.empty(0) if times is None else times,
+            "intensities": intensities,
+            "kept": kept,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+
+class MotionState(StrEnum):
+    """Result of checking a motion against the scans."""
+
+    UNCHECKED = "unchecked"
+    """Not checked: too little motion since the last check."""
+    CONFIRMED = "confirmed"
+    """The motion of the odometry, consistent with the scans."""
+    REFINED = "refined"
+    """Registered again; the motion of the odometry was within the tolerance."""
+    REPAIRED = "repaired"
+    """Replaced by a registration: the motion of the odometry was off by more than the tolerance."""
+    REJOINED = "rejoined"
+    """Registered with the scans before a break; only in logs of earlier versions."""
+    BROKEN = "broken"
+    """A break: the standard deviation of the motion is above a metre; its mean is the most likely one."""
+    BEGUN = "begun"
+    """First scan of another session of a merged run: its motion from the scan before is unknown."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Motion(Record):
+    """The check of a scan's motion since the last checked scan."""
+
+    state: MotionState
+    moved_m: float | None = None
+    """Distance from the odometry's pose to the registered one; None if there was no registration."""
+    moved_deg: float | None = None
+    overlap: float | None = None
+    """Share of the scan that lies on earlier scans, at the registered pose."""
+    rms_m: float | None = None
+    information: Information | None = None
+    """Information of the motion in the graph; None if the noise model of the odometry holds."""
+    covariance: Information | None = None
+    """(6, 6) of the motion since the scan before, tangent in the scan's frame; None if it was not checked."""
+
+    @property
+    def is_break(self) -> bool:
+        """True if the motion is almost unknown."""
+        return self.state in (MotionState.BEGUN, MotionState.BROKEN)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Keyframe(Record):
+    """A scan kept for loop closing. It has no world pose: the pose graph owns all world poses."""
+
+    id: int
+    scan_index: int
+    stamp_ns: int
+    T_odom_keyframe: Transform
+    travel_m: float
+    """Length of the odometry's path from the first scan."""
+    points: Points
+    """Motion-compensated, in the keyframe's frame, float32."""
+    labels: Labels
+    intensities: Vector | None = None
+    """Intensities of the scan, per point; None if unknown."""
+    labelled_by_shape: bool | None = None
+    """True if the labels were computed from the points alone; None if unknown."""
+    place: bytes | None = None
+    """Signature by which its place is recognised (`segslam.candidates`); None where none was made."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Description(Record):
+    """Features of one scan for matching, in the scan's frame: clusters (k rows) and key points (m rows).
+
+    Each is a Gaussian with a class. Thousands of descriptions fit in memory.
+    """
+
+    means: Points
+    """Centres; for upright objects above observed ground, the point on the ground below."""
+    covariances: Covariances
+    classes: Labels
+    sizes: Indices
+    """Points in each cluster."""
+    feature_points: Points
+    feature_covariances: Covariances
+    feature_classes: Labels
+    feature_descriptors: Float[np.ndarray, "_ 33"]
+    """Square roots of FPFH at unit length, float16."""
+    ground_points: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    """Centres of flat patches of the ground, a row each."""
+    ground_normals: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    """Unit normals of the patches, towards the sensor."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopCandidate(Record):
+    """A possible loop: the new keyframe `source_id` and the older `target_id`. The prior is used by gates only."""
+
+    source_id: int
+    target_id: int
+    T_target_source_prior: Transform
+    distance_m: float
+    """Distance between the two positions, by the current estimate."""
+    search_radius_m: float
+    chain_m: float = 0.0
+    """Length of the shortest chain of odometry and closures between the two."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Registration(Record):
+    """The pose of the source in the target: `p_target = T_target_source @ p_source`."""
+
+    T_target_source: Transform
+    num_correspondences: int
+    num_inliers: int
+    rms_m: float
+    """Root mean square distance of the inliers."""
+    information: Information
+    num_edges: int = 0
+    """Edges of the consistency graph (0 if the method has none)."""
+
+    @property
+    def ok(self) -> bool:
+        """True; False for `Rejected`."""
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """A failed registration or rejected loop. It has no pose, and no truth value: ask `isinstance`, or `ok`."""
+
+    reason: RejectReason
+    detail: str = ""
+    probability: float | None = None
+    """That the best pose is right; None if none could be judged."""
+    evidence: dict[str, float] = field(default_factory=dict)
+    """As that of `Alignment`."""
+
+    def __bool__(self) -> NoReturn:
+        raise TypeError("a Rejected is neither true nor false; ask isinstance(found, Rejected), or found.ok")
+
+    @property
+    def ok(self) -> bool:
+        """False; True for a registration, alignment or closure."""
+        return False
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Alignment(Record):
+    """A refined and verified registration."""
+
+    coarse: Registration
+    fine: Registration
+    overlap: float
+    """Share of the standing points within reach of the other scan that lie on it; the smaller of both directions."""
+    rms_m: float
+    """Root mean square distance of these points to the planes of the other scan (m)."""
+    free_space_violation: float
+    """Share of the points in space that the other scan observed empty."""
+    observability: float = 1.0
+    """Smallest divided by largest variance of the translation, 0 to 1: small along a corridor."""
+    probability: float | None = None
+    """That the pose is right; None in logs of older versions."""
+    evidence: dict[str, float] = field(default_factory=dict)
+    """Summands of its log odds by name (nats): `surfaces`, `no_surface`, `free_space`, `usual`, and `other_pose`."""
+
+    @property
+    def T_target_source(self) -> Transform:  # noqa: N802  (a transform)
+        """The pose of the source in the target: `p_target = T_target_source @ p_source`, (4, 4)."""
+        return self.fine.T_target_source
+
+    @property
+    def ok(self) -> bool:
+        """True; False for `Rejected`."""
+        return True
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopClosure(Record):
+    """A verified loop, a between-factor of the graph. `information`: of `T_target_source`, right perturbation."""
+
+    source_id: int
+    target_id: int
+    T_target_source: Transform
+    information: Information
+    alignment: Alignment
+
+    @classmethod
+    def of(cls, source_id: int, target_id: int, alignment: Alignment) -> "LoopClosure":
+        """The loop between two keyframes with the pose and information of their alignment."""
+        return cls(source_id, target_id, alignment.fine.T_target_source, alignment.fine.information, alignment)
+
+    @property
+    def ok(self) -> bool:
+        """True; False for `Rejected`."""
+        return True
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopAttempt(Record):
+    """A candidate and its outcome."""
+
+    candidate: LoopCandidate
+    outcome: LoopClosure | Rejected
+    seconds: dict[str, float]
+    """Seconds by stage (prepare, match, refine, verify); only stages that ran."""
+
+
+def probability_text(probability: float, evidence: dict[str, float]) -> str:
+    """In words: the probability that a pose is right, and the evidence that it is made of (nats)."""
+    parts = ", ".join(f"{name.replace('_', ' ')} {value:+.1f}" for name, value in evidence.items())
+    return f"probability {probability:.4f} ({parts})"
+
+
+REJECTED_WEIGHT = 0.5
+"""Closures with a smaller weight count as rejected by the optimiser."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Placement(Record):
+    """The verified pose of a keyframe in an old map, one prior factor to be. `information` is that of the pose."""
+
+    keyframe_id: int
+    map_keyframe_id: int
+    """The map's keyframe that it was registered with."""
+    T_world_keyframe: Transform
+    """In the map's world."""
+    information: Information
+    alignment: Alignment
+    """With the map's keyframe."""
+    is_found: bool
+    """Found with no initial guess, or else tracked: registered from a predicted pose."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class GraphEstimate(Record):
+    """The result of one optimisation."""
+
+    T_world_keyframe: dict[int, Transform]
+    error: float
+    """Minimised cost as GTSAM defines it: half the chi-square, under robust kernels before the final optimisation."""
+    closure_weights: dict[tuple[int, int], float]
+    """(source_id, target_id) -> 0 (rejected) to 1 (full weight)."""
+    motion_weights: dict[tuple[int, int], float] = field(default_factory=dict)
+    """(keyframe_id, next keyframe_id) -> 0 for rejected motions of the odometry. All other motions have weight 1."""
+
+    @property
+    def rejected(self) -> set[tuple[int, int]]:
+        """The closures (source_id, target_id) that the optimiser rejected."""
+        return {pair for pair, weight in self.closure_weights.items() if weight < REJECTED_WEIGHT}
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Step(Record):
+    """Everything that one scan caused."""
+
+    scan_index: int
+    stamp_ns: int
+    T_odom_lidar: Transform
+    keyframe: Keyframe | None
+    attempts: tuple[LoopAttempt, ...]
+    estimate: GraphEstimate | None
+    """Present only if this step optimised the graph."""
+    stage_seconds: dict[str, float]
+    motion: Motion | None = None
+    """Check of the scan's motion; None if it was not checked."""
+    placements: tuple[Placement, ...] = ()
+    """Keyframes placed in an old map: the keyframe of this step, and earlier ones that it confirms."""
+    not_placed: Rejected | None = None
+    """Why the keyframe of this step has no place in the old map; None if it has one, or there is no map."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LateLoops(Record):
+    """Loops tried after the last scan."""
+
+    attempts: tuple[LoopAttempt, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Trajectory(Record):
+    """Stamped poses, one row per scan. `T_world_lidar` (n, 4, 4); `scan_index`: numbers of the scans."""
+
+    scan_index: Indices
+    stamp_ns: Indices
+    T_world_lidar: Float[np.ndarray, "_ 4 4"]
+
+    def __len__(self) -> int:
+        return len(self.scan_index)

@@ -1,0 +1,50 @@
+"""Atomic writing of files: a file appears under its name when it is complete, or not at all."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from segslam.core.errors import SegslamError, WorkFailed, reason
+from segslam.core.interrupts import removed_when_stopped
+
+
+def check_target(file: Path) -> None:
+    """Raises SegslamError for a file that cannot be written: its folder is missing, or it is no regular file."""
+    try:
+        if file.exists() and not file.is_file():
+            raise SegslamError(f"{file}: exists and is not a regular file, so it is not replaced; give another file")
+        if not file.parent.is_dir():
+            raise SegslamError(f"{file}: there is no folder {file.parent}; create it, or give another file")
+    except OSError as error:
+        raise cannot_write(file, error) from error
+
+
+@contextmanager
+def whole_file(file: Path) -> Iterator[Path]:
+    """Context manager with a temporary path, whose file replaces `file` at the end unless an exception is raised.
+
+    If `file` is a link, its target is replaced. Raises SegslamError as `check_target`, and WorkFailed for an OSError
+    within.
+    """
+    check_target(file)
+    target = file.resolve()
+    part = target.with_name(f".{target.name}.part")
+    try:
+        with removed_when_stopped(part):
+            yield part
+            part.replace(target)
+    except OSError as error:
+        raise cannot_write(file, error) from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_whole(file: Path, content: bytes | str) -> None:
+    """Write a file atomically; text in UTF-8."""
+    with whole_file(file) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def cannot_write(file: Path, error: OSError) -> WorkFailed:
+    """The exception for a file that cannot be written."""
+    return WorkFailed(f"{file}: cannot be written ({reason(error)}); free space there, or give another file")

@@ -1,6 +1,0 @@
-"""Any number of drives in one frame: each mapped on its own, related to the others, and joined where they overlap."""
-
-from segslam.fleets.drives import Drive, drives_of, read_drives
-from segslam.fleets.orchestrate import FleetResult, fleet
-
-__all__ = ["Drive", "FleetResult", "drives_of", "fleet", "read_drives"]

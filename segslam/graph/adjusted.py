@@ -1,0 +1,124 @@
+"""The optimum of a drive with further relative poses, measured all along it and between its passes.
+
+The noise of odometry and of these measurements is known up to a factor each. Both are estimated from how the two
+contradict themselves and each other: after a solution, the median of the squared errors of each kind is compared with
+its median in a simulation with the noise as claimed, whose solution has the same degrees of freedom.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from segslam.core import geometry
+from segslam.graph.breaks import is_break
+from segslam.graph.edges import (
+    Edge,
+    Kernel,
+    Transforms,
+    factor_graph,
+    joined,
+    poses_by_id,
+    squared_errors,
+    values_of,
+)
+from segslam.graph.levenberg_marquardt import Search, search
+
+ROUNDS = 10
+"""Chosen: largest number of estimates of the two factors; they usually settle in three to six."""
+SETTLED = 0.05
+"""Chosen: relative change of a factor below which the estimate ends."""
+LEAST, MOST = np.array([0.05, 0.4]), 20.0
+"""Bounds of the factors, least of odometry and of measurements. Chosen on NCLT with an odometry as good as its map: the
+measurements share scans, so they contradict each other less than they err."""
+
+LEAST_WEIGHT = 1e-6
+"""Keeps the information of an outlier positive definite, as a g2o file requires."""
+
+
+def solve_adjusted(
+    prior: gtsam.NonlinearFactorGraph,
+    odometry: Sequence[Edge],
+    closures: Sequence[Edge],
+    measured: Sequence[Edge],
+    start: gtsam.Values,
+    kernel: Kernel | None,
+) -> tuple[Search, tuple[float, float]]:
+    """The optimum near `start`, and the factors of the standard deviations of odometry and of the measurements.
+
+    Closures and measurements are under the kernel. Breaks of the odometry keep their noise.
+    """
+    fixed = [edge for edge in odometry if is_break(edge)]
+    groups = [edge for edge in odometry if not is_break(edge)], list(measured)
+    kernels = None, kernel
+    factors = np.ones(2)
+    rng = np.random.default_rng(0)
+
+    def solved(groups: Sequence[Sequence[Edge]], closures: Sequence[Edge], start: gtsam.Values) -> Search:
+        parts = [factor_graph(group, kernel=one) for group, one in zip(groups, kernels, strict=True)]
+        return search(joined(prior, factor_graph(fixed), factor_graph(closures, kernel=kernel), *parts), start)
+
+    for _ in range(ROUNDS):
+        scaled = [_scaled(group, float(factor)) for group, factor in zip(groups, factors, strict=True)]
+        found = solved(scaled, closures, start)
+        start = found.values
+        T_world = poses_by_id(start)
+        exact = [_simulated(group, T_world, rng) for group in (*scaled, closures)]
+        simulated = solved(exact[:2], exact[2], values_of(T_world))
+        change = np.array(
+            [
+                np.sqrt(_median_chi2(real, start) / _median_chi2(made, simulated.values))
+                for real, made in zip(scaled, exact[:2], strict=True)
+            ]
+        )
+        before = factors
+        factors = np.clip(factors * change, LEAST, MOST)
+        if np.abs(factors / before - 1.0).max() < SETTLED:
+            break
+    return found, (float(before[0]), float(before[1]))
+
+
+def weighted_edges(
+    odometry: Sequence[Edge],
+    closures: Sequence[Edge],
+    measured: Sequence[Edge],
+    factors: tuple[float, float],
+    values: gtsam.Values,
+    kernel: Kernel | None,
+) -> list[Edge]:
+    """All edges with the information that they have at the optimum `values`: with the factors of noise of
+    `solve_adjusted`, and the weights of the robust kernel."""
+    moving = [edge if is_break(edge) else _scaled([edge], factors[0])[0] for edge in odometry]
+    robust = [*closures, *_scaled(measured, factors[1])]
+    if kernel is None or not robust:
+        return [*moving, *robust]
+    errors = np.sqrt(squared_errors(factor_graph(robust), values))
+    weights = [max(kernel.weight(float(error)), LEAST_WEIGHT) for error in errors]
+    return [
+        *moving,
+        *(replace(edge, information=w * edge.information) for edge, w in zip(robust, weights, strict=True)),
+    ]
+
+
+def _scaled(edges: Sequence[Edge], factor: float) -> list[Edge]:
+    return [replace(edge, information=edge.information / factor**2) for edge in edges]
+
+
+def _simulated(edges: Sequence[Edge], T_world: Transforms, rng: np.random.Generator) -> list[Edge]:
+    """The edges as measured between these poses with errors as their information claims."""
+    errors = rng.standard_normal((len(edges), 6))
+    return [
+        replace(
+            edge,
+            T_a_b=geometry.inverse(T_world[edge.a])
+            @ T_world[edge.b]
+            @ geometry.exp(np.linalg.solve(np.linalg.cholesky(edge.information).T, error)),
+        )
+        for edge, error in zip(edges, errors, strict=True)
+    ]
+
+
+def _median_chi2(edges: Sequence[Edge], values: gtsam.Values) -> float:
+    """Median squared error; 1 without edges, and at least next to nothing."""
+    return max(float(np.median(squared_errors(factor_graph(edges), values))), 1e-9) if edges else 1.0

@@ -1,0 +1,157 @@
+"""The search for the optimum of a graph from a file, and for the inliers among its closures."""
+
+import logging
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.special import chdtrc
+
+from segslam.core.types import Mask, Vector
+from segslam.graph import noise
+from segslam.graph.closure_pairs import consistent_pairs, ends_m, largest_consistent, neighbours
+from segslam.graph.contradictions import contradicting, turned, unknown_motion
+from segslam.graph.edges import Edge
+from segslam.graph.g2o import G2oGraph
+from segslam.graph.gnc import Solution, TruncatedProblem, better, settle, solve
+from segslam.graph.levenberg_marquardt import Search, deeply, search
+from segslam.graph.selection import exchange_groups, large_groups
+
+logger = logging.getLogger(__name__)
+IMPLAUSIBLE = 1e-6
+"""A fit less probable than this, under the noise of the edges, is implausible. Chosen."""
+MAX_PAIRED = 5_000
+"""Largest number of closures compared pairwise, in 8 s; for more, graduated non-convexity selects."""
+NEAR_IDS = 10
+"""Closures whose ends are this near in ids join the same two places. Chosen: a ring of `sphere2500` has 50 vertices."""
+MIN_KEPT = 0.8
+"""A plausible solution that keeps this share of the closures is not compared with others. Chosen."""
+GOOD_START = 0.5
+"""The file's poses are a start of their own where this share of the closures fits them. Chosen."""
+GENEROUS = 4.0
+"""Closures with an error below this many bounds are also tried as inliers. Chosen: twice the error of an inlier."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FileProblem:
+    """The edges of a file by their role."""
+
+    num_vertices: int
+    first_id: int
+    odometry: list[Edge]
+    """Edges between consecutive ids; where several contradict each other, one without information."""
+    closures: list[Edge]
+    """All other edges, and those between consecutive ids that contradict each other."""
+    contradicting: list[list[Edge]]
+    """Edges between the same neighbours that contradict each other."""
+    inlier_bound: float
+    """Chi-square that all closures, if all are inliers, are below with the given probability."""
+
+    @classmethod
+    def of(cls, graph: G2oGraph, inlier_probability: float) -> "FileProblem":
+        """The edges of a graph."""
+        groups = contradicting([edge for edge in graph.edges if abs(edge.a - edge.b) == 1])
+        moved = {id(edge) for edges in groups for edge in edges}
+        odometry = [edge for edge in graph.edges if abs(edge.a - edge.b) == 1 and id(edge) not in moved]
+        odometry += [unknown_motion(edges) for edges in groups]
+        closures = [edge for edge in graph.edges if abs(edge.a - edge.b) != 1 or id(edge) in moved]
+        each = 1.0 - (1.0 - inlier_probability) / max(1, len(closures))
+        first_id = min(graph.T_world_vertex)
+        return cls(len(graph.T_world_vertex), first_id, odometry, closures, groups, noise.inlier_bound(each))
+
+    def redundancy(self, weights: Vector) -> int:
+        """Degrees of freedom of the edges beyond those of the poses, without the closures of weight 0."""
+        num_edges = len(self.odometry) - len(self.contradicting) + int((weights > 0.0).sum())
+        return noise.DEGREES_OF_FREEDOM * (num_edges - self.num_vertices + 1)
+
+    def undecided(self, weights: Vector) -> list[tuple[int, int]]:
+        """The neighbours whose contradicting edges no kept closure (of weight above 0) across them decides."""
+        moved = {id(edge) for edges in self.contradicting for edge in edges}
+        across = [
+            (min(edge.a, edge.b), max(edge.a, edge.b))
+            for edge, weight in zip(self.closures, weights, strict=True)
+            if weight > 0.0 and id(edge) not in moved
+        ]
+        pairs = [sorted((edges[0].a, edges[0].b)) for edges in self.contradicting]
+        return [(a, b) for a, b in pairs if not any(first <= a and b <= last for first, last in across)]
+
+    def chain(self) -> tuple[list[Edge], list[Edge]]:
+        """One motion from each vertex to the next, and the closures, with vertices numbered from 0."""
+        motions = {min(edge.a, edge.b): edge for edge in reversed(self.odometry)}  # the first of several stays
+        forwards = [edge if edge.a < edge.b else turned(edge) for _, edge in sorted(motions.items())]
+        return _renumbered(forwards, self.first_id), _renumbered(self.closures, self.first_id)
+
+
+def plausible(chi2: float, redundancy: int) -> bool:
+    """Whether this chi-square is plausible for edges with this many redundant degrees of freedom."""
+    return redundancy <= 0 or float(chdtrc(redundancy, chi2)) > IMPLAUSIBLE
+
+
+def least_squares(factors: gtsam.NonlinearFactorGraph, start: gtsam.Values, *, redundancy: int) -> Search:
+    """The optimum near `start`, or near chordal poses if the first is implausible and the second is better.
+
+    Chordal initialisation: Carlone et al., "Initialization Techniques for 3D SLAM", ICRA 2015.
+    """
+    near = search(factors, start)
+    if plausible(2.0 * near.error, redundancy):
+        return near
+    logger.info("the optimum near the file's poses does not fit the edges: searching from chordal poses too")
+    other = search(factors, deeply(start.size(), lambda: gtsam.InitializePose3.initialize(factors)))
+    best = min(near, other, key=lambda found: found.error)
+    return best._replace(iterations=near.iterations + other.iterations)
+
+
+def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Values) -> Solution:
+    """Poses and inliers, near the file's poses if those fit many closures, else from a consistent set.
+
+    The search begins with the large groups of the largest consistent set. The whole set, graduated non-convexity and
+    groups of rejected closures follow only if the solution is implausible or rejects many closures.
+    """
+    if not problem.closures:
+        return settle(truncated, least_squares(truncated.weighted(np.ones(0)), start, redundancy=0).values)
+    candidates = []
+    if truncated.inliers(start).mean() >= GOOD_START:
+        candidates.append(_generous(truncated, settle(truncated, start)))
+        if _is_certain(problem, candidates[0]):
+            return candidates[0]
+    if len(problem.closures) > MAX_PAIRED:
+        logger.info("more than %d closures: graduated non-convexity instead of pairwise consistency", MAX_PAIRED)
+        return solve(truncated, start)
+    odometry, closures = problem.chain()
+    consistent = consistent_pairs(odometry, closures, problem.inlier_bound)
+    near = neighbours(ends_m(closures, np.arange(problem.num_vertices, dtype=float)), NEAR_IDS)
+    largest = largest_consistent(consistent, np.ones(len(closures), dtype=bool))
+
+    def settled(likely: Mask) -> Solution:
+        weights = likely.astype(float)
+        found = least_squares(truncated.weighted(weights), start, redundancy=problem.redundancy(weights))
+        return _generous(truncated, settle(truncated, found.values, found.iterations))
+
+    candidates.append(settled(large_groups(consistent, near, largest)))
+    best = min(candidates, key=lambda solution: solution.truncated_cost)
+    if _is_certain(problem, best):
+        return best
+    logger.info("the solution is uncertain: searching from other starts")
+    candidates += [settled(largest), solve(truncated, start)]
+    exchanged = [exchange_groups(truncated, solution, consistent, near) for solution in candidates]
+    return _generous(truncated, min(exchanged, key=lambda solution: solution.truncated_cost))
+
+
+def _is_certain(problem: FileProblem, solution: Solution) -> bool:
+    """Whether a solution is plausible and keeps most closures."""
+    enough = bool(solution.weights.mean() >= MIN_KEPT)
+    return enough and plausible(2.0 * solution.search.error, problem.redundancy(solution.weights))
+
+
+def _generous(truncated: TruncatedProblem, solution: Solution) -> Solution:
+    """The solution, or a better one in which closures a little beyond the bound are inliers."""
+    squared = truncated.squared_errors(solution.search.values)
+    wider = squared <= GENEROUS * truncated.inlier_bound
+    if (wider == (solution.weights > 0.0)).all():
+        return solution
+    found = search(truncated.weighted(wider.astype(float)), solution.search.values)
+    return better(solution, settle(truncated, found.values, solution.search.iterations + found.iterations))
+
+
+def _renumbered(edges: list[Edge], first: int) -> list[Edge]:
+    return [Edge(edge.a - first, edge.b - first, edge.T_a_b, edge.information) for edge in edges]

@@ -1,0 +1,210 @@
+"""Pairwise-consistent closures: the largest set in which every pair is consistent within its noise.
+
+Mangelson, Dominic, Eustice, Vasudevan, "Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map
+Merging", ICRA 2018. Two closures and the odometry between their sources and between their targets make a loop; its
+error is whitened by the noise of these four.
+
+| symbol | here |
+|---|---|
+| z_ik, z_jl | `T_target_source` of two closures |
+| x_ij, x_lk | odometry between the targets, between the sources |
+| gamma | `bound` |
+
+A closure moves its source by C = T_odom_target T_target_source inverse(T_odom_source), the drift on the way. Two
+closures are consistent if C_p inverse(C_q) is within the noise of the drift between them. All are in one frame, so the
+covariance of any stretch of odometry is a difference of two sums, transformed by C_p between the sources. Differs from
+the paper: odometry shared by both stretches cancels if both are driven the same way, and counts twice otherwise.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+
+from segslam.core.kernels import kernel
+from segslam.core.types import Indices, Mask, Vector
+from segslam.graph.edges import Edge, Transforms
+from segslam.registration.cliques import maximum_cliques, pack_rows
+
+MOST_NODES = 20_000
+"""Bound of the clique search: a second where 1,500 true closures are almost all consistent; any large set of them will
+do."""
+Matrices = Float[np.ndarray, "_ 6 6"]
+Pairs = Bool[np.ndarray, "_ _"]
+
+
+class Shifts(NamedTuple):
+    """The drift that each closure measures, a row each, in one frame."""
+
+    T_world_drifted: Transforms
+    covariances: Matrices
+    """Covariances of the closures' own noise."""
+    sources: Indices
+    targets: Indices
+
+
+def consistent_pairs(odometry: Sequence[Edge], closures: Sequence[Edge], bound: float) -> Pairs:
+    """(k, k) which two closures have a chi-square, with 6 degrees of freedom, within `bound`.
+
+    `odometry` leads from each vertex 0, 1, 2, ... to the next.
+    """
+    if not closures:
+        return np.zeros((0, 0), dtype=bool)
+    return pairwise_chi2(odometry, closures, enough=bound) <= bound
+
+
+def largest_consistent(consistent: Pairs, among: Mask) -> Mask:
+    """(k,) the largest pairwise-consistent set among some closures."""
+    chosen = np.zeros(len(among), dtype=bool)
+    rows = np.flatnonzero(among)
+    if len(rows):
+        found = maximum_cliques(pack_rows(consistent[np.ix_(rows, rows)]), max_cliques=1, max_nodes=MOST_NODES)
+        chosen[rows[found.cliques[0]]] = True
+    return chosen
+
+
+def pairwise_chi2(
+    odometry: Sequence[Edge], closures: Sequence[Edge], *, enough: float = math.inf
+) -> Float[np.ndarray, "_ _"]:
+    """(k, k) chi-square of the loop that two closures make; above `enough`, a lower bound of it, which is faster."""
+    T_world = _chained(odometry)
+    shifts = _shifts(T_world, closures)
+    summed = np.cumsum(np.concatenate([np.zeros((1, 6, 6)), _carried(T_world[1:], odometry)]), axis=0)
+    chi2 = np.zeros((len(closures), len(closures)))
+    _fill(
+        shifts.T_world_drifted,
+        np.linalg.inv(shifts.T_world_drifted),
+        adjoints(shifts.T_world_drifted),
+        shifts.covariances,
+        summed,
+        shifts.sources,
+        shifts.targets,
+        enough,
+        chi2,
+    )
+    return chi2
+
+
+def ends_m(closures: Sequence[Edge], travel_m: Vector) -> Float[np.ndarray, "_ 2"]:
+    """(k, 2) m of travel to the two ends of each closure."""
+    return travel_m[np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64).reshape(-1, 2)]
+
+
+def neighbours(ends_m: Float[np.ndarray, "k 2"], within_m: float) -> Pairs:
+    """(k, k) which two closures join the same two places: both ends within so much travel, as are its own."""
+    first, second = (np.abs(column[:, None] - column) <= within_m for column in ends_m.T)
+    return first & second
+
+
+def num_near(ends_m: Float[np.ndarray, "k 2"], within_m: float) -> Indices:
+    """(k,) how many closures join the same two places as each, itself among them: the row sums of `neighbours`."""
+    return KDTree(ends_m).query_ball_point(ends_m, within_m, p=np.inf, return_length=True)
+
+
+def adjoints(T_a_b: Transforms) -> Matrices:
+    """(k, 6, 6) adjoint matrices, which map tangents of b to tangents of a."""
+    x, y, z = T_a_b[:, :3, 3].T
+    nothing = np.zeros_like(x)
+    cross = np.array([[nothing, -z, y], [z, nothing, -x], [-y, x, nothing]]).transpose(2, 0, 1)
+    whole = np.zeros((len(T_a_b), 6, 6))
+    whole[:, :3, :3] = whole[:, 3:, 3:] = T_a_b[:, :3, :3]
+    whole[:, 3:, :3] = cross @ T_a_b[:, :3, :3]
+    return whole
+
+
+def _chained(odometry: Sequence[Edge]) -> Transforms:
+    """(n, 4, 4) poses along odometry; the origin is at the middle pose, which limits rounding errors."""
+    T_world = np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
+    T_world[:, :3, 3] -= T_world[:, :3, 3].mean(axis=0)
+    return T_world
+
+
+def _shifts(T_world: Transforms, closures: Sequence[Edge]) -> Shifts:
+    targets, sources = (np.array([(edge.a, edge.b) for edge in closures])).T.copy()
+    T_world_moved = T_world[targets] @ np.array([edge.T_a_b for edge in closures])
+    return Shifts(T_world_moved @ np.linalg.inv(T_world[sources]), _carried(T_world_moved, closures), sources, targets)
+
+
+def _carried(T_world_end: Transforms, edges: Sequence[Edge]) -> Matrices:
+    """Covariances of edges in the world frame, at their second vertices."""
+    turns = adjoints(T_world_end)
+    return turns @ np.linalg.inv(np.array([edge.information for edge in edges])) @ turns.transpose(0, 2, 1)
+
+
+@kernel("void(float64[:, ::1], float64[:, ::1], float64[::1])")
+def _log_of_product(T_a_b, T_b_c, tangent):
+    """Writes log(T_a_b T_b_c), by the quaternion of its rotation: exact up to half a turn."""
+    R, t = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = T_a_b[i, 0] * T_b_c[0, j] + T_a_b[i, 1] * T_b_c[1, j] + T_a_b[i, 2] * T_b_c[2, j]
+        t[i] = T_a_b[i, 0] * T_b_c[0, 3] + T_a_b[i, 1] * T_b_c[1, 3] + T_a_b[i, 2] * T_b_c[2, 3] + T_a_b[i, 3]
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    w = 1.0 + R[0, 0] + R[1, 1] + R[2, 2]
+    if w < 1.0:  # beyond 120 degrees: by the largest part of the axis, of which the others are products
+        i = 0 if R[0, 0] >= R[1, 1] and R[0, 0] >= R[2, 2] else 1 if R[1, 1] >= R[2, 2] else 2
+        w = x if i == 0 else y if i == 1 else z
+        x = 1.0 + 2.0 * R[0, 0] - R[0, 0] - R[1, 1] - R[2, 2] if i == 0 else R[0, i] + R[i, 0]
+        y = 1.0 + 2.0 * R[1, 1] - R[0, 0] - R[1, 1] - R[2, 2] if i == 1 else R[1, i] + R[i, 1]
+        z = 1.0 + 2.0 * R[2, 2] - R[0, 0] - R[1, 1] - R[2, 2] if i == 2 else R[2, i] + R[i, 2]
+        if w < 0.0:
+            w, x, y, z = -w, -x, -y, -z
+    length = math.sqrt(x * x + y * y + z * z)
+    angle = 2.0 * math.atan2(length, w)
+    small = angle < 1e-4  # the next terms of the series are below 1e-9
+    scale = 2.0 / w if small else angle / length
+    x, y, z = x * scale, y * scale, z * scale
+    # half / tan(half) = half * w / length, half of the angle
+    bend = 1.0 / 12.0 if small else (1.0 - 0.5 * angle * w / length) / (angle * angle)
+    u, v, w = y * t[2] - z * t[1], z * t[0] - x * t[2], x * t[1] - y * t[0]
+    tangent[0], tangent[1], tangent[2] = x, y, z
+    tangent[3] = t[0] - u / 2.0 + bend * (y * w - z * v)
+    tangent[4] = t[1] - v / 2.0 + bend * (z * u - x * w)
+    tangent[5] = t[2] - w / 2.0 + bend * (x * v - y * u)
+
+
+@kernel(
+    "void(float64[:, :, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[:, :, ::1],"
+    "int64[::1], int64[::1], float64, float64[:, ::1])"
+)
+def _fill(T_world_drifted, T_drifted_world, turns, own, summed, sources, targets, enough, chi2):
+    """Writes the chi-square of each two closures, by Cholesky's root of the covariance of their loop."""
+    error, root, turned = np.empty(6), np.empty((6, 6)), np.empty(6)
+    for p in range(len(sources)):
+        A = turns[p]
+        for q in range(p):
+            _log_of_product(T_world_drifted[p], T_drifted_world[q], error)
+            s0, s1 = min(sources[p], sources[q]), max(sources[p], sources[q])
+            t0, t1 = min(targets[p], targets[q]), max(targets[p], targets[q])
+            both0 = max(s0, t0)
+            both1 = max(min(s1, t1), both0)
+            same_way = (sources[q] > sources[p]) == (targets[q] > targets[p])
+            sign = -1.0 if same_way else 1.0
+            total = 0.0
+            for i in range(6):
+                for m in range(6):
+                    turned[m] = 0.0
+                    for k in range(6):
+                        turned[m] += A[i, k] * (summed[s1, k, m] - summed[s0, k, m])
+                for j in range(i + 1):
+                    entry = own[p, i, j] + own[q, i, j] + summed[t1, i, j] - summed[t0, i, j]
+                    for k in range(6):
+                        entry += turned[k] * A[j, k]
+                    if both1 > both0:
+                        for k in range(6):
+                            entry += sign * A[i, k] * (summed[both1, k, j] - summed[both0, k, j])
+                            entry += sign * A[j, k] * (summed[both1, i, k] - summed[both0, i, k])
+                    for k in range(j):
+                        entry -= root[i, k] * root[j, k]
+                    root[i, j] = math.sqrt(entry) if i == j else entry / root[j, j]
+                for k in range(i):
+                    error[i] -= root[i, k] * error[k]
+                error[i] /= root[i, i]
+                total += error[i] * error[i]
+                if total > enough:
+                    break
+            chi2[p, q] = chi2[q, p] = total

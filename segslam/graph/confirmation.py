@@ -1,0 +1,82 @@
+"""Loops without a useful prior wait until others confirm them.
+
+A single registration may be wrong, because places repeat. Where the odometry predicts the pose, the prior and the other
+closures exclude such errors; after much drift, and across a break of the odometry, nothing does, and one wrong loop
+ruins the map. Such a loop is closed only if several keyframes, along some metres of travel, are registered, and their
+poses are consistent with the odometry between them.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from segslam.core import geometry
+from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
+from segslam.graph import Graph
+
+MIN_CONSISTENT, MIN_SPREAD_M = 3, 5.0
+"""Chosen: number of keyframes that must be consistent, and travel between the first and the last."""
+WAITING_M = 40.0
+"""Chosen: travel after which an unconfirmed registration is dropped."""
+SAME_M, SAME_SHARE, SAME_RAD = 0.5, 0.05, math.radians(2.0)
+"""Chosen: largest difference of motions between consistent registrations; constant (m), and per metre between them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unconfirmed:
+    """A registration that is not yet confirmed by others."""
+
+    closure: LoopClosure
+    candidate: LoopCandidate
+
+
+class Confirmation:
+    """The registrations that are not yet confirmed, and their confirmation by later ones."""
+
+    def __init__(self, graph: Graph, T_odom_keyframe: Callable[[int], Transform]) -> None:
+        """`T_odom_keyframe`: pose of a keyframe by odometry."""
+        self._graph, self._T_odom = graph, T_odom_keyframe
+        self._waiting: list[Unconfirmed] = []
+
+    def is_waiting(self, keyframe_id: int) -> bool:
+        """True if this keyframe may confirm an earlier registration."""
+        at_m = self._graph.travel_m[keyframe_id]
+        self._waiting = [one for one in self._waiting if abs(at_m - self._travel_m(one)) <= WAITING_M]
+        return bool(self._waiting)
+
+    def attempts(
+        self, candidate: LoopCandidate, closure: LoopClosure, seconds: dict[str, float]
+    ) -> tuple[LoopAttempt, ...]:
+        """The closures of a registration and of all that confirm it; one UNCONFIRMED attempt if these are too few."""
+        newest = Unconfirmed(closure, candidate)
+        consistent = (
+            [one for one in self._waiting if self._are_consistent(one, newest)]
+            if self.is_waiting(closure.source_id)
+            else []
+        )
+        sources = {one.closure.source_id for one in consistent} - {closure.source_id}
+        if (
+            len(sources) + 1 < MIN_CONSISTENT
+            or max(abs(self._travel_m(newest) - self._travel_m(one)) for one in consistent) < MIN_SPREAD_M
+        ):
+            self._waiting.append(newest)
+            shown = f"{len(sources)} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
+            return (LoopAttempt(candidate, Rejected(RejectReason.UNCONFIRMED, shown), seconds),)
+        self._waiting = []
+        return (
+            *(LoopAttempt(one.candidate, one.closure, {}) for one in consistent),
+            LoopAttempt(candidate, closure, seconds),
+        )
+
+    def _are_consistent(self, earlier: Unconfirmed, later: Unconfirmed) -> bool:
+        """True if the motion between two keyframes is the same by their registrations and by odometry."""
+        T_world = self._graph.T_world_keyframes
+        a, b = earlier.closure, later.closure
+        T_a_b = geometry.inverse(T_world[a.target_id] @ a.T_target_source) @ T_world[b.target_id] @ b.T_target_source
+        T_odom = geometry.inverse(self._T_odom(a.source_id)) @ self._T_odom(b.source_id)
+        apart = geometry.inverse(T_odom) @ T_a_b
+        within_m = SAME_M + SAME_SHARE * abs(self._travel_m(later) - self._travel_m(earlier))
+        return geometry.distance(apart) <= within_m and geometry.angle(apart) <= SAME_RAD
+
+    def _travel_m(self, one: Unconfirmed) -> float:
+        return float(self._graph.travel_m[one.closure.source_id])

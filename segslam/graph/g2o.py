@@ -1,0 +1,192 @@
+"""Pose graphs as g2o text: the tags VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX.
+
+A vertex is `id x y z qx qy qz qw`; an edge is `a b`, the pose of b in a as for a vertex, and the upper triangle of its
+information, row by row. g2o puts translation before rotation, segslam after it: only this module converts.
+Like GTSAM, it uses the rotational part of the information as it is.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import SupportsIndex
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation as ScipyRotation
+
+from segslam.core.errors import brief
+from segslam.core.types import Indices, SegslamError, Transform
+from segslam.graph.edges import Edge, Transforms
+
+VERTEX, EDGE, FIX = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "FIX"
+NUM_IDS = {VERTEX: 1, EDGE: 2, FIX: 1}
+NUM_FIELDS = {VERTEX: 8, EDGE: 30, FIX: 1}
+"""Ids included, the tag not."""
+PLANAR = ("VERTEX_SE2", "EDGE_SE2")
+UPPER = np.triu_indices(6)
+OTHER_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+"""Turns [translation; rotation] into [rotation; translation], and back."""
+MAX_ID = 2**63
+QUATERNION_TOLERANCE = 0.01  # chosen: above the rounding of any writer met, far below any other four numbers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class G2oGraph:
+    """Contents of a g2o file."""
+
+    T_world_vertex: dict[int, Transform]
+    """Poses of the vertices by id, as in the file."""
+    edges: list[Edge]
+    fixed: tuple[int, ...] = ()
+    """Vertices that FIX lines name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Table:
+    """The lines of one tag, a row each."""
+
+    path: Path
+    line_numbers: list[int]
+    ids: list[list[int]]
+    numbers: np.ndarray
+
+    def refusal(self, row: SupportsIndex, what: str) -> SegslamError:
+        return SegslamError(f"{self.path}:{self.line_numbers[row]}: {what}; correct or remove the line")
+
+
+def read_g2o(path: Path) -> G2oGraph:
+    """The pose graph of a file, every line checked.
+
+    Raises SegslamError that names file and line: an unknown tag, a broken line, a vertex missing or twice there,
+    an information that is not positive definite, a vertex without a chain of edges to the first, no vertex at all.
+    """
+    fields, line_numbers = _read_fields(path)
+    vertices, edges, fixes = (_table(path, tag, line_numbers[tag], fields[tag]) for tag in (VERTEX, EDGE, FIX))
+    if not vertices.ids:
+        raise SegslamError(f"{path}: holds no vertex; a graph needs lines of {VERTEX}")
+    row_of = _row_of_vertex(vertices)
+    for table in (edges, fixes):
+        _require_known(table, row_of)
+    graph = G2oGraph(
+        dict(zip(row_of, _poses(vertices), strict=True)), _edges(edges), tuple(ids[0] for ids in fixes.ids)
+    )
+    part = parts(row_of, graph.edges)
+    if part.any():
+        what = f"no chain of edges leads from vertex {vertices.ids[0][0]} to this one ({part.max() + 1} separate parts)"
+        raise vertices.refusal(int(np.argmax(part > 0)), what)
+    return graph
+
+
+def write_g2o(path: Path, graph: G2oGraph) -> None:
+    """Vertices, fixed vertices, edges: numbers to twelve digits, where GTSAM's writer keeps six."""
+    vertex_texts = _pose_texts(graph.T_world_vertex.values())
+    edge_texts = _pose_texts(edge.T_a_b for edge in graph.edges)
+    lines = [f"{VERTEX} {i} {pose}" for i, pose in zip(graph.T_world_vertex, vertex_texts, strict=True)]
+    lines += [f"{FIX} {i}" for i in graph.fixed]
+    lines += [
+        f"{EDGE} {edge.a} {edge.b} {pose} {_text(edge.information[OTHER_ORDER][UPPER])}"
+        for edge, pose in zip(graph.edges, edge_texts, strict=True)
+    ]
+    path.write_text("".join(line + "\n" for line in lines), encoding="ascii")
+
+
+def parts(vertices: Iterable[int], edges: Iterable[Edge]) -> Indices:
+    """Which part each vertex belongs to, that of the first being 0; within a part, chains of edges lead everywhere."""
+    position = {vertex: i for i, vertex in enumerate(vertices)}
+    pairs = np.array([(position[edge.a], position[edge.b]) for edge in edges], dtype=np.int64).reshape(-1, 2)
+    adjacency = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(position), len(position)))
+    return connected_components(adjacency, directed=False)[1]
+
+
+def _read_fields(path: Path) -> tuple[dict[str, list[list[str]]], dict[str, list[int]]]:
+    """The fields after each tag, a list a line, and the numbers of those lines."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{path}: cannot read the pose graph ({error}); give a g2o file") from error
+    fields: dict[str, list[list[str]]] = {tag: [] for tag in NUM_FIELDS}
+    line_numbers: dict[str, list[int]] = {tag: [] for tag in NUM_FIELDS}
+    for number, line in enumerate(text.split("\n"), start=1):
+        tag, *rest = line.partition("#")[0].split() or [""]
+        if len(rest) == NUM_FIELDS.get(tag):
+            fields[tag].append(rest)
+            line_numbers[tag].append(number)
+        elif tag:
+            raise SegslamError(f"{path}:{number}: {_complaint(tag, len(rest))}")
+    return fields, line_numbers
+
+
+def _complaint(tag: str, num_fields: int) -> str:
+    if tag in PLANAR:
+        return f"{tag} belongs to a graph in the plane; only graphs in space ({VERTEX}, {EDGE}) can be read"
+    if tag not in NUM_FIELDS:
+        return f"unknown tag {brief(tag)}; known are {', '.join(NUM_FIELDS)}: remove the line"
+    return f"{tag} takes {NUM_FIELDS[tag]} numbers, found {num_fields}; correct or remove the line"
+
+
+def _table(path: Path, tag: str, line_numbers: list[int], fields: list[list[str]]) -> _Table:
+    num_ids = NUM_IDS[tag]
+    table = _Table(path, line_numbers, [], np.empty((len(fields), NUM_FIELDS[tag] - num_ids)))
+    for row, texts in enumerate(fields):
+        try:
+            table.ids.append([int(text) for text in texts[:num_ids]])
+            table.numbers[row] = texts[num_ids:]
+        except ValueError as error:
+            raise table.refusal(row, brief(str(error))) from error
+        if not 0 <= min(table.ids[row]) <= max(table.ids[row]) < MAX_ID:
+            raise table.refusal(row, "ids are at least 0 and below 2**63")
+    for broken in np.flatnonzero(~np.isfinite(table.numbers).all(axis=1)):
+        raise table.refusal(broken, "every number must be finite")
+    return table
+
+
+def _row_of_vertex(vertices: _Table) -> dict[int, int]:
+    row_of: dict[int, int] = {}
+    for row, (vertex,) in enumerate(vertices.ids):
+        if row_of.setdefault(vertex, row) != row:
+            raise vertices.refusal(row, f"vertex {vertex} is in line {vertices.line_numbers[row_of[vertex]]} already")
+    return row_of
+
+
+def _require_known(table: _Table, row_of: dict[int, int]) -> None:
+    for row, ids in enumerate(table.ids):
+        for vertex in ids:
+            if vertex not in row_of:
+                raise table.refusal(row, f"vertex {vertex} has no {VERTEX} line")
+
+
+def _poses(table: _Table) -> Transforms:
+    """Those of the first seven numbers of each row."""
+    off = np.abs(np.linalg.norm(table.numbers[:, 3:7], axis=1) - 1.0)
+    for row in np.flatnonzero(off > QUATERNION_TOLERANCE):
+        raise table.refusal(row, f"the quaternion's length is off by {off[row]:.3g}")
+    poses = np.tile(np.eye(4), (len(off), 1, 1))
+    poses[:, :3, :3] = ScipyRotation.from_quat(table.numbers[:, 3:7]).as_matrix()
+    poses[:, :3, 3] = table.numbers[:, :3]
+    return poses
+
+
+def _edges(table: _Table) -> list[Edge]:
+    triangles = np.zeros((len(table.ids), 6, 6))
+    triangles[:, *UPPER] = table.numbers[:, 7:]
+    information = triangles + np.triu(triangles, 1).transpose(0, 2, 1)
+    smallest = np.linalg.eigvalsh(information)[:, 0]
+    for flat in np.flatnonzero(smallest <= 0.0):
+        raise table.refusal(flat, f"the information is not positive definite (an eigenvalue is {smallest[flat]:.3g})")
+    edges = []
+    for row, ((a, b), T_a_b) in enumerate(zip(table.ids, _poses(table), strict=True)):
+        if a == b:
+            raise table.refusal(row, f"the edge ties vertex {a} to itself")
+        edges.append(Edge(a, b, T_a_b, information[row][OTHER_ORDER]))
+    return edges
+
+
+def _pose_texts(T_a_b: Iterable[Transform]) -> list[str]:
+    poses = np.array(list(T_a_b)).reshape(-1, 4, 4)
+    quaternions = ScipyRotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+    return [_text(row) for row in np.column_stack([poses[:, :3, 3], quaternions])]
+
+
+def _text(numbers: np.ndarray) -> str:
+    return " ".join([f"{number:.12g}" for number in numbers.tolist()])

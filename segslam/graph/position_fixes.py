@@ -1,0 +1,62 @@
+"""The optimum of a finished graph with measured positions: position fixes of a receiver in a frame of the Earth."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.types import Indices, Points, Transform
+from segslam.graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, values_of
+from segslam.graph.levenberg_marquardt import search
+
+GAUGE = geometry.tangent(rotation_rad=[0.1, 0.1, 10.0], translation_m=1e4)
+"""Standard deviations of the first pose. Chosen: more than the start is off by, so that it only holds what no fix
+determines; 0.1 rad of tilt where heights are unknown."""
+LEAST_PRECISION = 1e-12
+
+
+class PositionedGraph:
+    """Poses of a drive in a frame of the Earth, from the edges of its graph and measured positions."""
+
+    def __init__(self, edges: Sequence[Edge], T_map: Transforms) -> None:
+        """`edges` of a graph whose optimum are the poses `T_map` (k, 4, 4).
+
+        Every edge gets its value at this optimum: the sum of squares then has the same second derivatives as the graph,
+        and its minimum, without fixes, at the poses of the run.
+        """
+        self._factors = factor_graph(
+            replace(edge, T_a_b=geometry.nearest_transform(geometry.inverse(T_map[edge.a]) @ T_map[edge.b]))
+            for edge in edges
+        )
+
+    def solve(
+        self, start: Transforms, keys: Indices, points: Points, positions: Points, precisions: Points
+    ) -> Transforms:
+        """(k, 4, 4) poses for fixes that measure `positions` (n, 3) of `points` (n, 3) in the frames of poses `keys`.
+
+        `precisions` (n, 3): inverse variance of each axis (1 / m^2); 0 for an unknown one. Raises Unsolvable.
+        """
+        values = search(self._with_fixes(start, keys, points, positions, precisions), values_of(start)).values
+        return poses_by_id(values)
+
+    def covariance(
+        self, T: Transforms, keys: Indices, points: Points, positions: Points, precisions: Points, *, key: int
+    ) -> np.ndarray:
+        """(6, 6) covariance of the pose `key` at the solution `T`, tangent in its own frame."""
+        graph = self._with_fixes(T, keys, points, positions, precisions)
+        return gtsam.Marginals(graph, values_of(T)).marginalCovariance(key)
+
+    def _with_fixes(
+        self, start: Transforms, keys: Indices, points: Points, positions: Points, precisions: Points
+    ) -> gtsam.NonlinearFactorGraph:
+        fixes = gtsam.NonlinearFactorGraph()
+        first: Transform = geometry.nearest_transform(start[0])
+        fixes.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), gtsam.noiseModel.Diagonal.Sigmas(GAUGE)))
+        for key, point, position, precision in zip(keys, points, positions, precisions, strict=True):
+            if precision.max() <= LEAST_PRECISION:
+                continue
+            model = gtsam.noiseModel.Diagonal.Precisions(np.maximum(precision, LEAST_PRECISION))
+            fixes.add(gtsam.GPSFactorArm(int(key), np.nan_to_num(position), point, model))
+        return joined(self._factors, fixes)

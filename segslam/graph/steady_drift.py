@@ -1,0 +1,146 @@
+"""A steady drift of the heading: a rotation error at a constant rate per metre of travel and per second.
+
+If closures measure a drift far beyond the noise of the odometry, then noise is a poor model of it. Noise spreads the
+correction by its own growth, with turns counted more than straights, so a steady drift is corrected in wrong places.
+The two rates are therefore estimated together with all poses, by least squares.
+
+Only the heading is corrected. Closures of a drive observe the rates of roll, pitch and scale badly: an estimate of
+them adds errors of metres to a drive whose heading alone drifts.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
+
+from segslam.core import geometry
+from segslam.core.types import Vector
+from segslam.graph import noise
+from segslam.graph.breaks import is_break
+from segslam.graph.closure_pairs import pairwise_chi2
+from segslam.graph.edges import Edge, factor_graph, joined
+from segslam.graph.levenberg_marquardt import search
+
+MUCH_LESS = 0.5
+"""Chosen: the correction is used if the rest of the drift needs at most this share of the noise."""
+MODELS = ((0,), (1,), (0, 1))
+"""Columns of the growth whose rates are estimated: travel, time, both."""
+RATE_COST = 3.0
+"""Chosen: least decrease of the error (half the chi-square) for which a second rate is used, as in Bayes' criterion for
+some hundred motions."""
+MOST_COMPARED = 300
+"""Chosen: number of closures, spread over the drive, that are compared pairwise."""
+INDEPENDENT = 1e-6
+"""Chosen: below this ratio of eigenvalues, travel and time are proportional; the smallest rates are then used."""
+ROUNDS = 3
+"""Linear estimates, each of which begins where the one before ended."""
+HEADING = 2
+"""Element of a tangent."""
+Growth = Float[np.ndarray, "_ k"]
+
+
+def noise_factor(odometry: Sequence[Edge], certain: Edge) -> float:
+    """Factor by which odometry's noise is too small for the drift that a closure measures, at least 1.
+
+    Drift is usual if its chi-square is the number of its degrees of freedom. It is 1 across a break.
+    """
+    first, last = sorted((certain.a, certain.b))
+    if any(is_break(motion) for motion in odometry[first:last]):
+        return 1.0
+    at_target = Edge(certain.a, certain.a, np.eye(4), noise.CERTAIN)
+    chi2 = float(pairwise_chi2(odometry, [certain, at_target])[0, 1])
+    return max(1.0, math.sqrt(chi2 / noise.DEGREES_OF_FREEDOM))
+
+
+class SteadyDrift(NamedTuple):
+    """A steady drift of the heading, and what is left of the drift without it."""
+
+    rates: Vector
+    """(2,) heading missing in the motions: rad per metre and rad per second."""
+    noise_factor: float
+    """Factor by which the usual noise is too small for the corrected motions, at least 1."""
+    values: gtsam.Values
+    """The poses after the correction."""
+
+
+def steady_drift(
+    prior: gtsam.NonlinearFactorGraph,
+    odometry: Sequence[Edge],
+    closures: Sequence[Edge],
+    growth: Growth,
+    values: gtsam.Values,
+    *,
+    tolerated: float,
+) -> SteadyDrift | None:
+    """The steady drift of an odometry with its usual noise; None if it explains little of what `closures` measure.
+
+    None also if `tolerated` times that noise is enough for the drift. A row of `growth` has the travel (m) and the time
+    (s) of a motion, zeros for a motion without drift. `values`: poses that satisfy the closures.
+    """
+    if not closures:
+        return None
+    before = _mean_noise_factor(odometry, closures)
+    if before <= tolerated:
+        return None
+    trials = []
+    for model in (list(model) for model in MODELS if growth[:, model].any(axis=0).all()):
+        rates, at = np.zeros(growth.shape[1]), values
+        for _ in range(ROUNDS):
+            corrected = turned(odometry, growth, rates)
+            rates[model] += _rates(prior, corrected, closures, growth[:, model], at)
+            corrected = turned(odometry, growth, rates)
+            found = search(joined(prior, factor_graph(corrected), factor_graph(closures)), at)
+            at = found.values
+        trials.append((found.error + RATE_COST * len(model), rates, corrected, at))
+    if not trials:
+        return None
+    _, rates, corrected, at = min(trials, key=lambda trial: trial[0])
+    factor = _mean_noise_factor(corrected, closures)
+    return SteadyDrift(rates, factor, at) if factor <= MUCH_LESS * before else None
+
+
+def turned(odometry: Sequence[Edge], growth: Growth, rates: Vector) -> list[Edge]:
+    """Odometry corrected by a steady drift of the heading; `rates` as in `SteadyDrift`."""
+    return [
+        replace(edge, T_a_b=edge.T_a_b @ geometry.transform(geometry.yaw(float(angle)), np.zeros(3)))
+        for edge, angle in zip(odometry, growth @ rates, strict=True)
+    ]
+
+
+def _mean_noise_factor(odometry: Sequence[Edge], closures: Sequence[Edge]) -> float:
+    """As `noise_factor`, of the drift around each closure and between every two: the root of the mean chi-square.
+
+    Two rates explain the drift around one closure whatever its cause; they explain all only if the drift is steady.
+    """
+    some = [closures[row] for row in np.unique(np.linspace(0, len(closures) - 1, MOST_COMPARED).astype(int))]
+    chi2 = pairwise_chi2(odometry, [*some, Edge(0, 0, np.eye(4), noise.CERTAIN)])
+    return max(1.0, math.sqrt(float(chi2[np.tril_indices(len(chi2), -1)].mean()) / noise.DEGREES_OF_FREEDOM))
+
+
+def _rates(
+    prior: gtsam.NonlinearFactorGraph,
+    odometry: Sequence[Edge],
+    closures: Sequence[Edge],
+    growth: Growth,
+    values: gtsam.Values,
+) -> Vector:
+    """(k,) heading (rad) missing in the motions per unit of each column of `growth`, linearised at `values`."""
+    graph = joined(factor_graph(odometry), prior, factor_graph(closures))
+    rows, columns, entries = graph.linearize(values).sparseJacobian_()
+    size = 6 * graph.size(), 6 * values.size() + 1
+    whole = csc_array((entries, (rows.astype(int) - 1, columns.astype(int) - 1)), shape=size)
+    jacobian, errors = whole[:, :-1], whole[:, -1:].toarray()[:, 0]
+    whitened = np.stack([np.linalg.cholesky(edge.information)[HEADING] for edge in odometry])
+    rates = np.zeros((size[0], growth.shape[1]))
+    rates[: 6 * len(odometry)] = -(whitened[:, :, None] * growth[:, None, :]).reshape(-1, growth.shape[1])
+    poses = splu((jacobian.T @ jacobian).tocsc())
+    rest = rates - jacobian @ poses.solve(jacobian.T @ rates)
+    scale = np.maximum(np.linalg.norm(growth, axis=0), 1e-9)
+    normal, right = (rates.T @ rest) / np.outer(scale, scale), (rest.T @ errors) / scale
+    return np.linalg.pinv((normal + normal.T) / 2, rcond=INDEPENDENT, hermitian=True) @ right / scale

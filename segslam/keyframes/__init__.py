@@ -1,0 +1,1 @@
+"""Which scans are kept, their clouds, and clouds gathered from neighbouring keyframes."""

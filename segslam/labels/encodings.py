@@ -1,0 +1,137 @@
+"""The three encodings of SemanticKITTI's classes in label files, and their detection.
+
+`raw`: the ids of the annotation (Behley et al. 2019), 0-99 and 252-259. `learning`: the 19 classes of the benchmark
+as 1-19, 0 = unlabelled, and 20-25 for moving classes. `learning-0`: predictions without the unlabelled class, i.e.
+the learning ids minus one, 0-18.
+"""
+
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Int, Integer
+
+from segslam.core.types import Label, Labels, SegslamError
+
+Ids = Integer[np.ndarray, "_"]
+"""Class ids as a file stores them, one per point."""
+Histogram = Int[np.ndarray, "_"]
+"""Number of points of each id: `np.bincount` of the ids."""
+Encoding = Literal["raw", "learning", "learning-0"]
+ENCODINGS: tuple[Encoding, ...] = get_args(Encoding)
+
+UNKNOWN = 255  # entry of the tables below for ids that do not exist
+RAW: dict[Label, tuple[int, ...]] = {  # the `learning_map` of the benchmark, inverted: class -> raw ids
+    Label.UNLABELLED: (0, 1, 52, 99),
+    Label.CAR: (10,),
+    Label.BICYCLE: (11,),
+    Label.MOTORCYCLE: (15,),
+    Label.TRUCK: (18,),
+    Label.OTHER_VEHICLE: (13, 16, 20),
+    Label.PERSON: (30,),
+    Label.BICYCLIST: (31,),
+    Label.MOTORCYCLIST: (32,),
+    Label.ROAD: (40, 60),
+    Label.PARKING: (44,),
+    Label.SIDEWALK: (48,),
+    Label.OTHER_GROUND: (49,),
+    Label.BUILDING: (50,),
+    Label.FENCE: (51,),
+    Label.VEGETATION: (70,),
+    Label.TRUNK: (71,),
+    Label.TERRAIN: (72,),
+    Label.POLE: (80,),
+    Label.TRAFFIC_SIGN: (81,),
+    Label.MOVING_CAR: (252,),
+    Label.MOVING_BICYCLIST: (253,),
+    Label.MOVING_PERSON: (254,),
+    Label.MOVING_MOTORCYCLIST: (255,),
+    Label.MOVING_OTHER_VEHICLE: (256, 257, 259),
+    Label.MOVING_TRUCK: (258,),
+}
+RAW_OF_LABEL = np.array([RAW[label][0] for label in Label], dtype=np.uint32)
+"""The raw id that is written for each label; merged classes such as buses are written as the class they merge into."""
+
+RARE = (Label.BICYCLE, Label.MOTORCYCLE, Label.BICYCLIST, Label.MOTORCYCLIST)
+RARE_MAX_SHARE = (
+    0.02  # chosen: together they have 0.1 % of the data set's points, and under 0.1 % of each real scan tried
+)
+ROAD_MIN_SHARE = 0.02  # chosen: the real scans of KITTI 00 contain 20 to 28 %
+
+
+def to_labels(ids: Ids, encoding: Encoding) -> Labels:
+    """The labels of ids. Raises SegslamError for an id that the encoding does not contain."""
+    table = _TABLES[encoding]
+    labels = table[np.minimum(ids, len(table) - 1)]
+    unknown = labels == UNKNOWN
+    if unknown.any():
+        raise SegslamError(f"id {ids[unknown][0]} is not in the encoding {encoding}; give the right one by --encoding")
+    return labels
+
+
+def to_ids(labels: Labels, encoding: Encoding) -> Ids:
+    """The ids of labels, as a file stores them. Raises SegslamError for a label that the encoding does not contain."""
+    if encoding == "raw":
+        return RAW_OF_LABEL[labels]
+    if encoding == "learning":
+        return labels.astype(np.uint32)
+    missing = (labels == Label.UNLABELLED) | (labels > Label.TRAFFIC_SIGN)
+    if missing.any():
+        name = Label(labels[missing][0]).name.lower()
+        raise SegslamError(
+            f"the encoding {encoding} has no id for {name} ({missing.sum()} points); use raw or learning"
+        )
+    return labels.astype(np.uint32) - 1
+
+
+def detect_encoding(num_points_of_id: Histogram) -> Encoding:
+    """The only encoding that fits the ids of some scans; `num_points_of_id` counts the points of each id.
+
+    An encoding is excluded if it does not contain all ids. If several remain, an encoding is also excluded if more than
+    2 % of the points would be two-wheelers, or less than 2 % road. Raises SegslamError, with the reason, unless exactly
+    one encoding remains.
+    """
+    ids = np.flatnonzero(num_points_of_id)
+    possible = [encoding for encoding in ENCODINGS if _has_all(encoding, ids)]
+    if len(possible) > 1:
+        possible = [encoding for encoding in possible if _looks_like_a_street(num_points_of_id, encoding)]
+    if len(possible) != 1:
+        shown = ", ".join(str(value) for value in ids[:30]) or "none"
+        raise SegslamError(
+            f"the numbering of the classes cannot be detected (ids: {shown}): "
+            f"{_why_undecided(ids)}; pass --encoding {'|'.join(ENCODINGS)}"
+        )
+    return possible[0]
+
+
+def _looks_like_a_street(num_points_of_id: Histogram, encoding: Encoding) -> bool:
+    ids = np.flatnonzero(num_points_of_id)
+    share = np.bincount(to_labels(ids, encoding), num_points_of_id[ids], minlength=len(Label))
+    share = share / max(1, num_points_of_id.sum())
+    return bool(share[list(RARE)].sum() <= RARE_MAX_SHARE and share[Label.ROAD] >= ROAD_MIN_SHARE)
+
+
+def _why_undecided(ids: Ids) -> str:
+    fitting = [encoding for encoding in ENCODINGS if _has_all(encoding, ids)]
+    if not fitting:
+        return "no encoding contains all of them"
+    return f"they fit {' and '.join(fitting)}, and the shares of road and two-wheelers do not decide between these"
+
+
+def _has_all(encoding: Encoding, ids: Ids) -> bool:
+    table = _TABLES[encoding]
+    return bool((table[np.minimum(ids, len(table) - 1)] != UNKNOWN).all())
+
+
+def _table(label_of_id: dict[int, Label]) -> Labels:
+    """Label of each id; UNKNOWN for missing ids. The last row stands for all larger ids."""
+    table = np.full(max(label_of_id) + 2, UNKNOWN, dtype=np.uint8)
+    for value, label in label_of_id.items():
+        table[value] = label
+    return table
+
+
+_TABLES: dict[Encoding, Labels] = {
+    "raw": _table({value: label for label, values in RAW.items() for value in values}),
+    "learning": _table({int(label): label for label in Label}),
+    "learning-0": _table({int(label) - 1: label for label in Label if Label.CAR <= label <= Label.TRAFFIC_SIGN}),
+}

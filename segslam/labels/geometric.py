@@ -1,0 +1,137 @@
+"""Labels from geometry alone: ground, poles, small solid objects, cars, walls, and other objects.
+
+Loop closing needs labels that are the same in every scan of a place; whether the class is correct matters less.
+"""
+
+import numpy as np
+
+from segslam.core.points import within_range
+from segslam.core.types import Label, Labels, Mask, Points, Vector
+from segslam.labels.cells import grid_cells
+from segslam.labels.ground_surface import heights_above_ground, rotated, upright
+from segslam.labels.solids import Pieces, pieces
+from segslam.labels.uprights import NUM_SLICES, on_thin_uprights
+from segslam.labels.walls import on_walls
+
+MAX_RANGE_M = 70.0
+"""Chosen: points farther away remain unlabelled (m)."""
+GROUND_CELL_M = 1.0
+"""Chosen: cell size of the ground surface (m)."""
+MAX_SLOPE = 0.2
+"""Chosen: largest slope of the ground between cells."""
+GROUND_HEIGHT_M = 0.15
+"""Chosen: points lower than this are ground (m)."""
+BAND_M = (0.4, 2.6)
+"""Chosen: lowest and highest height in which poles and small solids are searched (m)."""
+MIN_POINTS = 4
+"""Chosen: smallest number of points of a pole, small solid or car within the band."""
+MAX_THINGS = 30
+"""Chosen: largest number of objects per class; those with most points are kept."""
+POLE_CORE_M = 0.4
+"""Chosen: largest radius of a pole (m)."""
+POLE_CLEAR_M = 0.8
+"""Chosen: radius around a pole without other points (m)."""
+POLE_MIN_M = 1.0
+"""Chosen: smallest height of a pole within the band (m)."""
+POLE_MIN_SHARE = 0.7
+"""Chosen: smallest share of the heights of a pole without other points nearby."""
+TRUNK_MAX_M = 1.6
+"""Chosen: largest length of a small solid: young trees, bushes, signs (m)."""
+TRUNK_MIN_M = 1.6
+"""Chosen: smallest height of the top of a small solid (m)."""
+CAR_TOP_M = (1.0, 2.1)
+"""Chosen: lowest and highest top of a car (m)."""
+CAR_LENGTH_M = (1.0, 6.0)
+"""Chosen: shortest and longest visible side of a car (m)."""
+CAR_MAX_WIDTH_M = 2.4
+"""Chosen: largest width of a car (m)."""
+WALL_THICKNESS_M = 0.16
+"""Chosen: standard deviation of a wall's points across it (m)."""
+WALL_MIN_TOP_M = 1.8
+"""Chosen: smallest height of the top of a wall; hedges are lower (m)."""
+
+COLUMN_M = 0.1
+"""Chosen: a post is some cells wide, and points on it are rarely farther apart at ranges below 40 m."""
+
+
+def geometric_labels(points: Points) -> Labels:
+    """A class for each point (n, 3) of a scan in the LiDAR frame, independent of the order of the points.
+
+    ROAD: ground. POLE: thin vertical objects. TRUNK: small solid objects (young trees, bushes, signs). Poles and trunks
+    are limited to a band of heights, so that their centres are repeatable. CAR: boxes of the size of a car.
+    BUILDING: walls. VEGETATION: all other objects above the ground. UNLABELLED: points that are not finite or out of
+    range. The sensor may be tilted by up to 40 degrees.
+    """
+    labels = np.full(len(points), Label.UNLABELLED, np.uint8)
+    usable = within_range(points, 0.0, MAX_RANGE_M)
+    if usable.any():
+        near = points[usable].astype(np.float64)
+        labels[usable] = _labels_of_level(rotated(near, upright(near)))
+    return labels
+
+
+def _labels_of_level(level: Points) -> Labels:
+    heights = heights_above_ground(level, cell_m=GROUND_CELL_M, max_range_m=MAX_RANGE_M, max_slope=MAX_SLOPE)
+    labels = np.where(heights < GROUND_HEIGHT_M, np.uint8(Label.ROAD), np.uint8(Label.VEGETATION))
+    for rule in (_poles, _solids, _walls):
+        rest = np.flatnonzero(labels == Label.VEGETATION)
+        labels[rest] = rule(level[rest], heights[rest])
+    return labels
+
+
+def _poles(points: Points, heights: Vector) -> Labels:
+    """POLE for the points of thin vertical objects, VEGETATION for the others."""
+    low, high = BAND_M
+    slice_m = (high - low) / NUM_SLICES
+    ring = round(POLE_CLEAR_M / COLUMN_M)
+    cells, _, shape = grid_cells(points, COLUMN_M, border=ring)
+    thin = on_thin_uprights(
+        cells,
+        np.floor((heights - low) / slice_m).astype(np.int64),
+        shape,
+        round(POLE_CORE_M / COLUMN_M),
+        ring,
+        round(POLE_MIN_M / slice_m),
+        POLE_MIN_SHARE,
+    )
+    rows = np.flatnonzero(thin)
+    found = pieces(points[rows], heights[rows], np.full(len(rows), True))
+    kept = _most_seen(found, np.full(len(found.top_m), True))
+    labels = np.full(len(points), Label.VEGETATION, np.uint8)
+    labels[rows[kept[found.of_point]]] = Label.POLE
+    return labels
+
+
+def _solids(points: Points, heights: Vector) -> Labels:
+    """TRUNK and CAR for the points of segments of these sizes, VEGETATION for the others."""
+    in_band = _within(heights, BAND_M)
+    found = pieces(points, heights, in_band)
+    is_trunk = (found.top_m >= TRUNK_MIN_M) & (found.length_m <= TRUNK_MAX_M)
+    is_car = _within(found.top_m, CAR_TOP_M) & _within(found.length_m, CAR_LENGTH_M)
+    is_car &= (found.width_m <= CAR_MAX_WIDTH_M) & ~is_trunk
+    trunks = _labelled(found, _most_seen(found, is_trunk), in_band, Label.TRUNK)
+    cars = _labelled(found, _most_seen(found, is_car), heights < BAND_M[1], Label.CAR)
+    return np.where(trunks == Label.TRUNK, trunks, cars)
+
+
+def _walls(points: Points, heights: Vector) -> Labels:
+    """BUILDING for points on vertical surfaces, VEGETATION for the others."""
+    walls = on_walls(points, heights, thickness_m=WALL_THICKNESS_M, min_top_m=WALL_MIN_TOP_M)
+    return np.where(walls, np.uint8(Label.BUILDING), np.uint8(Label.VEGETATION))
+
+
+def _most_seen(found: Pieces, suitable: Mask) -> Mask:
+    """The suitable segments with the most points: at most `max_things`, or more if the last ones have equal counts."""
+    counts = np.sort(found.num_points[suitable])
+    least = max(MIN_POINTS, counts[-MAX_THINGS]) if len(counts) > MAX_THINGS else MIN_POINTS
+    return suitable & (found.num_points >= least)
+
+
+def _labelled(found: Pieces, chosen: Mask, eligible: Mask, label: Label) -> Labels:
+    """`label` for the eligible points of the chosen segments, VEGETATION for the others."""
+    in_chosen = np.append(chosen, False)[found.of_point]  # points without a segment have the number -1
+    return np.where(in_chosen & eligible, np.uint8(label), np.uint8(Label.VEGETATION))
+
+
+def _within(values: Vector, bounds: tuple[float, float]) -> Mask:
+    return (values >= bounds[0]) & (values <= bounds[1])

@@ -1,0 +1,174 @@
+"""Labels from `.label` files (SemanticKITTI): one file per scan, named like the scan, in any of the encodings."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from segslam.core.paths import expanded
+from segslam.core.types import BadScan, Label, Labels, Mask, Points, ScanLabels, SegslamError, Vector
+from segslam.core.whole_files import whole_file
+from segslam.labels.encodings import Encoding, Histogram, Ids, detect_encoding, to_ids, to_labels
+from segslam.labels.network import Network, open_network
+
+logger = logging.getLogger(__name__)
+
+NETWORK = "network:"
+FILES_LOOKED_AT = 8  # chosen: number of files, spread over the drive, from which the encoding is detected
+
+
+@dataclass(frozen=True, slots=True)
+class LabelFiles:
+    """A folder of `.label` files, named like the scans."""
+
+    folder: Path
+    encoding: Encoding
+
+    def read(self, name: str, num_points: int) -> Labels:
+        """The labels of the scan `name`; all UNLABELLED if it has no file.
+
+        Raises BadScan if the file is invalid, does not have `num_points` labels, or has ids outside its encoding.
+        """
+        file = self.folder / f"{name}.label"
+        return read_labels(file, num_points, self.encoding) if file.exists() else unlabelled(num_points)
+
+
+@dataclass(frozen=True, slots=True)
+class LabelSource:
+    """The source of the labels of a drive: files, a network, or none."""
+
+    files: LabelFiles | None
+    geometric: bool
+    """True if scans without a label file are labelled by geometry when they become keyframes."""
+    network: Network | None = None
+
+    def read(self, name: str, points: Points, intensities: Vector | None = None) -> ScanLabels:
+        """The labels of the scan `name`; all UNLABELLED if there is no source for it.
+
+        `points` and `intensities` are in the order of the scan file. The labels of a network are computed when they are
+        first used; that call raises SegslamError like `Network.labels`, and zeros replace unknown intensities. Raises
+        BadScan like `LabelFiles.read`.
+        """
+        if self.network:
+            if intensities is None:
+                _warn_of_zeros()
+                intensities = np.zeros(len(points))
+            network, known = self.network, intensities
+            return lambda: network.labels(points, known)
+        return self.files.read(name, len(points)) if self.files else unlabelled(len(points))
+
+
+def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelSource:
+    """Open the value of `--labels`: `auto`, `none`, `geometric`, `network:MODEL.onnx`, or a folder of `.label` files.
+
+    Relative folders start at `beside`, where `auto` looks for `labels/`; without such a folder, `auto` is `geometric`.
+    Raises SegslamError for a folder that is missing or labels none of the scans, for files whose encoding is neither
+    given nor detectable, and for a network that `open_network` rejects.
+    """
+    if source in ("none", "geometric"):
+        return LabelSource(None, geometric=source == "geometric")
+    if source.startswith(NETWORK):
+        return LabelSource(None, geometric=False, network=open_network(expanded(source.removeprefix(NETWORK))))
+    if source == "auto":
+        if not _labelled(beside / "labels", scan_names):
+            return LabelSource(None, geometric=True)
+        return LabelSource(_open_folder(beside / "labels", scan_names, encoding), geometric=True)
+    folder = beside / expanded(source)
+    if not folder.is_dir():
+        raise SegslamError(f"--labels {source}: no folder {folder}; give one, auto, none, geometric or network:MODEL")
+    if not _labelled(folder, scan_names):
+        raise SegslamError(
+            f"{folder}: no .label file for any of the {len(scan_names)} scans; label files are named like the scans"
+        )
+    return LabelSource(_open_folder(folder, scan_names, encoding), geometric=False)
+
+
+def read_ids(file: Path) -> Ids:
+    """The class ids of a `.label` file: the lower 16 bits; the upper are instances. Raises BadScan if it is invalid."""
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise BadScan(f"{file}: cannot read the labels ({error})") from error
+    if len(content) % 4:
+        raise BadScan(f"{file}: {len(content)} bytes are not a multiple of 4 (uint32): truncated; copy the file again")
+    return np.frombuffer(content, dtype="<u4") & 0xFFFF
+
+
+def read_labels(file: Path, num_points: int, encoding: Encoding) -> Labels:
+    """The labels of a scan of `num_points` points.
+
+    Raises BadScan if the file is missing or invalid, has another number of labels, or ids outside the encoding.
+    """
+    ids = read_ids(file)
+    if len(ids) != num_points:
+        raise BadScan(f"{file}: {len(ids)} labels for {num_points} points; the labels are those of another scan")
+    try:
+        return to_labels(ids, encoding)
+    except SegslamError as error:
+        raise BadScan(f"{file}: {error}") from error
+
+
+def write_labels(file: Path, labels: Labels, kept: Mask | None, encoding: Encoding) -> None:
+    """Write the labels of a scan. Points of the scan file that are not `kept` become unlabelled.
+
+    Raises SegslamError, naming the file, for a label that the encoding does not contain, and on a write error.
+    """
+    if kept is not None:
+        whole = unlabelled(len(kept))
+        whole[kept] = labels
+        labels = whole
+    try:
+        ids = to_ids(labels, encoding).astype("<u4")
+    except SegslamError as error:
+        raise SegslamError(f"{file}: {error}") from error
+    with whole_file(file) as part:
+        ids.tofile(part)
+
+
+def encoding_of(files: Sequence[Path]) -> Encoding:
+    """The encoding of label files, detected from all of them. Raises SegslamError if it is ambiguous."""
+    try:
+        return detect_encoding(sum((_histogram(file) for file in files), np.zeros(2**16, dtype=np.int64)))
+    except SegslamError as error:
+        where = files[0].parent if len(files) > 2 else " and ".join(str(file) for file in files)
+        raise SegslamError(f"{where}: {error}") from error
+
+
+def unlabelled(num_points: int) -> Labels:
+    """UNLABELLED for each point."""
+    return np.full(num_points, Label.UNLABELLED, dtype=np.uint8)
+
+
+@cache
+def _warn_of_zeros() -> None:
+    """Warn once, not for every scan."""
+    logger.warning("the data contain no readable intensities; the network receives zeros instead")
+
+
+def _labelled(folder: Path, scan_names: Sequence[str]) -> list[str]:
+    return [name for name in scan_names if (folder / f"{name}.label").is_file()]
+
+
+def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelFiles:
+    named = _labelled(folder, scan_names)
+    if len(named) < len(scan_names):
+        logger.warning("%s: %d of %d scans have no label file", folder, len(scan_names) - len(named), len(scan_names))
+    return LabelFiles(folder, encoding or encoding_of(_spread(folder, named)))
+
+
+def _spread(folder: Path, names: list[str]) -> list[Path]:
+    """Files from which the encoding is detected, spread over the drive."""
+    rows = np.unique(np.linspace(0, len(names) - 1, FILES_LOOKED_AT).astype(int))
+    return [folder / f"{names[row]}.label" for row in rows]
+
+
+def _histogram(file: Path) -> Histogram:
+    """Number of points of each id; empty for an invalid file, which is reported when its scan is read."""
+    try:
+        ids = read_ids(file)
+    except BadScan:
+        ids = np.empty(0, dtype=np.uint32)
+    return np.bincount(ids, minlength=2**16)

@@ -1,7 +1,0 @@
-"""The MCAP log of a run: writing steps to a file, and reading them."""
-
-from segslam.log.output import is_being_written
-from segslam.log.reader import RunLog, read_log
-from segslam.log.writer import LogWriter, Mirror
-
-__all__ = ["LogWriter", "Mirror", "RunLog", "is_being_written", "read_log"]

@@ -1,0 +1,243 @@
+"""Calibration of a LiDAR's vertical angle from scans of one drive that are some metres apart.
+
+If all beams point lower than assumed, every plane is measured as a cone around the sensor. Scans from different places
+then distort one surface differently, and no rigid motion aligns them: the angle is a seventh unknown of their
+registration. An odometry that registers such scans explains part of the angle by a pitch in every motion. The angle is
+therefore corrected in the scans, before the odometry (`sensor.vertical_angle_deg`).
+
+Positive angles: the points of a scan are too low and have to be raised by the angle.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from segslam.core import geometry
+from segslam.core.config import Config, RefineConfig, SensorCalibrationConfig
+from segslam.core.geometry import raising
+from segslam.core.types import Mask, Points, Scan, Transform, Vector
+from segslam.keyframes.keyframes import KeyframeSelector
+from segslam.keyframes.keyframes import downsample_keyframe as thin_keyframe
+from segslam.labels.label_files import unlabelled
+from segslam.odometry import KissOdometry, Odometry
+from segslam.registration.refinement import Surface, downsample, make_surface
+
+PointsOf = Callable[[int], Points]
+"""Returns the points of a keyframe, by id, in its own frame."""
+
+APART_M = (6.0, 10.0, 14.0, 20.0, 30.0)
+"""Travel between the two scans of a pair, in turn. Chosen on KITTI 00: each distance has an error of its own, which
+depends on the density (dense scans: 0.17 to 0.19 degrees, thinned ones: 0.12 to 0.20)."""
+MOST_APART = 1.5
+"""Pairs are dropped if their straight distance is less than their travel divided by this, or more than their travel
+times this: the sensor stood still, or keyframes are missing."""
+MOST_PAIRS = 200
+"""Number of pairs measured. Chosen: 8 s of one core, whatever the length of the drive."""
+MIN_PAIRS = 8
+"""Chosen: the scatter of fewer pairs is too uncertain."""
+MOST_TURN_RAD = math.radians(30.0)
+"""Chosen: after larger rotations, scans share less of the scene."""
+MOST_POINTS = 4000
+"""Number of points of the source. Chosen: 1500 points change the median by 0.02 degrees, and lose pairs."""
+SEARCH_M = (1.0, 0.8, 0.6, *[0.5] * 17)
+"""Search distance of each step. Chosen: the error of the odometry over 10 m is below the first."""
+CONVERGED = 2e-3
+"""The iteration ends after a step smaller than this (rad, m)."""
+SETTLED_RAD = math.radians(0.03)
+"""Largest change of the angle in the last step if the iteration does not converge, because point pairs still change.
+Chosen: half of the scatter between pairs of KITTI's scans."""
+RESIDUAL_M = 0.05
+"""Distance at which the weight of a point is a quarter. Chosen: above the noise of ranges."""
+LEVEL_NORMAL_Z, STANDING_NORMAL_Z = 0.95, 0.15
+"""Chosen: surfaces that are neither horizontal nor vertical are mostly foliage."""
+MIN_PAIRED = 500
+"""Chosen: fewer matching points do not come from a dense scan of a street."""
+MOST_SIGMA_DEG = 0.05
+"""Pairs with a larger standard deviation of the angle, from their residuals, are dropped. Chosen: 0.02 for KITTI's
+pairs, 0.07 or more for downsampled clouds of 32 beams."""
+BIAS_DEG = 0.03
+"""Standard deviation added to that of the median. Chosen: the medians on KITTI 00 scatter so for 6 to 30 m between
+the scans."""
+SIGNIFICANT_SIGMAS, SIGNIFICANT_DEG = 2.5, 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class VerticalAngle:
+    """The remaining vertical angle of some scans; positive if their points are too low."""
+
+    angle_deg: float
+    sigma_deg: float
+    num_pairs: int
+
+    @property
+    def is_significant(self) -> bool:
+        """True if the angle differs from zero by more than its error, and by a relevant amount."""
+        return abs(self.angle_deg) > max(SIGNIFICANT_SIGMAS * self.sigma_deg, SIGNIFICANT_DEG)
+
+
+def vertical_angle_advice(metrics: Mapping[str, Any], sensor: SensorCalibrationConfig) -> str:
+    """A line about the vertical angle of a run: its correction, or the setting for it; empty if not significant."""
+    if "vertical_deg" not in metrics:
+        return ""
+    found = VerticalAngle(metrics["vertical_deg"], metrics["vertical_sigma_deg"], MIN_PAIRS)
+    if not found.is_significant:
+        return ""
+    if metrics.get("vertical_correction_deg"):
+        return f"{described(found)}; the adjustment and the map are corrected by it"
+    total_deg = found.angle_deg + (sensor.vertical_angle_deg or 0.0)
+    return f"{described(found)}; map again with --set sensor.vertical_angle_deg={total_deg:.2f}"
+
+
+def described(found: VerticalAngle) -> str:
+    """The angle as text."""
+    side = "low" if found.angle_deg >= 0 else "high"
+    return f"beams point {abs(found.angle_deg):.2f} +- {found.sigma_deg:.2f} degrees {side}"
+
+
+def measure_vertical_angle(
+    points_of: PointsOf,
+    T_odom_keyframes: Float[np.ndarray, "n 4 4"],
+    travel_m: Vector,
+    *,
+    config: RefineConfig,
+) -> VerticalAngle | None:
+    """The median over pairs of keyframes that are some metres apart; None if too few pairs determine the angle."""
+
+    @lru_cache(2)
+    def surface(keyframe_id: int) -> Surface:
+        return make_surface(downsample(points_of(keyframe_id), config=config), config=config)
+
+    found = []
+    for target, source in _pairs(T_odom_keyframes, travel_m):
+        T_prior = geometry.inverse(T_odom_keyframes[target]) @ T_odom_keyframes[source]
+        one = register_with_angle(surface(source), surface(target), T_prior)
+        if one is not None and one.sigma_rad < math.radians(MOST_SIGMA_DEG):
+            found.append(math.degrees(one.angle_rad))
+    if len(found) < MIN_PAIRS:
+        return None
+    median = float(np.median(found))
+    spread = 1.4826 * float(np.median(np.abs(np.array(found) - median)))
+    error = math.sqrt(math.pi / 2 / len(found)) * spread  # standard error of the median of normal errors
+    return VerticalAngle(median, math.hypot(error, BIAS_DEG), len(found))
+
+
+class Calibrator:
+    """Measures the vertical angle of the scans of one drive, without labels and map. It stores keyframes only."""
+
+    def __init__(self, config: Config, *, odometry: Odometry | None = None) -> None:
+        self._config = config
+        self._odometry = odometry or KissOdometry(config.odometry)
+        self._selector = KeyframeSelector(config.keyframes)
+        self._points: list[Points] = []
+        self._T_odom_keyframes: list[Transform] = []
+        self._travel_m: list[float] = []
+
+    @property
+    def travel_m(self) -> float:
+        """Length of the path so far (m)."""
+        return self._selector.travel_m
+
+    def add(self, scan: Scan) -> None:
+        """Add the next scan in order of time. Raises BadScan, and ignores the scan, if it cannot be used."""
+        registered = self._odometry.register(scan)
+        if self._selector.update(registered.T_odom_lidar):
+            kept = thin_keyframe(
+                registered.points, unlabelled(len(registered.points)), config=self._config.keyframes, whole_classes=()
+            )[0]
+            self._points.append(downsample(kept, config=self._config.refine))
+            self._T_odom_keyframes.append(registered.T_odom_lidar)
+            self._travel_m.append(self._selector.travel_m)
+
+    def vertical_angle(self) -> VerticalAngle | None:
+        """The remaining vertical angle of the scans so far; None if too few of them determine it."""
+        if not self._points:
+            return None
+        poses, travel_m = np.stack(self._T_odom_keyframes), np.array(self._travel_m)
+        return measure_vertical_angle(
+            self._points.__getitem__,
+            poses,
+            travel_m,
+            config=self._config.refine,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairAngle:
+    """The pose of one scan in another, and their common vertical angle."""
+
+    T_target_source: Transform
+    angle_rad: float
+    sigma_rad: float
+    """Standard deviation of the angle for independent errors of the points."""
+
+
+def register_with_angle(source: Surface, target: Surface, T_target_source: Transform) -> PairAngle | None:
+    """Estimate pose and angle together, starting at an initial guess of the pose.
+
+    Minimises point-to-plane distances under the Geman-McClure kernel. Returns None if too few points match, or the
+    angle does not converge.
+    """
+    if min(len(source.points), len(target.points)) < MIN_PAIRED:
+        return None
+    points = source.points[_is_clear(source.normals)]
+    points = points[:: math.ceil(max(len(points), 1) / MOST_POINTS)]
+    target_is_clear = _is_clear(target.normals)
+    angle_rad = 0.0
+    for search_m in SEARCH_M:
+        nearest, distance_m = target.nearest(geometry.apply(T_target_source, points))
+        paired = (distance_m < search_m) & target_is_clear[nearest]
+        if paired.sum() < MIN_PAIRED:
+            return None
+        rows = nearest[paired]
+        step, sigma_rad = _step(points[paired], target.points[rows], target.normals[rows], T_target_source, angle_rad)
+        T_target_source = T_target_source @ geometry.exp(step[:6])
+        angle_rad += float(step[6])
+        if np.linalg.norm(step) < CONVERGED:
+            break
+    return PairAngle(T_target_source, angle_rad, sigma_rad) if abs(step[6]) < SETTLED_RAD else None
+
+
+def _is_clear(normals: Points) -> Mask:
+    """(n,) bool: whether each surface is horizontal or vertical, like ground and walls."""
+    upward = np.abs(normals[:, 2])
+    return (upward > LEVEL_NORMAL_Z) | (upward < STANDING_NORMAL_Z)
+
+
+def _step(
+    source: Points, target: Points, normals: Points, T_target_source: Transform, angle_rad: float
+) -> tuple[Float[np.ndarray, "7"], float]:
+    """One Gauss-Newton step from matched points: tangent of the pose and change of the angle; sigma of the angle."""
+    raising_source, raising_target = raising(source), raising(target)
+    raised = source + angle_rad * raising_source
+    moved = geometry.apply(T_target_source, raised)
+    residual_m = np.einsum("ij,ij->i", normals, moved - target - angle_rad * raising_target)
+    normals_source = normals @ T_target_source[:3, :3]
+    by_angle = (normals_source * raising_source - normals * raising_target).sum(axis=1)
+    jacobian = np.column_stack([np.cross(raised, normals_source), normals_source, by_angle])
+    weight = (1.0 + (residual_m / RESIDUAL_M) ** 2) ** -2
+    weighted = jacobian * weight[:, None]
+    hessian = weighted.T @ jacobian
+    variance = float(weight @ residual_m**2 / weight.sum()) * float(np.linalg.pinv(hessian)[6, 6])
+    known = np.linalg.cond(hessian) < 1e12  # otherwise a direction, perhaps the angle, is undetermined
+    return -np.linalg.lstsq(hessian, weighted.T @ residual_m)[0], math.sqrt(variance) if known else math.inf
+
+
+def _pairs(T_odom_keyframes: np.ndarray, travel_m: Vector) -> list[tuple[int, int]]:
+    """(older, newer) keyframes some distances apart, evenly along the drive, without a sharp turn between them."""
+    pairs = []
+    for target in range(len(travel_m)):
+        apart_m = APART_M[target % len(APART_M)]
+        source = int(np.searchsorted(travel_m, travel_m[target] + apart_m))
+        if source == len(travel_m):
+            continue
+        T_target_source = geometry.inverse(T_odom_keyframes[target]) @ T_odom_keyframes[source]
+        is_apart = apart_m / MOST_APART < geometry.distance(T_target_source) < apart_m * MOST_APART
+        if is_apart and geometry.angle(T_target_source) < MOST_TURN_RAD:
+            pairs.append((target, source))
+    rows = np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS)).astype(int)
+    return [pairs[row] for row in rows]

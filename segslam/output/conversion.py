@@ -1,0 +1,93 @@
+"""Trajectories of other tools: KITTI, TUM and CSV files, in the camera or in the LiDAR frame."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from segslam.core.errors import SegslamError
+from segslam.core.trajectory import (
+    PoseFile,
+    Poses,
+    camera_from_lidar,
+    lidar_from_camera,
+    read_poses,
+    write_kitti,
+    write_tum,
+)
+from segslam.core.types import Indices
+from segslam.core.whole_files import whole_file
+from segslam.scans.dataset import read_stamps
+from segslam.scans.kitti import read_calibration
+
+FileFormat = Literal["kitti", "tum", "csv"]
+Frame = Literal["camera", "lidar"]
+HEADER = "seconds,x,y,z,qx,qy,qz,qw"
+"""First line of a CSV file: the columns of TUM format, with commas."""
+
+
+def convert(
+    source: Path,
+    target: Path,
+    *,
+    source_format: FileFormat | None = None,
+    target_format: FileFormat | None = None,
+    times: Path | None = None,
+    calib: Path | None = None,
+    to: Frame | None = None,
+) -> int:
+    """Write the poses of a file in another format; returns their number.
+
+    Formats are found from the columns of the source and from the name of the target (`.csv`, `.tum`; otherwise KITTI,
+    or TUM if the source has stamps). `times`: KITTI's times.txt, for a source without stamps. With `to`, poses of the
+    camera become those of the LiDAR or back, by the `calib` of KITTI's calib.txt; the first LiDAR pose stays the origin
+    if the first camera pose is. Raises SegslamError, naming the file and the remedy.
+    """
+    if (calib is None) != (to is None):
+        raise SegslamError("--calib and --to-frame belong together: the calibration, and camera or lidar")
+    poses = _with_stamps(_read(source, source_format), source, times)
+    if calib is not None:
+        T_camera_lidar = read_calibration(calib)
+        moved = lidar_from_camera if to == "lidar" else camera_from_lidar
+        poses = replace(poses, T_a_b=moved(poses.T_a_b, T_camera_lidar))
+    written_as = target_format or _format_of_name(target, poses)
+    if written_as == "kitti":
+        with whole_file(target) as part:
+            write_kitti(part, poses.T_a_b)
+        return len(poses)
+    if poses.stamp_ns is None:
+        raise SegslamError(f"{source}: has no stamps, which {written_as} needs; give KITTI's times.txt with --times")
+    with whole_file(target) as part:
+        (write_tum if written_as == "tum" else write_csv)(part, poses.stamp_ns, poses.T_a_b)
+    return len(poses)
+
+
+def write_csv(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
+    """Write a line of column names, then the columns of TUM format with commas; stamps to the nanosecond."""
+    write_tum(path, stamp_ns, T_a_b)
+    lines = path.read_text(encoding="ascii").splitlines()
+    path.write_text("".join(f"{line}\n" for line in (HEADER, *(line.replace(" ", ",") for line in lines))))
+
+
+def _read(source: Path, kind: FileFormat | None) -> PoseFile:
+    """The poses of a file; a line of column names at the start of a CSV file is not read."""
+    if kind == "csv" or (kind is None and source.suffix.lower() == ".csv"):
+        return read_poses(source, format="tum", skips_names=True)
+    return read_poses(source, format="tum" if kind == "tum" else "kitti" if kind == "kitti" else None)
+
+
+def _with_stamps(poses: PoseFile, source: Path, times: Path | None) -> PoseFile:
+    if times is None:
+        return poses
+    if poses.stamp_ns is not None:
+        raise SegslamError(f"--times {times}: {source} has stamps of its own; omit the option")
+    stamps = read_stamps(times)
+    if len(stamps) != len(poses):
+        raise SegslamError(f"{times}: {len(stamps)} times, but {source} has {len(poses)} poses; give the times of it")
+    return replace(poses, stamp_ns=stamps)
+
+
+def _format_of_name(target: Path, poses: PoseFile) -> FileFormat:
+    suffix = target.suffix.lower()
+    if suffix == ".csv":
+        return "csv"
+    return "tum" if suffix == ".tum" or (suffix != ".kitti" and poses.stamp_ns is not None) else "kitti"

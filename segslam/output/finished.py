@@ -1,0 +1,218 @@
+"""A finished run, read from its folder, and ground-truth poses from a file, matched to its scans."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam.core.config import Config
+from segslam.core.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
+from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
+from segslam.output.folder import ALONE, LOG, read_alone, read_localised
+from segslam.output.log import RunLog, read_log
+from segslam.slam.slam import SlamResult
+
+STAMP_TOLERANCE_NS = 10_000_000
+"""Largest time difference between a scan and its ground-truth pose."""
+
+
+FIGURES = {
+    "ate_m": "absolute trajectory error after alignment, rms (m)",
+    "odometry_ate_m": "the same error of the odometry, after repairs by the check (m)",
+    "kiss_icp_ate_m": "the same error of KISS-ICP alone, without repairs and loops (m)",
+    "are_deg": "absolute rotation error after alignment, rms (degrees)",
+    "height_m": "height error after alignment, rms (m)",
+    "rpe_m": "error of the motion from pose to pose, rms (m)",
+    "rpe_deg": "rotation error of the motion from pose to pose, rms (degrees)",
+    "kitti_translation_percent": "KITTI's translation error over 100 to 800 m (%)",
+    "kitti_rotation_deg_per_100m": "KITTI's rotation error over 100 to 800 m (degrees per 100 m)",
+    "num_poses": "poses scored",
+    "length_m": "length of the drive (m)",
+    "duration_s": "duration of the drive (s)",
+    "num_scans": "scans mapped",
+    "num_scans_skipped": "scans skipped (unreadable or empty)",
+    "num_keyframes": "keyframes",
+    "num_candidates": "loop candidates tried",
+    "num_motions_repaired": "motions of the odometry replaced by registrations",
+    "num_motions_broken": "breaks: motions not supported by the scans",
+    "num_motions_rejected": "motions of the odometry rejected by the optimiser, because loops contradict them",
+    "num_loops_accepted": "loops accepted",
+    "localised_percent": "scans localised in the old map (%)",
+    "num_sessions": "sessions merged",
+    "num_loops_between": "loops between sessions, accepted",
+    "num_loops_between_switched_off": "loops between sessions rejected by the optimiser",
+    "num_loops_switched_off": "accepted loops rejected by the optimiser",
+    "num_loops_false": "false loops: accepted, but wrong by more than 2 m or 5 degrees",
+    "loop_precision": "share of the accepted loops that are correct",
+    "loop_recall": "share of the revisits within 4 m that a correct loop closes",
+    "vertical_deg": "remaining error of the vertical angles; positive: points are too low (degrees)",
+    "vertical_sigma_deg": "standard deviation of this error (degrees)",
+    "vertical_correction_deg": "elevation added to all points for the adjustment and the map (degrees)",
+    "map_thickness_before_m": "thickness of surfaces in the map before the adjustment (m)",
+    "map_thickness_m": "thickness of surfaces in the map: median standard deviation about local planes (m)",
+    "num_submap_pairs": "pairs of submaps registered for the adjustment",
+    "adjustment_moved_m": "distance by which the adjustment moved keyframes, rms (m)",
+    "num_map_points": "points of the map",
+    "num_map_moving_points": "points removed from the map by class, as moving",
+    "num_map_voxels_seen_through": "voxels removed from the map, because other scans see through them",
+    "map_seconds": "time to write the map (s)",
+    "gnss_kept": "position fixes kept",
+    "gnss_dropped": "position fixes not used: without position, outside of the drive, or contradicted by it",
+    "seconds_total": "total time (s)",
+    "scans_per_second": "scans per second",
+    "peak_rss_mb": "peak memory (MB)",
+}
+"""Meaning of the figures of `metrics.json`, the most important first."""
+
+COMPARED = ("odometry_", f"{ALONE}_")
+"""Prefixes of the figures of the odometry after repairs, and of KISS-ICP alone."""
+ACCURACY = frozenset(
+    (
+        *("ate_m", "are_deg", "height_m", "rpe_m", "rpe_deg", "kitti_translation_percent"),
+        *("kitti_rotation_deg_per_100m", "num_loops_false", "loop_precision", "loop_recall"),
+    )
+)
+"""Figures that need a reference; another reference replaces all of them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FinishedRun:
+    """The content of a run folder."""
+
+    folder: Path
+    dataset: str
+    config: Config
+    result: SlamResult
+    reference: Trajectory | None
+    T_camera_lidar: Transform | None
+    metrics: dict[str, Any]
+    options: Mapping[str, str]
+    """Command-line options of the run other than settings, such as `frames`; empty for a replay."""
+
+    def __repr__(self) -> str:
+        scans, error = len(self.result.trajectory), self.metrics.get("ate_m")
+        return f"FinishedRun({str(self.folder)!r}, {scans} scans{'' if error is None else f', error {error:.3f} m'})"
+
+    def _repr_html_(self) -> str:
+        """The trajectory and the figures, for notebooks."""
+        from segslam.output.report.summary import as_html
+
+        return as_html(self)
+
+
+def read_run(folder: str | Path) -> FinishedRun:
+    """The run of a folder. Raises SegslamError if there is none, or it did not finish."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise SegslamError(f"{folder}: no such folder; give a folder made by `segslam map --out`")
+    log = read_log(folder / LOG)
+    result = _result(log)
+    return FinishedRun(
+        folder=folder,
+        dataset=log.run.get("dataset", ""),
+        config=log.config,
+        result=replace(
+            result,
+            from_map_m=read_localised(folder, len(result.trajectory)),
+            alone=read_alone(folder, result.odometry),
+        ),
+        reference=log.reference(),
+        T_camera_lidar=log.T_camera_lidar,
+        metrics=read_metrics(folder),
+        options=log.options,
+    )
+
+
+def read_metrics(folder: Path) -> dict[str, Any]:
+    """The figures of `metrics.json`. Raises SegslamError if there are none."""
+    file = folder / "metrics.json"
+    try:
+        return _checked_metrics(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, RecursionError) as error:
+        raise SegslamError(f"{file}: cannot read the figures of the run ({error}); replay its log.mcap") from error
+
+
+def plain_name(key: str) -> str:
+    """The name of a figure without the prefix of the trajectory that it measures."""
+    return next((key.removeprefix(prefix) for prefix in COMPARED if key.startswith(prefix)), key)
+
+
+def _checked_metrics(values: Any) -> dict[str, Any]:
+    """The figures, without those that are null. Raises ValueError if a figure that is shown is no number."""
+    if not isinstance(values, dict):
+        raise ValueError("not a JSON object")
+    known = {key: value for key, value in values.items() if value is not None}
+    times = known.get("stage_ms", {})
+    if not isinstance(times, dict) or not all(isinstance(one, dict) for one in times.values()):
+        raise ValueError("stage_ms is not a JSON object of objects")
+    shown = {key: value for key, value in known.items() if plain_name(key) in FIGURES}
+    shown |= {f"stage_ms.{stage}.{name}": one.get(name) for stage, one in times.items() for name in ("median", "p95")}
+    for key, value in shown.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{key} is no number")
+    return known
+
+
+def true_poses(file: Path, run: FinishedRun) -> Trajectory:
+    """Ground-truth LiDAR poses of the scans of a run, from a KITTI or TUM file.
+
+    KITTI rows are matched by scan number; they are camera poses if the data of the run is KITTI's. TUM rows are matched
+    by stamp. Raises SegslamError if no scan has a pose, or if the number of KITTI rows does not match the run.
+    """
+    poses = read_poses(file)
+    scans = run.result.trajectory
+    if poses.stamp_ns is None:
+        _check_length(file, len(poses), run)
+    rows, numbers = _rows_and_scans(poses, scans)
+    if len(rows) == 0:
+        raise SegslamError(f"{file}: none of its {len(poses)} poses belongs to a scan of {run.folder}")
+    T_world_lidar = poses.T_a_b
+    if poses.stamp_ns is None and run.T_camera_lidar is not None:
+        T_world_lidar = lidar_from_camera(T_world_lidar, run.T_camera_lidar)
+    return Trajectory(scans.scan_index[numbers], scans.stamp_ns[numbers], T_world_lidar[rows])
+
+
+def _check_length(file: Path, num_poses: int, run: FinishedRun) -> None:
+    last = int(run.result.trajectory.scan_index[-1])
+    num_read = run.metrics.get("num_scans", 0) + run.metrics.get("num_scans_skipped", 0)
+    took_all = run.options.get("frames") == "" and not run.dataset.startswith("kitti/")  # whose numbers may have gaps
+    if num_poses <= last or (took_all and num_poses != num_read):
+        raise SegslamError(
+            f"{file}: {num_poses} poses, but the run has scans up to number {last}; KITTI format needs one line per "
+            "scan, line n + 1 for scan n. TUM format is matched by stamp and may omit scans"
+        )
+
+
+def _rows_and_scans(poses: PoseFile, scans: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """Matching rows of a pose file and of the scans."""
+    if poses.stamp_ns is None:
+        return scans.scan_index, np.arange(len(scans))
+    pairs = rows_of_same_stamp(poses.stamp_ns, scans.stamp_ns, max_difference_ns=STAMP_TOLERANCE_NS)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _result(log: RunLog) -> SlamResult:
+    final = log.result()
+    if final is None:
+        raise SegslamError(f"{log.path}: the run did not finish; `segslam replay` it, or map the data again")
+    estimate, trajectory = final
+    T_odom_lidar, keyframe_rows = [], []
+    attempts: list[LoopAttempt] = []
+    motions: list[Motion] = []
+    for row, step in enumerate(log.steps(clouds=False)):
+        T_odom_lidar.append(step.T_odom_lidar)
+        attempts += step.attempts
+        motions += [step.motion] if step.motion else []
+        if step.keyframe is not None:
+            keyframe_rows.append(row)
+    if len(T_odom_lidar) < len(trajectory):
+        left = f"only {len(T_odom_lidar)} of its {len(trajectory)} steps are readable"
+        raise SegslamError(f"{log.path}: damaged, {left}; replay it, or map the data again")
+    late = log.late_loops()
+    odometry = Trajectory(trajectory.scan_index, trajectory.stamp_ns, np.array(T_odom_lidar))
+    return SlamResult(
+        trajectory, odometry, estimate, np.array(keyframe_rows), (*attempts, *late), tuple(motions), len(late)
+    )

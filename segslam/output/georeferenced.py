@@ -1,0 +1,279 @@
+"""A run with its place on the globe: the files that `georeference` adds to a run folder, and their reader."""
+
+import csv
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from segslam.core.trajectory import Poses, corrected_poses, read_poses, write_tum
+from segslam.core.types import Indices, SegslamError
+from segslam.core.whole_files import whole_file, write_whole
+from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
+from segslam.gnss import georeference as georeference_drive
+from segslam.gnss.fixes import DUPLICATE, NO_FIX, NOT_FINITE, Row, make_fixes
+from segslam.gnss.geodesy import Geodetic
+from segslam.gnss.reading import read_fixes
+from segslam.graph import read_g2o
+from segslam.output.finished import FinishedRun, read_run
+from segslam.output.folder import ADJUSTED_GRAPH, folder_of, log_of, room_for, write_metrics
+from segslam.output.log import schema
+from segslam.output.log.locations import Locations, write_locations
+
+logger = logging.getLogger(__name__)
+
+FILE, FIXES, GEODETIC, ENU = "georeference.json", "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
+DATUM = "WGS84 (EPSG:4979)"
+PLACE = ("datum", "latitude_deg", "longitude_deg", "height_m", "epsg", "T_enu_map", "sigma")
+"""What a run localised in the map takes over from `FILE`."""
+SIGMAS = ("east_m", "north_m", "up_m")
+DEGREES_AND_HEIGHT = ("latitude_deg", "longitude_deg", "height_m")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Globe:
+    """Where a finished run is on the globe."""
+
+    origin: Origin
+    T_enu_lidar: Poses
+    """(n, 4, 4) poses of all scans in the local frame (east, north, up) at the origin."""
+
+    @property
+    def epsg(self) -> int:
+        """EPSG code of the UTM zone of the origin."""
+        return utm_epsg(self.origin.latitude_deg, self.origin.longitude_deg)
+
+
+def georeference(
+    run: str | Path, fixes: Fixes | str | Path, *, use: Use | str = Use.FUSE, offset_s: float = 0.0
+) -> Georeference:
+    """Place a finished run on the globe by its position fixes; the files are added to its folder.
+
+    `use`: "align" places the map as it is, "fuse" also bends it where held-out fixes confirm that. `offset_s` is added
+    to the times of the fixes. Raises SegslamError if the run or the fixes cannot be read, or if the fixes do not
+    determine a placement.
+    """
+    finished = read_run(run)
+    known = fixes if isinstance(fixes, Fixes) else read_fixes(fixes)
+    scans = finished.result.trajectory
+    drive = Drive(scans.stamp_ns, scans.T_world_lidar, finished.result.keyframe_rows)
+    graph = finished.folder / ADJUSTED_GRAPH
+    if not graph.exists():
+        raise SegslamError(
+            f"{graph}: missing, the run was made by an earlier version; `segslam replay` it into a new folder first"
+        )
+    placed = georeference_drive(read_g2o(graph).edges, drive, known, use=Use(use), offset_s=offset_s)
+    _write(finished, placed, Use(use), offset_s)
+    return placed
+
+
+def read_globe(folder: Path) -> Globe | None:
+    """The place of a run on the globe; None if it was not georeferenced. Raises SegslamError for damaged files."""
+    file = folder / FILE
+    if not file.exists():
+        return None
+    try:
+        origin = json.loads(file.read_text(encoding="utf-8"))
+        found = Origin(*(float(origin[name]) for name in DEGREES_AND_HEIGHT))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
+    return Globe(found, read_poses(folder / ENU, format="tum").T_a_b)
+
+
+def georeference_if_possible(
+    folder: Path, source: str, rows: Sequence[Row], *, use: Use | str = Use.FUSE, offset_s: float = 0.0
+) -> str:
+    """As `georeference`, at the end of a run that has results without it, too; a failure is a warning.
+
+    `source` names the fixes `rows` in messages. Returns what was found; empty after a failure.
+    """
+    try:
+        return summary(georeference(folder, make_fixes(source, rows), use=use, offset_s=offset_s))
+    except SegslamError as error:
+        logger.warning("%s: has no place on the globe: %s", folder, error)
+        return ""
+
+
+def take_over(run: str | Path, map_run: str | Path) -> bool:
+    """Place a run that was localised in the map of a georeferenced run on the globe; False if that has no place.
+
+    Each scan keeps its pose relative to the nearest keyframe of the map, so that it moves as the map was bent.
+    """
+    source = folder_of(Path(map_run))
+    globe = read_globe(source)
+    if globe is None:
+        return False
+    made, mapped = read_run(run), read_run(source).result
+    T_enu_map = globe.T_enu_lidar[mapped.keyframe_rows] @ np.linalg.inv(
+        mapped.trajectory.T_world_lidar[mapped.keyframe_rows]
+    )
+    poses = made.result.trajectory.T_world_lidar
+    _, nearest = cKDTree(mapped.trajectory.T_world_lidar[mapped.keyframe_rows, :3, 3]).query(poses[:, :3, 3])
+    of_map = json.loads((source / FILE).read_text(encoding="utf-8"))
+    values = {name: of_map[name] for name in PLACE if name in of_map} | {"in_map": str(source.resolve())}
+    with room_for(made.folder):
+        places = _write_poses(made, globe.origin, T_enu_map[nearest] @ poses)
+        is_localised = made.result.localised()
+        stamp_ns = made.result.trajectory.stamp_ns[is_localised]
+        sigma_m = np.array([values.get("sigma", {}).get(name) or np.nan for name in SIGMAS])
+        shown = Locations(schema.LIDAR, stamp_ns, places[is_localised], sigma_m)
+        write_locations(log_of(made.folder), {schema.POSITIONS: shown})
+        write_whole(made.folder / FILE, json.dumps(values, indent=2) + "\n")
+    return True
+
+
+def use_of(folder: Path) -> str:
+    """How the fixes of a run were used; empty without fixes. Raises SegslamError for a damaged file."""
+    file = folder / FILE
+    try:
+        return str(json.loads(file.read_text(encoding="utf-8")).get("use", "")) if file.exists() else ""
+    except (OSError, ValueError, AttributeError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
+
+
+def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
+    """The fixes of a georeferenced run in the clock of its scans, shifted; none for another run.
+
+    Raises SegslamError for damaged files.
+    """
+    file = folder / FIXES
+    if not file.exists():
+        return []
+    try:
+        values = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        offset_ns = round(1e9 * (values["given_offset_s"] + values["clock_offset_s"])) + stamp_shift_ns
+        with file.open(newline="", encoding="utf-8") as stream:
+            rows = [row for row in csv.DictReader(stream) if row["reason"] not in (NO_FIX, NOT_FINITE, DUPLICATE)]
+        found = []
+        for row in rows:
+            latitude, longitude, height_m = (float(row[name] or "nan") for name in DEGREES_AND_HEIGHT)
+            found.append(Row(int(row["stamp_ns"]) + offset_ns, latitude, longitude, height_m))
+        return found
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
+
+
+def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) -> None:
+    trajectory = run.result.trajectory
+    T_enu_lidar = corrected_poses(trajectory.T_world_lidar, run.result.keyframe_rows, placed.T_enu_keyframe)
+    with room_for(run.folder):
+        places = _write_poses(run, placed.origin, T_enu_lidar)
+        write_locations(log_of(run.folder), _locations(placed, trajectory.stamp_ns, places, offset_s))
+        _write_fixes(run.folder, placed)
+        values = figures(placed) | {"use": str(use), "given_offset_s": offset_s}
+        write_whole(run.folder / FILE, json.dumps(values, indent=2) + "\n")
+        num_kept = placed.num_kept
+        write_metrics(run.folder, run.metrics | {"gnss_kept": num_kept, "gnss_dropped": len(placed.fixes) - num_kept})
+
+
+def _write_poses(run: FinishedRun, origin: Origin, T_enu_lidar: Poses) -> Geodetic:
+    """The two files with poses; returns the geodetic positions of all scans."""
+    places = geodetic_from_enu(T_enu_lidar[:, :3, 3], origin)
+    with whole_file(run.folder / ENU) as part:
+        write_tum(part, run.result.trajectory.stamp_ns, T_enu_lidar)
+    _write_geodetic(run, places, T_enu_lidar)
+    return places
+
+
+def figures(placed: Georeference) -> dict[str, Any]:
+    """The content of `georeference.json`; unknown figures are null."""
+    origin = placed.origin
+    return {
+        "datum": DATUM,
+        "latitude_deg": origin.latitude_deg,
+        "longitude_deg": origin.longitude_deg,
+        "height_m": origin.height_m,
+        "epsg": utm_epsg(origin.latitude_deg, origin.longitude_deg),
+        "T_enu_map": placed.T_enu_map.ravel().tolist(),
+        "sigma": dict(zip(SIGMAS, _known(placed.position_sigma_m), strict=True))
+        | {"heading_deg": placed.heading_sigma_deg},
+        "fix_sigma_m": _known(placed.fix_sigma_m),
+        "num_fixes": len(placed.fixes),
+        "num_fixes_kept": placed.num_kept,
+        "is_bent_horizontally": placed.is_bent[0],
+        "is_bent_in_height": placed.is_bent[1],
+        "clock_offset_s": placed.measured_offset_s,
+        "clock_offset_sigma_s": placed.offset_sigma_s,
+        "lever_arm_m": _known(placed.arm_m),
+        "lever_arm_sigma_m": _known(placed.arm_sigma_m),
+        "source": Path(placed.fixes.source).name,
+        "note": placed.fixes.note,
+    }
+
+
+def _known(values: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def _locations(placed: Georeference, stamp_ns: Indices, places: Geodetic, offset_s: float) -> dict[str, Locations]:
+    """What the Map panel of Foxglove shows: the fixes within the drive, and the scans."""
+    within = np.isfinite(placed.residual_m[:, 0])
+    measured_ns = placed.fixes.stamp_ns[within] + round(1e9 * (offset_s + placed.measured_offset_s))
+    return {
+        schema.FIXES: Locations(schema.ANTENNA, measured_ns, placed.fixes.places[within], placed.fix_sigma_m),
+        schema.POSITIONS: Locations(schema.LIDAR, stamp_ns, places, placed.position_sigma_m),
+    }
+
+
+def _write_geodetic(run: FinishedRun, places: Geodetic, T_enu_lidar: Poses) -> None:
+    """A row a localised scan: time, latitude, longitude, height, and heading of the x axis clockwise from north."""
+    trajectory = run.result.trajectory
+    heading_deg = np.degrees(np.arctan2(T_enu_lidar[:, 0, 0], T_enu_lidar[:, 1, 0])) % 360.0
+    with whole_file(run.folder / GEODETIC) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(("seconds", "latitude", "longitude", "height", "heading"))
+        for stamp_ns, (latitude, longitude, height_m), heading in zip(
+            *(values[run.result.localised()] for values in (trajectory.stamp_ns, places, heading_deg)), strict=True
+        ):
+            seconds = Decimal(int(stamp_ns)).scaleb(-9)
+            writer.writerow(
+                (f"{seconds:f}", f"{latitude:.10f}", f"{longitude:.10f}", f"{height_m:.4f}", f"{heading:.4f}")
+            )
+
+
+def _write_fixes(folder: Path, placed: Georeference) -> None:
+    """A row a fix: what was measured, by how much it differs from the drive, and whether it was kept or why not."""
+    head = ("stamp_ns", *DEGREES_AND_HEIGHT, *SIGMAS)
+    residuals = ("residual_east_m", "residual_north_m", "residual_up_m")
+    with whole_file(folder / FIXES) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow((*head, *residuals, "weight", "weight_up", "kept", "reason"))
+        for row, reason in enumerate(placed.reasons):
+            measured = (*placed.measured_enu_m[row], *placed.residual_m[row], *placed.weights[row])
+            degrees = (f"{value:.10f}" if np.isfinite(value) else "" for value in placed.fixes.places[row, :2])
+            others = (
+                f"{value:.4f}" if np.isfinite(value) else "" for value in (placed.fixes.places[row, 2], *measured)
+            )
+            writer.writerow((int(placed.fixes.stamp_ns[row]), *degrees, *others, int(not reason), reason))
+
+
+def summary(placed: Georeference) -> str:
+    """What the fixes say, and what they were used for."""
+    east, north, _ = placed.position_sigma_m
+    lines = [
+        f"{placed.num_kept} of {len(placed.fixes)} fixes kept; single fixes are off by {placed.fix_sigma_m[0]:.2f} m, "
+        "a standard deviation",
+        f"map placed: heading known to {placed.heading_sigma_deg:.2f} degrees, position to {east:.2f} m east and "
+        f"{north:.2f} m north",
+    ]
+    axes = [name for name, is_bent in zip(("horizontally", "in height"), placed.is_bent, strict=True) if is_bent]
+    lines.append(f"trajectory bent {' and '.join(axes)} by the fixes" if axes else "trajectory kept its shape")
+    if placed.measured_offset_s:
+        lines.append(
+            f"clock of the receiver: {placed.measured_offset_s:+.3f} s added to its times, "
+            f"known to {placed.offset_sigma_s:.3f} s"
+        )
+    if placed.arm_m.any():
+        lines.append(
+            f"antenna {placed.arm_m[0]:+.2f} m ahead and {placed.arm_m[1]:+.2f} m to the left of the LiDAR, "
+            f"known to {max(placed.arm_sigma_m):.2f} m"
+        )
+    if placed.fixes.note:
+        lines.append(placed.fixes.note)
+    return "\n".join(lines)

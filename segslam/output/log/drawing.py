@@ -1,0 +1,241 @@
+"""Visualisation of a run, step by step, as Foxglove messages."""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import Message
+
+from segslam.core import geometry
+from segslam.core.config import LogConfig
+from segslam.core.points import voxel_first, within_range
+from segslam.core.types import (
+    GraphEstimate,
+    Keyframe,
+    Label,
+    Labels,
+    LoopAttempt,
+    Points,
+    Rejected,
+    RejectReason,
+    Step,
+    Trajectory,
+    Transform,
+    Vector,
+)
+from segslam.output.log import foxglove, schema
+from segslam.output.log.messages import messages_of
+from segslam.output.log.records import codec
+
+ACCEPTED_COLOR = "#2ca02cff"
+REJECTED_COLORS = {
+    RejectReason.TOO_FEW_POINTS: "#c7c7c7ff",
+    RejectReason.TOO_FEW_CORRESPONDENCES: "#7f7f7fff",
+    RejectReason.SMALL_CLIQUE: "#1f77b4ff",
+    RejectReason.DEGENERATE: "#17becfff",
+    RejectReason.TOO_FEW_INLIERS: "#9467bdff",
+    RejectReason.FAR_FROM_PRIOR: "#e377c2ff",
+    RejectReason.REFINEMENT_DIVERGED: "#8c564bff",
+    RejectReason.LOW_OVERLAP: "#bcbd22ff",
+    RejectReason.HIGH_RESIDUAL: "#ffbb78ff",
+    RejectReason.FREE_SPACE_VIOLATED: "#dbdb8dff",
+    RejectReason.IMPROBABLE: "#ff7f0eff",
+    RejectReason.AMBIGUOUS: "#d62728ff",
+    RejectReason.NO_PLACE: "#aec7e8ff",
+    RejectReason.UNCONFIRMED: "#ff9896ff",
+}
+"""Cold colours for candidates rejected early, warm colours for those rejected late."""
+
+PATH_GROWTH = 1.05
+"""Chosen: a path is written again when it has grown by this factor. The size of all versions together is then
+linear in its length (about 20 times the last), and a viewer that jumps in time shows at least 95 % of the path."""
+
+VIEW_GRID_M = 2.0**-5
+"""Chosen: displayed points are rounded to 3 cm (a binary fraction), which halves their compressed size."""
+
+MAP_KEYFRAMES = 500
+"""Chosen: in longer drives, every second keyframe is in the displayed map, or every third, and so on."""
+MAP_BATCH = 50
+"""Chosen: number of keyframes after which the displayed map is downsampled again, which limits the memory."""
+MAP_RANGE_M, MAP_VOXEL_M = 40.0, 0.2
+
+Topical = tuple[str, Message]
+CloudOf = Callable[[int], tuple[Points, Labels]]
+"""Function from the id of a keyframe to its points, in its frame, and their labels."""
+
+
+class Drawing:
+    """Converts the steps of a run to messages by topic."""
+
+    def __init__(self, config: LogConfig) -> None:
+        self._config = config
+        self._T_odom_keyframe: dict[int, Transform] = {}
+        self._T_world_keyframe: Mapping[int, Transform] = {}
+        self._T_world_odom = np.eye(4)
+        self._num_on_path = 0
+        self._rejected: set[str] = set()
+        """Identities of the drawn rejected loops."""
+
+    def draw(self, step: Step, *, path: bool = True) -> Iterator[Topical]:
+        """The messages of the next step.
+
+        Those of an estimate whose size grows with the drive are omitted without `path`.
+        """
+        yield (
+            schema.TRANSFORMS,
+            foxglove.frame_transform(step.T_odom_lidar, parent=schema.ODOM, child=schema.LIDAR, stamp_ns=step.stamp_ns),
+        )
+        if step.keyframe is not None:
+            yield from self._keyframe(step.keyframe, corrected=step.estimate is None or not path)
+        if step.estimate is not None:
+            yield from self.draw_estimate(step.estimate, stamp_ns=step.stamp_ns, path=path)
+        else:
+            yield self._odom_in_world(step.stamp_ns)
+        yield from self._attempts(step.attempts, step.stamp_ns)
+        for message in messages_of(step):
+            yield schema.LOG, message
+
+    def draw_estimate(self, estimate: GraphEstimate, *, stamp_ns: int, path: bool = True) -> Iterator[Topical]:
+        """Pose of odom in world and, if `path`, the corrected path and the closures."""
+        self._T_world_keyframe = estimate.T_world_keyframe
+        last = max(estimate.T_world_keyframe)
+        self._T_world_odom = estimate.T_world_keyframe[last] @ geometry.inverse(self._T_odom_keyframe[last])
+        yield self._odom_in_world(stamp_ns)
+        if path:
+            poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
+            yield schema.TRAJECTORY, poses
+            yield schema.GRAPH, self._graph(estimate, stamp_ns)
+
+    def draw_path(self, estimate: GraphEstimate, *, stamp_ns: int) -> Topical:
+        """The path before the adjustment of the whole map."""
+        poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
+        return schema.TRAJECTORY_BEFORE, poses
+
+    def draw_map(self, estimate: GraphEstimate, cloud: CloudOf, *, stamp_ns: int) -> Iterator[Topical]:
+        """One cloud of the whole drive in world.
+
+        `cloud` returns the points of a keyframe, in its frame, and their labels.
+        """
+        points, labels = map_points(estimate.T_world_keyframe, cloud, view_every=self._config.view_every)
+        if len(points):
+            yield map_message(points, labels, stamp_ns=stamp_ns)
+
+    def _odom_in_world(self, stamp_ns: int) -> Topical:
+        """Written at every step: viewers interpolate, and would otherwise start a correction too early."""
+        return schema.TRANSFORMS, foxglove.frame_transform(
+            self._T_world_odom, parent=schema.WORLD, child=schema.ODOM, stamp_ns=stamp_ns
+        )
+
+    def _keyframe(self, keyframe: Keyframe, *, corrected: bool) -> Iterator[Topical]:
+        """Its points, and now and then the paths: by odometry and, with `corrected`, in world as far as it is known."""
+        self._T_odom_keyframe[keyframe.id] = keyframe.T_odom_keyframe
+        stamp_ns, some = keyframe.stamp_ns, slice(None, None, self._config.view_every)
+        points = np.round(keyframe.points[some] / VIEW_GRID_M) * VIEW_GRID_M
+        yield (
+            schema.POINTS,
+            foxglove.point_cloud(points, keyframe.labels[some], frame=schema.LIDAR, stamp_ns=stamp_ns),
+        )
+        if len(self._T_odom_keyframe) >= PATH_GROWTH * self._num_on_path:
+            self._num_on_path = len(self._T_odom_keyframe)
+            path = foxglove.poses_in_frame(self._T_odom_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
+            yield schema.ODOMETRY, path
+            if corrected:
+                poses = [self._in_world(number) for number in self._T_odom_keyframe]
+                yield schema.TRAJECTORY, foxglove.poses_in_frame(poses, frame=schema.WORLD, stamp_ns=stamp_ns)
+
+    def _attempts(self, attempts: tuple[LoopAttempt, ...], stamp_ns: int) -> Iterator[Topical]:
+        for topic, wanted in ((schema.ACCEPTED, False), (schema.REJECTED, True)):
+            entities = [
+                self._attempt(attempt, stamp_ns)
+                for attempt in attempts
+                if isinstance(attempt.outcome, Rejected) is wanted
+            ]
+            outdated = self._rejected & {entity.id for entity in entities} if topic == schema.ACCEPTED else set()
+            if entities:
+                yield topic, foxglove.scene(entities)
+            if outdated:  # loops that waited for confirmation
+                yield schema.REJECTED, foxglove.scene([], deleted=outdated)
+                self._rejected -= outdated
+            if topic == schema.REJECTED:
+                self._rejected |= {entity.id for entity in entities}
+
+    def _attempt(self, attempt: LoopAttempt, stamp_ns: int) -> foxglove.SceneEntity:
+        outcome, pair = attempt.outcome, (attempt.candidate.source_id, attempt.candidate.target_id)
+        color = REJECTED_COLORS[outcome.reason] if isinstance(outcome, Rejected) else ACCEPTED_COLOR
+        return foxglove.entity(
+            f"{pair[0]} to {pair[1]}",
+            foxglove.line([self._position(keyframe_id) for keyframe_id in pair], [color]),
+            numbers_and_words(codec(LoopAttempt).encode(attempt)),
+            frame=schema.WORLD,
+            stamp_ns=stamp_ns,
+        )
+
+    def _graph(self, estimate: GraphEstimate, stamp_ns: int) -> foxglove.SceneUpdate:
+        ends = [self._position(keyframe_id) for pair in estimate.closure_weights for keyframe_id in pair]
+        colors = [weight_color(weight) for weight in estimate.closure_weights.values()]
+        about = {"error": f"{estimate.error:g}", "closures": str(len(colors))}
+        lines = foxglove.line(ends, colors)
+        return foxglove.scene([foxglove.entity("closures", lines, about, frame=schema.WORLD, stamp_ns=stamp_ns)])
+
+    def _position(self, keyframe_id: int) -> Vector:
+        """Position in world, by the last estimate and the odometry since."""
+        return self._in_world(keyframe_id)[:3, 3]
+
+    def _in_world(self, keyframe_id: int) -> Transform:
+        if keyframe_id in self._T_world_keyframe:
+            return self._T_world_keyframe[keyframe_id]
+        return self._T_world_odom @ self._T_odom_keyframe[keyframe_id]
+
+
+def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, *, view_every: int) -> tuple[Points, Labels]:
+    """Some points (n, 3), in world, of between `MAP_KEYFRAMES` and twice as many keyframes, and their labels.
+
+    Moving classes are omitted.
+    """
+    every = 1 + len(T_world_keyframe) // MAP_KEYFRAMES
+    some = slice(None, None, view_every)
+    ids = list(T_world_keyframe)[::every]
+    drawn = np.empty((0, 3)), np.empty(0, np.uint8)
+    for start in range(0, len(ids), MAP_BATCH):
+        parts = [drawn]
+        for keyframe_id in ids[start : start + MAP_BATCH]:
+            points, labels = cloud(keyframe_id)
+            kept = within_range(points[some], 0.0, MAP_RANGE_M) & (labels[some] < Label.MOVING_CAR)
+            placed = geometry.apply(T_world_keyframe[keyframe_id], points[some][kept].astype(np.float64))
+            parts.append((placed, labels[some][kept]))
+        points, labels = (np.concatenate(column) for column in zip(*parts, strict=True))
+        rows = voxel_first(points, MAP_VOXEL_M)
+        drawn = points[rows], labels[rows]
+    points, labels = drawn
+    return np.round(points / VIEW_GRID_M) * VIEW_GRID_M, labels
+
+
+def map_message(points: Points, labels: Labels, *, stamp_ns: int) -> Topical:
+    """The message of the displayed map, a cloud in world."""
+    return schema.MAP, foxglove.point_cloud(points, labels, frame=schema.WORLD, stamp_ns=stamp_ns)
+
+
+def ground_truth(reference: Trajectory, *, stamp_ns: int) -> Topical:
+    """The true path, moved to start at the origin of world."""
+    T_first_true = geometry.inverse(reference.T_world_lidar[0])
+    path = (T_first_true @ T_true_lidar for T_true_lidar in reference.T_world_lidar)
+    return schema.GROUND_TRUTH, foxglove.poses_in_frame(path, frame=schema.WORLD, stamp_ns=stamp_ns)
+
+
+def weight_color(weight: float) -> str:
+    """Green for a closure of weight 1, red for 0."""
+    green = round(255 * min(max(weight, 0.0), 1.0))
+    return f"#{255 - green:02x}{green:02x}30ff"
+
+
+def numbers_and_words(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Metadata of a record to show on a click: numbers and texts with dotted keys, without arrays."""
+    flat: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= numbers_and_words(value, f"{prefix}{key}.")
+        elif isinstance(value, float):
+            flat[prefix + key] = f"{value:.4g}"
+        elif not isinstance(value, list):
+            flat[prefix + key] = str(value)
+    return flat

@@ -1,0 +1,259 @@
+"""Reads the steps of a run from an MCAP log, up to the end of its complete part."""
+
+import json
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from google.protobuf.message import DecodeError
+
+from segslam.core.config import Config, config_from_yaml
+from segslam.core.errors import brief
+from segslam.core.types import (
+    GraphEstimate,
+    Keyframe,
+    LateLoops,
+    LoopAttempt,
+    SegslamError,
+    Step,
+    Trajectory,
+    Transform,
+)
+from segslam.output.log import container, schema
+from segslam.output.log.cloud import KeyframePoints, intensities, place_of, points_and_labels
+from segslam.output.log.container import CutError
+from segslam.output.log.foxglove import transforms
+from segslam.output.log.keyframes import RecordedKeyframe, RecordedKeyframes
+from segslam.output.log.origin import restored
+from segslam.output.log.records import codec
+from segslam.slam.adjustment import Adjustment
+
+logger = logging.getLogger(__name__)
+
+NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
+NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, RecursionError, DecodeError)
+"""Exceptions on content of another program, or damaged in spite of a correct checksum."""
+Parts = Mapping[str, bytes]
+"""The latest message of each topic."""
+Encoded = TypeVar("Encoded")
+Decoded = TypeVar("Decoded")
+
+
+@dataclass(frozen=True, slots=True)
+class RunLog:
+    """An open log: metadata of the run, and access to its steps."""
+
+    path: Path
+    config: Config
+    """The effective settings of the run."""
+    run: Mapping[str, str]
+    """schema_version, dataset, python, platform, and T_camera_lidar (JSON) if known."""
+    packages: Mapping[str, str]
+    """Package -> version."""
+    options: Mapping[str, str]
+    """Options beside the settings, such as the source of the labels."""
+
+    @property
+    def T_camera_lidar(self) -> Transform | None:  # noqa: N802  (a transform)
+        """Calibration of KITTI data; None for other data."""
+        return self._decoded(_calibration, self.run["T_camera_lidar"]) if "T_camera_lidar" in self.run else None
+
+    def num_steps(self) -> int:
+        """Number of complete steps in the log."""
+        return container.count(self.path, schema.STEP)
+
+    def steps(self, *, clouds: bool = True) -> Iterator[Step]:
+        """The steps in order, read when they are requested.
+
+        Without `clouds`, keyframes have no points, and reading takes a quarter of the time.
+        A truncated or damaged log yields its complete steps and logs a warning with their number.
+        Raises SegslamError if the content is not in the format of this version.
+        """
+        num_steps = 0
+        parts: dict[str, bytes] = {}
+        try:
+            for topic, data in self._messages():
+                parts[topic] = data
+                if topic == schema.STEP:
+                    if not clouds and schema.KEYFRAME in parts:
+                        parts[schema.KEYFRAME] = b""  # encodes zero points
+                    yield self._decoded(_step, parts)
+                    num_steps += 1
+                    parts.clear()
+        except CutError as cut:
+            size = self.path.stat().st_size
+            logger.warning(
+                "%s: cut or damaged at byte %d of %d: kept the first %d steps", self.path, cut.offset, size, num_steps
+            )
+
+    def reference(self) -> Trajectory | None:
+        """The true poses of the scans, if known."""
+        with suppress(CutError):
+            for topic, data in self._messages():
+                if topic == schema.REFERENCE:
+                    return self._decoded(_trajectory, data)
+                if topic == schema.STEP:
+                    return None
+        return None
+
+    def result(self) -> tuple[GraphEstimate, Trajectory] | None:
+        """The last estimate and the pose of every scan; None if the run did not finish."""
+        parts = self._ending()
+        return (self._decoded(_estimate, parts), self._decoded(_trajectory, parts[schema.RESULT])) if parts else None
+
+    def late_loops(self) -> tuple[LoopAttempt, ...]:
+        """Loops tried after the last scan; empty if the run did not finish."""
+        parts = self._ending()
+        if schema.LATE_LOOPS not in parts:
+            return ()
+        return self._decoded(_late_loops, parts[schema.LATE_LOOPS]).attempts
+
+    def adjustment(self) -> Adjustment | None:
+        """The adjustment of the whole map; None without one, or if the run did not finish."""
+        parts = self._ending()
+        return self._decoded(_adjustment, parts[schema.ADJUSTMENT]) if schema.ADJUSTMENT in parts else None
+
+    def _ending(self) -> Parts:
+        """The messages of the result; empty if the run did not finish."""
+        parts: dict[str, bytes] = {}
+        with suppress(CutError):
+            for topic, data in self._messages(since_last=schema.TRAJECTORY):
+                parts[topic] = data
+                if topic == schema.RESULT:
+                    return parts
+        return {}
+
+    def keyframes(self) -> "RecordedKeyframes":
+        """The keyframes of the complete steps, with access to their points. Raises SegslamError as `steps` does."""
+        kept: list[RecordedKeyframe] = []
+        parts: dict[str, bytes] = {}
+        cloud: container.Stored | None = None
+        with suppress(CutError):
+            for message in self._stored():
+                parts[message.topic] = message.data
+                if message.topic == schema.KEYFRAME:
+                    cloud = message
+                if message.topic == schema.STEP:
+                    if cloud is not None:
+                        kept.append(self._decoded(_recorded_keyframe, (parts, cloud)))
+                        if kept[-1].keyframe.id != len(kept) - 1:
+                            raise SegslamError(f"{self.path}: keyframe {len(kept) - 1} is missing; map the data again")
+                    parts.clear()
+                    cloud = None
+        return RecordedKeyframes(self.path, kept)
+
+    def _messages(self, *, since_last: str | None = None) -> Iterator[tuple[str, bytes]]:
+        """Topic and data, as `_stored`."""
+        for message in self._stored(since_last=since_last):
+            yield message.topic, message.data
+
+    def _stored(self, *, since_last: str | None = None) -> Iterator[container.Stored]:
+        """As `container.messages`. Raises CutError, and SegslamError if the records are not those of this version."""
+        own = schema.json_schemas()
+        for message in container.messages(self.path, since_last=since_last):
+            if message.topic in own and not _is_readable(message.schema.data, own.pop(message.topic)):
+                raise SegslamError(
+                    f"{self.path}: its {message.schema.name} has another format than this version reads; "
+                    f"use segslam {self.packages.get('segslam', 'of that time')}, which wrote it"
+                )
+            yield message
+
+    def _decoded(self, decode: Callable[[Encoded], Decoded], encoded: Encoded) -> Decoded:
+        try:
+            return decode(encoded)
+        except (
+            LookupError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+            DecodeError,
+        ) as error:
+            raise SegslamError(
+                f"{self.path}: not written by segslam ({brief(repr(error))}); map the data again"
+            ) from error
+
+
+def read_log(path: Path) -> RunLog:
+    """Open the log of a run, complete or not. Raises SegslamError if it is missing or has another schema version."""
+    remedy = "give the log.mcap of a run"
+    try:
+        metadata, cut = container.metadata(path)
+    except OSError as error:
+        raise SegslamError(f"{path}: cannot read the log ({error.strerror}); {remedy}") from error
+    check = metadata.get(schema.CHECK_METADATA)
+    if cut is not None and check is None:
+        raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}") from cut
+    if check is not None and check.get("crc32") != str(schema.checksum(metadata)):
+        raise SegslamError(f"{path}: the settings at its start are damaged (wrong checksum); map the data again")
+    run = restored(metadata.get(schema.RUN_METADATA, {}))
+    if "yaml" not in metadata.get(schema.CONFIG_METADATA, {}) or "schema_version" not in run:
+        raise SegslamError(f"{path}: an MCAP file, but not a log of segslam; {remedy}")
+    packages = metadata.get(schema.PACKAGES_METADATA, {})
+    if run["schema_version"] != str(schema.VERSION):
+        raise SegslamError(
+            f"{path}: a log of schema version {brief(run['schema_version'])}, but this version reads {schema.VERSION}; "
+            f"use segslam {brief(packages.get('segslam', 'of that time'))}, which wrote it"
+        )
+    config = config_from_yaml(metadata[schema.CONFIG_METADATA]["yaml"], f"{path} (settings)")
+    options = restored(metadata.get(schema.OPTIONS_METADATA, {}))
+    return RunLog(path=path, config=config, run=run, packages=packages, options=options)
+
+
+def _is_readable(written: bytes, own: dict[str, Any]) -> bool:
+    try:
+        return schema.is_readable(json.loads(written), own)
+    except (ValueError, AttributeError, TypeError, RecursionError):
+        return False
+
+
+def _step(parts: Parts) -> Step:
+    keyframe: dict = {}
+    if schema.KEYFRAME in parts:
+        message = KeyframePoints.FromString(parts[schema.KEYFRAME])
+        points, labels = points_and_labels(message)
+        keyframe = {"points": points, "labels": labels, "intensities": intensities(message), **place_of(message)}
+    estimate = _estimate(parts) if schema.ESTIMATE in parts else None
+    return codec(Step).decode(json.loads(parts[schema.STEP]), {Step: {"estimate": estimate}, Keyframe: keyframe})
+
+
+def _recorded_keyframe(found: tuple[Parts, container.Stored]) -> RecordedKeyframe:
+    parts, stored = found
+    message = KeyframePoints.FromString(stored.data)
+    step = codec(Step).decode(
+        json.loads(parts[schema.STEP]),
+        {Step: {"estimate": None}, Keyframe: {"points": NO_POINTS, "labels": NO_LABELS, **place_of(message)}},
+    )
+    if step.keyframe is None:
+        raise ValueError("points without a keyframe")
+    return RecordedKeyframe(step.keyframe, stored.chunk, stored.channel_id)
+
+
+def _estimate(parts: Parts) -> GraphEstimate:
+    """The estimate from an /estimate message and the /trajectory before it."""
+    values = json.loads(parts[schema.ESTIMATE])
+    poses = transforms(PosesInFrame.FromString(parts[schema.TRAJECTORY]))
+    T_world_keyframe = dict(zip(values["keyframe_ids"], poses, strict=True))
+    return codec(GraphEstimate).decode(values, {GraphEstimate: {"T_world_keyframe": T_world_keyframe}})
+
+
+def _calibration(text: str) -> Transform:
+    return np.array(json.loads(text), np.float64).reshape(4, 4)
+
+
+def _late_loops(data: bytes) -> LateLoops:
+    return codec(LateLoops).decode(json.loads(data), {})
+
+
+def _adjustment(data: bytes) -> Adjustment:
+    return codec(Adjustment).decode(json.loads(data), {})
+
+
+def _trajectory(data: bytes) -> Trajectory:
+    return codec(Trajectory).decode(json.loads(data), {})

@@ -1,0 +1,155 @@
+"""Lossless conversion of records to JSON with a JSON Schema, and back. Python's JSON keeps all digits of a float64.
+
+Each record becomes an object with one key per field: `segslam.core.types` defines the format. Large fields are
+in separate binary messages and omitted from the JSON: see `BULK`. Foxglove's schema parser supports neither nested
+arrays nor alternatives, therefore:
+
+- an array of numbers is a flat list, row by row;
+- a field that is None is omitted, and a field with a default may be missing, as in logs of older versions;
+- one of several records is an object with one key, the name of the record;
+- a mapping with tuples as keys is a list of objects with a `key` and a `value`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+from jaxtyping import AbstractArray
+
+from segslam.core.types import GraphEstimate, Keyframe, Step
+
+Json = dict[str, Any]
+Bulk = Mapping[type, Mapping[str, Any]]
+"""Values of the fields that the JSON omits, by record."""
+
+BULK: Mapping[type, frozenset[str]] = {
+    Step: frozenset({"estimate"}),
+    Keyframe: frozenset({"points", "labels", "intensities", "place"}),
+    GraphEstimate: frozenset({"T_world_keyframe"}),
+}
+"""Fields that the JSON omits."""
+
+_NUMBERS_AND_TEXTS = {bool: "boolean", int: "integer", float: "number", str: "string"}
+
+
+@dataclass(frozen=True, slots=True)
+class Codec:
+    """Encoder, decoder and schema of one type."""
+
+    encode: Callable[[Any], Any]
+    """Converts a value to objects that `json` can write."""
+    decode: Callable[[Any, Bulk], Any]
+    """Converts objects that `json` read to a value.
+
+    Raises ValueError, TypeError or KeyError for invalid or missing data.
+    """
+    schema: Json
+    """JSON Schema of the encoded values."""
+
+
+@cache
+def codec(hint: Any) -> Codec:
+    """The codec of a type: a record, or the type of one of its fields."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if is_dataclass(hint):
+        return _record(hint)
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+        return _array(hint)
+    if origin is UnionType:
+        return _one_of(arguments)
+    if origin is tuple:
+        return _tuple(codec(arguments[0]))
+    if origin is dict and get_origin(arguments[0]) is tuple:
+        return _mapping_by_tuples(codec(arguments[0]), codec(arguments[1]))
+    if origin is dict:
+        return _mapping_by_names(codec(arguments[1]))
+    if issubclass(hint, Enum):
+        values = {"type": "string", "enum": [member.value for member in hint]}
+        return Codec(lambda member: member.value, lambda value, _: hint(value), values)
+    return Codec(hint, lambda value, _: hint(value), {"type": _NUMBERS_AND_TEXTS[hint]})
+
+
+def _record(record: Any) -> Codec:
+    hints = get_type_hints(record)
+    kept = [field for field in fields(record) if field.name not in BULK.get(record, ())]
+    names = [field.name for field in kept]
+    optional = {name for name in names if NoneType in get_args(hints[name])}
+    has_default = {field.name for field in kept if not (field.default is field.default_factory is MISSING)}
+    codecs = {name: codec(hints[name]) for name in names}
+
+    def encode(value: Any) -> Json:
+        present = ((name, getattr(value, name)) for name in names)
+        return {name: codecs[name].encode(item) for name, item in present if item is not None}
+
+    def decode(value: Json, bulk: Bulk) -> Any:
+        absent = dict.fromkeys(optional - has_default - set(value))
+        left_out = (optional | has_default) - set(value)
+        present = {name: codecs[name].decode(value[name], bulk) for name in names if name not in left_out}
+        return record(**absent, **present, **(bulk[record] if record in BULK else {}))
+
+    schema = {
+        "title": record.__name__,
+        "type": "object",
+        "properties": {name: codecs[name].schema for name in names},
+        "required": [name for name in names if name not in optional | has_default],
+    }
+    return Codec(encode, decode, schema)
+
+
+def _array(hint: Any) -> Codec:
+    """Codec of an array with the shape in the type hint; at most one dimension is variable."""
+    sizes = hint.dim_str.split()
+    shape = [int(size) if size.isdigit() else -1 for size in sizes]
+    dtype, kind = (np.float64, "number") if "float64" in hint.dtypes else (np.int64, "integer")
+    return Codec(
+        lambda array: array.ravel().tolist(),
+        lambda numbers, _: np.array(numbers, dtype).reshape(shape),
+        {"type": "array", "items": {"type": kind}, "description": f"shape {' x '.join(sizes)}, row by row"},
+    )
+
+
+def _one_of(hints: tuple[Any, ...]) -> Codec:
+    """Codec of a record or None, which is omitted; or of one of several records."""
+    records = {hint.__name__: codec(hint) for hint in hints if hint is not NoneType}
+    if len(records) == 1:
+        return next(iter(records.values()))
+
+    def encode(value: Any) -> Json:
+        name = type(value).__name__
+        return {name: records[name].encode(value)}
+
+    def decode(value: Json, bulk: Bulk) -> Any:
+        [(name, item)] = value.items()
+        return records[name].decode(item, bulk)
+
+    properties = {name: record.schema for name, record in records.items()}
+    return Codec(encode, decode, {"type": "object", "properties": properties})
+
+
+def _tuple(item: Codec) -> Codec:
+    return Codec(
+        lambda values: [item.encode(value) for value in values],
+        lambda values, bulk: tuple(item.decode(value, bulk) for value in values),
+        {"type": "array", "items": item.schema},
+    )
+
+
+def _mapping_by_tuples(key: Codec, value: Codec) -> Codec:
+    properties = {"key": key.schema, "value": value.schema}
+    return Codec(
+        lambda items: [{"key": key.encode(k), "value": value.encode(v)} for k, v in items.items()],
+        lambda rows, bulk: {key.decode(row["key"], bulk): value.decode(row["value"], bulk) for row in rows},
+        {"type": "array", "items": {"type": "object", "properties": properties}},
+    )
+
+
+def _mapping_by_names(value: Codec) -> Codec:
+    return Codec(
+        lambda items: {name: value.encode(item) for name, item in items.items()},
+        lambda items, bulk: {name: value.decode(item, bulk) for name, item in items.items()},
+        {"type": "object", "properties": {}, "additionalProperties": value.schema},
+    )

@@ -1,0 +1,118 @@
+"""Topics, frames and metadata of a log, and the version of this format."""
+
+import json
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+from segslam.core.types import GraphEstimate, LateLoops, Step, Trajectory
+from segslam.output.log.records import codec
+from segslam.slam.adjustment import Adjustment
+
+VERSION = 1
+"""Increased whenever readers of the previous version would misread a log."""
+
+STEP = "/step"
+"""segslam.Step (JSON): a step without the fields in `records.BULK`; the last message of each step."""
+ESTIMATE = "/estimate"
+"""segslam.Estimate (JSON): result of an optimisation, and the keyframes of the /trajectory before it. Written after
+every optimisation; in a long run with many loops, after every second or third."""
+MEMORY = "/memory"
+"""segslam.Memory (JSON): `rss_mb`, memory of the process at each step, if known."""
+RESULT = "/result"
+"""segslam.Result (JSON): the pose of every scan; once, after the last step and the last estimate."""
+LATE_LOOPS = "/late_loops"
+"""segslam.LateLoops (JSON): loops tried after the last scan; once, after the last estimate; missing if none."""
+ADJUSTMENT = "/adjustment"
+"""segslam.Adjustment (JSON): the adjustment of the whole map; once, before the result; missing if none."""
+REFERENCE = "/reference"
+"""segslam.Reference (JSON): the true poses of the scans, if known; before the first step."""
+TRANSFORMS = "/tf"
+"""foxglove.FrameTransform: lidar in odom at every scan, odom in world after every optimisation."""
+KEYFRAME = "/keyframe"
+"""segslam.KeyframePoints (protobuf): all points of the step's keyframe, for replay. See `cloud`."""
+POINTS = "/points"
+"""foxglove.PointCloud: a subset of each keyframe's points in the lidar frame, with labels and colours, for display."""
+MAP = "/map"
+"""foxglove.PointCloud: a subset of all points in world, by the last estimate; once, before the result."""
+ODOMETRY = "/odometry"
+"""foxglove.PosesInFrame: the keyframes by odometry alone; world and odom coincide at the start."""
+TRAJECTORY = "/trajectory"
+"""foxglove.PosesInFrame: the keyframes in world, with each /estimate; between them, as often as /odometry, by the last
+estimate and the odometry since."""
+TRAJECTORY_BEFORE = "/trajectory_before"
+"""foxglove.PosesInFrame: the keyframes in world before the adjustment of the whole map; once, if there was one."""
+GROUND_TRUTH = "/ground_truth"
+"""foxglove.PosesInFrame: the true poses in world, moved to start at the origin of odom."""
+ACCEPTED = "/loops/accepted"
+REJECTED = "/loops/rejected"
+"""foxglove.SceneUpdate: a line between the keyframes of each loop candidate; a click shows the outcome."""
+LOG = "/log"
+"""foxglove.Log: skipped scans, repairs and breaks of the odometry, accepted loops, in words."""
+GRAPH = "/graph"
+"""foxglove.SceneUpdate: all closures, as often as /estimate; green: full weight, red: rejected by the optimiser."""
+
+FIXES, POSITIONS = "/gnss/fixes", "/gnss/positions"
+"""foxglove.LocationFix: position fixes within the drive, and the position of every scan; behind the result, in logs of
+georeferenced runs. See `locations`."""
+
+WORLD, ODOM, LIDAR, ANTENNA = "world", "odom", "lidar", "antenna"
+"""Frames."""
+
+RUN_METADATA = "segslam"
+"""Metadata record: schema_version, dataset, python, platform, started (UTC), command, processor, and T_camera_lidar
+(JSON) for KITTI."""
+CONFIG_METADATA = "segslam.config"
+"""Metadata record: the effective settings under the key `yaml`."""
+OPTIONS_METADATA = "segslam.options"
+"""Metadata record: options beside the settings, such as the source of the labels; empty for a replay."""
+PACKAGES_METADATA = "segslam.packages"
+"""Metadata record: package -> version."""
+
+CHECK_METADATA = "segslam.check"
+"""Metadata record: `crc32`, the checksum of the other records, because MCAP has none; missing in older logs."""
+
+
+def checksum(metadata: Mapping[str, Mapping[str, str]]) -> int:
+    """CRC-32 of metadata records."""
+    named = {name: dict(values) for name, values in metadata.items() if name != CHECK_METADATA}
+    return zlib.crc32(json.dumps(named, sort_keys=True).encode())
+
+
+def json_schemas() -> dict[str, dict[str, Any]]:
+    """Topic -> JSON Schema of its messages, for topics without a Foxglove schema."""
+    estimate = codec(GraphEstimate).schema
+    keyframe_ids = {"keyframe_ids": {"type": "array", "items": {"type": "integer"}}}
+    estimate = estimate | {"properties": estimate["properties"] | keyframe_ids}
+    return {
+        STEP: codec(Step).schema | {"title": "segslam.Step"},
+        ESTIMATE: estimate | {"title": "segslam.Estimate"},
+        MEMORY: {"title": "segslam.Memory", "type": "object", "properties": {"rss_mb": {"type": "number"}}},
+        RESULT: codec(Trajectory).schema | {"title": "segslam.Result"},
+        ADJUSTMENT: codec(Adjustment).schema | {"title": "segslam.Adjustment"},
+        LATE_LOOPS: codec(LateLoops).schema | {"title": "segslam.LateLoops"},
+        REFERENCE: codec(Trajectory).schema | {"title": "segslam.Reference"},
+    }
+
+
+def schema_text(schema: dict[str, Any]) -> bytes:
+    """A JSON Schema as stored in the file."""
+    return json.dumps(schema).encode()
+
+
+def is_readable(written: dict[str, Any], own: dict[str, Any]) -> bool:
+    """True if records written with one JSON Schema contain all fields that a reader of `own` needs, with equal types.
+
+    Fields that only the writer knows are ignored. Fields that only the reader knows are optional if they have a
+    default.
+    """
+    if any(written.get(key) != own.get(key) for key in ("type", "description")):
+        return False
+    parts = [(written, own, key) for key in ("items", "additionalProperties") if key in own]
+    given = written.get("properties", {})
+    for name in own.get("properties", {}):
+        if name in given:
+            parts.append((given, own["properties"], name))
+        elif name in own.get("required", ()):
+            return False
+    return all(key in theirs and is_readable(theirs[key], ours[key]) for theirs, ours, key in parts)

@@ -1,0 +1,260 @@
+"""Writes the steps of a run to an MCAP file that is readable up to its last complete step at any time."""
+
+import json
+import resource
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import IO, Any, cast
+
+from mcap.writer import CompressionType, Writer
+
+from segslam.core.config import Config
+from segslam.core.types import (
+    GraphEstimate,
+    Keyframe,
+    Labels,
+    LateLoops,
+    LoopAttempt,
+    Points,
+    SegslamError,
+    Step,
+    Trajectory,
+    Transform,
+    WorkFailed,
+)
+from segslam.output.log import schema
+from segslam.output.log.channels import channels
+from segslam.output.log.cloud import KeyframePoints, keyframe_points, points_and_labels
+from segslam.output.log.container import messages_within
+from segslam.output.log.drawing import Drawing, Topical, ground_truth
+from segslam.output.log.messages import warning
+from segslam.output.log.origin import metadata
+from segslam.output.log.output import Output
+from segslam.output.log.records import codec
+from segslam.slam.adjustment import Adjusted, Adjustment
+
+POSES_PER_KEYFRAME = 50
+"""Chosen: number of logged poses of estimates per keyframe, about 4 kB each, so that the log grows with the drive
+only. All estimates are logged until the limit is reached; then every second estimate, and so on."""
+CHUNK_BYTES = 4 * 2**20
+"""Larger than any step: a chunk ends with its step, so that a step is complete or missing."""
+
+_STATM = Path("/proc/self/statm")
+
+Encoded = tuple[str, bytes]
+"""Topic and data of a message."""
+Mirror = Callable[[str, bytes, int], None]
+"""Called with topic, data and stamp (ns) of each message after it is written."""
+
+
+class LogWriter:
+    """Writes the steps of a run as they come; a context manager.
+
+    Each step is passed to the operating system as one compressed chunk with a checksum before `write` returns: a slow
+    disk delays the run, and memory does not grow. A full or failing disk raises WorkFailed and leaves a file that ends
+    with the last complete step. Ctrl-C takes effect after a step is complete.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        config: Config,
+        dataset: str = "",
+        T_camera_lidar: Transform | None = None,
+        reference: Trajectory | None = None,
+        options: Mapping[str, str] = MappingProxyType({}),
+        mirror: Mirror | None = None,
+    ) -> None:
+        """`reference`: true poses; `T_camera_lidar`: calibration of KITTI data. A replay has no other source for both.
+
+        `options` are options beside the settings, which must be the same when the run is resumed.
+        `mirror` is called with each message that is written.
+        """
+        self._mirror = mirror
+        self._path = path
+        self._drawing = Drawing(config.log)
+        self._resolution_m = config.keyframes.resolution_m
+        self._stamp_ns = 0
+        self._num_poses = 0
+        self._newest: Keyframe | None = None
+        self._steps_of_keyframes: dict[int, tuple[int, int]] = {}
+        """Position in the file, and size, of the step of each keyframe."""
+        try:
+            self._output = Output(path)
+        except OSError as error:
+            raise SegslamError(f"{path}: cannot write the log ({error.strerror}); give another folder") from error
+        compression = CompressionType[config.log.compression.upper()]
+        self._mcap = Writer(cast(IO[bytes], self._output), chunk_size=CHUNK_BYTES, compression=compression)
+        with self._whole():
+            self._mcap.start(library=f"segslam {version('segslam')}")
+            for name, data in metadata(config, dataset, T_camera_lidar, options).items():
+                self._mcap.add_metadata(name, data)
+            self._channels = _register_channels(self._mcap)
+        if reference is not None and len(reference):
+            self._write(_reference_messages(reference), stamp_ns=int(reference.stamp_ns[0]))
+
+    def write(self, step: Step) -> None:
+        """Add a step."""
+        written = self._write(self._step_messages(step), stamp_ns=step.stamp_ns)
+        if step.keyframe is not None:
+            self._steps_of_keyframes[step.keyframe.id] = written
+
+    def warn(self, text: str) -> None:
+        """Add a warning to `/log`, at the time of the last step."""
+        self._write(_serialised([(schema.LOG, warning(text, stamp_ns=self._stamp_ns))]), stamp_ns=self._stamp_ns)
+
+    def keep(self, keyframe: Keyframe) -> None:
+        """Keep the newest keyframe in memory until its step is written: `Clouds` of segslam.keyframes."""
+        self._newest = keyframe
+
+    def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
+        """Points and labels of a keyframe, read from the file. Raises SegslamError if the log is closed.
+
+        Another thread may write the next step meanwhile.
+        """
+        newest = self._newest
+        if newest is not None and newest.id == keyframe_id:
+            return newest.points, newest.labels
+        offset, size = self._steps_of_keyframes[keyframe_id]
+        try:
+            records = self._output.read(offset, size)
+        except (OSError, ValueError) as error:  # ValueError: closed, perhaps just now
+            raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read, the log is closed") from error
+        for channel_id, data in messages_within(records):
+            if channel_id == self._channels[schema.KEYFRAME]:
+                return points_and_labels(KeyframePoints.FromString(data))
+        raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
+
+    def write_result(
+        self,
+        estimate: GraphEstimate,
+        trajectory: Trajectory,
+        late_loops: tuple[LoopAttempt, ...] = (),
+        adjusted: Adjusted | None = None,
+    ) -> None:
+        """Write the final estimate, the pose of every scan, loops tried after the last scan, and the adjustment."""
+        drawn = self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns)
+        whole_map = self._drawing.draw_map(estimate, self.cloud, stamp_ns=self._stamp_ns)
+        messages = [*_serialised(whole_map), *_serialised(drawn), _estimate_message(estimate)]
+        if late_loops:
+            messages.append((schema.LATE_LOOPS, _json(LateLoops, LateLoops(late_loops))))
+        if adjusted is not None:
+            path = self._drawing.draw_path(adjusted.before, stamp_ns=self._stamp_ns)
+            messages += [*_serialised([path]), (schema.ADJUSTMENT, _json(Adjustment, adjusted.record))]
+        self._write([*messages, (schema.RESULT, _json(Trajectory, trajectory))], stamp_ns=self._stamp_ns)
+
+    def move(self, path: Path) -> None:
+        """Replace the file `path`, after all data written here is safely on the disk."""
+        try:
+            self._output.sync()
+            self._path.replace(path)
+        except OSError as error:
+            raise WorkFailed(f"{path}: cannot be replaced by {self._path} ({error.strerror})") from error
+        self._path = path
+
+    def close(self) -> None:
+        """Write the index. A log without index is readable, but slower to search."""
+        if not self._output.closed:
+            with self._whole():
+                self._mcap.finish()
+            self._output.close()
+
+    def __enter__(self) -> "LogWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _step_messages(self, step: Step) -> Iterator[Encoded]:
+        """The messages of a step. The step itself is last: it marks the others as complete."""
+        logs_estimate = step.estimate is not None and self._affords(len(step.estimate.T_world_keyframe))
+        yield from _serialised(self._drawing.draw(step, path=logs_estimate))
+        if (rss_mb := _rss_mb()) is not None:
+            yield schema.MEMORY, json.dumps({"rss_mb": rss_mb}).encode()
+        if step.keyframe is not None:
+            yield schema.KEYFRAME, keyframe_points(step.keyframe, resolution_m=self._resolution_m).SerializeToString()
+        if step.estimate is not None and logs_estimate:
+            yield _estimate_message(step.estimate)
+        yield schema.STEP, _json(Step, step)
+
+    def _affords(self, num_poses: int) -> bool:
+        """True if the logged estimates may contain this many more poses; counts them if so."""
+        if self._num_poses + num_poses > POSES_PER_KEYFRAME * num_poses:
+            return False
+        self._num_poses += num_poses
+        return True
+
+    def _write(self, messages: Iterable[Encoded], *, stamp_ns: int) -> tuple[int, int]:
+        """Position in the file, and size."""
+        if stamp_ns < 0:
+            raise SegslamError(f"{self._path}: stamp {stamp_ns} ns is negative; shift the stamps of the scans")
+        encoded = list(messages)  # before writing: an encoding error must not leave half a step
+        self._stamp_ns = stamp_ns
+        with self._whole():
+            offset = self._output.tell()
+            for topic, data in encoded:
+                self._mcap.add_message(self._channels[topic], stamp_ns, data, stamp_ns)
+            self._mcap.flush()
+            written = offset, self._output.tell() - offset
+        if self._mirror is not None:
+            for topic, data in encoded:
+                self._mirror(topic, data, stamp_ns)
+        return written
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        """As `Output.whole`, with a message for a disk failure."""
+        if self._output.closed:
+            raise SegslamError(f"{self._path}: the log is closed; open another log to write more")
+        try:
+            with self._output.whole():
+                yield
+        except OSError as error:
+            raise WorkFailed(
+                f"{self._path}: cannot continue writing the log ({error.strerror}); free space on the disk; "
+                "the log ends with the last complete step"
+            ) from error
+
+
+def _register_channels(mcap: Writer) -> dict[str, int]:
+    """Channel by topic; all topics and their schemas are written at the start of the file."""
+    schema_ids: dict[str, int] = {}
+    found: dict[str, int] = {}
+    for topic, encoding, name, schema_encoding, description in channels():
+        if name not in schema_ids:
+            schema_ids[name] = mcap.register_schema(name, schema_encoding, description)
+        found[topic] = mcap.register_channel(topic, encoding, schema_ids[name])
+    return found
+
+
+def _serialised(drawn: Iterable[Topical]) -> Iterator[Encoded]:
+    for topic, message in drawn:
+        yield topic, message.SerializeToString()
+
+
+def _estimate_message(estimate: GraphEstimate) -> Encoded:
+    return schema.ESTIMATE, _json(GraphEstimate, estimate, keyframe_ids=list(estimate.T_world_keyframe))
+
+
+def _reference_messages(reference: Trajectory) -> Iterator[Encoded]:
+    yield from _serialised([ground_truth(reference, stamp_ns=int(reference.stamp_ns[0]))])
+    yield schema.REFERENCE, _json(Trajectory, reference)
+
+
+def _rss_mb() -> float | None:
+    """Memory of the process; None without /proc."""
+    try:
+        pages = int(_STATM.read_text().split()[1])
+    except OSError:
+        return None
+    return round(pages * resource.getpagesize() / 2**20, 1)
+
+
+def _json(record: type, value: Any, **more: Any) -> bytes:
+    return json.dumps(codec(record).encode(value) | more, allow_nan=False).encode()

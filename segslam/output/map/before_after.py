@@ -1,0 +1,149 @@
+"""The map from odometry alone beside the corrected map, with a detail of the place where loop closing changed most.
+
+Each pixel counts the points in it, in top view: walls are sharp lines in an accurate map and blurred in another.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from segslam.core import geometry
+from segslam.core.points import within_range
+from segslam.core.types import GROUND_LABELS, GraphEstimate, Keyframe, Label, Points, Transform
+from segslam.output.map.from_above import draw_path, png, scale_bar
+from segslam.output.map.overhead import cut_heights, visible
+from segslam.output.map.part import Window
+
+MOST_PIXELS = 900
+"""Chosen: largest number of pixels along the longer side of a panel."""
+FINEST_M = 0.1
+"""Chosen: smallest size of a pixel, about the error of a keyframe's pose."""
+REACH_M = 40.0
+"""Chosen: points farther from their keyframe are not drawn; they are sparse and blur both maps."""
+DETAIL_M = 30.0
+"""Chosen: smallest half width of the detail."""
+TRUSTED = 0.5
+"""Closures with at least this weight are kept by the optimiser."""
+NO_LOOP = "after: adjusted as a whole; no loop was found"
+BEFORE, AFTER, BACKGROUND = "#E69F00", "#56B4E9", "#10141a"
+
+
+class BeforeAfter:
+    """Draws the figure from keyframes added one by one."""
+
+    def __init__(
+        self, T_odom_keyframe: Mapping[int, Transform], estimate: GraphEstimate, keyframes: Iterable[Keyframe] = ()
+    ) -> None:
+        """Takes the poses of all keyframes by odometry, and the last estimate.
+
+        `keyframes`: those whose points show where ceilings hang over the path, which are not drawn; see `overhead`.
+        """
+        first = min(T_odom_keyframe)
+        T_world_odom = estimate.T_world_keyframe[first] @ geometry.inverse(T_odom_keyframe[first])
+        poses = {keyframe_id: T_world_odom @ T for keyframe_id, T in T_odom_keyframe.items()}
+        self._maps = (poses, estimate.T_world_keyframe)
+        self._path_m = np.array([T[:3, 3] for _, T in sorted(estimate.T_world_keyframe.items())])
+        self._cut_m = cut_heights(self._path_m, (self._placed(keyframe) for keyframe in keyframes))
+        whole = _around(np.array([T[:2, 3] for poses in self._maps for T in poses.values()]), REACH_M / 2)
+        self._whole = [_Density(whole) for _ in self._maps]
+        self._loops = [pair for pair, weight in estimate.closure_weights.items() if weight >= TRUSTED]
+        detail = most_changed(*self._maps, self._loops)
+        self._detail = [] if detail is None else [_Density(window) for window in _details(self._maps, detail)]
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Draw a keyframe into both maps."""
+        stands = ~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8)) & (keyframe.labels < Label.MOVING_CAR)
+        stands &= within_range(keyframe.points, 0.0, REACH_M)
+        stands &= visible(self._placed(keyframe), self._path_m, self._cut_m)
+        points = keyframe.points[stands].astype(np.float64)
+        for number, poses in enumerate(self._maps):
+            placed = geometry.apply(poses[keyframe.id], points)
+            for panels in (self._whole, self._detail):
+                if panels:
+                    panels[number].add(placed)
+
+    def _placed(self, keyframe: Keyframe) -> Points:
+        return geometry.apply(self._maps[1][keyframe.id], keyframe.points.astype(np.float64))
+
+    def draw(self) -> bytes:
+        """The figure as a PNG: the whole maps above, the detail of the largest change below, if there are closures."""
+        rows = [panels for panels in (self._whole, self._detail) if panels]
+        heights = [panels[0].height_per_width for panels in rows]
+        layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
+        figure = Figure(figsize=(12.0, 6.0 * sum(heights) + 0.5), facecolor=BACKGROUND, layout=layout)
+        grid = figure.subplots(len(rows), 2, squeeze=False, height_ratios=heights)
+        num = len(self._loops)
+        titles = ("before: odometry only", f"after: corrected by {num} loop{'s' * (num != 1)}" if num else NO_LOOP)
+        for row, panels in zip(grid, rows, strict=True):
+            brightest = max(panel.brightest() for panel in panels)
+            for axes, panel, poses, color in zip(row, panels, self._maps, (BEFORE, AFTER), strict=True):
+                panel.show(axes, brightest)
+                draw_path(axes, np.array([T[:3, 3] for T in poses.values()]), color=color, width=1.4)
+                panel.frame(axes)
+        for axes, title in zip(grid[0], titles, strict=True):
+            axes.set_title(title, color="white", fontsize=15)
+        return png(figure)
+
+
+class _Density:
+    """Number of points in each pixel of a window."""
+
+    def __init__(self, window: Window) -> None:
+        west, east, south, north = self._window = window
+        width_m, height_m = east - west, north - south
+        self._pixel_m = max(FINEST_M, max(width_m, height_m) / MOST_PIXELS)
+        self._counts = np.zeros((int(height_m / self._pixel_m) + 1, int(width_m / self._pixel_m) + 1), np.uint32)
+        self.height_per_width = height_m / width_m
+
+    def add(self, points: Points) -> None:
+        """Count points (n, 3) of the world."""
+        column, row = ((points[:, :2] - [self._window[0], self._window[2]]) // self._pixel_m).astype(np.int64).T
+        rows, columns = self._counts.shape
+        seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        np.add.at(self._counts, (row[seen], column[seen]), 1)
+
+    def brightest(self) -> float:
+        """A count that few pixels exceed."""
+        counted = self._counts[self._counts > 0]
+        return float(np.percentile(counted, 99)) if len(counted) else 1.0
+
+    def show(self, axes: Axes, brightest: float) -> None:
+        """Draw the logarithm of the counts."""
+        west, east, south, north = self._window
+        image = np.log1p(self._counts) / np.log1p(brightest)
+        extent = (west, east, south, north)
+        axes.imshow(image, origin="lower", extent=extent, cmap="bone", vmin=0.0, vmax=1.0, interpolation="antialiased")
+
+    def frame(self, axes: Axes) -> None:
+        """Set the axis limits and add a scale bar; no ticks."""
+        west, east, south, north = self._window
+        axes.set(xlim=(west, east), ylim=(south, north), xticks=[], yticks=[], facecolor=BACKGROUND)
+        scale_bar(axes, east - west, color="white")
+
+
+def most_changed(
+    before: Mapping[int, Transform], after: Mapping[int, Transform], loops: Iterable[tuple[int, int]]
+) -> tuple[int, int] | None:
+    """The loop (source, target) whose relative pose changed most; None without loops."""
+
+    def moved_m(loop: tuple[int, int]) -> float:
+        T_before, T_after = (geometry.inverse(poses[loop[1]]) @ poses[loop[0]] for poses in (before, after))
+        return geometry.distance(geometry.inverse(T_after) @ T_before)
+
+    return max(loops, key=moved_m, default=None)
+
+
+def _around(xy: np.ndarray, margin_m: float) -> Window:
+    (west, south), (east, north) = xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m
+    return float(west), float(east), float(south), float(north)
+
+
+def _details(maps: Iterable[Mapping[int, Transform]], loop: tuple[int, int]) -> list[Window]:
+    """A window of each map around both ends of a loop; all have one size, so that the panels have one scale."""
+    ends = np.array([[poses[keyframe_id][:2, 3] for keyframe_id in loop] for poses in maps])
+    apart_m = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max())
+    half_m = DETAIL_M + min(apart_m, DETAIL_M)
+    return [(x - half_m, x + half_m, y - half_m / 1.6, y + half_m / 1.6) for x, y in ends.mean(axis=1)]

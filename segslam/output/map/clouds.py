@@ -1,0 +1,171 @@
+"""Point cloud files written piece by piece: PLY, PCD, LAS and LAZ."""
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from segslam.core.config import MapConfig
+from segslam.core.extras import how_to_install
+from segslam.core.types import Label, Points, SegslamError
+from segslam.gnss.geodesy import Origin
+from segslam.output.map.part import Extent, Part
+
+PLY_ROW = [("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")]
+PCD_ROW = [("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")]
+INTENSITY = [("intensity", "<f4")]
+"""Last column, if intensities are known."""
+HEADER_BYTES = 512
+"""Bytes reserved for the header, which is written last because it contains the number of points."""
+LAS_SCALE_M = 0.001
+ASPRS_OF_LABEL = {
+    Label.ROAD: 11,
+    Label.PARKING: 11,
+    Label.SIDEWALK: 2,
+    Label.OTHER_GROUND: 2,
+    Label.TERRAIN: 2,
+    Label.BUILDING: 6,
+    Label.VEGETATION: 5,
+    Label.TRUNK: 5,
+}
+"""Classes of the LAS 1.4 specification, table 17: 2 ground, 5 high vegetation, 6 building, 11 road; else 1."""
+
+
+class PlyCloud:
+    """Binary PLY: x y z (float32, m), red green blue, label (SemanticKITTI learning id), intensity if known."""
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        self._stream = _begin(file)
+        self._more = [] if extent.brightest is None else INTENSITY
+        self._row = np.dtype([*PLY_ROW, *self._more])
+        self._num_points = 0
+
+    def add(self, part: Part) -> None:
+        """Append the points of a part."""
+        rows = np.empty(len(part.points), self._row)
+        rows["xyz"], rows["rgb"], rows["label"] = part.points, part.colors, part.labels
+        for name, _ in self._more:
+            rows[name] = part.intensities
+        rows.tofile(self._stream)
+        self._num_points += len(rows)
+
+    def close(self) -> None:
+        """Complete the file."""
+        lines = [
+            "ply",
+            "format binary_little_endian 1.0",
+            f"element vertex {self._num_points}",
+            *(f"property float {name}" for name in "xyz"),
+            *(f"property uchar {name}" for name in ("red", "green", "blue", "label")),
+            *(f"property float {name}" for name, _ in self._more),
+        ]
+        _end(self._stream, lines, filler="comment", last="end_header")
+
+
+class PcdCloud:
+    """Binary PCD 0.7: x y z (float32, m), rgb packed as in PCL, label, intensity if known."""
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        self._stream = _begin(file)
+        self._more = [] if extent.brightest is None else INTENSITY
+        self._row = np.dtype([*PCD_ROW, *self._more])
+        self._num_points = 0
+
+    def add(self, part: Part) -> None:
+        """Append the points of a part."""
+        rows = np.zeros(len(part.points), self._row)
+        rows["xyz"], rows["label"] = part.points, part.labels
+        rows["bgra"][:, :3] = part.colors[:, ::-1]
+        for name, _ in self._more:
+            rows[name] = part.intensities
+        rows.tofile(self._stream)
+        self._num_points += len(rows)
+
+    def close(self) -> None:
+        """Complete the file."""
+        names = ["x", "y", "z", "rgb", "label", *(name for name, _ in self._more)]
+        lines = [
+            "VERSION 0.7",
+            f"FIELDS {' '.join(names)}",
+            f"SIZE{' 4' * len(names)}",
+            f"TYPE {' '.join('U' if name == 'label' else 'F' for name in names)}",
+            f"COUNT{' 1' * len(names)}",
+            f"WIDTH {self._num_points}",
+            "HEIGHT 1",
+            "VIEWPOINT 0 0 0 1 0 0 0",
+            f"POINTS {self._num_points}",
+        ]
+        _end(self._stream, lines, filler="#", last="DATA binary")
+
+
+class LasCloud:
+    """LAS 1.4, point format 7, in millimetres, with colours and ASPRS classes; compressed if the name ends in .laz.
+
+    With the origin of the world frame on the globe, coordinates are UTM, with ellipsoidal heights. `user_data` holds
+    the label (SemanticKITTI learning id). Intensities are scaled to 16 bits, as LAS requires.
+    """
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        import laspy  # type: ignore[import-untyped]  # an optional package
+
+        self._laspy = laspy
+        header = laspy.LasHeader(version="1.4", point_format=7)
+        header.scales = np.full(3, LAS_SCALE_M)
+        self._intensity_step = None if extent.brightest is None else (extent.brightest or 1.0) / 65535
+        self._projected: Callable[[Points], Points] = np.asarray
+        if extent.origin is not None:
+            self._projected = _utm(extent.origin, header)
+        self._writer = laspy.open(file, mode="w", header=header)
+        self._class_of_label = np.array([ASPRS_OF_LABEL.get(label, 1) for label in Label], np.uint8)
+
+    def add(self, part: Part) -> None:
+        """Append the points of a part."""
+        record = self._laspy.ScaleAwarePointRecord.zeros(len(part.points), header=self._writer.header)
+        record.x, record.y, record.z = self._projected(part.points.astype(np.float64)).T
+        record.red, record.green, record.blue = 257 * part.colors.astype(np.uint16).T  # 255 to 65535
+        record.classification, record.user_data = self._class_of_label[part.labels], part.labels
+        if self._intensity_step is not None:
+            record.intensity = np.rint(part.intensities / self._intensity_step).astype(np.uint16)
+        self._writer.write_points(record)
+
+    def close(self) -> None:
+        """Complete the file."""
+        self._writer.close()
+
+
+def _utm(origin: Origin, header: Any) -> Callable[[Points], Points]:
+    """UTM coordinates of points, whose zone and offsets are written into the header of a LAS file."""
+    from pyproj import CRS
+
+    from segslam.output.map.projected import Utm
+
+    utm = Utm(origin)
+    header.offsets = np.floor(utm(np.zeros((1, 3)))[0])
+    header.add_crs(CRS.from_epsg(utm.epsg))
+    return utm
+
+
+def check_las(file: Path, *, is_projected: bool) -> None:
+    """Raises SegslamError if the packages for LAS and LAZ, and those for coordinate systems, are missing."""
+    missing = [name for name in ("laspy", "lazrs") if find_spec(name) is None]
+    if missing:
+        raise SegslamError(f"{file}: LAS and LAZ need extra packages: {how_to_install('las')}; .ply and .pcd do not")
+    if is_projected and find_spec("pyproj") is None:
+        raise SegslamError(f"{file}: a coordinate system needs extra packages: {how_to_install('geo')}; .ply does not")
+
+
+def _begin(file: Path) -> BinaryIO:
+    stream = file.open("wb")
+    stream.write(bytes(HEADER_BYTES))
+    return stream
+
+
+def _end(stream: BinaryIO, lines: list[str], *, filler: str, last: str) -> None:
+    """Write the header into the reserved bytes, padded with a comment, and close the file."""
+    text = "".join(f"{line}\n" for line in lines)
+    spaces = HEADER_BYTES - len(text) - len(filler) - len(last) - 2
+    stream.seek(0)
+    stream.write(f"{text}{filler}{' ' * spaces}\n{last}\n".encode("ascii"))
+    stream.close()

@@ -1,0 +1,66 @@
+"""Free range of each keyframe: distance, by direction, up to which it sees the ground and no obstacle.
+
+Beams hit the ground in rings. There are no points between two rings, but the ray to the outer ring passed over the gap.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from segslam.core.types import GROUND_LABELS, Label, Labels, Points, Vector
+from segslam.output.map.lowest_ground import OBSTACLE_M, lowest_ground
+from segslam.output.map.tiles import Tile, distance_m
+
+NUM_DIRECTIONS = 720
+"""Chosen: steps of half a degree; one step is a cell of 0.2 m at 23 m."""
+REACH_M = 40.0
+"""Chosen: at larger ranges, grazing beams leave gaps between rings that may hide obstacles."""
+
+
+class FreeRanges:
+    """The free range of each keyframe, by direction in the world."""
+
+    def __init__(self) -> None:
+        self._places: list[Vector] = []
+        self._free_m: list[Vector] = []
+
+    def add(self, points: Points, labels: Labels, place: Vector) -> None:
+        """Add a keyframe: its points (n, 3) in the world, and its position."""
+        self._places.append(place[:2])
+        self._free_m.append(free_range_m(points - place, labels, low_m=OBSTACLE_M[0], high_m=OBSTACLE_M[1]))
+
+    def free(self, tile: Tile, places: Float[np.ndarray, "_ 2"]) -> Iterator[np.ndarray]:
+        """For each keyframe near a tile: whether each of the places (n, 2) is within its free range."""
+        for place, free_m in zip(self._places, self._free_m, strict=True):
+            if distance_m(tile, place) >= REACH_M:
+                continue
+            x, y = (places - place).T
+            yield np.hypot(x, y) < free_m[_direction(x, y)]
+
+
+def free_range_m(points: Points, labels: Labels, *, low_m: float, high_m: float) -> Vector:
+    """(NUM_DIRECTIONS,) free range (m) in each direction. Points (n, 3) are relative to the sensor.
+
+    An obstacle has points from `low_m` to `high_m` above the ground; points of moving classes do not count.
+    """
+    near = np.abs(points[:, :2]).max(axis=1, initial=0.0) < REACH_M
+    near &= labels < Label.MOVING_CAR
+    points, labels = points[near], labels[near]
+    if not len(points):
+        return np.zeros(NUM_DIRECTIONS)
+    is_ground = np.isin(labels, np.array(GROUND_LABELS, np.uint8))
+    within = points + np.array([REACH_M, REACH_M, 0.0])
+    height_m = points[:, 2] - lowest_ground(within, within[is_ground] if is_ground.any() else within, 2 * REACH_M)
+    stands = (height_m >= low_m) & (height_m <= high_m) & ~is_ground
+    range_m, direction = np.hypot(points[:, 0], points[:, 1]), _direction(points[:, 0], points[:, 1])
+    farthest, nearest = np.zeros(NUM_DIRECTIONS), np.full(NUM_DIRECTIONS, np.inf)
+    flat = is_ground | (height_m < low_m)
+    np.maximum.at(farthest, direction[flat], range_m[flat])
+    np.minimum.at(nearest, direction[stands], range_m[stands])
+    return np.minimum(farthest, nearest)
+
+
+def _direction(x: Vector, y: Vector) -> np.ndarray:
+    turn = (np.arctan2(y, x) / (2 * np.pi)) % 1.0
+    return (turn * NUM_DIRECTIONS).astype(np.int64) % NUM_DIRECTIONS

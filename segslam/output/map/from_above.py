@@ -1,0 +1,112 @@
+"""Drawing of top-view images: one image pixel per map pixel, with a scale bar."""
+
+import io
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from PIL import Image
+
+from segslam.core.types import Points
+from segslam.output.map.part import Window
+
+DPI = 100
+PATH = "#d62728"
+SMALL_PX = 1500
+"""Chosen: a little more than the width of the report."""
+LEGEND_PX, LEAST_PX = 190, 700
+"""Chosen: width of the legend, and smallest width of the map."""
+
+
+def drawn_map(
+    image: np.ndarray, window: Window, *, path_m: Points, title: str, marks: Iterable[tuple[str, str]]
+) -> bytes:
+    """A PNG of a map in top view: an image (rows, columns, 3), a path, a scale bar, and a legend beside it."""
+    height, width = image.shape[:2]
+    zoom = max(1.0, LEAST_PX / width)
+    large = max(1.0, zoom * width / SMALL_PX)  # text stays readable in a reduced picture
+    share = zoom * width / (zoom * width + large * LEGEND_PX)
+    figure = Figure(figsize=((zoom * width + large * LEGEND_PX) / DPI, zoom * height / DPI), facecolor="none")
+    axes, legend = (figure.add_axes(place) for place in ((0.0, 0.0, share, 1.0), (share, 0.0, 1.0 - share, 1.0)))
+    draw_path(axes, path_m, color=PATH, width=1.5 * large)
+    scale_bar(axes, window[1] - window[0], color="black", size=11.0 * large)
+    axes.set(xlim=window[:2], ylim=window[2:])
+    axes.axis("off")
+    legend.axis("off")
+    handles = [
+        Line2D([], [], color=color, marker="s", linestyle="", label=text, markersize=6 * large) for text, color in marks
+    ]
+    handles.insert(0, Line2D([], [], color=PATH, label="trajectory"))
+    size = 10.0 * large
+    legend.legend(
+        handles=handles,
+        title=title,
+        loc="upper left",
+        frameon=False,
+        fontsize=size,
+        title_fontsize=size,
+        alignment="left",
+    )
+    return _png_over(image, (round(zoom * width), round(zoom * height)), figure)
+
+
+def _png_over(image: np.ndarray, size: tuple[int, int], figure: Figure) -> bytes:
+    """A PNG of the image, scaled to a size, with the figure over it. `imshow` would take 120 bytes for each pixel."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    drawn = Image.fromarray(np.asarray(canvas.buffer_rgba()))
+    picture = Image.new("RGB", drawn.size, "white")
+    picture.paste(Image.fromarray(image).resize(size, Image.Resampling.NEAREST))
+    picture.paste(drawn, mask=drawn)
+    content = io.BytesIO()
+    picture.save(content, format="png")
+    return content.getvalue()
+
+
+def scale_bar(axes: Axes, width_m: float, *, color: str, size: float = 11.0) -> None:
+    """Draw a bar of a round length, at most a quarter of the shown width, in the lower left corner."""
+    length_m = round_length_m(width_m / 4)
+    share = length_m / width_m
+    left, low = 0.03, 0.035
+    axes.plot(
+        [left, left + share], [low, low], color=color, linewidth=4, solid_capstyle="butt", transform=axes.transAxes
+    )
+    text = f"{length_m:g} m" if length_m < 1000 else f"{length_m / 1000:g} km"
+    axes.text(left, low + 0.012, text, color=color, fontsize=size, transform=axes.transAxes, va="bottom")
+
+
+def round_length_m(longest_m: float) -> float:
+    """The largest length of 1, 2 or 5 times a power of ten below the limit."""
+    power = 10.0 ** math.floor(math.log10(longest_m))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= longest_m * (1 + 1e-9))
+
+
+def draw_path(axes: Axes, path_m: Points | Sequence[Points], *, color: str, width: float) -> None:
+    """Draw a trajectory, (n, 3) positions in order, and its start."""
+    xy = np.asarray(path_m)[:, :2]
+    axes.plot(*xy.T, color=color, linewidth=width, solid_joinstyle="round")
+    axes.plot(*xy[0], "o", color=color, markersize=3 + 2 * width, markeredgecolor="white", markeredgewidth=0.8)
+
+
+def small_png(file: Path) -> bytes:
+    """A PNG file, reduced to `SMALL_PX` along its longer side if it is larger."""
+    with Image.open(file) as image:
+        if max(image.size) <= SMALL_PX:
+            return file.read_bytes()
+        small = image.convert("RGB")
+        small.thumbnail((SMALL_PX, SMALL_PX))
+        content = io.BytesIO()
+        small.save(content, format="png")
+        return content.getvalue()
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG at `DPI`; equal data give equal bytes."""
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=DPI, metadata={"Software": None})
+    return image.getvalue()

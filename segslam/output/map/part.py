@@ -1,0 +1,62 @@
+"""Input of the map writers: the extent of the map, then its parts."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from segslam.core.config import MapConfig
+from segslam.core.types import Labels, Points, Vector
+from segslam.gnss.geodesy import Origin
+from segslam.labels.class_colors import Colors
+from segslam.output.map.free_ranges import FreeRanges
+from segslam.output.map.tiles import Tile
+
+Window = tuple[float, float, float, float]
+"""West, east, south and north end of an image (m)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extent:
+    """Range of tiles of a map: columns `west` to `east`, rows `south` to `north`, all included."""
+
+    west: int
+    east: int
+    south: int
+    north: int
+    brightest: float | None
+    """Upper bound of the intensities; None if intensities are unknown."""
+    path_m: Points
+    """Positions of the keyframes in the world, in order (m)."""
+    span: tuple[float, float]
+    """Both ends of the colour scale, for heights or intensities."""
+    free_ranges: FreeRanges
+    """Free space observed by the keyframes."""
+    cut_m: Vector | None = None
+    """Heights (n,) of `overhead.cut_heights` for each position of the path; None if no picture is drawn."""
+    origin: Origin | None = None
+    """Place of the world frame (east, north, up) on the globe, if it is known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """The clean voxels of one tile; `points` (n, 3) float64 in the world (m)."""
+
+    tile: Tile
+    points: Points
+    labels: Labels
+    intensities: Vector
+    """Mean intensity in the sensor's unit; 0 if unknown."""
+    colors: Colors
+
+
+class MapFile(Protocol):
+    """A map file while it is written. Parts come by rows from north to south, each row from west to east."""
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        """Open the file."""
+
+    def add(self, part: Part) -> None:
+        """Write the points of a part, or store the data needed of them."""
+
+    def close(self) -> None:
+        """Complete the file."""

@@ -1,0 +1,139 @@
+"""Top view of a map as a PNG: shaded by height, with the trajectory, a scale bar and a legend."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, uniform_filter
+
+from segslam.core.config import MapConfig
+from segslam.labels.class_colors import COLORS
+from segslam.output.map.colors import scale_of
+from segslam.output.map.overhead import visible
+from segslam.output.map.part import Extent, Part, Window
+from segslam.output.map.tiles import TILE_M, corner
+
+MAX_SIDE = 4000
+"""Largest number of pixels along the longer side; limits the memory."""
+MARGIN_M = 4.0
+BACKGROUND = 255
+SHADED_M = 3.0
+"""Chosen: the shading of a height is relative to the mean height in a square of this size."""
+GAP_PX = 1.5
+"""Chosen: a pixel is filled if one of its 8 neighbours is known."""
+BAND_PX = 256
+"""Rows of the image that are shaded at once; the result does not depend on it."""
+RELIEF_M, CONTRAST = 1.5, 0.35
+"""Chosen: height difference with strong shading, and strength of the shading."""
+
+
+class Picture:
+    """Top view with north (y) up; the highest point of a pixel is visible, below ceilings: see `overhead`."""
+
+    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+        self._file = file
+        self._extent = extent
+        self._color = config.color
+        columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
+        self._pixels = max(min(round(TILE_M / config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
+        size = rows * self._pixels, columns * self._pixels
+        self._image = np.full((*size, 3), BACKGROUND, np.uint8)
+        self._height_m = np.full(size, np.nan, np.float32)
+        self._labels: set[int] = set()
+
+    def add(self, part: Part) -> None:
+        """Draw a part into its area of the image."""
+        cut_m = self._extent.cut_m
+        seen = np.arange(len(part.points))
+        if cut_m is not None:
+            seen = seen[visible(part.points, self._extent.path_m, cut_m)]
+        order = seen[np.argsort(part.points[seen, 2], kind="stable")]  # the last assignment to a pixel remains
+        inside = (part.points[order] - corner(part.tile))[:, :2] / TILE_M * self._pixels
+        column, row = np.clip(inside.astype(np.int64), 0, self._pixels - 1).T
+        top = (self._extent.north - part.tile[1]) * self._pixels
+        left = (part.tile[0] - self._extent.west) * self._pixels
+        square = np.s_[top : top + self._pixels, left : left + self._pixels]
+        self._image[square][self._pixels - 1 - row, column] = part.colors[order]
+        self._height_m[square][self._pixels - 1 - row, column] = part.points[order, 2]
+        self._labels |= set(np.unique(part.labels[order]).tolist())
+
+    def close(self) -> None:
+        """Write the image."""
+        image, window, _ = self._finished()
+        del self._image, self._height_m  # drawing needs as much memory again
+        from segslam.output.map.from_above import drawn_map  # importing matplotlib takes long
+
+        titles = {"class": "class", "height": "height (m)", "intensity": "intensity"}
+        path_m = self._extent.path_m
+        self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=titles[self._color], marks=self._marks()))
+
+    def _finished(self) -> tuple[np.ndarray, Window, float]:
+        """The shaded image (rows, columns, 3), its window, and the median height of its pixels (m)."""
+        rows, columns = self._seen()
+        image, height_m = closed_and_shaded(
+            self._image[rows, columns], self._height_m[rows, columns], max(round(SHADED_M * self._pixels / TILE_M), 3)
+        )
+        return image, self._window(rows, columns), float(np.nanmedian(height_m))
+
+    def _seen(self) -> tuple[slice, slice]:
+        """Rows and columns of the image that have points, with a margin."""
+        margin = round(MARGIN_M * self._pixels / TILE_M)
+        known = np.isfinite(self._height_m)
+        ends = []
+        for axis in (1, 0):
+            places = np.flatnonzero(known.any(axis=axis))
+            ends.append(slice(max(places[0] - margin, 0), places[-1] + 1 + margin))
+        return ends[0], ends[1]
+
+    def _window(self, rows: slice, columns: slice) -> Window:
+        west, south = corner((self._extent.west, self._extent.south))[:2].tolist()
+        pixel_m = TILE_M / self._pixels
+        height, width = self._height_m.shape
+        last_column, last_row = min(columns.stop, width), min(rows.stop, height)
+        return (
+            west + columns.start * pixel_m,
+            west + last_column * pixel_m,
+            south + (height - last_row) * pixel_m,
+            south + (height - rows.start) * pixel_m,
+        )
+
+    def _marks(self) -> list[tuple[str, str]]:
+        """Text and colour of each class in the map, or of values along the colour scale."""
+        if self._color == "class":
+            return [(label.name.lower().replace("_", " "), COLORS[label]) for label in COLORS if label in self._labels]
+        return [(f"{value:.3g}", color) for value, color in scale_of(self._extent.span)]
+
+
+def closed_and_shaded(image: np.ndarray, height_m: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and heights with gaps filled, and the colours shaded, band by band: a large image takes little memory."""
+    shades, heights = np.empty_like(image), np.empty_like(height_m)
+    around = window // 2 + math.ceil(GAP_PX)
+    for first in range(0, len(image), BAND_PX):
+        low, last = max(first - around, 0), first + BAND_PX
+        colors, filled_m = closed(image[low : last + around], height_m[low : last + around])
+        band = slice(first - low, first - low + BAND_PX)
+        shades[first:last], heights[first:last] = shaded(colors, filled_m, window)[band], filled_m[band]
+    return shades, heights
+
+
+def closed(image: np.ndarray, height_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and heights with gaps between points filled from a known neighbouring pixel."""
+    away, nearest = distance_transform_edt(np.isnan(height_m), return_indices=True)
+    fill = away < GAP_PX
+    rows, columns = (place[fill] for place in nearest)
+    full, heights = image.copy(), height_m.copy()
+    full[fill], heights[fill] = image[rows, columns], height_m[rows, columns]
+    return full, heights
+
+
+def shaded(image: np.ndarray, height_m: np.ndarray, window: int) -> np.ndarray:
+    """Colours (rows, columns, 3), brighter above and darker below the mean height of the surroundings.
+
+    `height_m` is NaN for unknown pixels; `window` is the size of the surroundings in pixels.
+    """
+    known = np.isfinite(height_m)
+    weight = uniform_filter(known.astype(np.float32), window)
+    mean = uniform_filter(np.where(known, height_m, 0.0).astype(np.float32), window) / np.maximum(weight, 1e-6)
+    relief = np.tanh(np.where(known, height_m - mean, 0.0) / RELIEF_M)
+    factor = np.where(known, 1.0 + CONTRAST * relief, 1.0)[..., None]
+    return np.clip(image * factor, 0, 255).astype(np.uint8)

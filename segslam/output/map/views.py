@@ -1,0 +1,98 @@
+"""Visibility: which points of the map other keyframes see through.
+
+Each keyframe has a range image: the range of the nearest point in each direction. A map point is compared with the
+range images of all keyframes near it. A keyframe confirms the point if its range is similar, sees through the point
+if its range is clearly larger, and gives no information if its range is smaller. Visibility as in Pomerleau et al.,
+"Long-term 3D map maintenance in dynamic environments" (ICRA 2014); range images as in Kim and Kim, "Remove, then
+Revert" (IROS 2020).
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from segslam.core.kernels import kernel
+from segslam.core.types import Points
+
+CELL_RAD = math.radians(0.5)
+"""Chosen: the beams of a 64-beam sensor are 0.4 degrees apart."""
+NUM_COLUMNS = 720
+NUM_ROWS = 180
+"""45 degrees down to 45 degrees up."""
+STEP_M = 0.01
+NOTHING = 65535
+"""Value of a pixel without points, i.e. unknown. Ranges are multiples of STEP_M, at most 655 m."""
+MIN_RANGE_M = 1.0
+MAX_SPREAD_CELLS = 12
+"""Largest number of pixels that a near point covers to each side."""
+
+
+class Views:
+    """The range images of all keyframes, on disk."""
+
+    def __init__(self, file: Path, *, spread_m: float) -> None:
+        """A point covers all directions within `spread_m` of it, because keyframes are downsampled."""
+        self._file = file
+        self._spread_m = spread_m
+        file.touch()
+
+    def add(self, points: Points) -> None:
+        """Add the points (n, 3) of the next keyframe, in its own frame."""
+        with self._file.open("ab") as stream:
+            nearest_returns(points.astype(np.float32), self._spread_m).tofile(stream)
+
+    def __getitem__(self, number: int) -> np.ndarray:
+        """(NUM_ROWS, NUM_COLUMNS) uint16, the range image of the keyframe added as number 0, 1, ..."""
+        cells = NUM_ROWS * NUM_COLUMNS
+        return np.fromfile(self._file, np.uint16, cells, offset=2 * cells * number).reshape(NUM_ROWS, NUM_COLUMNS)
+
+
+@kernel("UniTuple(float64, 3)(float64, float64, float64)")
+def _direction(x, y, z):
+    """Row and column, as fractions, and range."""
+    across = math.sqrt(x * x + y * y)
+    row = math.atan2(z, across) / CELL_RAD + NUM_ROWS / 2
+    column = (math.atan2(y, x) + math.pi) / CELL_RAD
+    return row, column, math.sqrt(across * across + z * z)
+
+
+@kernel("uint16[:, :](float32[:, :], float64)")
+def nearest_returns(points, spread_m):
+    """Range image in units of STEP_M; each point covers all pixels within `spread_m` of it."""
+    nearest = np.full((NUM_ROWS, NUM_COLUMNS), NOTHING, np.uint16)
+    for x, y, z in points:
+        row, column, distance = _direction(x, y, z)
+        if distance < MIN_RANGE_M or distance >= NOTHING * STEP_M:
+            continue
+        steps = np.uint16(distance / STEP_M)
+        spread = min(max(spread_m / distance / CELL_RAD, 0.5), MAX_SPREAD_CELLS)
+        for i in range(max(int(row - spread), 0), min(int(row + spread), NUM_ROWS - 1) + 1):
+            for j in range(math.floor(column - spread), math.floor(column + spread) + 1):
+                nearest[i, j % NUM_COLUMNS] = min(nearest[i, j % NUM_COLUMNS], steps)
+    return nearest
+
+
+@kernel("void(float32[:, :], float64[:, :], uint16[:, :], float64[:], uint32[:, :])")
+def count_votes(points, T_view_points, nearest, limits, votes):
+    """Add the votes of one range image to `votes`: confirmations in column 0, views through a point in column 1.
+
+    `limits`: largest distance of a point from the keyframe (m); tolerance of its range, constant (m) and per metre.
+    """
+    T = T_view_points
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+        b = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+        c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        if a * a + b * b + c * c > limits[0] * limits[0]:
+            continue
+        row, column, distance = _direction(a, b, c)
+        if row < 0 or row >= NUM_ROWS or distance < MIN_RANGE_M:
+            continue
+        seen = nearest[int(row), int(column) % NUM_COLUMNS]
+        margin = limits[1] + limits[2] * distance
+        if seen != NOTHING and seen * STEP_M > distance + margin:
+            votes[i, 1] += 1
+        elif seen != NOTHING and seen * STEP_M > distance - margin:
+            votes[i, 0] += 1

@@ -1,0 +1,112 @@
+"""The report of a run: one HTML page with map, plots, figures and settings, without network access."""
+
+from collections.abc import Collection, Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+
+import matplotlib
+
+from segslam.core.types import Keyframe, LoopAttempt
+from segslam.core.whole_files import write_whole
+from segslam.output.finished import FinishedRun, read_run
+from segslam.output.folder import LOG
+from segslam.output.log import read_log
+from segslam.output.map.before_after import BeforeAfter
+from segslam.output.map.from_above import small_png
+from segslam.output.report import figures, gallery, interactive
+from segslam.output.report.fixes import draw_fixes
+from segslam.output.report.page import Pictures, page
+
+__all__ = ["BEFORE_AFTER", "draw_before_after", "write_before_after", "write_report"]
+
+BEFORE_AFTER = "before_after.png"
+
+MOST_KEYFRAMES = 500
+"""Chosen: in longer drives, every second keyframe is drawn, or every third, and so on; each takes about 10 ms."""
+
+
+def write_report(folder: str | Path) -> Path:
+    """Write `report.html` into a run folder, from the files there; returns its path.
+
+    Raises SegslamError if the folder contains no finished run, or cannot be written.
+    """
+    folder = Path(folder)
+    run = read_run(folder)
+    log = read_log(folder / LOG)
+    with matplotlib.rc_context(figures.STYLE):
+        plots = _plots(run)
+    about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
+    return _write(
+        folder / "report.html", page(run, plots, _pictures(run), about=about).encode(errors="backslashreplace")
+    )
+
+
+def write_before_after(folder: Path, file: Path) -> Path:
+    """Write the picture of `draw_before_after` to a file."""
+    return _write(file, draw_before_after(folder))
+
+
+def draw_before_after(folder: Path) -> bytes:
+    """A PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
+    picture, _ = _drawn(read_run(folder))
+    return picture
+
+
+def _write(file: Path, content: bytes) -> Path:
+    write_whole(file, content)
+    return file
+
+
+def _plots(run: FinishedRun) -> dict[str, str]:
+    """The plots by caption, as far as the run contains the data."""
+    plots = {"Trajectory, top view and height": figures.draw_paths(run)}
+    true = figures.compared(run)
+    if true is not None:
+        plots["Error along the drive, after alignment"] = figures.draw_errors(true)
+    if (fixes := draw_fixes(run.folder)) is not None:
+        plots["Position fixes, top view and residuals"] = fixes
+    plots["Loops by outcome"] = figures.draw_loops(run)
+    if run.result.attempts:
+        plots["Loops over time"] = figures.draw_loops_over_time(run)
+    stages = {stage: ms for stage, ms in run.metrics.get("stage_ms", {}).items() if stage != "finish"}
+    if stages:
+        plots["Time per call of each stage"] = figures.draw_stages(stages)
+    return plots
+
+
+def _pictures(run: FinishedRun) -> Pictures:
+    """Pictures that need the clouds of the log: the map before and after, and pairs of keyframes."""
+    chosen, shown = gallery.choose(run.result.attempts), interactive.with_clouds(run)
+    before_after, kept = _drawn(run, _keyframes_of([*chosen, *shown]))
+    of_view = {number: kept[number] for number in sorted(_keyframes_of(shown)) if number in kept}
+    map_file = run.folder / "map.png"
+    return Pictures(
+        before_after=before_after,
+        map=small_png(map_file) if map_file.is_file() else None,
+        loops=gallery.draw(run, chosen, kept),
+        top_view=interactive.top_view(run, of_view),
+    )
+
+
+def _keyframes_of(attempts: Iterable[LoopAttempt]) -> set[int]:
+    return {number for one in attempts for number in (one.candidate.source_id, one.candidate.target_id)}
+
+
+def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:
+    """The map before and after, and the keyframes with these ids, in two passes over the log."""
+    poses = run.result.odometry.T_world_lidar[run.result.keyframe_rows]
+    every = 1 + len(poses) // MOST_KEYFRAMES
+    kept: dict[int, Keyframe] = {}
+
+    def keyframes() -> Iterator[Keyframe]:
+        steps = read_log(run.folder / LOG).steps()
+        return islice((step.keyframe for step in steps if step.keyframe is not None), len(poses))
+
+    drawn = (keyframe for keyframe in keyframes() if keyframe.id % every == 0)
+    before_after = BeforeAfter(dict(enumerate(poses)), run.result.estimate, drawn)
+    for keyframe in keyframes():
+        if keyframe.id % every == 0:
+            before_after.add(keyframe)
+        if keyframe.id in wanted:
+            kept[keyframe.id] = keyframe
+    return before_after.draw(), kept

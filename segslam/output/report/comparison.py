@@ -1,0 +1,130 @@
+"""Figures that compare several runs, or an estimate and its reference."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from segslam.core.evaluation import Up, align_positions, pose_errors
+from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
+from segslam.core.types import SegslamError
+from segslam.core.whole_files import check_target, whole_file
+from segslam.output.finished import FinishedRun
+from segslam.output.report import figures
+
+COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")
+ENDINGS = (".png", ".svg", ".pdf")
+ACROSS: dict[Up, list[int]] = {"z": [0, 1], "-y": [0, 2]}
+"""The axes of the page by the upward axis: x to the right, and y or z ahead."""
+SAME_TRUTH_M = 0.01
+
+
+def check_picture(file: Path) -> None:
+    """Raises SegslamError for a file that cannot be written, or whose extension is not that of a figure."""
+    if file.suffix.lower() not in ENDINGS:
+        raise SegslamError(f"{file}: unknown kind of figure; its name must end in {', '.join(ENDINGS)}")
+    check_target(file)
+
+
+def draw_scored(file: Path, estimate: Poses, reference: Poses, *, up: Up = "z") -> None:
+    """Draw matched poses in top view, the estimate aligned with the reference, and the error against travel.
+
+    `up`: upward axis of the reference frame.
+    """
+    aligned = align_positions(estimate[:, :3, 3], reference[:, :3, 3]) @ estimate
+    with matplotlib.rc_context(figures.STYLE):
+        figure = Figure(figsize=(12.8, 6.0), layout="constrained")
+        above, error = figure.subplots(1, 2)
+        _plot_above(above, "reference", reference, figures.TRUTH, width=4.0, up=up)
+        _plot_above(above, "estimate", aligned, COLORS[0], up=up)
+        _plot_error(error, "estimate", aligned, reference, COLORS[0])
+        _finish(figure, [above], error, file, up=up)
+
+
+def draw_runs(file: Path, runs: Mapping[str, FinishedRun]) -> None:
+    """Draw the trajectories of runs in top view and their errors against travel, a top view for each data set.
+
+    The runs of a data set are aligned with its ground truth, or with the first of them if it has none, by common scans.
+    """
+    groups = by_data(runs)
+    colors = dict(zip(runs, _colors(len(runs)), strict=True))
+    has_truth = [any(runs[name].reference is not None for name in names) for names in groups]
+    with matplotlib.rc_context(figures.STYLE):
+        figure = Figure(figsize=(6.4 * (len(groups) + 1), 6.0), layout="constrained")
+        *above, error = figure.subplots(1, len(groups) + 1)
+        for axes, names in zip(above, groups, strict=True):
+            _plot_group(axes, error, {name: runs[name] for name in names}, colors)
+            if len(groups) > 1:
+                axes.set_title(runs[names[0]].dataset or names[0], loc="right", fontsize=10)
+        _finish(figure, above, error, file, error_of="error" if all(has_truth) else "distance from truth or first run")
+
+
+def by_data(runs: Mapping[str, FinishedRun]) -> list[list[str]]:
+    """The names of runs, grouped by the data that they have mapped."""
+    groups: list[list[str]] = []
+    for name, run in runs.items():
+        group = next((names for names in groups if _same_data(runs[names[0]], run)), None)
+        if group is None:
+            groups.append([name])
+        else:
+            group.append(name)
+    return groups
+
+
+def _same_data(one: FinishedRun, other: FinishedRun) -> bool:
+    """True if the common scans of two runs have equal stamps, and equal ground truth, or else data sets of one name."""
+    drives = one.result.trajectory, other.result.trajectory
+    rows = rows_of_same_scan(drives[0].scan_index, drives[1].scan_index)
+    if len(rows) == 0 or (drives[0].stamp_ns[rows[:, 0]] != drives[1].stamp_ns[rows[:, 1]]).any():
+        return False
+    if one.reference is None or other.reference is None:
+        return one.dataset == other.dataset
+    rows = rows_of_same_scan(one.reference.scan_index, other.reference.scan_index)
+    truths = one.reference.T_world_lidar[rows[:, 0], :3, 3], other.reference.T_world_lidar[rows[:, 1], :3, 3]
+    return len(rows) > 0 and bool(np.allclose(truths[0] - truths[0][0], truths[1] - truths[1][0], atol=SAME_TRUTH_M))
+
+
+def _plot_group(above: Axes, error: Axes, runs: Mapping[str, FinishedRun], colors: Mapping[str, str]) -> None:
+    truth = next((run.reference for run in runs.values() if run.reference is not None), None)
+    common = truth if truth is not None else next(iter(runs.values())).result.trajectory
+    if truth is not None:
+        _plot_above(above, "ground truth", truth.T_world_lidar, figures.TRUTH, width=4.0)
+    for name, run in runs.items():
+        poses = run.result.trajectory.T_world_lidar
+        rows = rows_of_same_scan(run.result.trajectory.scan_index, common.scan_index)
+        target = common.T_world_lidar[rows[:, 1]]
+        if len(rows):
+            poses = align_positions(poses[rows[:, 0], :3, 3], target[:, :3, 3]) @ poses
+            _plot_error(error, name, poses[rows[:, 0]], target, colors[name])
+        _plot_above(above, name, poses, colors[name])
+
+
+def _colors(count: int) -> Sequence[str]:
+    return [COLORS[number % len(COLORS)] for number in range(count)]
+
+
+def _plot_above(axes: Axes, name: str, poses: Poses, color: str, *, width: float = 1.4, up: Up = "z") -> None:
+    axes.plot(*poses[:, ACROSS[up], 3].T, color=color, label=name, linewidth=width)
+
+
+def _plot_error(axes: Axes, name: str, aligned: Poses, reference: Poses, color: str) -> None:
+    error_m = pose_errors(aligned, reference).translation_m
+    label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
+    axes.plot(travelled_m(reference), error_m, color=color, label=label, linewidth=1.4)
+
+
+def _finish(
+    figure: Figure, above: Sequence[Axes], error: Axes, file: Path, *, error_of: str = "error", up: Up = "z"
+) -> None:
+    right, ahead = ("xyz"[axis] for axis in ACROSS[up])
+    for axes in above:
+        axes.set(xlabel=f"{right} (m)", ylabel=f"{ahead} (m)", aspect="equal", adjustable="datalim")
+    error.set(xlabel="distance travelled (m)", ylabel=f"{error_of} after alignment (m)")
+    error.set_ylim(bottom=0)
+    for axes in (*above, error):
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, fontsize=10)
+    with whole_file(file) as part:
+        figure.savefig(part, format=file.suffix.lower()[1:], dpi=100)

@@ -1,0 +1,257 @@
+"""The plots of a run."""
+
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import cycle
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from segslam.core.evaluation import align_positions, false_loops, pose_errors
+from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
+from segslam.core.types import LoopClosure, MotionState, Rejected, RejectReason, Vector
+from segslam.output.accuracy import judged_closures
+from segslam.output.finished import FinishedRun
+
+# Okabe and Ito's colours, distinguishable with any colour vision
+TRUTH, CORRECTED, ODOMETRY, ALONE = "#B8B8B8", "#0072B2", "#E69F00", "#CC79A7"
+ACCEPTED, OPTIMISED_AWAY, FALSE = "#009E73", "#CC79A7", "#D55E00"
+REJECTED = ("#56B4E9", "#8C564B", "#7F7F7F", "#9467BD", "#BCBD22", "#17BECF", "#1F3A93")
+STYLE: Any = {
+    "svg.fonttype": "none",
+    "font.size": 11,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "legend.frameon": False,
+    "text.parse_math": False,  # names of files may contain a dollar sign
+}
+WIDTH_IN = 5.4
+"""Text of 11 points is then 10 pixels high on a phone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """The scans with ground truth, one row each."""
+
+    truth: Poses
+    corrected: Poses
+    odometry: Poses
+    alone: Poses | None = None
+    """By KISS-ICP alone; None if they are unknown."""
+
+
+class Line(NamedTuple):
+    """A path and its style."""
+
+    name: str
+    poses: Poses
+    color: str
+    style: str
+    width: float
+
+
+def compared(run: FinishedRun) -> Compared | None:
+    """The scans of a run with ground truth; None if there are none."""
+    if run.reference is None:
+        return None
+    rows = rows_of_same_scan(run.result.trajectory.scan_index, run.reference.scan_index)
+    if len(rows) == 0:
+        return None
+    return Compared(
+        run.reference.T_world_lidar[rows[:, 1]],
+        run.result.trajectory.T_world_lidar[rows[:, 0]],
+        run.result.odometry.T_world_lidar[rows[:, 0]],
+        None if run.result.alone is None else run.result.alone.T_world_lidar[rows[:, 0]],
+    )
+
+
+def paths_of(run: FinishedRun) -> list[Line]:
+    """The paths to draw, in the frame of the run, as all other plots and the map."""
+    true = compared(run)
+    paths = []
+    if true is not None:
+        T_world_truth = align_positions(true.truth[:, :3, 3], true.corrected[:, :3, 3])
+        paths.append(Line("truth", T_world_truth @ true.truth, TRUTH, "-", 4.0))
+    if run.result.alone is not None:
+        paths.append(Line("KISS-ICP alone", run.result.alone.T_world_lidar, ALONE, ":", 1.5))
+    return [
+        *paths,
+        Line("odometry", run.result.odometry.T_world_lidar, ODOMETRY, "--", 1.5),
+        Line("corrected", run.result.trajectory.T_world_lidar, CORRECTED, "-", 1.2),
+    ]
+
+
+def draw_paths(run: FinishedRun) -> str:
+    """Ground truth, odometry and corrected trajectory in top view, and their heights against travel."""
+    figure = Figure(figsize=(WIDTH_IN, 6.6), layout="constrained")
+    above, height = figure.subplots(2, 1, height_ratios=(3, 1))
+    paths = paths_of(run)
+    _plot_motions(above, run, paths[-1].poses)
+    _plot_from_above(above, paths)
+    for line in paths:
+        along_m = travelled_m(line.poses)
+        height.plot(along_m, line.poses[:, 2, 3], line.style, color=line.color, linewidth=line.width)
+    height.set(xlabel="distance travelled (m)", ylabel="height (m)")
+    return svg(figure, "paths")
+
+
+def draw_loops(run: FinishedRun) -> str:
+    """All loop candidates on the corrected trajectory: closures as lines between their ends, rejected ones as dots."""
+    figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
+    _plot_attempts(figure.subplots(), run)
+    return svg(figure, "loops")
+
+
+def draw_loops_over_time(run: FinishedRun) -> str:
+    """All loop candidates: time of the new keyframe against that of the old one, coloured by outcome."""
+    figure = Figure(figsize=(WIDTH_IN, 5.2), layout="constrained")
+    axes = figure.subplots()
+    time_s = (run.result.odometry.stamp_ns - run.result.odometry.stamp_ns[0]) / 1e9
+    keyframe_s = time_s[run.result.keyframe_rows]
+    for (reason, pairs), color in zip(_rejected_pairs(run).items(), cycle(REJECTED), strict=False):
+        _plot_times(axes, keyframe_s, pairs, f"{reason.replace('_', ' ')} ({len(pairs)})", color, "x")
+    for name, color, closures in _closure_kinds(run):
+        if closures:
+            pairs = [(closure.source_id, closure.target_id) for closure in closures]
+            _plot_times(axes, keyframe_s, pairs, f"{name} ({len(pairs)})", color, "o")
+    axes.plot([0, keyframe_s[-1]], [0, keyframe_s[-1]], color=TRUTH, linewidth=1.0)
+    axes.set(xlabel="time of the new keyframe (s)", ylabel="time of the old keyframe (s)")
+    _legend_on_top(axes, num_columns=2)
+    return svg(figure, "times")
+
+
+def _plot_times(axes: Axes, time_s: Vector, pairs: list[tuple[int, int]], label: str, color: str, marker: str) -> None:
+    sources, targets = np.array(pairs).T
+    axes.plot(time_s[sources], time_s[targets], marker, color=color, label=label, markersize=5)
+
+
+def draw_errors(poses: Compared) -> str:
+    """Position error and height error against the distance travelled, after the alignment of the ATE."""
+    figure = Figure(figsize=(WIDTH_IN, 5.4), layout="constrained")
+    whole, height = figure.subplots(2, 1, sharex=True)
+    along_m = travelled_m(poses.truth)
+    drives = [("odometry", poses.odometry, ODOMETRY), ("corrected", poses.corrected, CORRECTED)]
+    if poses.alone is not None:
+        drives = [("KISS-ICP alone", poses.alone, ALONE), ("odometry after repairs", *drives[0][1:]), drives[1]]
+    for name, estimate, color in drives:
+        aligned = align_positions(estimate[:, :3, 3], poses.truth[:, :3, 3]) @ estimate
+        error_m = pose_errors(aligned, poses.truth).translation_m
+        label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
+        whole.plot(along_m, error_m, color=color, label=label, linewidth=1.4)
+        height.plot(along_m, (aligned - poses.truth)[:, 2, 3], color=color, linewidth=1.4)
+    whole.set(ylabel="error (m)")
+    whole.set_ylim(bottom=0)
+    height.set(xlabel="distance travelled (m)", ylabel="height error (m)")
+    _legend_on_top(whole, num_columns=1)
+    return svg(figure, "errors")
+
+
+def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
+    """Median and 95th percentile of the time of each stage per call, longest first."""
+    figure = Figure(figsize=(WIDTH_IN, 0.9 + 0.32 * len(stage_ms)), layout="constrained")
+    axes = figure.subplots()
+    stages = sorted(stage_ms, key=lambda stage: stage_ms[stage]["median"])
+    axes.barh(stages, [stage_ms[stage]["p95"] for stage in stages], color="#CFE3F1", label="95th percentile")
+    axes.barh(stages, [stage_ms[stage]["median"] for stage in stages], color=CORRECTED, height=0.45, label="median")
+    axes.grid(visible=False, axis="y")
+    axes.set(xlabel="time (ms)", xscale="log")  # from a keyframe's fraction of a millisecond to minutes of adjustment
+    _legend_on_top(axes)
+    return svg(figure, "stages")
+
+
+def _plot_from_above(axes: Axes, paths: Iterable[Line]) -> None:
+    for line in paths:
+        xy = line.poses[:, :2, 3]
+        axes.plot(*xy.T, line.style, color=line.color, label=line.name, linewidth=line.width)
+        axes.plot(*xy[0], "o", color=line.color, markersize=5)
+    _finish_map(axes, num_columns=3)
+
+
+def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:
+    """Mark motions of the odometry that were repaired, unsupported by the scans, or rejected by the optimiser."""
+
+    def rows_of(*states: MotionState) -> list[int]:
+        return [row for row, motion in enumerate(run.result.motions) if motion.state in states]
+
+    rejected = [int(run.result.keyframe_rows[after]) for _, after in run.result.estimate.motion_weights]
+    for name, color, marker, rows in (
+        ("motion repaired", "#D55E00", ".", rows_of(MotionState.REPAIRED, MotionState.REJOINED)),
+        ("break", "#CC0000", "x", rows_of(MotionState.BROKEN)),
+        ("motion rejected", "#CC0000", "+", rejected),
+    ):
+        if rows:
+            label = f"{name} ({len(rows)})"
+            axes.plot(*T_corrected[rows, :2, 3].T, marker, color=color, markersize=7, zorder=4, label=label)
+
+
+def _plot_attempts(axes: Axes, run: FinishedRun) -> None:
+    positions = run.result.trajectory.T_world_lidar[:, :2, 3]
+    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
+    ends = positions[run.result.keyframe_rows]
+    for (reason, pairs), color in zip(_rejected_pairs(run).items(), cycle(REJECTED), strict=False):
+        label = f"{reason.replace('_', ' ')} ({len(pairs)})"
+        axes.plot(*ends[[source for source, _ in pairs]].T, ".", color=color, markersize=7, label=label, zorder=2)
+    for name, color, closures in _closure_kinds(run):
+        for closure in closures:
+            axes.plot(*ends[[closure.source_id, closure.target_id]].T, "o-", color=color, markersize=3, linewidth=1.5)
+        if closures:
+            axes.plot([], [], "o-", color=color, label=f"{name} ({len(closures)})")
+    _finish_map(axes, num_columns=2)
+
+
+def _finish_map(axes: Axes, *, num_columns: int) -> None:
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
+    _legend_on_top(axes, num_columns=num_columns)
+
+
+def _rejected_pairs(run: FinishedRun) -> dict[RejectReason, list[tuple[int, int]]]:
+    """New and old keyframe of each rejected candidate, by reason, in the order of the pipeline."""
+    pairs: dict[RejectReason, list[tuple[int, int]]] = {}
+    for attempt in run.result.attempts:
+        if isinstance(attempt.outcome, Rejected):
+            ids = (attempt.candidate.source_id, attempt.candidate.target_id)
+            pairs.setdefault(attempt.outcome.reason, []).append(ids)
+    return {reason: pairs[reason] for reason in RejectReason if reason in pairs}
+
+
+def _closure_kinds(run: FinishedRun) -> list[tuple[str, str, list[LoopClosure]]]:
+    """Name, colour and closures: accepted, rejected by the optimiser, or false by the ground truth."""
+    closures = [attempt.outcome for attempt in run.result.attempts if isinstance(attempt.outcome, LoopClosure)]
+    false = _false_closures(run)
+    off = run.result.estimate.rejected - false
+    pairs = [(closure.source_id, closure.target_id) for closure in closures]
+    kinds = (
+        ("accepted", ACCEPTED, set(pairs) - off - false),
+        ("rejected by the optimiser", OPTIMISED_AWAY, off),
+        ("false", FALSE, false),
+    )
+    return [
+        (name, color, [closure for pair, closure in zip(pairs, closures, strict=True) if pair in members])
+        for name, color, members in kinds
+    ]
+
+
+def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:
+    """(source, target) of the closures that are false by the ground truth."""
+    if run.reference is None:
+        return set()
+    closures, rows, truth = judged_closures(run.result, run.reference)
+    measured = np.array([closure.T_target_source for closure in closures]).reshape(-1, 4, 4)
+    false = false_loops(measured, rows, truth)
+    return {(c.source_id, c.target_id) for c, is_false in zip(closures, false, strict=True) if is_false}
+
+
+def _legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=num_columns, borderaxespad=0.2, fontsize=10)
+
+
+def svg(figure: Figure, name: str) -> str:
+    """The figure as SVG; equal data give equal text."""
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": name}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()

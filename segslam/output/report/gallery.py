@@ -1,0 +1,76 @@
+"""Pictures of loop candidates: the best accepted ones, and the rejected ones closest to acceptance."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.types import (
+    GROUND_LABELS,
+    Keyframe,
+    LoopAttempt,
+    LoopClosure,
+    Points,
+    Rejected,
+    RejectReason,
+)
+from segslam.output.finished import FinishedRun
+from segslam.output.report.pairs import draw_pair
+from segslam.slam import slam_result
+
+NUM_EACH = 3
+APART = 10
+"""Chosen: keyframes between two pictures of one kind, so that they show different places."""
+
+
+def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
+    """Accepted candidates by overlap; then rejected ones, those that failed last first, by distance."""
+    attempts = list(attempts)
+    accepted = [a for a in attempts if isinstance(a.outcome, LoopClosure)]
+    rejected = [a for a in attempts if isinstance(a.outcome, Rejected)]
+    return _apart(sorted(accepted, key=_overlap, reverse=True)) + _apart(sorted(rejected, key=_miss))
+
+
+def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int, Keyframe]) -> dict[str, bytes]:
+    """A PNG for each candidate, by caption."""
+    pictures = {}
+    for attempt in chosen:
+        source_id, target_id = attempt.candidate.source_id, attempt.candidate.target_id
+        T_world = run.result.estimate.T_world_keyframe
+        poses = {"initial guess": attempt.candidate.T_target_source_prior}
+        if isinstance(attempt.outcome, LoopClosure):
+            poses["registered"] = attempt.outcome.T_target_source
+        else:
+            poses["final map"] = geometry.inverse(T_world[target_id]) @ T_world[source_id]
+        source, target = (_standing(keyframes[number]) for number in (source_id, target_id))
+        caption = f"{source_id} to {target_id}: {outcome_text(run, attempt)}"
+        pictures[caption] = draw_pair(source, target, poses=poses, title=f"keyframes {caption}")
+    return pictures
+
+
+def outcome_text(run: FinishedRun, attempt: LoopAttempt) -> str:
+    """The outcome of a candidate in one line."""
+    return slam_result.outcome_text(attempt, run.result.estimate.closure_weights)
+
+
+def _apart(attempts: list[LoopAttempt]) -> list[LoopAttempt]:
+    chosen: list[LoopAttempt] = []
+    for attempt in attempts:
+        source_id = attempt.candidate.source_id
+        if len(chosen) < NUM_EACH and all(abs(source_id - one.candidate.source_id) >= APART for one in chosen):
+            chosen.append(attempt)
+    return chosen
+
+
+def _overlap(attempt: LoopAttempt) -> float:
+    return attempt.outcome.alignment.overlap if isinstance(attempt.outcome, LoopClosure) else 0.0
+
+
+def _miss(attempt: LoopAttempt) -> tuple[int, float]:
+    reason = attempt.outcome.reason if isinstance(attempt.outcome, Rejected) else RejectReason.TOO_FEW_POINTS
+    return -list(RejectReason).index(reason), attempt.candidate.distance_m
+
+
+def _standing(keyframe: Keyframe) -> Points:
+    """The points above ground; all points if none is labelled as ground."""
+    return keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))].astype(np.float64)

@@ -1,0 +1,151 @@
+"""The interactive top view of the report: data for `interactive.js`, drawn by plotly.js, all embedded in the page."""
+
+import base64
+import gzip
+import json
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.evaluation import align_positions, pose_errors
+from segslam.core.trajectory import Poses, rows_of_same_scan
+from segslam.core.types import (
+    GROUND_LABELS,
+    REJECTED_WEIGHT,
+    Keyframe,
+    LoopAttempt,
+    LoopClosure,
+    Points,
+    Transform,
+)
+from segslam.output.finished import FinishedRun
+from segslam.output.report.figures import paths_of
+from segslam.slam.slam_result import outcome_text
+
+MOST_SCANS = 3000
+"""Chosen: of longer drives, every second scan is drawn, or every third, and so on; a browser pans these smoothly."""
+MOST_PAIRS = 150
+"""Chosen: number of loop candidates with clouds, accepted ones first; 3 kB a keyframe."""
+CLOUD_POINTS = 500
+NEAR_M = 50.0
+"""Chosen: points drawn of each cloud, and their largest distance."""
+STEP_M = 0.1
+"""Resolution of the coordinates of clouds, in whole numbers of 16 bits."""
+
+
+def with_clouds(run: FinishedRun) -> list[LoopAttempt]:
+    """The loop candidates whose clouds are shown: accepted ones, spread over the drive, then the rejected ones."""
+    attempts = run.result.attempts
+    accepted = [one for one in attempts if isinstance(one.outcome, LoopClosure)]
+    rejected = [one for one in attempts if not isinstance(one.outcome, LoopClosure)]
+    kept = _spread(accepted, MOST_PAIRS)
+    return kept + _spread(rejected, MOST_PAIRS - len(kept))
+
+
+def top_view(run: FinishedRun, keyframes: Mapping[int, Keyframe]) -> str:
+    """HTML of the view. `keyframes`: those of `with_clouds`, by id; a loop without them is shown without clouds."""
+    ids = set(keyframes)
+    data = {
+        "paths": [_path(line.name, line.poses, line.color) for line in paths_of(run)],
+        "values": _values(run),
+        "loops": [_loop(run, attempt, ids) for attempt in run.result.attempts],
+        "clouds": {str(number): _cloud(keyframe) for number, keyframe in keyframes.items()},
+        "step_m": STEP_M,
+    }
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
+    return (
+        "<p>Scroll or pinch to zoom, drag to move. Point at a dot to see its figures; click on a loop to see its two "
+        "scans before and after.</p>"
+        f'<label>colour of the trajectory: <select id="colour"></select></label>'
+        '<div id="topview"></div><div id="pair"></div><noscript>This view needs JavaScript.</noscript>'
+        f'<script type="application/json" id="topview-data">{text}</script>'
+        f'<script type="text/plain" id="plotly-packed">{packed_plotly()}</script>'
+        f"<script>{_script()}</script>"
+    )
+
+
+@lru_cache(1)
+def packed_plotly() -> str:
+    """plotly.js (MIT licence), compressed, in base64; the page unpacks it."""
+    source = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_bytes()
+    return base64.b64encode(gzip.compress(source, 9, mtime=0)).decode("ascii")
+
+
+def _script() -> str:
+    return resources.files("segslam.output.report").joinpath("interactive.js").read_text(encoding="utf-8")
+
+
+def _path(name: str, poses: Poses, color: str) -> dict[str, Any]:
+    x, y = _thinned(poses[:, :3, 3])[:, :2].T
+    return {"name": name, "color": color, "x": _rounded(x), "y": _rounded(y)}
+
+
+def _values(run: FinishedRun) -> dict[str, list[float]]:
+    """What the trajectory can be coloured by; the last of `paths_of` has the same scans."""
+    trajectory = run.result.trajectory
+    values = {
+        "scan": trajectory.scan_index.astype(float),
+        "time (s)": (trajectory.stamp_ns - trajectory.stamp_ns[0]) / 1e9,
+        "height (m)": trajectory.T_world_lidar[:, 2, 3],
+    }
+    if run.reference is not None:
+        rows = rows_of_same_scan(trajectory.scan_index, run.reference.scan_index)
+        made, true = trajectory.T_world_lidar[rows[:, 0]], run.reference.T_world_lidar[rows[:, 1]]
+        if len(rows) == len(trajectory):
+            T_true_made = align_positions(made[:, :3, 3], true[:, :3, 3])
+            values["error (m)"] = pose_errors(T_true_made @ made, true).translation_m
+    return {name: _rounded(_thinned(of_scans)) for name, of_scans in values.items()}
+
+
+def _loop(run: FinishedRun, attempt: LoopAttempt, ids: set[int]) -> dict[str, Any]:
+    source_id, target_id = pair = attempt.candidate.source_id, attempt.candidate.target_id
+    estimate, rows = run.result.estimate, run.result.keyframe_rows
+    T_world, T_odom = estimate.T_world_keyframe, run.result.odometry.T_world_lidar[rows]
+    kind = "rejected"
+    if isinstance(attempt.outcome, LoopClosure):
+        kind = "accepted" if estimate.closure_weights[pair] >= REJECTED_WEIGHT else "rejected by the optimiser"
+    loop: dict[str, Any] = {
+        "name": f"{source_id} to {target_id}",
+        "kind": kind,
+        "ends": [_rounded(T_world[number][:2, 3]) for number in pair],
+        "text": outcome_text(attempt, estimate.closure_weights),
+    }
+    if ids.issuperset(pair):
+        loop |= {
+            "pair": list(pair),
+            "before": _top_rows(geometry.inverse(T_odom[target_id]) @ T_odom[source_id]),
+            "after": _top_rows(geometry.inverse(T_world[target_id]) @ T_world[source_id]),
+        }
+    return loop
+
+
+def _top_rows(T_target_source: Transform) -> list[float]:
+    """The first two rows, which give x and y in the target."""
+    return [round(float(value), 5) for value in T_target_source[:2].ravel()]
+
+
+def _cloud(keyframe: Keyframe) -> str:
+    """Points above ground in steps of `STEP_M`: 16-bit x, y, z of each, little endian, in base64."""
+    points: Points = keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))]
+    points = points if len(points) else keyframe.points
+    near = points[np.abs(points).max(axis=1, initial=0.0) < NEAR_M]
+    kept = near[np.linspace(0, len(near) - 1, min(len(near), CLOUD_POINTS)).astype(int)] if len(near) else near
+    return base64.b64encode(np.round(kept / STEP_M).astype("<i2").tobytes()).decode("ascii")
+
+
+def _thinned(rows: np.ndarray) -> np.ndarray:
+    return rows[:: 1 + (len(rows) - 1) // MOST_SCANS]
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [round(float(value), 2) for value in values]
+
+
+def _spread(attempts: list[LoopAttempt], most: int) -> list[LoopAttempt]:
+    if len(attempts) <= most:
+        return attempts
+    return [attempts[row] for row in np.linspace(0, len(attempts) - 1, most).astype(int)] if most else []

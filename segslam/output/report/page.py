@@ -1,0 +1,266 @@
+"""The HTML page: headline figures, plots and tables in one file."""
+
+import base64
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from html import escape
+from types import MappingProxyType
+from typing import Any
+
+from pydantic.fields import FieldInfo
+
+from segslam.core.config import Config, Section, changed_settings
+from segslam.core.types import Rejected, RejectReason
+from segslam.odometry.calibration import vertical_angle_advice
+from segslam.output.finished import COMPARED, FIGURES, FinishedRun
+from segslam.output.words import REASONS, WORDS
+
+FILES = {
+    "map.png": "the map in top view",
+    "map.ply": "the map as a point cloud",
+    "before_after.png": "the map by odometry beside the corrected map",
+    "poses_tum.txt": "pose of every scan, TUM format, LiDAR frame",
+    "poses_kitti.txt": "pose of every scan, KITTI format",
+    "odometry_tum.txt": "the same before loop closing, TUM format",
+    "odometry_kitti.txt": "the same before loop closing, KITTI format",
+    "kiss_icp_tum.txt": "the same by KISS-ICP alone, TUM format",
+    "kiss_icp_kitti.txt": "the same by KISS-ICP alone, KITTI format",
+    "georeference.json": "place of the map on the globe",
+    "gnss.csv": "position fixes: kept, or why not",
+    "poses_geodetic.csv": "latitude, longitude, height and heading of every scan",
+    "loops.csv": 'all loop candidates and their outcomes (<a href="#words">words</a>)',
+    "graph.g2o": "the pose graph",
+    "metrics.json": "the figures of this page",
+    "config.yaml": "the settings",
+    "log.mcap": "complete log, for Foxglove and segslam replay",
+}
+ODOMETRIES = ("odometry, after repairs", "KISS-ICP alone")
+CONDITIONS = {
+    "started": "started (UTC)",
+    "command": "command",
+    "segslam": "segslam",
+    "processor": "processor",
+    "platform": "system",
+    "python": "Python",
+}
+"""Key in the log -> text on the page."""
+STYLE = """
+:root { color-scheme: light; --line: #d8dee4; --soft: #57606a; }
+body { margin: 0 auto; max-width: 76rem; padding: 1rem; font: 16px/1.45 system-ui, sans-serif; color: #1f2328; }
+h1 { font-size: 1.5rem; margin: 0 0 .2rem; } h2 { font-size: 1.1rem; margin: 0 0 .4rem; }
+.soft { color: var(--soft); } .plots { columns: 2 30rem; column-gap: 1rem; margin-bottom: 1rem; }
+.tiles { display: grid; gap: 1rem; margin: 1rem 0; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); }
+section { margin-bottom: 1rem; break-inside: avoid; min-width: 0; overflow-x: auto; }
+.tiles div, section { border: 1px solid var(--line); border-radius: .5rem; padding: .7rem .9rem; background: #fff; }
+.tiles b { display: block; font-size: 1.4rem; } img { width: 100%; height: auto; display: block; }
+table { border-collapse: collapse; width: 100%; font-size: .92rem; }
+td, th { text-align: left; padding: .2rem .6rem .2rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+#pair { display: flex; flex-wrap: wrap; gap: 1rem; } #pair h3 { flex-basis: 100%; margin: .5rem 0 0; font-size: 1rem; }
+#pair h4 { margin: 0; text-align: center; }
+.panel { flex: 1 1 18rem; min-width: 0; } figure { margin: 0; min-width: 0; } .gallery { display: grid; gap: 1rem;
+  grid-template-columns: repeat(auto-fit, minmax(min(34rem, 100%), 1fr)); } p { margin: .2rem 0 .6rem; }
+td.number, th + th { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+th + th { white-space: normal; width: 5.5rem; }
+tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: anywhere; }
+details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child { white-space: nowrap; }
+@media (max-width: 40rem) { body, section { padding: .5rem; } td code { display: block; }
+  th + th { white-space: normal; } }
+@media print { body { max-width: none; padding: 0; font-size: 11px; } .plots { columns: 2 7cm; }
+  .tiles div, tr, img { break-inside: avoid; } h2, summary { break-after: avoid; }
+  section:has(details) { break-inside: auto; }
+  details::details-content { content-visibility: visible; height: auto; } }
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """PNGs, and the interactive view."""
+
+    before_after: bytes | None = None
+    """The map by odometry alone beside the corrected map."""
+    map: bytes | None = None
+    """Top view of the map, if the run has one."""
+    loops: Mapping[str, bytes] = field(default_factory=dict)
+    """Pairs of scans, by caption."""
+    top_view: str = ""
+    """HTML of the interactive top view."""
+
+
+def page(
+    run: FinishedRun,
+    plots: Mapping[str, str],
+    pictures: Pictures | None = None,
+    *,
+    about: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """The page of a run; `plots`: caption -> SVG text. `about`: metadata of the run from the log."""
+    pictures = pictures or Pictures()
+    name = run.folder.resolve().name
+    title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
+    maps = {"Map by odometry, and corrected": pictures.before_after, "Map in top view": pictures.map}
+    top = section("Top view", pictures.top_view) if pictures.top_view else ""
+    top += "".join(png_section(caption, png) for caption, png in maps.items() if png is not None)
+    sections = [plot_section(caption, svg) for caption, svg in plots.items()]
+    sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
+    sections += [section("Files", _files(run)), section("Conditions", _conditions(run, about))]
+    if advice := vertical_angle_advice(run.metrics, run.config.sensor):
+        top = f"<p>{escape(advice)}</p>{top}"
+    return document(
+        title,
+        f'<div class="soft">segslam run <code>{escape(name)}</code></div>\n'
+        f'<div class="tiles">{_tiles(run.metrics)}</div>\n{top}<div class="plots">{"".join(sections)}</div>\n'
+        f"{_gallery(pictures.loops)}{section('Settings', settings_tables(run.config))}",
+    )
+
+
+def _gallery(loops: Mapping[str, bytes]) -> str:
+    if not loops:
+        return ""
+    shown = "".join(f"<figure>{_picture(caption, png, 'png')}</figure>" for caption, png in loops.items())
+    note = "Target in grey, source in orange, top view without ground. Left: initial guess of the loop."
+    return section("Loops: best accepted, and nearest missed", f'<p>{note}</p><div class="gallery">{shown}</div>')
+
+
+def _files(run: FinishedRun) -> str:
+    """Links to the existing files beside the page."""
+    there = [(name, text) for name, text in FILES.items() if (run.folder / name).is_file()]
+    rows = (f'<tr><td><a href="{escape(name)}">{escape(name)}</a></td><td>{text}</td></tr>' for name, text in there)
+    return f"<table>{''.join(rows)}</table>"
+
+
+def _conditions(run: FinishedRun, about: Mapping[str, str]) -> str:
+    facts = {name: about[key] for key, name in CONDITIONS.items() if key in about}
+    facts["settings other than the defaults"] = settings_not_default(run.config) or "none"
+    rows = (f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in facts.items())
+    return f"<table>{''.join(rows)}</table>"
+
+
+def settings_not_default(config: Config) -> str:
+    """The settings that differ from the defaults, in the format of `--set`."""
+    return ", ".join(f"{key}={value}" for key, _, value in changed_settings(Config(), config))
+
+
+def document(title: str, body: str) -> str:
+    """A whole HTML file in the style of all reports."""
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body><h1>{escape(title)}</h1>"
+        f"{body}</body></html>\n"
+    )
+
+
+def _tiles(metrics: dict[str, Any]) -> str:
+    tiles = [
+        ("ate_m", " m", "error after alignment"),
+        ("odometry_ate_m", " m", "error of the odometry, after repairs"),
+        ("kiss_icp_ate_m", " m", "error of KISS-ICP alone"),
+        ("length_m", " m", "length of the drive"),
+        ("duration_s", " s", "duration of the drive"),
+        ("num_loops_accepted", "", "loops accepted"),
+        ("num_loops_false", "", "false loops"),
+        ("scans_per_second", "", "scans per second"),
+        ("peak_rss_mb", " MB", "peak memory"),
+    ]
+    known = [(key, unit, text) for key, unit, text in tiles if key in metrics]
+    return "".join(f"<div><b>{number(metrics[key])}{unit}</b>{text}</div>" for key, unit, text in known)
+
+
+def plot_section(caption: str, svg: str) -> str:
+    """A plot and its caption."""
+    return _picture_section(caption, svg.encode(), "svg+xml")
+
+
+def png_section(caption: str, png: bytes) -> str:
+    """A picture and its caption."""
+    return _picture_section(caption, png, "png")
+
+
+def _picture_section(caption: str, picture: bytes, kind: str) -> str:
+    return section(caption, _picture(caption, picture, kind))
+
+
+def _picture(caption: str, picture: bytes, kind: str) -> str:
+    data = base64.b64encode(picture).decode()
+    return f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{data}">'
+
+
+def _figures(metrics: dict[str, Any]) -> str:
+    """Figures with a description first, in their order, then the others; each beside those of the odometry."""
+    known = [key for key in FIGURES if key in metrics]
+    rest = [key for key, value in metrics.items() if key not in FIGURES and isinstance(value, int | float)]
+    of_run = [key for key in known + rest if not key.startswith(COMPARED)]
+    titles = {prefix: title for prefix, title in zip(COMPARED, ODOMETRIES, strict=True) if prefix + "ate_m" in metrics}
+    rows = [(_meaning(key), metrics[key], *(metrics.get(prefix + key) for prefix in titles)) for key in of_run]
+    return _table(("", "run", *titles.values()), rows)
+
+
+def _meaning(key: str) -> str:
+    return f"{FIGURES.get(key, '')} <code>{escape(key)}</code>"
+
+
+def _outcomes(run: FinishedRun) -> str:
+    if not run.result.attempts:
+        return "<p>No place was visited twice, according to the estimate.</p>"
+    outcomes = (attempt.outcome for attempt in run.result.attempts)
+    names = Counter(outcome.reason.value if isinstance(outcome, Rejected) else "accepted" for outcome in outcomes)
+    rows = ((_outcome(name), count) for name, count in names.most_common())
+    return _table(("", "attempts"), rows) + _words()
+
+
+def _outcome(name: str) -> str:
+    """An outcome as in `loops.csv`, with what it means."""
+    meaning = "" if name == "accepted" else f'<div class="soft">{REASONS[RejectReason(name)]}</div>'
+    return f"{name.replace('_', ' ')}{meaning}"
+
+
+def _words() -> str:
+    rows = (f"<tr><td>{word}</td><td>{escape(meaning)}</td></tr>" for word, meaning in WORDS.items())
+    return f'<details id="words"><summary>What the words mean</summary><table>{"".join(rows)}</table></details>'
+
+
+def settings_tables(config: Config) -> str:
+    """All settings by section. Changed settings are marked; their sections come first and are open."""
+    default = Config()
+    names = sorted(Config.model_fields, key=lambda name: getattr(config, name) == getattr(default, name))
+    return "".join(_setting_section(name, getattr(config, name), getattr(default, name)) for name in names)
+
+
+def _setting_section(name: str, section: Section, default: Section) -> str:
+    values, usual = section.model_dump(mode="json"), default.model_dump(mode="json")
+    rows = "".join(
+        _setting(key, values[key], field, changed=values[key] != usual[key])
+        for key, field in type(section).model_fields.items()
+    )
+    return f"<details{' open' if values != usual else ''}><summary>{name}</summary><table>{rows}</table></details>"
+
+
+def _setting(key: str, value: Any, field: FieldInfo, *, changed: bool) -> str:
+    kind = ' class="changed"' if changed else ""
+    cells = f"<code>{key}</code>", escape(str(value)), escape(field.description or "")
+    return f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+
+
+def section(title: str, body: str) -> str:
+    """A box with a heading; `body` is HTML."""
+    return f"<section><h2>{escape(title)}</h2>{body}</section>\n"
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, *tuple[float | None, ...]]]) -> str:
+    """Rows of a name and numbers; unknown numbers are None."""
+    titles = "".join(f"<th>{title}</th>" for title in head)
+    return f"<table><tr>{titles}</tr>{''.join(_row(*row) for row in rows)}</table>"
+
+
+def _row(name: str, *values: float | None) -> str:
+    cells = ("" if value is None else number(value) for value in values)
+    return f"<tr><td>{name}</td>" + "".join(f'<td class="number">{cell}</td>' for cell in cells) + "</tr>"
+
+
+def number(value: float) -> str:
+    """At least three significant digits, and at most three decimals."""
+    if isinstance(value, int):
+        return str(value)
+    digits = 3 if abs(value) < 1 else 2 if abs(value) < 10 else 1 if abs(value) < 100 else 0
+    return f"{value:.{digits}f}"

@@ -1,0 +1,167 @@
+"""Free space: a ray that returned from 30 m passed through empty space up to there.
+
+The returns of a scan form a spherical image with rows as fine as the sensor's beams. A point of another scan violates
+free space if it lies in front of all returns around its direction, by a margin that depends on the place: 1 m in a
+street, 0.4 m in a corridor.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from segslam.core import geometry
+from segslam.core.config import VerifyConfig
+from segslam.core.kernels import kernel
+from segslam.core.points import within_range
+from segslam.core.types import Indices, Mask, Points, Transform, Vector
+
+NUM_COLUMNS = 360
+"""A cell is one degree wide."""
+ROWS_RAD = tuple(math.radians(0.5 * 2.0 ** (step / 2)) for step in range(7))
+"""Cell heights that are tried: 0.5 to 4 degrees."""
+MIN_DETAIL = 1.6
+"""Chosen: smallest ratio of filled cells when the cell height is halved: 2 if all cells are filled, 1 if the beams
+are so far apart that half of the rows stay empty."""
+SHARE_OF_PATH = 0.125
+"""Chosen: the margin as a share of the free path. 1 m where the sensor sees 8 m far, as in KITTI's streets (7 to 9)."""
+MIN_MARGIN_M = 0.3
+"""Chosen: three times the range noise of a poor sensor."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeSpace:
+    """Spherical image of a scan: for each direction with a return, the nearest return there or in the 8 cells around.
+
+    Rows have equal height, from the lowest elevation of the scan to the highest. Cells without a return are infinite:
+    they are unknown, not free, because grazing rays on the ground are often lost.
+    """
+
+    nearest_m: Float[np.ndarray, "rows columns"]
+    """float32, m."""
+    lowest_rad: float
+    """Lower edge of the first row."""
+    row_rad: float
+    """Height of a row."""
+    free_path_m: float
+    """Median range over the directions with a return: the scale of the place (m); 0 without returns."""
+
+    @property
+    def view(self) -> float:
+        """Share of the azimuths with a return, 0 to 1."""
+        return float(np.isfinite(self.nearest_m).any(axis=0).mean())
+
+
+def observe_free_space(points: Points) -> FreeSpace:
+    """The spherical image of a scan; `points` (n, 3) in the sensor's frame."""
+    rays = np.ascontiguousarray(points, np.float32)
+    rays = rays.compress(within_range(rays, 0.0, np.inf), axis=0)
+    _, elevation, azimuth = geometry.spherical(rays)
+    column = ((azimuth + np.pi) * (NUM_COLUMNS / math.tau)).astype(np.int64) % NUM_COLUMNS
+    lowest_rad = float(elevation.min(initial=np.inf)) if len(rays) else 0.0
+    row_rad = _row_height(elevation - lowest_rad, column)
+    num_rows = 1 + int((float(elevation.max(initial=lowest_rad)) - lowest_rad) / row_rad)
+    nearest = _nearest_returns(rays, lowest_rad, row_rad, num_rows)
+    seen = np.isfinite(nearest)
+    padded = np.pad(nearest, ((1, 1), (0, 0)), constant_values=np.inf)
+    padded = np.pad(padded, ((0, 0), (1, 1)), mode="wrap")
+    across = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
+    around = np.minimum(np.minimum(across[:-2], across[1:-1]), across[2:])
+    path_m = float(np.median(nearest[seen])) if seen.any() else 0.0
+    return FreeSpace(np.where(seen, around, np.float32(np.inf)), lowest_rad, row_rad, path_m)
+
+
+def _row_height(elevation_rad: Vector, column: Indices) -> float:
+    """The smallest row height that leaves few rows empty between two beams."""
+    counts = []
+    for row_rad in (*ROWS_RAD, 2 * ROWS_RAD[-2], 2 * ROWS_RAD[-1]):
+        rows = (elevation_rad / row_rad).astype(np.int64)
+        filled = np.zeros((rows.max(initial=0) + 1, NUM_COLUMNS), bool)
+        filled[rows, column] = True
+        counts.append(int(filled.sum()))
+    detail = [fine / max(coarse, 1) for fine, coarse in zip(counts, counts[2:], strict=False)]
+    return next((row_rad for row_rad, found in zip(ROWS_RAD, detail, strict=True) if found >= MIN_DETAIL), ROWS_RAD[-1])
+
+
+def violation(
+    points: Points, seen: FreeSpace, T_view_points: Transform, *, config: VerifyConfig, is_coarse: bool = False
+) -> float:
+    """Share, 0 to 1, of the points that lie in front of all returns around their direction.
+
+    Only directions with a return count; 0 where there is none. The margin of a coarse pose, which may be off by more
+    than a narrow place allows, is `free_space_margin_m` everywhere.
+    """
+    moved = geometry.apply(T_view_points, points).astype(np.float32)
+    margin_m = config.free_space_margin_m if is_coarse else _margin_m(seen, config)
+    margins = np.array([margin_m, config.free_space_margin_ratio])
+    num_violations, num_seen = _count_violations(moved, seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
+    return num_violations / num_seen if num_seen else 0.0
+
+
+def fates(points: Points, seen: FreeSpace, *, config: VerifyConfig) -> tuple[Mask, Mask]:
+    """(n,) each: points that violate free space, and points behind all that was seen or where nothing was.
+
+    `points` (n, 3) in the frame of the scan that sees.
+    """
+    margins = np.array([_margin_m(seen, config), config.free_space_margin_ratio])
+    found = _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
+    return found < 0, found > 0
+
+
+def _margin_m(seen: FreeSpace, config: VerifyConfig) -> float:
+    return min(max(SHARE_OF_PATH * seen.free_path_m, MIN_MARGIN_M), config.free_space_margin_m)
+
+
+@kernel("UniTuple(int64, 2)(float32, float32, float32, float64, float64)")
+def _cell(x, y, z, lowest_rad, row_rad):
+    """Row and column of a direction; the row may be outside the image."""
+    elevation = math.atan2(z, math.sqrt(x * x + y * y))
+    row = math.floor((elevation - lowest_rad) / row_rad)
+    column = math.floor((math.atan2(y, x) + math.pi) / (2.0 * math.pi) * NUM_COLUMNS)
+    return int(row), int(column) % NUM_COLUMNS
+
+
+@kernel("float32[:, :](float32[:, ::1], float64, float64, int64)")
+def _nearest_returns(points, lowest_rad, row_rad, num_rows):
+    nearest = np.full((num_rows, NUM_COLUMNS), np.inf, np.float32)
+    for at in range(len(points)):
+        x, y, z = points[at, 0], points[at, 1], points[at, 2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        row, column = _cell(x, y, z, lowest_rad, row_rad)
+        row = min(max(row, 0), num_rows - 1)  # rounding, at the edges
+        nearest[row, column] = min(nearest[row, column], distance)
+    return nearest
+
+
+@kernel("UniTuple(int64, 2)(float32[:, :], float32[:, :], float64, float64, float64[:])")
+def _count_violations(points, nearest, lowest_rad, row_rad, margins):
+    """Number of points in front of the returns in their direction by `margins` (m, and per metre), and number of points
+    in directions with a return."""
+    num_violations = num_seen = 0
+    for x, y, z in points:
+        row, column = _cell(x, y, z, lowest_rad, row_rad)
+        if 0 <= row < len(nearest) and nearest[row, column] < np.inf:
+            num_seen += 1
+            distance = math.sqrt(x * x + y * y + z * z)
+            if distance + margins[0] + margins[1] * distance < nearest[row, column]:
+                num_violations += 1
+    return num_violations, num_seen
+
+
+@kernel("int8[:](float32[:, :], float32[:, :], float64, float64, float64[:])")
+def _fates(points, nearest, lowest_rad, row_rad, margins):
+    """For each point -1 if it is in front of the returns in its direction by `margins` (m, and per metre), 1 if it is
+    behind them by as much or there is no return, else 0."""
+    found = np.zeros(len(points), np.int8)
+    for at in range(len(points)):
+        x, y, z = points[at]
+        row, column = _cell(x, y, z, lowest_rad, row_rad)
+        return_m = nearest[row, column] if 0 <= row < len(nearest) else np.inf
+        distance = math.sqrt(x * x + y * y + z * z)
+        margin_m = margins[0] + margins[1] * distance
+        if return_m == np.inf or distance > return_m + margin_m:
+            found[at] = 1
+        elif distance + margin_m < return_m:
+            found[at] = -1
+    return found

@@ -1,0 +1,175 @@
+"""Semantic clusters: labelled points -> Gaussians.
+
+Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator: Global Point Cloud Registration with Semantic and Geometric Cues", ICRA
+2023, section III. The segmentation is dynamic curved-voxel clustering (DCVC) of Zhou, Guo, Gan, Yang, "T-LOAM:
+Truncated Least Squares LiDAR-Only Odometry and Mapping in Real Time", TGRS 2021: points fall in voxels of range, pitch
+and azimuth around the sensor, and occupied voxels that touch (26 neighbours) form one cluster.
+
+Differs from T-LOAM and from the Segregator authors' program: azimuth wraps, and clusters are connected components
+proper. Theirs joins clusters only where a point without a cluster meets them, so how a row of cars splits depends on
+the order of the points.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.config import SegregatorConfig
+from segslam.core.kernels import kernel
+from segslam.core.points import EMPTY, canonical_order, find_key, group_means, hash_keys, within_range
+from segslam.core.types import Covariances, Indices, Label, Labels, Points, Vector
+
+DCVC_START_RADIUS_M = 0.35
+"""Authors: first radial bin of DCVC (m)."""
+DCVC_RADIUS_STEP_M = 0.0004
+"""Authors: shrinking of each further radial bin (m)."""
+DCVC_AZIMUTH_DEG = 1.2
+"""Authors: azimuth bin of DCVC (degrees)."""
+MIN_RANGE_M = 0.5
+"""Authors: nearest point clustered (m)."""
+MAX_RANGE_M = 120.0
+"""Authors: farthest point clustered (m)."""
+
+FIRST_RADIUS_M = 5.0
+"""Start of the first radial bin, or the nearest point of the class if that is nearer (the authors' program) (m)."""
+
+
+class Clusters(NamedTuple):
+    """Gaussians, a row each: centre (m), covariance (m^2, normalised by n), class, number of points."""
+
+    means: Points
+    covariances: Covariances
+    classes: Labels
+    sizes: Indices
+
+
+NO_CLUSTERS = Clusters(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.uint8), np.empty(0, np.int64))
+
+
+def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfig) -> Clusters:
+    """The clusters of each class in `config.cluster_min_points`, by class, then by visible surface, largest first.
+
+    The visible surface is proportional to the number of points times the squared range. The first
+    `config.max_clusters_per_class` clusters of each class are kept.
+    Centres are in the frame of `points`, whose origin is the sensor. Points that are NaN or out of range are ignored.
+    The result does not depend on the order of the points.
+    """
+    chosen = np.flatnonzero(np.isin(labels, [int(label) for label in config.cluster_min_points]))
+    chosen = chosen[within_range(points[chosen], MIN_RANGE_M, MAX_RANGE_M)]
+    chosen = chosen[canonical_order(points[chosen])]
+    points, labels = points[chosen].astype(np.float64), labels[chosen]
+    parts = [
+        _class_clusters(points[labels == label], label, min_points, config)
+        for label, min_points in sorted(config.cluster_min_points.items())
+    ]
+    return Clusters(*(np.concatenate(columns) for columns in zip(NO_CLUSTERS, *parts, strict=True)))
+
+
+def curved_voxel_clusters(
+    points: Points, *, start_m: float, step_m: float, pitch_deg: float, azimuth_deg: float
+) -> Indices:
+    """(n,) the cluster of each point by DCVC, numbered from 0. The points are finite and none is at the origin.
+
+    Radial bin k, from 1, is `start_m - k * step_m` deep; the first starts at the nearest point, 5 m away at most. The
+    width of azimuth bins is the one nearest to `azimuth_deg` that divides the circle.
+    """
+    if not len(points):
+        return np.empty(0, np.int64)
+    range_m, elevation, turn = geometry.spherical(points)
+    num_azimuth = max(1, round(360.0 / azimuth_deg))
+    radial = _radial_bins(range_m, start_m, step_m)
+    pitch = _nearest_bin(elevation - min(0.0, elevation.min()), math.radians(pitch_deg))
+    azimuth = _nearest_bin(turn, math.tau / num_azimuth) % num_azimuth
+    num_radial = int(radial.max()) + 2  # one more than occupied: neighbours of the outermost bin have keys of their own
+    keys, voxel = np.unique((pitch * num_radial + radial) * num_azimuth + azimuth, return_inverse=True)
+    return _components(keys, num_radial, num_azimuth)[voxel]
+
+
+def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, Covariances]:
+    """Mean and covariance (normalised by n) of the points of each group. A group has a point at least."""
+    means = group_means(points, group, num_groups)
+    centred = points - means[group]
+    products = (centred[:, :, None] * centred[:, None, :]).reshape(-1, 9)
+    return means, group_means(products, group, num_groups).reshape(-1, 3, 3)
+
+
+def _class_clusters(points: Points, label: Label, min_points: int, config: SegregatorConfig) -> Clusters:
+    cluster = curved_voxel_clusters(
+        points,
+        start_m=DCVC_START_RADIUS_M,
+        step_m=DCVC_RADIUS_STEP_M,
+        pitch_deg=config.dcvc_pitch_deg,
+        azimuth_deg=DCVC_AZIMUTH_DEG,
+    )
+    sizes = np.bincount(cluster)
+    large = sizes >= min_points
+    renumbered = np.cumsum(large) - 1
+    kept = large[cluster]
+    means, covariances = gaussians(points[kept], renumbered[cluster[kept]], int(large.sum()))
+    area = sizes[large] * (means**2).sum(axis=1)
+    order = np.lexsort((*means.T, -area))[: config.max_clusters_per_class]
+    return Clusters(means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[large][order])
+
+
+def _nearest_bin(values: Vector, width: float) -> Indices:
+    return np.floor(values / width + 0.5).astype(np.int64)
+
+
+def _radial_bins(distance: Vector, start_m: float, step_m: float) -> Indices:
+    """The radial bin of each distance. The bins start at the nearest, but no farther than `FIRST_RADIUS_M`."""
+    farthest = distance.max()
+    bounds = [min(FIRST_RADIUS_M, distance.min())]
+    while bounds[-1] <= farthest:
+        bounds.append(bounds[-1] + start_m - len(bounds) * step_m)
+    return np.searchsorted(bounds[1:], distance, side="right")
+
+
+@kernel("int64(int64[:], int64)")
+def _root(parent, node):
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
+
+
+@kernel("void(int64[:], int64, int64)")
+def _join(parent, a, b):
+    a, b = _root(parent, a), _root(parent, b)
+    parent[max(a, b)] = min(a, b)
+
+
+@kernel("int64[:](int64[:])")
+def _numbered(parent):
+    number = np.empty(len(parent), np.int64)
+    count = 0
+    for node in range(len(parent)):
+        root = _root(parent, node)
+        if root == node:
+            number[node] = count
+            count += 1
+        else:
+            number[node] = number[root]
+    return number
+
+
+@kernel("int64[:](int64[:], int64, int64)")
+def _components(keys, num_radial, num_azimuth):
+    """The connected component of each voxel, numbered from 0 by its first voxel.
+
+    Keys are distinct: (pitch * num_radial + radial) * num_azimuth + azimuth. Azimuth wraps.
+    """
+    table, _ = hash_keys(keys)
+    parent = np.arange(len(keys))
+    for voxel in range(len(keys)):
+        row, azimuth = keys[voxel] // num_azimuth, keys[voxel] % num_azimuth
+        for pitch_step in range(0, 2):
+            for radial_step in range(-1, 2):
+                for azimuth_step in range(-1, 2):
+                    neighbour_row = row + pitch_step * num_radial + radial_step
+                    neighbour_azimuth = (azimuth + azimuth_step) % num_azimuth
+                    neighbour = find_key(table, keys, neighbour_row * num_azimuth + neighbour_azimuth)
+                    if neighbour != EMPTY:
+                        _join(parent, voxel, neighbour)
+    return _numbered(parent)

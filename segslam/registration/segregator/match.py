@@ -1,0 +1,210 @@
+"""Matching of two descriptions: the pose of one scan in the other.
+
+Yin et al., "Segregator", ICRA 2023, figure 2: correspondences, consistency graph, maximum clique, pose.
+Differs from the paper: while the pose is uncertain, all maximum cliques are tried, then wider bounds, as in the pyramid
+of graphs of Qiao et al., "G3Reg: Pyramid Graph-Based Global Registration Using Gaussian Ellipsoid Model", T-ASE 2024,
+then point features.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.config import SegregatorConfig
+from segslam.core.types import (
+    Description,
+    Direction,
+    Indices,
+    Points,
+    Registration,
+    Rejected,
+    RejectReason,
+    Transform,
+)
+from segslam.registration.cliques import maximum_cliques
+from segslam.registration.segregator.consistency_graph import consistency_graph
+from segslam.registration.segregator.correspondences import (
+    Correspondences,
+    cluster_correspondences,
+    concatenate,
+    feature_correspondences,
+)
+from segslam.registration.segregator.gaussians import align_gaussians
+from segslam.registration.segregator.pose_solver import PoseFit, solve_level, solve_pose
+
+TUPLE_SIMILARITY = 0.95
+"""Authors: edge ratio of the tuple test."""
+TUPLE_TRIALS_PER_PAIR = 100
+"""Authors: random triples drawn for each mutual pair."""
+TUPLE_SEED = 0
+"""Chosen: random seed of these triples."""
+CLIQUE_MAX_NODES = 200_000
+"""Chosen: search nodes after which the search stops with the best clique found."""
+CERTAIN_INLIERS = 12
+"""Chosen on simulated 00 and 08: number of inliers above which a pose is certain and no other is tried."""
+
+SAME_PLACE_M, SAME_TURN_RAD = 0.5, np.radians(2.0)
+"""Chosen: closer poses are one hypothesis, because refinement leads to the same pose."""
+MIN_GROUND_PATCHES = 5
+"""Chosen: smallest number of ground patches that determine the vertical."""
+TILT_RAD = math.radians(5.0)
+"""Chosen: standard deviation of a sensor's tilt, without visible ground."""
+PATCH_RAD = math.radians(13.0)
+"""Chosen: scatter of a ground normal before any is seen, as in a corridor whose ground is seen by 16 beams."""
+RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
+"""Median angle of directions that scatter by 1 in each of two directions."""
+
+
+def match(source: Description, target: Description, *, config: SegregatorConfig) -> Registration | Rejected:
+    """The pose of the source in the target with the most consistent correspondences, without an initial guess.
+
+    Returns `Rejected` with TOO_FEW_CORRESPONDENCES, SMALL_CLIQUE, DEGENERATE or TOO_FEW_INLIERS if there is no pose.
+    """
+    ranked = hypotheses(source, target, config=config)
+    return ranked if isinstance(ranked, Rejected) else ranked[0]
+
+
+def hypotheses(source: Description, target: Description, *, config: SegregatorConfig) -> list[Registration] | Rejected:
+    """Distinct poses, the one with the highest score first; only one if it is certain.
+
+    `Rejected` as `match` returns it, for the narrowest bound.
+    """
+    found, rejections = [], []
+    for attempt in _attempts(source, target, config):
+        if isinstance(attempt, Rejected):
+            rejections.append(attempt)
+            continue
+        found.append(attempt)
+        if attempt.fit.inliers.sum() >= CERTAIN_INLIERS:
+            break
+    if not found:
+        return rejections[0]
+    found.sort(key=lambda attempt: -attempt.fit.score)
+    poses = [attempt.fit.T_target_source for attempt in found]
+    return [attempt.registration() for k, attempt in enumerate(found) if not _is_among(poses[k], poses[:k])]
+
+
+class _Attempt(NamedTuple):
+    """A pose, and the numbers of correspondences and edges of the graph from which it was computed."""
+
+    fit: PoseFit
+    num_correspondences: int
+    num_edges: int
+
+    def registration(self) -> Registration:
+        return Registration(
+            T_target_source=self.fit.T_target_source,
+            num_correspondences=self.num_correspondences,
+            num_inliers=int(self.fit.inliers.sum()),
+            rms_m=self.fit.rms_m,
+            information=self.fit.information,
+            num_edges=self.num_edges,
+        )
+
+
+def _attempts(source: Description, target: Description, config: SegregatorConfig) -> Iterator[_Attempt | Rejected]:
+    """Poses of the maximum cliques: first of clusters, then of clusters and features, for increasing bounds."""
+    for correspondences in putative(source, target, config=config):
+        if len(correspondences) < config.min_clique:
+            yield Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
+            continue
+        for bound_m in config.noise_bounds_m:
+            graph = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
+            search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=CLIQUE_MAX_NODES)
+            size = len(search.cliques[0])
+            if size < config.min_clique:
+                yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} consistent correspondences")
+                continue
+            for clique in search.cliques:
+                fit = _solve(source, target, correspondences, clique, bound_m, config)
+                yield fit if isinstance(fit, Rejected) else _Attempt(fit, len(correspondences), len(graph.edges))
+
+
+def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Iterator[Correspondences]:
+    """Sets of correspondences to try: clusters; then clusters and features, if both scans have features.
+
+    With `features` set to `always`, the first set contains features.
+    """
+    clusters = cluster_correspondences(source, target)
+    if config.features != "always":
+        yield clusters
+    if config.features == "always" or (
+        config.features != "never" and len(source.feature_points) and len(target.feature_points)
+    ):
+        features = feature_correspondences(
+            source,
+            target,
+            similarity=TUPLE_SIMILARITY,
+            trials_per_pair=TUPLE_TRIALS_PER_PAIR,
+            seed=TUPLE_SEED,
+        )
+        yield concatenate(clusters, features)
+
+
+def _solve(
+    source: Description,
+    target: Description,
+    correspondences: Correspondences,
+    clique: Indices,
+    bound_m: float,
+    config: SegregatorConfig,
+) -> PoseFit | Rejected:
+    """The pose from the correspondences of one clique, by `config.solver`."""
+    if config.solver != "gaussians":
+        members = correspondences.take(clique)
+        return solve_pose(members.source, members.target, bound_m=bound_m, config=config)
+    rough = _rough_pose(source, target, correspondences.take(clique), bound_m, config)
+    if isinstance(rough, Rejected):
+        return rough
+    return align_gaussians(correspondences, source, target, rough, config=config)
+
+
+def _rough_pose(
+    source: Description, target: Description, members: Correspondences, bound_m: float, config: SegregatorConfig
+) -> Transform | Rejected:
+    """Initial pose: with the verticals aligned, if both are known."""
+    source_up, target_up = upward(source), upward(target)
+    if source_up is None or target_up is None:
+        fit = solve_pose(members.source, members.target, bound_m=bound_m, config=config)
+        return fit if isinstance(fit, Rejected) else fit.T_target_source
+    return solve_level(members.source, members.target, source_up, target_up, bound_m=bound_m, config=config)
+
+
+def upward(description: Description) -> Direction | None:
+    """Upward unit vector from the normals of the ground; None if too little ground is visible."""
+    if len(description.ground_normals) < MIN_GROUND_PATCHES:
+        return None
+    return _middle(description.ground_normals)
+
+
+def vertical(description: Description) -> Direction:
+    """Upward unit vector: the scan's z axis, corrected by the normals of the ground as far as ground is visible.
+
+    Ground and z axis are weighted by their inverse variances: that of the ground follows from the scatter of its
+    normals around their middle, that of the z axis is `TILT_RAD`.
+    """
+    normals = description.ground_normals
+    if not len(normals):
+        return np.array([0.0, 0.0, 1.0])
+    middle = _middle(normals)
+    scatter = np.median(np.linalg.norm(normals - middle, axis=1)) / RAYLEIGH_MEDIAN
+    variance = (len(normals) * scatter**2 + PATCH_RAD**2) / len(normals) ** 2  # of the middle
+    total = middle / variance + np.array([0.0, 0.0, 1.0 / TILT_RAD**2])
+    return total / np.linalg.norm(total)
+
+
+def _middle(normals: Points) -> Direction:
+    """Unit vector of the medians of the components: patches of slopes and walls do not move it, as they do the mean."""
+    middle = np.median(normals.astype(np.float64), axis=0)
+    return middle / np.linalg.norm(middle)
+
+
+def _is_among(T_target_source: Transform, poses: list[Transform]) -> bool:
+    differences = [geometry.inverse(T_target_other) @ T_target_source for T_target_other in poses]
+    return any(
+        geometry.distance(difference) <= SAME_PLACE_M and geometry.angle(difference) <= SAME_TURN_RAD
+        for difference in differences
+    )

@@ -1,6 +1,0 @@
-"""Place recognition: keyframes whose surroundings resemble those of a scan, without initial guess."""
-
-from segslam.retrieval.places import PlaceCandidate, Places
-from segslam.retrieval.signature import PlaceSignature, signature_of, signature_of_standing, signatures_around
-
-__all__ = ["PlaceCandidate", "PlaceSignature", "Places", "signature_of", "signature_of_standing", "signatures_around"]

@@ -1,0 +1,147 @@
+"""The drives of a fleet: recordings with the options of `segslam map`, from a list in YAML or from paths."""
+
+import hashlib
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from segslam.core.config.yaml_text import parse_yaml, short
+from segslam.core.types import SegslamError
+
+KEY_DIGITS = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A recording, and how it is mapped: the options of `segslam map` under their names."""
+
+    name: str
+    data: str
+    """Absolute path, the same on all machines."""
+    dataset: str = ""
+    sequence: str = "00"
+    frames: str = ""
+    topic: str = ""
+    labels: str = "auto"
+    encoding: str = ""
+    odometry: str = ""
+    preset: str = "auto"
+    config: str = ""
+    gnss: str = ""
+    set: tuple[str, ...] = ()
+
+    def key(self, version: str) -> str:
+        """A hash of the recording, of the options, and of the version: equal keys stand for equal runs.
+
+        Of a recording the names, sizes and times of its files are used. Raises SegslamError if it is missing.
+        """
+        options = {name: value for name, value in asdict(self).items() if name not in ("name", "data")}
+        gnss = self.gnss if self.gnss and Path(self.gnss).exists() else ""  # otherwise a topic
+        files = [path for path in (self.config, self.odometry, gnss) if path]
+        return key_of(version, options, _state(Path(self.data)), *(_state(Path(file)) for file in files))
+
+
+OPTIONS = tuple(field.name for field in fields(Drive))
+PATHS = ("data", "odometry", "config", "gnss")
+
+
+def key_of(*parts: Any) -> str:
+    """A short hash of values that JSON can hold."""
+    text = json.dumps(parts, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
+
+
+def _state(path: Path) -> list[tuple[str, int, int]]:
+    """Name, size and time of each file of a recording."""
+    try:
+        if path.is_file():
+            files = [path]
+        else:
+            files = sorted(Path(folder) / name for folder, _, names in os.walk(path, onerror=_raise) for name in names)
+        states = [(file, file.stat()) for file in files]
+    except OSError as error:
+        raise SegslamError(f"{path}: cannot be read ({error.strerror}); correct the list of drives") from error
+    return [(os.path.relpath(file, path), state.st_size, state.st_mtime_ns) for file, state in states]
+
+
+def _raise(error: OSError) -> None:
+    raise error
+
+
+def read_drives(file: Path) -> list[Drive]:
+    """The drives of a list in YAML: paths, or mappings with the options of `segslam map`, `data` among them.
+
+    Relative paths are relative to the list. Raises SegslamError, naming the file and the entry.
+    """
+    try:
+        values = parse_yaml(file.read_text(encoding="utf-8"), str(file))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{file}: cannot be read ({error}); give a list of drives in YAML") from error
+    if isinstance(values, dict) and set(values) == {"drives"}:
+        values = values["drives"]
+    if not isinstance(values, list) or not values:
+        raise SegslamError(f"{file}: expected a list of drives, found {short(values)}; write one line `- PATH` a drive")
+    return _named([_drive(value, f"{file}: drive {number}", file.parent) for number, value in enumerate(values, 1)])
+
+
+def drives_of(data: Sequence["Drive | str | Path"], *, config: Path | None = None) -> list[Drive]:
+    """One drive for each recording, with the settings of a file."""
+    options = {"config": str(config)} if config else {}
+    return _named(
+        [one if isinstance(one, Drive) else _drive({"data": str(one), **options}, str(one), Path.cwd()) for one in data]
+    )
+
+
+def with_settings(drives: Iterable[Drive], settings: Sequence[str]) -> list[Drive]:
+    """The drives with further settings, before their own."""
+    return [Drive(**{**asdict(drive), "set": (*settings, *drive.set)}) for drive in drives]
+
+
+def _drive(value: Any, where: str, folder: Path) -> Drive:
+    """Raises SegslamError for an entry that is neither a path nor a mapping of known options."""
+    given = {"data": value} if isinstance(value, str) else value
+    if not isinstance(given, dict) or "data" not in given:
+        raise SegslamError(f"{where}: expected a path or options with data: PATH, found {short(value)}")
+    unknown = [name for name in given if name not in OPTIONS]
+    if unknown:
+        raise SegslamError(f"{where}: unknown option {short(unknown[0])}; known: {', '.join(OPTIONS)}")
+    given = {"name": "", **{name: one for name, one in given.items() if one is not None}}
+    settings = given.pop("set", [])
+    settings = [settings] if isinstance(settings, str) else settings
+    if not isinstance(settings, list) or not all(isinstance(one, str) for one in settings):
+        raise SegslamError(f"{where}: set: expected texts section.key=value, found {short(settings)}")
+    texts = {name: _text(one, f"{where}: {name}") for name, one in given.items()}
+    for name in PATHS:
+        if texts.get(name):
+            texts[name] = str((folder / Path(texts[name]).expanduser()).resolve())
+    if not re.fullmatch(r"[\w. +=@-]*", texts["name"]) or texts["name"].startswith("."):
+        raise SegslamError(f"{where}: name {short(texts['name'])}: use letters, digits, spaces and _ . + = @ -")
+    return Drive(**texts, set=tuple(settings))
+
+
+def _text(value: Any, where: str) -> str:
+    """Texts and numbers, such as a sequence without quotes."""
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise SegslamError(f"{where}: expected a text, found {short(value)}")
+    return value if isinstance(value, str) else f"{value:02d}"
+
+
+def _named(drives: list[Drive]) -> list[Drive]:
+    """The drives with names: those given, or the names of their files, numbered where these are equal."""
+    given = [
+        drive.name or re.sub(r"[^\w. +=@-]", "_", Path(drive.data).stem).lstrip(".") or "drive" for drive in drives
+    ]
+    counts, seen = Counter(given), Counter[str]()
+    names = []
+    for name in given:
+        seen[name] += 1
+        names.append(name if counts[name] == 1 else f"{name}-{seen[name]}")
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise SegslamError(f"{twice[0]}: two drives have this name; give each its own")
+    return [Drive(**{**asdict(drive), "name": name}) for drive, name in zip(drives, names, strict=True)]

@@ -1,0 +1,218 @@
+"""A fleet: drives are mapped, related to each other, and joined to components, each in one frame."""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from segslam.core.types import SegslamError, WorkFailed
+from segslam.core.whole_files import write_whole
+from segslam.run.fleets import steps
+from segslam.run.fleets.drives import Drive, drives_of, key_of, read_drives, with_settings
+from segslam.run.fleets.relations import Components, Relation
+from segslam.run.fleets.steps import Mapped
+from segslam.run.fleets.workers import Outcome, Workers, workers
+from segslam.run.sessions.session_pose import MIN_FOUND
+
+FILE = "fleet.json"
+CORES_OF_WORKER = 2
+"""A drive is mapped by two threads."""
+Shown = Callable[[Iterable[Any], int, str], Iterator[Any]]
+"""Passes items on and shows progress: takes the items, their number, and the step's name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FleetResult:
+    """What became of a fleet."""
+
+    folder: Path
+    drives: dict[str, dict[str, Any]]
+    """By name: `state` (mapped or failed), `component` (number, None if it failed), and `reason` of a failure."""
+    components: tuple[dict[str, Any], ...]
+    """`folder`, names of the `drives`, `num_loops_between`, `ate_m` if it is known, and `reason` if it failed."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time by step."""
+
+    @property
+    def num_loops_between(self) -> int:
+        """Loops between drives, in all components."""
+        return sum(int(component.get("num_loops_between", 0)) for component in self.components)
+
+
+def _not_shown(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
+    return iter(items)
+
+
+def fleet(
+    drives: str | Path | Sequence[Drive | str | Path],
+    out: str | Path,
+    *,
+    scheduler: str | None = None,
+    num_workers: int | None = None,
+    same_reference: bool = False,
+    settings: Sequence[str] = (),
+    shown: Shown = _not_shown,
+    say: Callable[[str], object] = lambda text: None,
+) -> FleetResult:
+    """Map drives and join those that share places, in the folder `out`; what is there already is not done again.
+
+    `drives`: a file with a list (`read_drives`), or recordings. Its calls belong under `if __name__ == "__main__":` in
+    a script, because worker processes import it.
+    `scheduler`: address of a Dask scheduler, all of whose workers see the recordings and `out` under the same paths;
+    otherwise `num_workers` processes of this machine, by default one for two cores. `same_reference`: the true poses of
+    all drives are in one frame. `settings`: `section.key=value` texts for all drives. Raises SegslamError if no drive
+    could be mapped, or if a worker cannot take part; a drive that fails is in the result, with the reason.
+    """
+    listed = read_drives(Path(drives)) if isinstance(drives, str | Path) else drives_of(drives)
+    folder = Path(out).expanduser().resolve()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        steps.remove_unfinished(folder)
+    except OSError as error:
+        raise SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out") from error
+    number = num_workers or max((os.cpu_count() or 1) // CORES_OF_WORKER, 1)
+    with workers(folder, number=number, scheduler=scheduler) as (run, dashboard):
+        if dashboard:
+            say(f"dashboard: {dashboard}")
+        return _Fleet(folder, run, shown, say).run(with_settings(listed, settings), same_reference)
+
+
+class _Fleet:
+    """The steps in turn."""
+
+    def __init__(self, folder: Path, run: Workers, shown: Shown, say: Callable[[str], object]) -> None:
+        self._folder, self._run, self._shown, self._say = folder, run, shown, say
+        self._seconds: dict[str, float] = {}
+        self._reasons: dict[str, str] = {}
+
+    def run(self, drives: Sequence[Drive], same_reference: bool) -> FleetResult:
+        mapped = self._indexed(self._mapped(drives))
+        if not mapped:
+            first, why = next(iter(self._reasons.items()))
+            raise SegslamError(f"no drive could be mapped; {first}: {why}")
+        components = self._related(mapped, self._proposed(mapped))
+        made = self._joined(mapped, components, same_reference)
+        where = {name: number for number, one in enumerate(made) for name in one["drives"]}
+        states: dict[str, dict[str, Any]] = {}
+        for drive in drives:
+            reason = self._reasons.get(drive.name)
+            state = {"state": "failed" if reason else "mapped", "component": where.get(drive.name)}
+            states[drive.name] = state | ({"reason": reason} if reason else {})
+        result = FleetResult(self._folder, states, tuple(made), self._seconds)
+        _write(result)
+        failed = [one["reason"] for one in made if "reason" in one]
+        if failed:
+            raise WorkFailed(f"{self._folder}: {failed[0]}; correct it, and call `segslam fleet` again to go on")
+        return result
+
+    def _all(self, name: str, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[Outcome]:
+        """The outcomes of a step, in the order of its tasks."""
+        started = perf_counter()
+        done = self._run(function, tasks)
+        outcomes: dict[int, Outcome] = dict(self._shown(done, len(tasks), name) if tasks else ())
+        self._seconds[name] = self._seconds.get(name, 0.0) + perf_counter() - started
+        return [outcomes[number] for number in range(len(tasks))]
+
+    def _failed(self, name: str, reason: str) -> None:
+        self._reasons[name] = reason
+        self._say(f"{name}: {reason}")
+
+    def _mapped(self, drives: Sequence[Drive]) -> list[Mapped]:
+        tasks: list[tuple[Path, Drive, str]] = []
+        for drive in drives:
+            try:
+                tasks.append((self._folder, drive, drive.key(version("segslam"))))
+            except SegslamError as error:
+                self._failed(drive.name, str(error))
+        outcomes = self._all("map", steps.map_drive, tasks)
+        return self._without_failed([task[1].name for task in tasks], outcomes)
+
+    def _indexed(self, mapped: list[Mapped]) -> list[Mapped]:
+        outcomes = self._all("index", steps.index_drive, [(self._folder, drive) for drive in mapped])
+        done = [Outcome(drive, one.failure) for drive, one in zip(mapped, outcomes, strict=True)]
+        return self._without_failed([drive.name for drive in mapped], done)
+
+    def _without_failed(self, names: Iterable[str], outcomes: Iterable[Outcome]) -> list[Mapped]:
+        kept: list[Mapped] = []
+        for name, outcome in zip(names, outcomes, strict=True):
+            if outcome.failure is None:
+                kept.append(outcome.value)
+            else:
+                self._failed(name, outcome.failure)
+        return kept
+
+    def _proposed(self, mapped: Sequence[Mapped]) -> dict[tuple[int, int], list[tuple[int, float]]]:
+        """Keyframes of a drive that look most like places of an earlier one, by the numbers of both."""
+        tasks = [
+            (self._folder, drive, mapped[:number], key_of([one.key for one in mapped[: number + 1]]))
+            for number, drive in enumerate(mapped)
+        ]
+        numbers = {drive.name: number for number, drive in enumerate(mapped)}
+        proposals: dict[tuple[int, int], list[tuple[int, float]]] = {}
+        for later, outcome in enumerate(self._all("propose", steps.propose, tasks)):
+            if outcome.failure is not None:
+                raise WorkFailed(f"{mapped[later].name}: {outcome.failure}; call `segslam fleet` again to go on")
+            proposals |= {(later, numbers[name]): likely for name, likely in outcome.value.items()}
+        return proposals
+
+    def _related(
+        self, mapped: Sequence[Mapped], proposals: Mapping[tuple[int, int], list[tuple[int, float]]]
+    ) -> Components:
+        """The most similar pairs of drives are related first, until all are joined or tried."""
+        components = Components(len(mapped))
+        similarity = {pair: sum(score for _, score in likely[:MIN_FOUND]) for pair, likely in proposals.items()}
+        while pairs := components.next_pairs(similarity):
+            tasks = []
+            for later, earlier in pairs:
+                queries = [keyframe_id for keyframe_id, _ in proposals[later, earlier]]
+                key = key_of(mapped[later].key, mapped[earlier].key, queries)
+                tasks.append((self._folder, mapped[later], mapped[earlier], queries, key))
+            for pair, outcome in zip(pairs, self._all("relate", steps.relate, tasks), strict=True):
+                if outcome.failure is not None:
+                    raise WorkFailed(f"{mapped[pair[0]].name}: {outcome.failure}; call `segslam fleet` again to go on")
+                relation: Relation = outcome.value
+                components.add(*pair, relation)
+                self._say(_line(mapped[pair[0]].name, mapped[pair[1]].name, relation))
+        return components
+
+    def _joined(self, mapped: Sequence[Mapped], components: Components, same: bool) -> list[dict[str, Any]]:
+        tasks, made = [], []
+        for number, members in enumerate(components.members()):
+            order, poses = components.arranged(members)
+            drives = [mapped[drive] for drive in order]
+            folder = self._folder / f"component_{number}"
+            related = [pose and [pose.earlier, pose.T_earlier_world.tolist()] for pose in poses]
+            key = key_of([drive.key for drive in drives], related, same)
+            tasks.append((self._folder, folder, drives, poses, key, same))
+            made.append({"folder": folder.name, "drives": [drive.name for drive in drives]})
+        for one, outcome in zip(made, self._all("join", steps.join, tasks), strict=True):
+            figures = outcome.value or {}
+            names = ("num_loops_between", "num_keyframes", "length_m", "ate_m")
+            one |= {name: figures[name] for name in names if name in figures}
+            one |= {"reason": outcome.failure} if outcome.failure else {}
+        steps.remove_components(self._folder, keep=len(made))
+        return made
+
+
+def _line(later: str, earlier: str, relation: Relation) -> str:
+    if relation.T_earlier_later is None:
+        return f"{later} is not joined to {earlier}: {relation.reason}"
+    return f"{later} is joined to {earlier} by {len(relation.found)} of its keyframes"
+
+
+def _write(result: FleetResult) -> None:
+    """`fleet.json`, and the report."""
+    from segslam.run.fleets.report import write_report
+
+    values = {
+        "drives": result.drives,
+        "components": result.components,
+        "num_loops_between": result.num_loops_between,
+        "seconds": {name: round(seconds, 3) for name, seconds in result.seconds.items()},
+    }
+    write_whole(result.folder / FILE, json.dumps(values, indent=2) + "\n")
+    write_report(result)

@@ -1,0 +1,136 @@
+"""Relative poses of drives: written to files, inverted, and chained to the poses of a component."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.types import Alignment, Registration, SegslamError, Transform
+from segslam.graph.closure_pairs import adjoints
+from segslam.run.sessions.session_pose import MOST_FAILED, SessionPose
+
+Found = tuple[int, int, Alignment]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Relation:
+    """The pose of a drive's world frame in that of an earlier drive, or why it is unknown."""
+
+    T_earlier_later: Transform | None
+    found: tuple[Found, ...]
+    """Keyframe of the later drive, of the earlier one, and the pose of the first in the second."""
+    reason: str = ""
+
+
+def write_relation(file: Path, relation: Relation) -> None:
+    """As JSON, without loss."""
+    pose = None if relation.T_earlier_later is None else relation.T_earlier_later.tolist()
+    found = [(own, target, asdict(alignment)) for own, target, alignment in relation.found]
+    values = {"T_earlier_later": pose, "found": found, "reason": relation.reason}
+    file.write_text(json.dumps(values, default=np.ndarray.tolist) + "\n", encoding="utf-8")
+
+
+def read_relation(file: Path) -> Relation:
+    """Raises SegslamError, naming the file, if it is damaged."""
+    try:
+        values = json.loads(file.read_text(encoding="utf-8"))
+        found = tuple((int(own), int(target), _alignment(one)) for own, target, one in values["found"])
+        pose = values["T_earlier_later"]
+        return Relation(None if pose is None else np.array(pose, float).reshape(4, 4), found, str(values["reason"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); remove it, and call `segslam fleet` again") from error
+
+
+def _alignment(values: dict[str, Any]) -> Alignment:
+    return Alignment(**{**values, "coarse": _registration(values["coarse"]), "fine": _registration(values["fine"])})
+
+
+def _registration(values: dict[str, Any]) -> Registration:
+    arrays = {"T_target_source": (4, 4), "information": (6, 6)}
+    return Registration(**values | {name: np.array(values[name], float).reshape(size) for name, size in arrays.items()})
+
+
+def inverted(alignment: Alignment) -> Alignment:
+    """The same alignment as the pose of the target in the source."""
+    return replace(alignment, coarse=_inverted(alignment.coarse), fine=_inverted(alignment.fine))
+
+
+def _inverted(pose: Registration) -> Registration:
+    """`T exp(x)` has the inverse `inverse(T) exp(-Ad(T) x)`."""
+    undone = np.linalg.inv(adjoints(pose.T_target_source[None])[0])
+    information = undone.T @ pose.information @ undone
+    return replace(pose, T_target_source=geometry.inverse(pose.T_target_source), information=information)
+
+
+class Components:
+    """Which drives are joined, by the relations found so far."""
+
+    def __init__(self, num_drives: int) -> None:
+        self._component = list(range(num_drives))
+        self._relations: dict[tuple[int, int], Relation] = {}
+        self._tried = set[tuple[int, int]]()
+        self._num_failed = [0] * num_drives
+
+    def of(self, drive: int) -> int:
+        """The component of a drive: the number of its first drive."""
+        return self._component[drive]
+
+    def members(self) -> list[list[int]]:
+        """The drives of each component, by their first."""
+        return [
+            [drive for drive, own in enumerate(self._component) if own == first]
+            for first in sorted(set(self._component))
+        ]
+
+    def add(self, later: int, earlier: int, relation: Relation) -> None:
+        """Join two drives, unless they are joined already, or their relation is unknown."""
+        self._tried.add((later, earlier))
+        one, other = sorted((self.of(later), self.of(earlier)))
+        if relation.T_earlier_later is None:
+            self._num_failed[later] += 1
+            self._num_failed[earlier] += 1
+        if relation.T_earlier_later is None or one == other:
+            return
+        self._relations[later, earlier] = relation
+        self._component = [one if own == other else own for own in self._component]
+
+    def arranged(self, members: Sequence[int]) -> tuple[list[int], list[SessionPose | None]]:
+        """The drives of a component, each after one in which its pose is known, and these poses."""
+        order, poses = [members[0]], list[SessionPose | None]([None])
+        for before in order:  # which grows
+            for drive in members:
+                pose = None if drive in order else self._pose(drive, before, order.index(before))
+                if pose is not None:
+                    order.append(drive)
+                    poses.append(pose)
+        return order, poses
+
+    def _pose(self, drive: int, before: int, number: int) -> SessionPose | None:
+        """The pose of a drive in another, which has this number in the order; None if they are not related."""
+        if relation := self._relations.get((drive, before)):
+            assert relation.T_earlier_later is not None
+            return SessionPose(number, relation.T_earlier_later, relation.found)
+        if relation := self._relations.get((before, drive)):
+            assert relation.T_earlier_later is not None
+            found = tuple((target, own, inverted(alignment)) for own, target, alignment in relation.found)
+            return SessionPose(number, geometry.inverse(relation.T_earlier_later), found)
+        return None
+
+    def next_pairs(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
+        """For each component the most similar pair with another one, of those not tried yet.
+
+        Two drives that `MOST_FAILED` others each could not be joined to are not tried with each other.
+        """
+        best: dict[int, tuple[float, tuple[int, int]]] = {}
+        for pair, value in similarity.items():
+            ends = {self.of(drive) for drive in pair}
+            is_open = min(self._num_failed[drive] for drive in pair) < MOST_FAILED
+            if pair in self._tried or len(ends) < 2 or not is_open:
+                continue
+            for component in ends:
+                best[component] = max(best.get(component, (0.0, (0, 0))), (value, (-pair[0], -pair[1])))
+        return sorted({(-negated[0], -negated[1]) for _, negated in best.values()})

@@ -1,0 +1,259 @@
+"""The work of a fleet, each step a function of paths that any process with the same folder can call.
+
+A step writes its result beside the final name and renames it when it is whole. What is there is not done again.
+"""
+
+import json
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+from uuid import uuid4
+
+import numpy as np
+
+from segslam.candidates import Places, PlaceSignature
+from segslam.core.config import Config, load_config
+from segslam.core.types import SegslamError, Trajectory
+from segslam.gnss.fixes import Fixes
+from segslam.gnss.reading import read_fixes
+from segslam.labels.encodings import Encoding
+from segslam.output.finished import read_metrics
+from segslam.output.folder import write_poses
+from segslam.output.georeferenced import georeference
+from segslam.output.report import write_report
+from segslam.run.fleets.drives import Drive
+from segslam.run.fleets.relations import Relation, read_relation, write_relation
+from segslam.run.given_odometry import given_odometry
+from segslam.run.locator import Locator
+from segslam.run.map_folder import map_folder, open_scans
+from segslam.run.sessions.merge import arranged, write_merged
+from segslam.run.sessions.recorded import Session, read_session
+from segslam.run.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
+from segslam.scans import DataSource
+from segslam.scans.presets import SETTINGS, Preset, extent_m, preset, preset_for
+
+logger = logging.getLogger(__name__)
+RUNS, INDEX, PROPOSALS, PAIRS = "runs", "index", "proposals", "pairs"
+KEY = "fleet.key"
+"""File in a run folder of a fleet: the key that it was made with."""
+UNFINISHED = ".part"
+ONE_THREAD = "odometry.max_num_threads=1"
+NUM_LOCATORS = 2
+Likely = dict[str, list[tuple[int, float]]]
+"""By the name of an earlier drive: keyframes of a drive and their largest similarities to a place there, best first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mapped:
+    """A drive that is mapped."""
+
+    name: str
+    key: str
+
+    def folder(self, fleet: Path) -> Path:
+        """Its run."""
+        return fleet / RUNS / self.name
+
+    def signatures(self, fleet: Path) -> Path:
+        """Signatures of its keyframes, (n, 24, 60)."""
+        return fleet / INDEX / f"{self.name}-{self.key}.npy"
+
+
+def is_made(folder: Path, key: str) -> bool:
+    """True if a folder is whole and was made with this key."""
+    try:
+        return (folder / KEY).read_text(encoding="utf-8") == key
+    except OSError:
+        return False
+
+
+def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
+    """Map a drive into its run folder, as `segslam map` does. Raises SegslamError, as that does."""
+    mapped = Mapped(drive.name, key)
+    if is_made(mapped.folder(fleet), key):
+        return mapped
+    part = _part_of(mapped.folder(fleet))
+    source = DataSource(
+        Path(drive.data),
+        drive.sequence,
+        drive.dataset or None,
+        drive.labels,
+        cast("Encoding | None", drive.encoding or None),
+        drive.frames or None,
+        drive.topic,
+    )
+    config = _config(drive, source)
+    fixes = read_fixes(drive.gnss, recording=source.data) if drive.gnss else None  # fails before the drive is mapped
+    odometry = None
+    if drive.odometry:
+        odometry = given_odometry(Path(drive.odometry), open_scans(source, config), config.odometry)
+    map_folder(
+        source.data,
+        part,
+        config=config,
+        sequence=source.sequence,
+        dataset=source.dataset,
+        labels=source.labels,
+        encoding=source.encoding,
+        frames=source.frames,
+        topic=source.topic,
+        odometry=odometry,
+    )
+    if fixes is not None:
+        _georeference(part, drive.name, fixes)
+    _made(part, mapped.folder(fleet), key)
+    return mapped
+
+
+def _georeference(part: Path, name: str, fixes: Fixes) -> None:
+    """Place a mapped drive by its fixes; where they do not determine a place, the drive remains without."""
+    try:
+        georeference(part, fixes)
+    except SegslamError as error:
+        logger.warning("%s: has no place on the globe: %s", name, error)
+        return
+    write_report(part)
+
+
+def _config(drive: Drive, source: DataSource) -> Config:
+    """The settings of a drive: KISS-ICP has one thread, so that poses repeat exactly, unless they say otherwise.
+
+    Raises SegslamError for a wrong setting, and for an unknown preset.
+    """
+    if drive.preset != "auto" and drive.preset not in SETTINGS:
+        raise SegslamError(f"preset: {drive.preset}: unknown preset; known: auto, {', '.join(SETTINGS)}")
+    file = Path(drive.config) if drive.config else None
+    scans = open_scans(source, load_config(file, drive.set))
+    name = preset_for(extent_m(scans)) if drive.preset == "auto" else cast("Preset", drive.preset)
+    return load_config(file, drive.set, base=load_config(None, [ONE_THREAD], base=preset(name)))
+
+
+def index_drive(fleet: Path, drive: Mapped) -> int:
+    """Write the signatures of all keyframes of a run; returns their number."""
+    file = drive.signatures(fleet)
+    if not file.exists():
+        spectra = np.array([one.spectrum for one in _locator(fleet, drive).signatures])
+        _replace(file, lambda part: np.save(part, spectra))
+    return len(np.load(file, mmap_mode="r"))
+
+
+def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped], key: str) -> Likely:
+    """For each earlier drive, the keyframes of this one that look most like one of its places, by its name."""
+    file = fleet / PROPOSALS / f"{drive.name}-{key}.json"
+    if not file.exists():
+        proposed = _proposed(fleet, drive, earlier)
+        _replace(file, lambda part: part.write_text(json.dumps(proposed), encoding="utf-8"))
+    found = json.loads(file.read_text(encoding="utf-8"))
+    return {name: [(keyframe_id, score) for keyframe_id, score in likely] for name, likely in found.items()}
+
+
+def _proposed(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
+    places, owners = Places(), list[str]()
+    for other in earlier:
+        for spectrum in np.load(other.signatures(fleet), mmap_mode="r"):
+            places.add(len(owners), PlaceSignature(np.asarray(spectrum)))
+            owners.append(other.name)
+    likely: dict[str, dict[int, float]] = {}
+    for keyframe_id, spectrum in enumerate(np.load(drive.signatures(fleet), mmap_mode="r")):
+        for similar in places.shortlist(PlaceSignature(np.asarray(spectrum))):
+            likely.setdefault(owners[similar.place_id], {}).setdefault(keyframe_id, similar.score)  # best first
+    return {
+        name: sorted(scores.items(), key=lambda one: -one[1])[:NUM_ENOUGH] for name, scores in sorted(likely.items())
+    }
+
+
+def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], key: str) -> Relation:
+    """The pose of a drive in an earlier one, from its keyframes that look like places there."""
+    file = fleet / PAIRS / f"{later.name} in {earlier.name}-{key}.json"
+    if not file.exists():
+        session, known = (read_session(one.folder(fleet)) for one in (later, earlier))
+        config = known.run.config
+        found = find_session(session, known, 0, _locator(fleet, earlier), config=config, likely=queries)
+        relation = Relation(None, (), found) if isinstance(found, str) else Relation(found.T_earlier_world, found.found)
+        _replace(file, lambda part: write_relation(part, relation))
+    return read_relation(file)
+
+
+def join(
+    fleet: Path,
+    folder: Path,
+    drives: Sequence[Mapped],
+    poses: Sequence[SessionPose | None],
+    key: str,
+    same_reference: bool,
+) -> Mapping[str, Any]:
+    """The drives of a component as one run, each with its pose in one before it; returns the figures of the run."""
+    if not is_made(folder, key):
+        part = _part_of(folder)
+        sessions = [read_session(drive.folder(fleet)) for drive in drives]
+        if len(drives) == 1:
+            shutil.copytree(drives[0].folder(fleet), part)
+            together = sessions[0].run.result.trajectory
+        else:
+            part.mkdir()
+            merged = arranged(sessions, poses, same_reference=same_reference)
+            together = write_merged(merged, part, sessions[0].run.config).result.trajectory
+        _write_drives(part / "drives", drives, sessions, together)
+        _made(part, folder, key)
+    return read_metrics(folder)
+
+
+def _write_drives(folder: Path, drives: Sequence[Mapped], sessions: Sequence[Session], together: Trajectory) -> None:
+    """The poses of each drive in the common frame, with its own scan numbers and stamps."""
+    folder.mkdir()
+    first = 0
+    for drive, session in zip(drives, sessions, strict=True):
+        own = session.run.result.trajectory
+        rows = slice(first, first + len(own))
+        poses = Trajectory(own.scan_index, own.stamp_ns, together.T_world_lidar[rows])
+        write_poses(folder, drive.name, poses, session.run.T_camera_lidar)
+        first = rows.stop
+
+
+@lru_cache(NUM_LOCATORS)
+def _locator(fleet: Path, drive: Mapped) -> Locator:
+    return Locator.from_run(drive.folder(fleet))
+
+
+def _part_of(target: Path) -> Path:
+    """A new name beside the target: two workers may do the same work, if the first seemed to be lost."""
+    return target.with_name(f".{target.name}.{uuid4().hex}{UNFINISHED}")
+
+
+def _made(part: Path, folder: Path, key: str) -> None:
+    """A whole folder takes its final name, in place of one that was made with another key."""
+    (part / KEY).write_text(key, encoding="utf-8")
+    if is_made(folder, key):
+        shutil.rmtree(part)
+        return
+    if folder.exists():
+        old = _part_of(folder)
+        folder.rename(old)
+        shutil.rmtree(old)
+    part.rename(folder)
+
+
+def _replace(file: Path, write: Any) -> None:
+    """Write a file under another name, then rename it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = _part_of(file).with_suffix(file.suffix)
+    write(part)
+    part.replace(file)
+
+
+def remove_components(fleet: Path, *, keep: int) -> None:
+    """Remove the components of an earlier call beyond this number: drives that were alone are joined now."""
+    while (folder := fleet / f"component_{keep}") and (folder / KEY).exists():
+        shutil.rmtree(folder)
+        keep += 1
+
+
+def remove_unfinished(fleet: Path) -> None:
+    """Remove what interrupted steps left."""
+    for folder in (fleet, *(fleet / name for name in (RUNS, INDEX, PROPOSALS, PAIRS))):
+        for part in folder.glob(f".*{UNFINISHED}*") if folder.is_dir() else ():
+            shutil.rmtree(part) if part.is_dir() else part.unlink()

@@ -1,0 +1,110 @@
+"""Where the steps of a fleet run: in this process, or in the processes of a Dask cluster."""
+
+import gc
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+from uuid import uuid4
+
+from segslam.core.cluster import cluster
+from segslam.core.memory import give_back
+from segslam.core.types import SegslamError
+
+logger = logging.getLogger(__name__)
+DIED = "every worker process that tried it died"
+
+
+class Outcome(NamedTuple):
+    """The result of a task, or why it has none."""
+
+    value: Any
+    failure: str | None = None
+
+
+@runtime_checkable
+class Workers(Protocol):
+    """Runs a function for several tuples of arguments."""
+
+    def __call__(self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Outcome]]:
+        """Yields the number and outcome of each task when it is done."""
+        ...
+
+
+def here(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Outcome]]:
+    """One task after the other, in this process."""
+    for number, task in enumerate(tasks):
+        yield number, attempted(function, *task)
+
+
+def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
+    """The outcome of one task. A bug, too, is the failure of one task, with its traceback in the worker's log.
+
+    Memory that the task freed is returned to the system: a worker does many tasks, and what each leaves behind in
+    another place of the heap would add up.
+    """
+    try:
+        return Outcome(function(*arguments))
+    except (SegslamError, OSError) as error:
+        return Outcome(None, str(error))
+    except Exception as error:
+        logger.exception("%s failed", function.__name__)
+        return Outcome(None, f"{type(error).__name__}: {error}")
+    finally:
+        gc.collect()
+        give_back()
+
+
+@contextmanager
+def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tuple[Workers, str]]:
+    """Runs tasks on the workers of a scheduler, or on so many processes of this machine; with its dashboard's address.
+
+    One process here needs no Dask. Raises SegslamError if the scheduler does not answer, has no worker, or if a worker
+    has another version or does not see the folder.
+    """
+    if scheduler is None and number == 1:
+        yield here, ""
+        return
+    import dask
+
+    with dask.config.set({"distributed.worker.daemon": False}), cluster(workers=number, scheduler=scheduler) as client:
+        _check(client, folder, scheduler)
+        yield _On(client), client.dashboard_link if scheduler else ""
+
+
+def _check(client: Any, folder: Path, scheduler: str | None) -> None:
+    """Raises SegslamError unless all workers have this version and see the folder."""
+    versions = client.run(version, "segslam", on_error="return")
+    if not versions:
+        raise SegslamError(f"--scheduler {scheduler}: it has no workers; start `dask worker {scheduler}`")
+    for worker, found in versions.items():
+        if found != version("segslam"):
+            has = f"has segslam {found}" if isinstance(found, str) else "cannot import segslam"
+            raise SegslamError(f"worker {worker}: {has}, this is {version('segslam')}; install the same version there")
+    for worker, sees in client.run(Path.is_dir, folder).items():
+        if not sees:
+            raise SegslamError(f"worker {worker}: does not see {folder}; give a folder that all workers share")
+
+
+class _On:
+    """Tasks on a Dask cluster, which repeats those of a worker that dies."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def __call__(self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Outcome]]:
+        """Raises SegslamError if the scheduler is lost."""
+        from distributed import KilledWorker, as_completed
+
+        name, submit = function.__name__, self._client.submit  # the dashboard groups tasks by name
+        futures = [submit(attempted, function, *task, key=f"{name}-{uuid4().hex}") for task in tasks]
+        numbers = {future.key: number for number, future in enumerate(futures)}
+        for future in as_completed(futures):
+            if future.status in ("cancelled", "lost"):
+                raise SegslamError("the scheduler is lost; start it again, and call `segslam fleet` again to go on")
+            try:
+                yield numbers[future.key], future.result()
+            except KilledWorker:
+                yield numbers[future.key], Outcome(None, DIED)

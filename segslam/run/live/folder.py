@@ -1,0 +1,184 @@
+"""A folder into which a recorder writes scans. A scan is read when its file is closed or renamed to its final name."""
+
+import ctypes
+import os
+import re
+import select
+import struct
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.sharedctypes import RawValue
+from pathlib import Path
+from threading import Event
+from time import time_ns
+
+import numpy as np
+
+from segslam.core.types import BadScan, Scan, SegslamError, Transform
+from segslam.run.live.waiting import Arrival, Waiting
+from segslam.scans.clouds import read_cloud, read_intensities
+from segslam.scans.dataset import make_scan
+
+SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
+IN_CLOSE_WRITE, IN_MOVED_TO = 0x8, 0x80
+IN_DELETE_SELF, IN_MOVE_SELF, IN_UNMOUNT, IN_Q_OVERFLOW = 0x400, 0x800, 0x2000, 0x4000
+IN_ONLYDIR = 0x01000000
+"""Constants of Linux's inotify(7)."""
+EVENT = struct.Struct("iIII")
+"""Watch, mask, cookie and length of the following name."""
+NAMES_KEPT = 1000
+"""Number of names whose last content is remembered: a file that is closed again without a change is the same scan."""
+STAMP_NAME = re.compile(r"(?P<s>\d{9,10})[._-](?P<fraction>\d{1,9})|(?P<ns>\d{19})|(?P<us>\d{16})")
+WAKE_S = 0.2
+"""Longest time until a stop takes effect."""
+
+
+class FolderSource:
+    """Scans as their files appear; existing files are ignored. A name that is written again is another scan."""
+
+    def __init__(self, folder: Path, *, intensities: bool = False, vertical_angle_deg: float = 0.0) -> None:
+        self._folder = folder.expanduser().resolve()
+        self._has_intensities = intensities
+        self._vertical_angle_deg = vertical_angle_deg
+        self.name = f"live/{self._folder.name}"
+        self._fd = -1
+        self._has_missed = False
+        self._noted_ns = RawValue("q", 0)
+        """Time at which the newest file that was put has changed, at first that of `open`.
+
+        The memory is shared with the main process, from which the next front process continues."""
+        self._seen: OrderedDict[str, tuple[int, int]] = OrderedDict()
+        """Name -> time of the last change (ns) and size of the files that were put."""
+
+    def open(self, tell: Callable[[str], None]) -> None:
+        """Start to watch the folder. Raises SegslamError if it cannot be watched."""
+        libc = ctypes.CDLL(None, use_errno=True)
+        self._fd = libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
+        mask = IN_CLOSE_WRITE | IN_MOVED_TO | IN_DELETE_SELF | IN_MOVE_SELF | IN_ONLYDIR
+        if self._fd < 0 or libc.inotify_add_watch(self._fd, os.fsencode(self._folder), mask) < 0:
+            why = os.strerror(ctypes.get_errno())
+            raise SegslamError(f"{self._folder}: cannot be watched ({why}); give a folder on a local disk")
+        there = [entry for entry in self._folder.iterdir() if entry.suffix in SUFFIXES]
+        self._has_missed = self._noted_ns.value > 0
+        if there and not self._has_missed:
+            tell(f"{len(there)} scans already in {self._folder} are ignored; use segslam map for these")
+        self._noted_ns.value = self._noted_ns.value or time_ns()
+
+    def feed(self, waiting: Waiting, stopped: Event) -> str:
+        """Put the scans whose files are complete, until `stopped` is set or the folder is removed.
+
+        Those that appeared since the last scan put by an earlier process come first.
+        """
+        if self._has_missed:
+            self._put_missed(waiting)
+        while not stopped.is_set():
+            if not select.select([self._fd], [], [], WAKE_S)[0]:
+                continue
+            for mask, name in _events(os.read(self._fd, 65536)):
+                if mask & (IN_DELETE_SELF | IN_MOVE_SELF | IN_UNMOUNT):
+                    return f"{self._folder} was removed"
+                if mask & IN_Q_OVERFLOW:  # files appear faster than the system can report
+                    self._put_missed(waiting)
+                elif self._is_scan(self._folder / name):
+                    self._put(self._folder / name, waiting)
+        return ""
+
+    def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
+        """No effect: a folder has no subscribers."""
+
+    def close(self) -> None:
+        """Stop watching."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _is_scan(self, file: Path) -> bool:
+        return file.suffix in SUFFIXES and not file.name.startswith(".")
+
+    def _put(self, file: Path, waiting: Waiting) -> None:
+        """Put the scan of a file, unless its content is that of the scan put before."""
+        try:
+            found = file.stat()
+        except OSError as error:  # removed already
+            waiting.put_unusable(f"{file}: cannot be read ({error.strerror}); leave files until they are mapped")
+            return
+        content = found.st_mtime_ns, found.st_size
+        if self._seen.get(file.name) == content:
+            return
+        self._seen[file.name] = content
+        self._seen.move_to_end(file.name)
+        if len(self._seen) > NAMES_KEPT:
+            self._seen.popitem(last=False)
+
+        def read(index: int, stamp_ns: int) -> Scan:
+            return self._read(file, index, stamp_ns, content)
+
+        named_ns = stamp_of_name(file.stem)
+        self._noted_ns.value = max(self._noted_ns.value, found.st_ctime_ns)
+        waiting.put(found.st_mtime_ns if named_ns is None else named_ns, read)
+
+    def _put_missed(self, waiting: Waiting) -> None:
+        """Put the scans whose files have changed since the newest one that was put, in order.
+
+        A file that is still being written is put again when it is closed.
+        """
+        since_ns = self._noted_ns.value
+        found: list[tuple[int, Path]] = []
+        for name in os.listdir(self._folder):
+            file = self._folder / name
+            with suppress(OSError):  # removed meanwhile
+                found.append((file.stat().st_ctime_ns, file))
+        for changed_ns, file in sorted(found):
+            if changed_ns > since_ns and self._is_scan(file):
+                self._put(file, waiting)
+
+    def _read(self, file: Path, index: int, stamp_ns: int, content: tuple[int, int]) -> Scan:
+        """The scan of a file. Raises BadScan, also if the file has another content than when it was put."""
+        scan = self._read_now(file, index, stamp_ns)
+        found = file.stat()
+        if found.st_size != content[1] or found.st_mtime_ns > content[0]:
+            raise BadScan(f"{file}: written again before it was read; give each scan a file of its own")
+        return scan
+
+    def _read_now(self, file: Path, index: int, stamp_ns: int) -> Scan:
+        try:
+            points = read_cloud(file)
+            intensities = read_intensities(file) if self._has_intensities else None
+        except BadScan:
+            raise
+        except SegslamError as error:
+            raise BadScan(str(error)) from error
+        labels = np.zeros(len(points), np.uint8)
+        return make_scan(
+            file,
+            index,
+            stamp_ns,
+            points,
+            labels,
+            intensities=intensities,
+            vertical_angle_deg=self._vertical_angle_deg,
+        )
+
+
+def stamp_of_name(stem: str) -> int | None:
+    """The stamp in a file name: seconds with a fraction, or 19 digits of ns or 16 of us since 1970; or None."""
+    found = STAMP_NAME.fullmatch(stem)
+    if found is None:
+        return None
+    if found["ns"]:
+        return int(found["ns"])
+    if found["us"]:
+        return 1000 * int(found["us"])
+    return int(found["s"]) * 1_000_000_000 + int(found["fraction"].ljust(9, "0"))
+
+
+def _events(data: bytes) -> list[tuple[int, str]]:
+    """Mask and file name of each event."""
+    events, offset = [], 0
+    while offset < len(data):
+        _, mask, _, length = EVENT.unpack_from(data, offset)
+        offset += EVENT.size
+        events.append((mask, os.fsdecode(data[offset : offset + length].rstrip(b"\0"))))
+        offset += length
+    return events

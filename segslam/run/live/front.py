@@ -1,0 +1,177 @@
+"""The front process as seen from the main process: poses of the scans, as they come.
+
+Loop closing, graph, log and viewers run in the main process. They cannot delay a pose: poses are sent to the main
+process by a separate thread, and the only message in the other direction is the request to stop. If the front process
+dies, for example for lack of memory, another one continues from its last poses.
+"""
+
+import multiprocessing
+import signal
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from multiprocessing.sharedctypes import RawValue
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any
+
+from segslam.core.config import Config
+from segslam.core.memory import note_peak_of
+from segslam.core.types import SegslamError, Step
+from segslam.odometry import Tracked
+from segslam.run.live.placed import Ended, Past, Placed
+from segslam.run.live.serve import END_S, READY, serve
+from segslam.run.live.source import Source
+from segslam.run.live.waiting import Tally
+
+CLOUDS_KEPT = 20
+"""Chosen: number of keyframes whose points are kept for a new front process, about 1.5 MB each."""
+
+
+class Front:
+    """The front process as seen from the main process: an iterator of `Placed`; a context manager."""
+
+    def __init__(
+        self, source: Source, config: Config, *, tell: Callable[[str], None], idle_s: float | None = None
+    ) -> None:
+        """Start the process. `tell` prints messages of the source.
+
+        The stream ends after `idle_s` without a scan, unless it is None.
+        """
+        self._tell = tell
+        self._serving = source, config, idle_s
+        self._is_ready = self._is_stopping = False
+        self._tally = RawValue(Tally)
+        self._past = Past([], deque(maxlen=CLOUDS_KEPT))
+        self._num_placed = 0
+        self._received: SimpleQueue[Any] = SimpleQueue()
+        self.num_keyframes_waiting = 0
+        self.num_restarts = 0
+        self.ended = Ended()
+        self._start()
+        self._receiver = Thread(target=self._receive, name="receive", daemon=True)
+        self._receiver.start()
+
+    def wait_until_ready(self) -> None:
+        """Wait until arriving scans are processed. Raises SegslamError if the source cannot be opened."""
+        first = self._received.get()
+        if isinstance(first, Ended):
+            raise SegslamError(first.why)
+
+    def __iter__(self) -> Iterator[Placed]:
+        while not isinstance(item := self._received.get(), Ended):
+            if _is_keyframe(item):
+                self.num_keyframes_waiting -= 1
+            yield item
+        self.ended = item
+
+    def stop(self) -> None:
+        """Accept no more scans; waiting scans are still processed."""
+        self._is_stopping = True
+        with suppress(OSError):
+            self._pipe.send(None)
+
+    def __enter__(self) -> "Front":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+        while self._receiver.is_alive():
+            self._process.join(2 * END_S)
+            self._process.kill()  # no effect on a process that has ended
+            self._receiver.join(END_S)
+        self._pipe.close()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        arguments = (theirs, *self._serving, self._past, self._tally)
+        self._process = context.Process(target=serve, args=arguments, name="front")
+        self._process.start()
+        theirs.close()
+        if self._is_stopping:
+            self.stop()
+
+    def _receive(self) -> None:
+        """Pass on what the front process sends, and start another one if it dies."""
+        while True:
+            died = self._receive_until_dead()
+            if died is None:
+                return
+            self._process.join(timeout=1.0)
+            num_lost = self._tally.num_arrived - self._tally.num_dropped - self._num_placed
+            self._tally.num_dropped += num_lost
+            if self._is_stopping or not self._is_ready:
+                self._received.put(self._final(died))
+                return
+            lost = f"{num_lost} scan{'s' * (num_lost != 1)} lost" if num_lost else "no scan lost"
+            self._tell(f"{died.why}: {lost}; starting it again ...")
+            self._is_ready = False
+            self.num_restarts += 1
+            self._pipe.close()
+            self._start()
+
+    def _final(self, died: Ended) -> Ended:
+        """The end of the stream with the process that died; a death after the request to stop is no failure."""
+        return replace(
+            died,
+            failed=not self._is_stopping,
+            num_arrived=self._tally.num_arrived,
+            num_dropped=self._tally.num_dropped,
+            gaps=self._past.gaps,
+        )
+
+    def _receive_until_dead(self) -> Ended | None:
+        """None after the regular end of the stream, otherwise what the process died of."""
+        try:
+            while True:
+                item = self._pipe.recv()
+                if isinstance(item, Ended):
+                    if item.died:
+                        return item
+                    note_peak_of(self._process.pid)
+                    self._received.put(item)
+                    return None
+                self._take(item)
+        except (EOFError, OSError):
+            self._process.join(timeout=1.0)
+            return Ended(f"the odometry process has ended ({_cause(self._process.exitcode)})", failed=True, died=True)
+
+    def _take(self, item: object) -> None:
+        if isinstance(item, str):
+            self._tell(item)
+            return
+        if item == READY:
+            self._is_ready = True
+            if self.num_restarts:
+                self._tell("the odometry runs again")
+                return
+        if isinstance(item, Placed):
+            self._num_placed += 1
+            self._note(item)
+        self._received.put(item)
+
+    def _note(self, placed: Placed) -> None:
+        """Note what another front process needs to continue after this scan."""
+        tracked = placed.tracked
+        self._past.gaps = placed.gaps
+        if not isinstance(tracked, Tracked):
+            return
+        if tracked.registered is not None:
+            self.num_keyframes_waiting += 1
+            self._past.clouds.append((len(self._past.steps), tracked.registered.points))
+        step = Step(tracked.scan_index, tracked.stamp_ns, tracked.T_odom_lidar, None, (), None, {}, tracked.motion)
+        self._past.steps.append(step)
+
+
+def _is_keyframe(item: object) -> bool:
+    return isinstance(item, Placed) and isinstance(item.tracked, Tracked) and item.tracked.registered is not None
+
+
+def _cause(exit_code: int | None) -> str:
+    """The exit code of a process in words."""
+    if exit_code is None or exit_code >= 0:
+        return f"exit code {exit_code}"
+    number = signal.Signals(-exit_code)
+    return f"signal {number.name}{', often a lack of memory' if number == signal.SIGKILL else ''}"

@@ -1,0 +1,195 @@
+"""The front process: receives scans, estimates their poses by odometry and publishes the poses."""
+
+import signal
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from threading import Event, Thread
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.memory import keep_freed_memory
+from segslam.core.types import BadScan, Scan, SegslamError
+from segslam.odometry import KissOdometry, OdometryApart, Tracked, Tracker
+from segslam.run.live.placed import Ended, Gaps, Past, Placed
+from segslam.run.live.source import Source
+from segslam.run.live.waiting import Arrival, Tally, Waiting
+
+READY = b"ready"
+END_S = 5.0
+"""Chosen: time for a source to end; the process does not wait longer for a middleware that hangs."""
+ROWS_CONTINUED = 30
+"""Chosen: number of last scans, beside the last keyframes, from which the odometry continues: its usual interval is the
+median of 21."""
+MOST_SHOWN = 200
+"""Chosen: number of characters shown of an exception, which may contain the content of a file."""
+
+
+class OdometryEnded(Exception):
+    """The process of the odometry has ended, so this process cannot place further scans."""
+
+
+def serve(pipe: Connection, source: Source, config: Config, idle_s: float | None, past: Past, tally: Tally) -> None:
+    """Process scans until the source ends, `idle_s` pass without a scan, or the main process sends or closes.
+
+    The first scan follows those of `past`; `tally` counts the scans, in memory shared with the main process.
+    """
+    keep_freed_memory()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # the main process handles both, and then stops this process
+    to_send: SimpleQueue[Any] = SimpleQueue()
+    sender = Thread(target=_send, args=(pipe, to_send), daemon=True)
+    sender.start()
+    waiting, stopped = Waiting(tally=tally), Event()
+    why, failed, died = "", False, False
+    feeder: _Feeder | None = None
+    try:
+        with OdometryApart(config.odometry) as odometry:
+            _warm_up(config, odometry)
+            tracker = _continued(Tracker(config, odometry=odometry), past, waiting)
+            source.open(to_send.put)
+            to_send.put(READY)
+            feeder = _Feeder(source, waiting, stopped)
+            Thread(target=_listen, args=(pipe, waiting, stopped), daemon=True).start()
+            try:
+                is_idle = _place_all(tracker, source, waiting, to_send, idle_s, past)
+            finally:
+                stopped.set()
+                feeder.join(timeout=END_S)
+            why = f"no scan for {idle_s:g} s" if is_idle else feeder.why
+            failed = feeder.failed
+            if feeder.is_alive():
+                why, failed = f"the source did not end within {END_S:g} s", False
+    except (SegslamError, OdometryEnded) as error:
+        why, failed, died = str(error), True, isinstance(error, OdometryEnded)
+    finally:
+        if feeder is None or not feeder.is_alive():
+            source.close()
+    to_send.put(Ended(why, failed, died, waiting.num_arrived, waiting.num_dropped, Gaps.of(waiting)))
+    to_send.put(None)
+    sender.join()
+
+
+def _warm_up(config: Config, odometry: OdometryApart) -> None:
+    """Load what the first scan needs; this takes seconds, in which the first scans would be dropped."""
+    odometry.follow([], np.eye(4), np.eye(4))
+    throwaway = Tracker(config, odometry=KissOdometry(config.odometry))
+    points = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
+    points *= 0.5 * (config.odometry.min_range_m + config.odometry.max_range_m) / np.abs(points).max(axis=1)[:, None]
+    for stamp_ns in (0, 100_000_000, 400_000_000):  # the last one after a gap, so that its motion is checked
+        throwaway.track(Scan(points, stamp_ns))
+
+
+def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
+    """The tracker after the scans of earlier processes: its maps contain the last keyframes."""
+    if not past.steps:
+        return tracker
+    for step in past.steps:
+        tracker.note(step)
+    for step in past.steps[-ROWS_CONTINUED:]:
+        waiting.rhythm.note(step.stamp_ns)
+    rhythm = waiting.rhythm
+    rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_clock_set = past.gaps
+    keyframes = [row for row, _ in past.clouds]
+    last = range(max(len(past.steps) - ROWS_CONTINUED, keyframes[0]), len(past.steps))
+    rows = sorted({*keyframes, *last})
+    steps = [past.steps[row] for row in rows]
+
+    def scan_of(number: int) -> Scan:
+        """The cloud of the last keyframe, as seen from the pose of another scan."""
+        row = max(row for row in keyframes if row <= rows[number])
+        points = past.clouds[keyframes.index(row)][1]
+        T_scan_keyframe = geometry.inverse(steps[number].T_odom_lidar) @ past.steps[row].T_odom_lidar
+        return Scan(geometry.apply(T_scan_keyframe, points), steps[number].stamp_ns, steps[number].scan_index)
+
+    poses, stamps_ns = zip(*((step.T_odom_lidar, step.stamp_ns) for step in steps), strict=True)
+    tracker.resume(np.stack(poses), np.array(stamps_ns), scan_of)
+    return tracker
+
+
+def _place_all(
+    tracker: Tracker, source: Source, waiting: Waiting, to_send: "SimpleQueue[Any]", idle_s: float | None, past: Past
+) -> bool:
+    """Process each scan. Returns True if it ended because no scan came for `idle_s`."""
+    last_ns = past.steps[-1].stamp_ns if past.steps else None
+    while (arrival := waiting.take(idle_s)) is not None:
+        gap = 1.0 if last_ns is None else waiting.rhythm.intervals(last_ns, arrival.stamp_ns)
+        tracked = _tracked(tracker, arrival, gap)
+        if isinstance(tracked, Tracked):
+            last_ns = arrival.stamp_ns
+            _publish(source, arrival, tracked, to_send)
+        now = monotonic()
+        to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.num_dropped, Gaps.of(waiting)))
+    return not waiting.is_closed
+
+
+def _tracked(tracker: Tracker, arrival: Arrival, gap: float) -> Tracked | BadScan:
+    """The pose of a scan; BadScan for any exception of a single scan, because the run continues.
+
+    Raises OdometryEnded if no further scan can be placed.
+    """
+    try:
+        scan = arrival.read(arrival.index, arrival.stamp_ns)
+    except BadScan as error:
+        return error
+    except Exception as error:
+        return _unusable(arrival, error)
+    try:
+        return tracker.track(scan, gap=gap)
+    except BadScan as error:
+        return error
+    except SegslamError as error:
+        raise OdometryEnded(str(error).partition("; continue")[0]) from error
+    except Exception as error:
+        return _unusable(arrival, error)
+
+
+def _unusable(arrival: Arrival, error: Exception) -> BadScan:
+    shown = f"{type(error).__name__}: {error}".splitlines()[0][:MOST_SHOWN]
+    return BadScan(f"scan {arrival.index}: cannot be used ({shown})")
+
+
+def _publish(source: Source, arrival: Arrival, tracked: Tracked, to_send: "SimpleQueue[Any]") -> None:
+    """Publish a pose; a failure concerns the subscribers only."""
+    try:
+        source.publish(arrival, tracked.T_odom_lidar)
+    except Exception as error:
+        to_send.put(f"{source.name}: the pose of scan {arrival.index} was not published ({error!r})"[:MOST_SHOWN])
+
+
+class _Feeder(Thread):
+    """Thread that runs the source's `feed`."""
+
+    def __init__(self, source: Source, waiting: Waiting, stopped: Event) -> None:
+        super().__init__(name="feed", daemon=True)
+        self._source, self._waiting, self._stopped = source, waiting, stopped
+        self.why, self.failed = "", False
+        self.start()
+
+    def run(self) -> None:
+        """Run until the source ends; the queue is then closed."""
+        self.why, self.failed = "the source has failed", True  # remains after an unexpected exception
+        try:
+            self.why, self.failed = self._source.feed(self._waiting, self._stopped), False
+        except (SegslamError, OSError) as error:
+            self.why, self.failed = str(error), True
+        finally:
+            self._waiting.close()
+
+
+def _listen(pipe: Connection, waiting: Waiting, stopped: Event) -> None:
+    """Stop when the main process requests it or has ended."""
+    with suppress(EOFError, OSError):
+        pipe.recv()
+    stopped.set()
+    waiting.close()
+
+
+def _send(pipe: Connection, to_send: "SimpleQueue[Any]") -> None:
+    with suppress(OSError):
+        while (item := to_send.get()) is not None:
+            pipe.send(item)

@@ -1,0 +1,124 @@
+"""The pose graph of a drive in the frame of an existing map, which is fixed.
+
+The map is an additional, fixed vertex before all keyframes. The motion from it to the first keyframe is unknown, like
+that across a break of the odometry. Each keyframe that was placed in the map has a loop closure with it. The robust
+optimisation of loops and breaks therefore applies to placements without change.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.core.config import GraphConfig
+from segslam.core.trajectory import Poses
+from segslam.core.types import (
+    GraphEstimate,
+    Information,
+    LoopClosure,
+    Placement,
+    SegslamError,
+    Transform,
+    Vector,
+)
+from segslam.graph import PoseGraph
+
+OPTIMIZE_EVERY = 25
+"""Chosen: placements between two optimisations during the run; until then the pose of a keyframe is its placement."""
+
+
+class AnchoredGraph:
+    """Keyframes 0, 1, 2, ... in the world frame of an existing map, with the interface of `PoseGraph`."""
+
+    def __init__(self, config: GraphConfig) -> None:
+        self._graph = PoseGraph(config)
+        self._graph.add_keyframe(0, np.eye(4), 0.0)
+        self._placements: list[int] = []
+        self._num_waiting = 0
+        self.weights: dict[int, float] = {}
+        """Weight of each keyframe placed before the last optimisation: 0 (rejected) to 1 (full weight)."""
+
+    @property
+    def num_keyframes(self) -> int:
+        """Number of keyframes added so far."""
+        return self._graph.num_keyframes - 1
+
+    @property
+    def travel_m(self) -> Vector:
+        """(n,) travel of each keyframe, by id."""
+        return self._graph.travel_m[1:] - BREAK_TRAVEL_M
+
+    @property
+    def T_world_keyframes(self) -> Poses:  # noqa: N802
+        """(n, 4, 4) poses by id in the map's world: the last estimate, continued by odometry for newer keyframes."""
+        return self._graph.T_world_keyframes[1:]
+
+    @property
+    def is_due(self) -> bool:
+        """True if enough placements wait for an optimisation: the first, or `OPTIMIZE_EVERY`."""
+        return self._num_waiting >= OPTIMIZE_EVERY or 0 < self._num_waiting == len(self._placements)
+
+    def add_keyframe(
+        self,
+        keyframe_id: int,
+        T_odom_keyframe: Transform,
+        travel_m: float,
+        *,
+        information: Information | None = None,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """As `PoseGraph.add_keyframe`."""
+        if keyframe_id == 0:
+            information = np.zeros((6, 6))
+        self._graph.add_keyframe(
+            keyframe_id + 1,
+            T_odom_keyframe,
+            travel_m + BREAK_TRAVEL_M,
+            information=information,
+            stamp_ns=stamp_ns,
+        )
+
+    def add_closure(self, closure: LoopClosure) -> None:
+        """Raises SegslamError: a localised drive has no loops of its own."""
+        raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
+
+    def weigh_odometry_by(self, closure: LoopClosure) -> None:
+        """Raises SegslamError, as `add_closure` does."""
+        self.add_closure(closure)
+
+    def place(self, placement: Placement) -> None:
+        """Place a keyframe in the map; takes effect in the next optimisation."""
+        source_id = placement.keyframe_id + 1
+        self._graph.add_closure(
+            LoopClosure(source_id, 0, placement.T_world_keyframe, placement.information, placement.alignment)
+        )
+        self._placements.append(placement.keyframe_id)
+        self._num_waiting += 1
+
+    def optimize(self) -> GraphEstimate:
+        """As `PoseGraph.optimize`."""
+        return self._taken(self._graph.optimize())
+
+    def finish(self) -> GraphEstimate:
+        """As `PoseGraph.finish`; `weights` then contains the rejected placements."""
+        return self._taken(self._graph.finish())
+
+    def write_g2o(self, path: Path) -> None:
+        """As `PoseGraph.write_g2o`; vertex 0 is the map's origin, keyframe k is vertex k + 1."""
+        self._graph.write_g2o(path)
+
+    def _taken(self, estimate: GraphEstimate) -> GraphEstimate:
+        self._num_waiting = 0
+        self.weights = {source_id - 1: weight for (source_id, _), weight in estimate.closure_weights.items()}
+        return replace(
+            estimate,
+            T_world_keyframe=dict(enumerate(self.T_world_keyframes)),
+            closure_weights={},
+            motion_weights=_renumbered(estimate.motion_weights.items()),
+        )
+
+
+def _renumbered(weights: Iterable[tuple[tuple[int, int], float]]) -> dict[tuple[int, int], float]:
+    return {(before - 1, after - 1): weight for (before, after), weight in weights if before > 0}

@@ -1,0 +1,76 @@
+"""Localisation of a drive in an existing map, with one call per scan."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.trajectory import travelled_m
+from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
+from segslam.graph import Graph
+from segslam.odometry import Odometry
+from segslam.registration.prepared import Labeller
+from segslam.run.locator import Locator
+from segslam.run.sessions.anchored import AnchoredGraph
+from segslam.run.sessions.placer import Placer
+from segslam.slam.adjustment import Progress, no_progress
+from segslam.slam.slam import Slam, SlamResult
+
+
+class Localiser(Slam):
+    """Odometry, keyframes, and their placements in an existing map, which is fixed. `process` each scan, then `finish`.
+
+    A Step contains the keyframes placed in it (`placements`), or the reason why its own was not (`not_placed`). The
+    trajectory is in the map's frame where `SlamResult.localised` is True; loops within the drive are not searched.
+    """
+
+    def __init__(
+        self,
+        locator: Locator,
+        config: Config | None = None,
+        *,
+        odometry: Odometry | None = None,
+        labeller: Labeller | None = None,
+    ) -> None:
+        """`locator` belongs to the existing map; other arguments as for `Slam`."""
+        super().__init__(config, odometry=odometry, labeller=labeller)
+        self._placer = Placer(self.config, locator, self._anchored, self._loops.submaps)
+        self._placed: tuple[tuple[Placement, ...], Rejected | None] = (), None
+
+    def _new_graph(self) -> Graph:
+        self._anchored = AnchoredGraph(self.config.graph)
+        return self._anchored
+
+    def _advance(self, *about_scan: Any, **_: Any) -> Step:
+        self._placed = (), None
+        step = super()._advance(*about_scan, attempts_of=self._place)
+        placements, why = self._placed
+        return replace(step, placements=placements, not_placed=why)
+
+    def _place(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+        self._placed = self._placer.place(keyframe_id, watch)
+        return ()
+
+    def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
+        return self.graph.finish(), []
+
+    def finish(self, *, search_s: float = math.inf, progress: Progress = no_progress) -> SlamResult:
+        """As `Slam.finish`, in the map's frame; `from_map_m` determines which scans are localised."""
+        return replace(super().finish(search_s=search_s, progress=progress), from_map_m=self._from_map_m())
+
+    def _from_map_m(self) -> Vector:
+        """(n,) travel from each scan to the nearest keyframe whose placement was kept; infinite across a break."""
+        travel_m = travelled_m(np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]))
+        segment = np.cumsum([motion.is_break for motion in self._motions])
+        distance_m = np.full(len(travel_m), np.inf)
+        kept = [number for number, weight in self._anchored.weights.items() if weight >= REJECTED_WEIGHT]
+        placed = np.array([self._keyframe_rows[number] for number in sorted(kept)], dtype=int)
+        for number in np.unique(segment[placed]):
+            rows, own = np.flatnonzero(segment == number), placed[segment[placed] == number]
+            after = np.clip(np.searchsorted(own, rows), 0, len(own) - 1)
+            around = own[np.column_stack([np.maximum(after - 1, 0), after])]
+            distance_m[rows] = np.abs(travel_m[rows, None] - travel_m[around]).min(axis=1)
+        return distance_m

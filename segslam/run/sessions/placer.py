@@ -1,0 +1,195 @@
+"""Places the keyframes of a drive in an existing map: the first without initial guess, then by tracking.
+
+A location without initial guess is accepted if it is consistent, by odometry, with a second one or with the last
+placement. From then on each keyframe is registered with the nearest keyframes of the map, starting at the pose that
+odometry predicts, and verified. If that fails for some metres, or after a break of the odometry, the place is searched
+again without initial guess.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import Placement, Registration, Rejected, RejectReason, Transform
+from segslam.keyframes.submaps import Submaps
+from segslam.registration import refinement
+from segslam.registration.prepared import Observed, prepare_observed
+from segslam.run.locator import Located, Locator
+from segslam.run.sessions.anchored import AnchoredGraph
+from segslam.verification.patches import agreement
+from segslam.verification.verdict import judged
+
+REACH_M = 12.0
+"""Chosen: the map's keyframes within this distance of a prediction are used for registration."""
+NUM_TRIED, APART_M = 2, 4.0
+"""Chosen: largest number of these, nearest first, and smallest distance between them."""
+BASE_M, DRIFT = 0.8, 0.02
+"""Chosen: largest correction of a prediction by registration, constant and as a share of the travel since the last."""
+BASE_RAD, DRIFT_RAD_PER_M = np.radians(3.0), np.radians(0.03)
+MOST_M, MOST_RAD = 2.0, np.radians(10.0)
+"""Chosen: largest initial error from which refinement converges."""
+SEARCH_AFTER_M = 20.0
+"""Chosen: travel without a placement after which the place is searched without initial guess."""
+SEARCH_EVERY_M = 4.0
+"""Chosen: travel between two such searches, each of which takes some tenths of a second."""
+AGREE_M, AGREE_RAD = 1.0, np.radians(4.0)
+"""Chosen: tolerance of two consistent locations, in addition to the drift between them."""
+REMEMBERED_M = 60.0
+"""Chosen: travel within which a second location must be found."""
+NUM_PREPARED = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    """A keyframe with a pose in the map's world."""
+
+    keyframe_id: int
+    T_world_keyframe: Transform
+
+
+class Placer:
+    """Replaces the loop closer in a drive that is localised; the calls come in the same order."""
+
+    def __init__(self, config: Config, locator: Locator, graph: AnchoredGraph, submaps: Submaps) -> None:
+        """`submaps` provides the keyframes of the drive, which are in the graph."""
+        self._config, self._locator, self._graph, self._submaps = config, locator, graph, submaps
+        ids = sorted(locator.T_world_keyframe)
+        self._T_world_map = np.array([locator.T_world_keyframe[number] for number in ids])
+        self._map_seen: Callable[[int], Observed] = lru_cache(NUM_PREPARED)(self._seen_of_map)
+        self._last: _Pose | None = None
+        """The newest placed keyframe."""
+        self._found: list[Placement] = []
+        """Locations that are not yet confirmed."""
+        self._searched_m = -np.inf
+
+    def place(self, keyframe_id: int, watch: Stopwatch) -> tuple[tuple[Placement, ...], Rejected | None]:
+        """Placements of a keyframe and possibly earlier ones; or the reason why this keyframe is not placed."""
+        travel_m = self._graph.travel_m
+        why = Rejected(RejectReason.NO_PLACE, "not found yet")
+        since_m = np.inf if self._last is None else travel_m[keyframe_id] - travel_m[self._last.keyframe_id]
+        if since_m < BREAK_TRAVEL_M:
+            tracked = self._tracked(keyframe_id, float(since_m), watch)
+            if isinstance(tracked, Placement):
+                return self._taken((tracked,)), None
+            why = tracked
+        if since_m < SEARCH_AFTER_M or travel_m[keyframe_id] - self._searched_m < SEARCH_EVERY_M:
+            return (), why
+        self._searched_m = travel_m[keyframe_id]
+        with watch("locate"):
+            submap = self._submaps.submap(keyframe_id)
+            found = self._locator.locate(submap.points, submap.labels)
+        if isinstance(found, Rejected):
+            return (), found
+        return self._confirmed(_placement(keyframe_id, found))
+
+    def _tracked(self, keyframe_id: int, since_m: float, watch: Stopwatch) -> Placement | Rejected:
+        """The keyframe registered with the nearest ones of the map, starting at the odometry's prediction."""
+        T_world_predicted = self._predicted(keyframe_id)
+        apart_m = np.hypot(*(self._T_world_map[:, :2, 3] - T_world_predicted[:2, 3]).T)
+        apart_m = np.hypot(apart_m, self._T_world_map[:, 2, 3] - T_world_predicted[2, 3])
+        outcome: Placement | Rejected = Rejected(RejectReason.NO_PLACE, f"{apart_m.min():.0f} m from the map")
+        with watch("prepare"):
+            submap = self._submaps.submap(keyframe_id)
+            own = prepare_observed(
+                submap.points, submap.labels, config=self._config, seen_from_here=submap.seen_from_here
+            )
+        tried: list[int] = []
+        for target_id in np.argsort(apart_m)[: 10 * NUM_TRIED].tolist():
+            near = [np.linalg.norm(self._T_world_map[target_id, :3, 3] - self._T_world_map[t, :3, 3]) for t in tried]
+            if apart_m[target_id] > REACH_M or len(tried) == NUM_TRIED:
+                break
+            if all(distance_m >= APART_M for distance_m in near):
+                tried.append(target_id)
+                outcome = self._registered(keyframe_id, own, target_id, T_world_predicted, since_m, watch)
+                if isinstance(outcome, Placement):
+                    break
+        return outcome
+
+    def _registered(
+        self,
+        keyframe_id: int,
+        own: Observed,
+        target_id: int,
+        T_world_predicted: Transform,
+        since_m: float,
+        watch: Stopwatch,
+    ) -> Placement | Rejected:
+        with watch("prepare"):
+            target = self._map_seen(target_id)
+        T_world_target = self._T_world_map[target_id]
+        T_target_predicted = geometry.inverse(T_world_target) @ T_world_predicted
+        with watch("refine"):
+            fine = refinement.refine(
+                own[0], target[0], T_target_predicted, config=self._config.refine, must_converge=False
+            )
+        if isinstance(fine, Rejected):
+            return fine
+        moved = geometry.inverse(T_target_predicted) @ fine.T_target_source
+        most_m, most_rad = BASE_M + DRIFT * since_m, BASE_RAD + DRIFT_RAD_PER_M * since_m
+        if not _within(moved, min(most_m, MOST_M), min(most_rad, MOST_RAD)):
+            detail = f"{geometry.distance(moved):.1f} m, {np.degrees(geometry.angle(moved)):.1f} degrees"
+            return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
+        with watch("verify"):
+            found = agreement(own, target, fine.T_target_source, config=self._config.verify)
+        coarse = replace(fine, T_target_source=T_target_predicted, num_inliers=0, num_correspondences=0)
+        alignment = judged(coarse, fine, found, None, config=self._config)
+        if isinstance(alignment, Rejected):
+            return alignment
+        T_world_keyframe = T_world_target @ fine.T_target_source
+        return Placement(keyframe_id, target_id, T_world_keyframe, fine.information, alignment, is_found=False)
+
+    def _confirmed(self, found: Placement) -> tuple[tuple[Placement, ...], Rejected | None]:
+        """The location with an earlier one that is consistent with it; it waits if there is none."""
+        if self._last is not None and self._agree(self._last, found):
+            return self._taken((found,)), None
+        for earlier in reversed(self._found):
+            if self._agree(earlier, found):
+                return self._taken((earlier, found)), None
+        self._found.append(found)
+        return (), Rejected(RejectReason.UNCONFIRMED, "found, but not yet confirmed by another keyframe")
+
+    def _agree(self, earlier: "Placement | _Pose", later: Placement) -> bool:
+        """True if odometry leads from one location to the other."""
+        travel_m = self._graph.travel_m
+        way_m = float(travel_m[later.keyframe_id] - travel_m[earlier.keyframe_id])
+        if way_m >= (REMEMBERED_M if isinstance(earlier, Placement) else BREAK_TRAVEL_M):
+            return False
+        T_earlier_later = self._motion(earlier.keyframe_id, later.keyframe_id)
+        off = geometry.inverse(earlier.T_world_keyframe @ T_earlier_later) @ later.T_world_keyframe
+        return _within(off, AGREE_M + DRIFT * way_m, AGREE_RAD + DRIFT_RAD_PER_M * way_m)
+
+    def _taken(self, placements: tuple[Placement, ...]) -> tuple[Placement, ...]:
+        for placement in placements:
+            self._graph.place(placement)
+        newest = placements[-1]
+        self._last = _Pose(newest.keyframe_id, newest.T_world_keyframe)
+        self._found = []
+        return placements
+
+    def _predicted(self, keyframe_id: int) -> Transform:
+        assert self._last is not None
+        return self._last.T_world_keyframe @ self._motion(self._last.keyframe_id, keyframe_id)
+
+    def _motion(self, earlier_id: int, later_id: int) -> Transform:
+        return geometry.inverse(self._submaps.T_odom[earlier_id]) @ self._submaps.T_odom[later_id]
+
+    def _seen_of_map(self, map_keyframe_id: int) -> Observed:
+        submap = self._locator.submaps.submap(map_keyframe_id)
+        return prepare_observed(submap.points, submap.labels, config=self._config, seen_from_here=submap.seen_from_here)
+
+
+def _placement(keyframe_id: int, found: Located) -> Placement:
+    fine: Registration = found.alignment.fine
+    return Placement(
+        keyframe_id, found.keyframe_id, found.T_world_lidar, fine.information, found.alignment, is_found=True
+    )
+
+
+def _within(T: Transform, most_m: float, most_rad: float) -> bool:
+    return geometry.distance(T) <= most_m and bool(geometry.angle(T) <= most_rad)

@@ -1,0 +1,174 @@
+"""A finished run as one session of a merged run: its keyframes, and its steps with new numbers."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.core.config import Config
+from segslam.core.trajectory import Poses
+from segslam.core.types import (
+    Information,
+    Labels,
+    LoopAttempt,
+    LoopClosure,
+    Motion,
+    MotionState,
+    Points,
+    SegslamError,
+    Step,
+    Transform,
+    Vector,
+)
+from segslam.keyframes.submaps import Submaps
+from segslam.labels import geometric_labels
+from segslam.odometry import information_of
+from segslam.output.finished import FinishedRun, read_run
+from segslam.output.folder import folder_of, log_of
+from segslam.output.log import RunLog, read_log
+
+GAP_NS = 1_000_000_000
+"""Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
+FIRST_MOTION = Motion(MotionState.BEGUN, information=1e-12 * np.eye(6))
+"""The motion to the first scan of a session, which is unknown."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """A finished run with the poses of its keyframes."""
+
+    run: FinishedRun
+    log: RunLog
+    T_world_keyframe: Poses
+    """Poses by the run's own estimate."""
+    T_odom_keyframe: Poses
+    travel_m: Vector
+    informations: tuple[Information | None, ...]
+    """Information of the motion from the previous keyframe to each keyframe; None for the noise model of odometry."""
+
+    @property
+    def name(self) -> str:
+        """The folder of the run."""
+        return str(self.run.folder)
+
+
+def read_session(folder: Path) -> Session:
+    """The session of a run folder, or of its log. Raises SegslamError as `read_run`, or if keyframes are missing."""
+    run = read_run(folder_of(folder))
+    log = read_log(log_of(folder))
+    estimate = run.result.estimate.T_world_keyframe
+    T_odom, travel_m, informations = [], [], []
+    since: list[Motion] = []
+    for step in log.steps(clouds=False):
+        since += [step.motion] if step.motion else []
+        if step.keyframe is not None:
+            T_odom.append(step.keyframe.T_odom_keyframe)
+            travel_m.append(step.keyframe.travel_m)
+            informations.append(information_of(since))
+            since = []
+    if list(estimate) != list(range(len(T_odom))):
+        raise SegslamError(f"{log.path}: damaged, poses of {len(estimate)} keyframes for {len(T_odom)}; replay it")
+    poses = np.array([estimate[number] for number in range(len(T_odom))])
+    return Session(run, log, poses, np.array(T_odom), np.array(travel_m), tuple(informations))
+
+
+def read_sessions(folders: list[Path]) -> list[Session]:
+    """The sessions of several runs, in their order. Raises SegslamError for fewer than two, or one given twice."""
+    if len(folders) < 2:
+        raise SegslamError(f"{len(folders)} run given; give two or more")
+    given: dict[Path, Path] = {}
+    for folder in folders:
+        log = log_of(folder).resolve()
+        if log in given:
+            raise SegslamError(f"{folder}: given twice; give each run once")
+        given[log] = folder
+    return [read_session(folder) for folder in folders]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shift:
+    """Offsets of the numbers of a session, so that its steps follow those of the previous sessions."""
+
+    keyframe_id: int = 0
+    scan_index: int = 0
+    stamp_ns: int = 0
+    travel_m: float = 0.0
+    T_new_old: Transform | None = None
+    """Transform of its odometry frame; None for identity."""
+
+    def pose(self, T_odom_lidar: Transform) -> Transform:
+        """A pose of the session's odometry in that of the merged run."""
+        return T_odom_lidar if self.T_new_old is None else self.T_new_old @ T_odom_lidar
+
+    def attempt(self, attempt: LoopAttempt) -> LoopAttempt:
+        """A loop of the session with the new ids of its keyframes."""
+        ids = {name: getattr(attempt.candidate, name) + self.keyframe_id for name in ("source_id", "target_id")}
+        outcome = attempt.outcome
+        return replace(
+            attempt,
+            candidate=replace(attempt.candidate, **ids),
+            outcome=replace(outcome, **ids) if isinstance(outcome, LoopClosure) else outcome,
+        )
+
+
+def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopAttempt, ...]]) -> Iterator[Step]:
+    """The steps of a session with their points; `more`: further loops of its keyframes, by original id.
+
+    Loops tried after the session's last scan are added to the step of its last keyframe.
+    """
+    late = session.log.late_loops()
+    last_id = len(session.travel_m) - 1
+    for number, step in enumerate(session.log.steps()):
+        attempts, keyframe, motion = [shift.attempt(attempt) for attempt in step.attempts], step.keyframe, step.motion
+        if keyframe is not None:
+            attempts += [shift.attempt(attempt) for attempt in (late if keyframe.id == last_id else ())]
+            attempts += more.get(keyframe.id, ())
+            keyframe = replace(
+                keyframe,
+                id=keyframe.id + shift.keyframe_id,
+                scan_index=keyframe.scan_index + shift.scan_index,
+                stamp_ns=keyframe.stamp_ns + shift.stamp_ns,
+                T_odom_keyframe=shift.pose(keyframe.T_odom_keyframe),
+                travel_m=keyframe.travel_m + shift.travel_m,
+            )
+        if number == 0 and shift.keyframe_id:
+            motion = FIRST_MOTION
+        yield Step(
+            step.scan_index + shift.scan_index,
+            step.stamp_ns + shift.stamp_ns,
+            shift.pose(step.T_odom_lidar),
+            keyframe,
+            tuple(attempts),
+            None,
+            step.stage_seconds,
+            motion,
+        )
+
+
+def next_shift(before: Shift, session: Session, T_new_old: Transform, following: Session) -> Shift:
+    """The shift of the session `following`, after `session` with the shift `before`. Later stamps are unchanged."""
+    last_ns = int(session.run.result.trajectory.stamp_ns[-1]) + before.stamp_ns
+    first_ns = int(following.run.result.trajectory.stamp_ns[0])
+    return Shift(
+        keyframe_id=before.keyframe_id + len(session.travel_m),
+        scan_index=before.scan_index + int(session.run.result.trajectory.scan_index[-1]) + 1,
+        stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
+        travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_TRAVEL_M,
+        T_new_old=T_new_old,
+    )
+
+
+def submaps(session: Session, config: Config) -> Callable[[int], tuple[Points, Labels]]:
+    """Function from a keyframe's id to its points and labels; sparse keyframes are merged with their neighbours."""
+    recorded = session.log.keyframes()
+    made = Submaps(config, lambda: recorded, geometric_labels, lambda: session.travel_m)
+    for number in range(len(recorded)):
+        made.add(session.T_odom_keyframe[number], labelled_by_shape=bool(recorded[number].labelled_by_shape))
+
+    def of(keyframe_id: int) -> tuple[Points, Labels]:
+        submap = made.submap(keyframe_id)
+        return submap.points, submap.labels
+
+    return of

@@ -1,0 +1,159 @@
+"""Relative pose of two sessions: keyframes of one are located in the other, and the largest consistent set is used.
+
+Two located keyframes are consistent if they and the odometry between them, in both sessions, form a loop within the
+noise (`segslam.graph.closure_pairs`). A wrong location is consistent with few others.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
+from segslam.graph import PoseGraph
+from segslam.run.locator import Locator
+from segslam.run.sessions.recorded import FIRST_MOTION, Session, submaps
+
+NUM_QUERIES = 60
+"""Chosen: number of keyframes of a session that are searched in another, spread over its travel."""
+NUM_ENOUGH = 12
+"""Chosen: the search ends when this many are found; further loops are found by proximity."""
+MIN_FOUND = 3
+"""Chosen: smallest number of consistent locations that relate two sessions."""
+MOST_FAILED = 4
+"""Chosen on two fleets: the search for the pose of a session ends when so many of its likely keyframes, the first ones,
+were not found; in each of 15 pairs of drives that share places the first was."""
+MIN_SPREAD_M = 10.0
+"""Chosen: smallest travel between the first and the last of them; a single place may be a wrong one."""
+GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+"""Golden ratio less 1: steps of it, modulo 1, are spread evenly at any number."""
+
+Progress = Callable[[Iterable[Any], int, str], Iterator[Any]]
+"""Passes items on and shows progress: takes the items, their number, and a title."""
+
+
+def no_progress(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
+    """Passes the items on and shows nothing."""
+    return iter(items)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionPose:
+    """Pose of a session in an earlier one."""
+
+    earlier: int
+    """Number of the earlier session."""
+    T_earlier_world: Transform
+    """Pose of the session's world frame in that of the earlier session."""
+    found: tuple[tuple[int, int, Alignment], ...]
+    """Keyframe of the session, keyframe of the earlier one, and their alignment, for each consistent location."""
+
+
+def find_session(
+    session: Session,
+    earlier: Session,
+    number: int,
+    locator: Locator,
+    *,
+    config: Config,
+    likely: Sequence[int] | None = None,
+    progress: Progress = no_progress,
+) -> SessionPose | str:
+    """The pose of a session in the earlier session of this `number`, or the reason as text if it is unknown.
+
+    At most `NUM_QUERIES` keyframes, spread over the session, are searched; sparse ones together with their neighbours.
+    `likely`: these keyframes are searched instead, in this order, and those before and after each that is found, until
+    the first `MOST_FAILED` were not.
+    """
+    submap = submaps(session, config)
+    found: list[tuple[int, int, Alignment]] = []
+    count = len(session.travel_m)
+    queries = (
+        _spread(count) if likely is None else _with_neighbours(likely, count, lambda: found[-1][0] if found else None)
+    )
+    num_tried = 0
+    for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
+        num_tried += 1
+        place = locator.locate(*submap(keyframe_id))
+        if not isinstance(place, Rejected):
+            found.append((keyframe_id, place.keyframe_id, place.alignment))
+        if len(found) == NUM_ENOUGH or (likely is not None and not found and num_tried == MOST_FAILED):
+            break
+    summary = f"{len(found)} of {num_tried} keyframes were found there"
+    if len(found) < MIN_FOUND:
+        return f"{summary}, {MIN_FOUND} are needed"
+    graph, first_id = _both(earlier, session, config)
+    closures = [closure(one, first_id) for one in found]
+    consistent = graph.consistent(closures)
+    kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
+    travel_m = session.travel_m[[one[0] for one in kept]]
+    if len(kept) < MIN_FOUND or np.ptp(travel_m) < MIN_SPREAD_M:
+        return f"{summary}, but no {MIN_FOUND} of them, {MIN_SPREAD_M:g} m apart, are consistent with the odometry"
+    for one, keep in zip(closures, consistent, strict=True):
+        if keep:
+            graph.add_closure(one)
+    graph.optimize()
+    T_earlier_first = graph.T_world_keyframes[first_id]
+    return SessionPose(number, T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))
+
+
+def _spread(count: int) -> list[int]:
+    """Keyframes spread over a session of so many, each far from the previous ones."""
+    evenly = np.unique(np.linspace(0, count - 1, NUM_QUERIES).astype(int))
+    keyframe_ids: list[int] = evenly[np.argsort(np.arange(len(evenly)) * GOLDEN % 1.0)].tolist()
+    return keyframe_ids
+
+
+def _with_neighbours(likely: Sequence[int], count: int, last_found: Callable[[], int | None]) -> Iterator[int]:
+    """Likely keyframes of a session of so many, each once; after one that was found, first the next and the one before.
+
+    Where sessions share a place, they do so for some metres; at the end of one and the beginning of the other that may
+    be a few keyframes only.
+    """
+    queue, searched = deque(likely), set[int]()
+    while queue:
+        keyframe_id = queue.popleft()
+        if keyframe_id in searched or not 0 <= keyframe_id < count:
+            continue
+        searched.add(keyframe_id)
+        yield keyframe_id
+        if last_found() == keyframe_id:
+            queue.extendleft((keyframe_id - 1, keyframe_id + 1))
+
+
+def closure(found: tuple[int, int, Alignment], first_id: int, target_shift: int = 0) -> LoopClosure:
+    """A located keyframe as a loop of a graph in which the ids of the session start at `first_id`."""
+    own, target, alignment = found
+    return LoopClosure.of(own + first_id, target + target_shift, alignment)
+
+
+def attempt(found: tuple[int, int, Alignment], first_id: int, target_shift: int) -> LoopAttempt:
+    """The same loop as an attempt, whose prior is the found pose."""
+    made = closure(found, first_id, target_shift)
+    T_target_source = made.T_target_source
+    distance_m = geometry.distance(T_target_source)
+    candidate = LoopCandidate(made.source_id, made.target_id, T_target_source, distance_m, distance_m, BREAK_TRAVEL_M)
+    return LoopAttempt(candidate, made, {})
+
+
+def _both(earlier: Session, session: Session, config: Config) -> tuple[PoseGraph, int]:
+    """A graph of the keyframes of two sessions, each with the estimate of its run; and the first id of the second."""
+    graph = PoseGraph(config.graph)
+    first_id = len(earlier.travel_m)
+    add = partial(_add, graph)
+    for number, one in enumerate((earlier, session)):
+        shift_m = number * (float(earlier.travel_m[-1]) + BREAK_TRAVEL_M)
+        for row, (T_world, travel_m) in enumerate(zip(one.T_world_keyframe, one.travel_m, strict=True)):
+            information = FIRST_MOTION.information if number and row == 0 else one.informations[row]
+            add(T_world, float(travel_m) + shift_m, information)
+    return graph, first_id
+
+
+def _add(graph: PoseGraph, T_world_keyframe: Transform, travel_m: float, information: Any) -> None:
+    graph.add_keyframe(graph.num_keyframes, T_world_keyframe, travel_m, information=information)

@@ -1,0 +1,199 @@
+"""The interface of all readers, the selection of scans, and the removal of invalid points."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from segslam.core.errors import brief
+from segslam.core.geometry import raise_beams
+from segslam.core.points import squared_ranges
+from segslam.core.trajectory import nanoseconds
+from segslam.core.types import (
+    BadScan,
+    Indices,
+    Points,
+    Scan,
+    ScanLabels,
+    SegslamError,
+    Trajectory,
+    Transform,
+    Vector,
+)
+from segslam.labels.label_files import LabelSource
+from segslam.labels.late import of_rows
+
+logger = logging.getLogger(__name__)
+
+ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
+NO_TIMES = np.empty(0)
+NO_LIMIT = 2**63 - 1
+
+
+@runtime_checkable
+class Dataset(Protocol):
+    """Scans in order of time, each read when it is accessed.
+
+    `dataset[row]` raises BadScan for a scan that cannot be used; iteration skips such scans with a warning.
+    """
+
+    @property
+    def name(self) -> str:
+        """Name of the data for messages and logs, such as `kitti/00`."""
+        ...
+
+    @property
+    def scan_index(self) -> Indices:
+        """The number of each scan."""
+        ...
+
+    @property
+    def is_sequential(self) -> bool:
+        """True if reading a scan requires reading those before it, as in a rosbag."""
+        ...
+
+    @property
+    def names(self) -> Sequence[str]:
+        """The name of each scan, which is also that of its label file."""
+        ...
+
+    @property
+    def vertical_angle_deg(self) -> float:
+        """Angle by which the elevation of the points is increased on reading."""
+        ...
+
+    @property
+    def labels(self) -> LabelSource:
+        """Source of the labels."""
+        ...
+
+    @property
+    def reference(self) -> Trajectory | None:
+        """True poses of those scans that have one; None if there is no ground truth."""
+        ...
+
+    @property
+    def num_recorded(self) -> int:
+        """Number of lines in a pose file of the whole data; line n + 1 belongs to scan n, selected or not."""
+        ...
+
+    @property
+    def T_camera_lidar(self) -> Transform | None:  # noqa: N802  (a transform)
+        """Transform if ground-truth files contain camera poses (KITTI); None if they contain LiDAR poses."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, row: int) -> Scan: ...
+
+    def __iter__(self) -> Iterator[Scan]: ...
+
+
+def usable_scans(dataset: Dataset) -> Iterator[Scan]:
+    """The scans in order; invalid scans are skipped with a warning."""
+    for row in range(len(dataset)):
+        try:
+            scan = dataset[row]
+        except BadScan as error:
+            logger.warning("scan %d skipped: %s", dataset.scan_index[row], error)
+        else:
+            yield scan
+
+
+def make_scan(
+    source: Path,
+    index: int,
+    stamp_ns: int,
+    points: Points,
+    labels: ScanLabels,
+    times: Vector = NO_TIMES,
+    *,
+    intensities: Vector | None = None,
+    vertical_angle_deg: float = 0.0,
+) -> Scan:
+    """The scan without invalid points: those with a NaN or infinity, and those at the origin, which mean "no return".
+
+    A distance whose square exceeds float32 (1.8e19 m) is infinite. This
+    function alone applies `vertical_angle_deg`; label sources see the points as stored. Labels, times and
+    intensities are reduced to the same points. Raises BadScan, naming `source`, if no point remains.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # wild numbers, and NaNs that signal
+        points = points.astype(np.float32, copy=False)
+        squared_range = squared_ranges(points)
+    kept = np.isfinite(squared_range) & (squared_range > 0)
+    if not kept.any():
+        what = "has no points" if len(points) == 0 else f"none of its {len(points)} points is finite and not 0, 0, 0"
+        raise BadScan(f"{source}: {what}; copy the file again or omit the scan with --frames")
+    if not kept.all():
+        points, labels, times = points[kept], of_rows(labels, kept), times[kept] if len(times) else times
+        intensities = intensities if intensities is None else intensities[kept]
+    if intensities is not None:
+        intensities = np.ascontiguousarray(intensities, dtype=np.float32)
+    return Scan(
+        np.ascontiguousarray(raise_beams(points, vertical_angle_deg)),
+        stamp_ns,
+        index,
+        labels,
+        times,
+        intensities,
+        None if kept.all() else kept,
+    )
+
+
+def check_num_poses(file: Path, num_poses: int, num_recorded: int) -> None:
+    """Raises SegslamError if a pose file, one line per scan, has another number of lines than the data has scans."""
+    if num_poses != num_recorded:
+        raise SegslamError(
+            f"{file}: {num_poses} poses, but the data has {num_recorded} scans; it must have one line per scan, line "
+            "n + 1 for scan n. Correct or remove the file"
+        )
+
+
+def selected_rows(scan_index: Indices, frames: str | None, source: Path) -> Indices:
+    """Rows of the scans with numbers in `A:B` (A included, B excluded; either may be omitted); all rows for None.
+
+    Of `A:B:STEP`, the numbers A, A + STEP, ... are selected. Raises SegslamError for another form, and if no scan is
+    selected.
+    """
+    if frames is None:
+        return np.arange(len(scan_index))
+    first, last, step = (*frames.split(":"), "", "")[:3]
+    if frames.count(":") not in (1, 2) or not all(text.strip().isdecimal() for text in (first, last, step) if text):
+        raise SegslamError(f"--frames {frames}: write A:B, scans A to B - 1, or A:B:STEP, for example 0:100 or ::2")
+    if step and int(step) == 0:
+        raise SegslamError(f"--frames {frames}: STEP must be at least 1")
+    start, stop = min(int(first or 0), NO_LIMIT), min(int(last or NO_LIMIT), NO_LIMIT)
+    if start >= stop:
+        raise SegslamError(f"--frames {frames}: selects no scan, B must be greater than A")
+    if last and stop > scan_index[-1] + 1 and start <= scan_index[-1]:
+        logger.warning("--frames %s: the last scan of %s is %d", frames, source, scan_index[-1])
+    is_inside = (scan_index >= start) & (scan_index < stop)
+    rows = np.flatnonzero(is_inside & ((scan_index - start) % min(int(step or 1), NO_LIMIT) == 0))
+    if len(rows) == 0:
+        raise SegslamError(f"--frames {frames}: {source} has no such scan, only {scan_index[0]} to {scan_index[-1]}")
+    return rows
+
+
+def read_stamps(file: Path) -> Indices:
+    """Times (ns) from a file with one time in seconds per line. Raises SegslamError, naming file and line."""
+    try:
+        lines = file.read_text(encoding="ascii").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(
+            f"{file}: cannot read the scan times ({error}); expected one time in seconds per line"
+        ) from error
+    stamps: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            stamp_ns = nanoseconds(line)
+        except ValueError as error:
+            raise SegslamError(f"{file}:{number}: {error}; correct the line") from error
+        if stamp_ns < 0 or (stamps and stamp_ns <= stamps[-1]):
+            wrong = (
+                "is negative" if stamp_ns < 0 else f"is not later than the previous line, {brief(lines[number - 2])}"
+            )
+            raise SegslamError(f"{file}:{number}: {brief(line)} {wrong}; times must ascend and not be negative")
+        stamps.append(stamp_ns)
+    return np.array(stamps, dtype=np.int64)

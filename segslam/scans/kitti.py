@@ -1,0 +1,228 @@
+"""KITTI odometry (Geiger et al. 2012) and data of the same layout: scans, calibration, times, true poses, labels.
+
+The number of a scan is that of its file. It is also its row in times.txt and in the poses; numbers may be missing. Pose
+files hold poses of the left camera in the frame of the first; this module returns LiDAR poses.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from segslam.core import geometry
+from segslam.core.errors import brief
+from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera, read_poses
+from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory, Transform
+from segslam.labels.encodings import Encoding
+from segslam.labels.label_files import LabelSource, open_labels
+from segslam.scans.dataset import check_num_poses, make_scan, read_stamps, selected_rows, usable_scans
+from segslam.scans.scan_files import read_bytes
+
+VERTICAL_ANGLE_DEG = 0.205
+"""Angle by which the points of KITTI's scans are too low; value of KISS-ICP (Vizzo et al., RA-L 2023)."""
+EVERY = (101, 11)  # primes: the sampled rows start equally often at each of 3 or 5 columns
+FEWEST_COMPARED = 300
+ALIKE = 0.15
+"""Chosen: largest difference of quantiles, as a share of their range, between 300 samples of one distribution."""
+LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
+"""Names of T_camera_lidar in calib.txt, in KITTI's odometry, object and tracking benchmarks."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KittiSequence:
+    """The selected scans of one drive, one row per scan."""
+
+    name: str
+    scan_files: tuple[Path, ...]
+    scan_index: Indices
+    stamp_ns: Indices
+    labels: LabelSource
+    T_camera_lidar: Transform
+    reference: Trajectory | None
+    num_recorded: int
+    has_intensities: bool
+    vertical_angle_deg: float
+
+    @property
+    def is_sequential(self) -> bool:
+        """False: each scan has its own file."""
+        return False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each scan's file, without extension."""
+        return tuple(file.stem for file in self.scan_files)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
+
+    def __len__(self) -> int:
+        return len(self.scan_files)
+
+    def __getitem__(self, row: int) -> Scan:
+        """The scan, with corrected vertical angles. Raises BadScan if the file or its labels cannot be used."""
+        file = self.scan_files[row]
+        returns = read_returns(file)
+        points, intensities = returns[:, :3], returns[:, 3]
+        return make_scan(
+            file,
+            int(self.scan_index[row]),
+            int(self.stamp_ns[row]),
+            points,
+            self.labels.read(file.stem, points, intensities),
+            intensities=intensities if self.has_intensities else None,
+            vertical_angle_deg=self.vertical_angle_deg,
+        )
+
+    def __iter__(self) -> Iterator[Scan]:
+        return usable_scans(self)
+
+
+def is_kitti(data: Path) -> bool:
+    """True if the folder contains KITTI sequences, or is one."""
+    return (data / "sequences").is_dir() or _is_sequence(data)
+
+
+def open_kitti(
+    data: Path,
+    *,
+    sequence: str,
+    labels: str,
+    encoding: Encoding | None,
+    frames: str | None,
+    intensities: bool = False,
+    vertical_angle_deg: float | None = None,
+) -> KittiSequence:
+    """The sequence `sequence` of a folder with `sequences/`, or the folder itself if it is a sequence.
+
+    Raises SegslamError if the sequence, its scans, its calibration or its times are missing.
+    """
+    folder, poses_file = _find_sequence(data, sequence)
+    files, numbers = _numbered_scans(folder / "velodyne")
+    all_stamps = _stamps_of(folder / "times.txt", numbers)
+    T_camera_lidar = read_calibration(folder / "calib.txt")
+    rows = selected_rows(numbers, frames, folder / "velodyne")
+    chosen = tuple(files[row] for row in rows)
+    return KittiSequence(
+        name=f"kitti/{folder.name}",
+        scan_files=chosen,
+        scan_index=numbers[rows],
+        stamp_ns=all_stamps[numbers[rows]],
+        labels=open_labels(labels, beside=folder, scan_names=[file.stem for file in chosen], encoding=encoding),
+        T_camera_lidar=T_camera_lidar,
+        reference=_reference(poses_file, numbers[rows], all_stamps, T_camera_lidar),
+        num_recorded=len(all_stamps),
+        has_intensities=intensities,
+        vertical_angle_deg=VERTICAL_ANGLE_DEG if vertical_angle_deg is None else vertical_angle_deg,
+    )
+
+
+def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
+    """(n, 4) x, y, z, intensity of a velodyne file, as stored. Raises BadScan if it is invalid."""
+    content = read_bytes(file)
+    if len(content) % 16:
+        raise BadScan(
+            f"{file}: {len(content)} bytes are not a multiple of 16 (float32 x y z intensity): truncated, or not 4 "
+            "values per point; copy the file again, or convert it"
+        )
+    returns = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
+    if _mixes_columns(returns):
+        raise BadScan(
+            f"{file}: its four columns have the same distribution, so it does not have 4 values per point (x y z "
+            "intensity) but, for example, x y z; convert it, for example to .ply"
+        )
+    return returns
+
+
+def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
+    """True if the file has 3 or 5 values per point: each value then occurs in every column in turn."""
+    for every in EVERY:
+        some = returns[::every]
+        some = some[np.isfinite(some).all(axis=1)]
+        if len(some) >= FEWEST_COMPARED:
+            break
+    else:
+        return False
+    shares = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+    levels = np.sort(some, axis=0)[(shares * len(some)).astype(int)]
+    spread = np.ptp(levels)
+    return bool(spread > 0 and np.ptp(levels, axis=1).max() < ALIKE * spread)
+
+
+def read_calibration(file: Path) -> Transform:
+    """T_camera_lidar of a calib.txt. Raises SegslamError if the file or the entry is missing or invalid."""
+    try:
+        lines = file.read_text(encoding="ascii").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{file}: cannot read the calibration ({error}); put KITTI's calib.txt there") from error
+    for number, line in enumerate(lines, start=1):
+        key, _, values = line.replace(":", " ", 1).strip().partition(" ")
+        if key in LIDAR_KEYS:
+            return _rigid(values.split(), f"{file}:{number}")
+    raise SegslamError(
+        f"{file}: no line begins with any of {', '.join(LIDAR_KEYS)}; add KITTI's line `Tr:` with 12 numbers"
+    )
+
+
+def _rigid(texts: list[str], place: str) -> Transform:
+    try:
+        matrix = np.array(texts, dtype=float).reshape(3, 4)
+    except ValueError as error:
+        raise SegslamError(f"{place}: expected 12 numbers, a 3x4 matrix by rows ({brief(str(error))})") from error
+    if not np.isfinite(matrix).all():
+        raise SegslamError(f"{place}: all numbers must be finite")
+    T_camera_lidar = geometry.nearest_transform(matrix)
+    off = np.abs(matrix[:, :3] - T_camera_lidar[:3, :3]).max()
+    if not off <= ROTATION_TOLERANCE:
+        raise SegslamError(
+            f"{place}: the 3x3 part is not a rotation (error {off:.3g}); give the transform from LiDAR to camera "
+            "coordinates, not a projection"
+        )
+    return T_camera_lidar
+
+
+def _is_sequence(folder: Path) -> bool:
+    return (folder / "velodyne").is_dir() and ((folder / "calib.txt").exists() or folder.parent.name == "sequences")
+
+
+def _find_sequence(data: Path, sequence: str) -> tuple[Path, Path]:
+    """Folder of the sequence, and file of its true poses, which may be missing."""
+    if not (data / "sequences").is_dir() and _is_sequence(data):
+        folder = data.resolve()
+        return folder, folder.parent.parent / "poses" / f"{folder.name}.txt"
+    name = sequence.zfill(2)
+    folder = data / "sequences" / name
+    if not folder.is_dir():
+        known = ", ".join(sorted(other.name for other in (data / "sequences").glob("*") if other.is_dir())) or "none"
+        raise SegslamError(f"{folder}: no such sequence; {data / 'sequences'} has: {known}")
+    return folder, data / "poses" / f"{name}.txt"
+
+
+def _numbered_scans(velodyne: Path) -> tuple[list[Path], Indices]:
+    files = [file for file in velodyne.glob("*.bin") if not file.name.startswith(".")]
+    if not files:
+        raise SegslamError(f"{velodyne}: contains no .bin file; put KITTI's scans there, 000000.bin and so on")
+    misnamed = [file for file in files if not file.stem.isdecimal() or int(file.stem) >= 2**63]
+    if misnamed:
+        raise SegslamError(f"{misnamed[0]}: the name is not a scan number; rename the file, for example 000000.bin")
+    files.sort(key=lambda file: int(file.stem))
+    return files, np.array([int(file.stem) for file in files])
+
+
+def _stamps_of(times_file: Path, numbers: Indices) -> Indices:
+    stamps = read_stamps(times_file)
+    if numbers[-1] >= len(stamps):
+        raise SegslamError(
+            f"{times_file}: {len(stamps)} lines, but there is a scan {numbers[-1]}; line n + 1 is the time of scan n"
+        )
+    return stamps
+
+
+def _reference(poses_file: Path, numbers: Indices, stamps: Indices, T_camera_lidar: Transform) -> Trajectory | None:
+    if not poses_file.exists():
+        return None
+    poses = lidar_from_camera(read_poses(poses_file, format="kitti").T_a_b, T_camera_lidar)
+    check_num_poses(poses_file, len(poses), len(stamps))
+    return Trajectory(numbers, stamps[numbers], poses[numbers])

@@ -1,0 +1,160 @@
+"""ROS 2 messages on one topic of an MCAP file, each found by the file's index."""
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any, NamedTuple, cast
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, ChunkIndex, Message, MessageIndex, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.summary import Summary
+
+from segslam.core.extras import how_to_install
+from segslam.scans.in_order import InOrder
+from segslam.scans.scan_files import MAX_SCAN_BYTES
+
+MESSAGE = "sensor_msgs/msg/PointCloud2"
+RECORD_HEADER_BYTES = 9
+DAMAGE = (McapError, ValueError, OverflowError, struct.error)
+"""Exceptions of the library for damaged records."""
+
+
+class _Place(NamedTuple):
+    """Position of a message: its time, the position of its chunk in the file, and its own in the chunk's data."""
+
+    log_ns: int
+    chunk: int
+    offset: int
+
+
+class McapClouds:
+    """Messages with clouds, by their order in time; replaces kiss_icp's reader, which fails with mcap-ros2-support 0.6.
+
+    A message in a damaged chunk cannot be read; the others can. In a file without chunks, or without an index of their
+    messages, none after the damage can. Raises ValueError if the file has no index or no such topic, ImportError if
+    the decoding package is missing.
+    """
+
+    def __init__(self, file: Path, topic: str) -> None:
+        try:
+            from mcap_ros2.decoder import DecoderFactory
+        except ImportError as error:
+            raise ImportError(f"reading ROS 2 messages needs a package: {how_to_install('recordings')}") from error
+        self._file = file
+        self._chunk: tuple[int, bytes] = (-1, b"")
+        with file.open("rb") as stream:
+            summary = _summary(stream)
+            self._topic, channels, num_clouds = _topic_and_count(summary, topic)
+            self._places = _places(stream, summary, channels)
+        self._decode = {id: _decoder(DecoderFactory(), one, _schema(summary, one)) for id, one in channels.items()}
+        self._in_order = None
+        if len(self._places) != num_clouds:
+            self._in_order = InOrder(self._messages, num_clouds, num_bytes=file.stat().st_size)
+        self.is_sequential = self._in_order is not None
+        self._num_clouds = num_clouds
+
+    def __len__(self) -> int:
+        return self._num_clouds
+
+    def __getitem__(self, index: int) -> tuple[int, Any]:
+        """Log time (ns) and decoded message. Raises what the decoders raise for a damaged one."""
+        message = self._found(self._places[index]) if self._in_order is None else self._in_order[index]
+        return message.log_time, self._decode[message.channel_id](message.data)
+
+    def _found(self, place: _Place) -> Message:
+        if self._chunk[0] != place.chunk:
+            with self._file.open("rb") as stream:
+                self._chunk = (place.chunk, _chunk_data(stream, place.chunk))
+        data = BytesIO(self._chunk[1])
+        data.seek(place.offset)
+        record = ReadDataStream(data)
+        if record.read1() != Opcode.MESSAGE:
+            raise ValueError("the index of the file is damaged")
+        message = Message.read(record, record.read8())
+        if message.channel_id not in self._decode or message.log_time != place.log_ns:
+            raise ValueError("the index of the file is damaged")
+        return message
+
+    def _messages(self) -> Iterator[Message]:
+        with self._file.open("rb") as stream:
+            for _, _, message in make_reader(stream, validate_crcs=True).iter_messages(topics=[self._topic]):
+                if message.channel_id in self._decode:
+                    yield message
+
+
+def _decoder(factory: Any, channel: Channel, schema: Schema) -> Callable[[bytes], Any]:
+    decode = factory.decoder_for(channel.message_encoding, schema)
+    if decode is None:
+        raise ValueError(f"messages on {channel.topic} are encoded as {channel.message_encoding}, not as ROS 2's cdr")
+    return cast(Callable[[bytes], Any], decode)
+
+
+def _summary(stream: IO[bytes]) -> Summary:
+    summary = None
+    with suppress(*DAMAGE):
+        summary = make_reader(stream).get_summary()
+    if summary is None or summary.statistics is None:
+        raise ValueError("the file has no index, for example after a crash; `mcap recover` adds one")
+    return summary
+
+
+def _topic_and_count(summary: Summary, wanted: str) -> tuple[str, dict[int, Channel], int]:
+    """The topic, its channels by id, and its number of messages."""
+    assert summary.statistics is not None
+    clouds = [
+        channel
+        for channel in summary.channels.values()
+        if channel.schema_id and _schema(summary, channel).name == MESSAGE
+    ]
+    topics = {channel.topic for channel in clouds}
+    found = [topic for topic in topics if topic == wanted or not wanted]
+    if len(found) != 1:
+        known = ", ".join(f"--topic {topic}" for topic in sorted(topics)) or "none"
+        raise ValueError(f"give one topic of type {MESSAGE}; the file has: {known}")
+    channels = {channel.id: channel for channel in clouds if channel.topic == found[0]}
+    counts = summary.statistics.channel_message_counts
+    return found[0], channels, sum(counts.get(id, 0) for id in channels)
+
+
+def _schema(summary: Summary, channel: Channel) -> Schema:
+    try:
+        return summary.schemas[channel.schema_id]
+    except KeyError as error:
+        raise ValueError("the index of the file is damaged") from error
+
+
+def _places(stream: IO[bytes], summary: Summary, channels: dict[int, Channel]) -> list[_Place]:
+    """The place of each message on these channels, in order of time; not those of damaged parts of the index."""
+    places: list[_Place] = []
+    for chunk in summary.chunk_indexes:
+        for channel in channels.keys() & chunk.message_index_offsets.keys():
+            with suppress(*DAMAGE):
+                entries = _message_index(stream, chunk, channel)
+                places += [_Place(log_ns, chunk.chunk_start_offset, offset) for log_ns, offset in entries]
+    return sorted(places)
+
+
+def _message_index(stream: IO[bytes], chunk: ChunkIndex, channel: int) -> list[tuple[int, int]]:
+    """Time and offset of each message of a channel in a chunk."""
+    stream.seek(chunk.message_index_offsets[channel] + RECORD_HEADER_BYTES)
+    index = MessageIndex.read(ReadDataStream(stream))
+    return index.records if index.channel_id == channel else []
+
+
+def _chunk_data(stream: IO[bytes], start: int) -> bytes:
+    """The decompressed messages of a chunk. Raises ValueError if their checksum is wrong or there are too many."""
+    stream.seek(start)
+    record = ReadDataStream(stream)
+    if record.read1() != Opcode.CHUNK or record.read8() > MAX_SCAN_BYTES:
+        raise ValueError("the chunk of this message is damaged")
+    chunk = Chunk.read(record)
+    if chunk.uncompressed_size > MAX_SCAN_BYTES:
+        raise ValueError("the chunk of this message is damaged")
+    data, num_bytes = get_chunk_data_stream(chunk, validate_crc=True)
+    return data.read(num_bytes)

@@ -1,0 +1,224 @@
+"""Ouster recordings: a pcap of the sensor's UDP packets, and the JSON metadata of the same session beside it.
+
+kiss_icp's reader requires one release of ouster-sdk, which supports Python 3.11 and 3.12 only and requires versions
+of rosbags, kiss-icp and numpy that conflict with those of this package. The packet format is documented in Ouster's
+firmware manual, sections "Lidar Data" and "Coordinate Frames and XYZ Calculation".
+"""
+
+import json
+import mmap
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from segslam.core.types import Points, Vector
+from segslam.scans.pcap import udp_payloads
+
+
+class _Channel(NamedTuple):
+    """Format of the data per beam in a packet: the first range, and its reflectivity."""
+
+    num_bytes: int
+    range_type: str
+    range_bits: int
+    mm_per_count: int
+    reflectivity_type: str
+    reflectivity_offset: int
+
+    @property
+    def dtype(self) -> np.dtype:
+        return np.dtype(
+            {
+                "names": ["range", "reflectivity"],
+                "formats": [self.range_type, self.reflectivity_type],
+                "offsets": [0, self.reflectivity_offset],
+                "itemsize": self.num_bytes,
+            }
+        )
+
+
+CHANNELS = {
+    "LEGACY": _Channel(12, "<u4", 20, 1, "<u2", 4),
+    "RNG19_RFL8_SIG16_NIR16": _Channel(12, "<u4", 19, 1, "u1", 4),
+    "RNG19_RFL8_SIG16_NIR16_DUAL": _Channel(16, "<u4", 19, 1, "u1", 3),
+    "RNG15_RFL8_NIR8": _Channel(4, "<u2", 15, 8, "u1", 2),
+    "RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8, "u1", 2),
+    "FUSA_RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8, "u1", 2),
+}
+"""By profile name."""
+HEADER_BYTES = FOOTER_BYTES = 32
+"""Bytes around the columns of a packet, except in the legacy profile."""
+MAX_COLUMNS, MAX_BEAMS = 4096, 256
+"""Largest numbers in metadata. Chosen: the largest sensors have 4096 columns and 128 beams."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Sensor:
+    """The sensor's metadata, from either of the two layouts."""
+
+    profile: str
+    port: int | None
+    columns_per_frame: int
+    columns_per_packet: int
+    altitude_rad: np.ndarray
+    azimuth_rad: np.ndarray
+    beam_origin_mm: float
+    """Distance of the beam origins in front of their axis of rotation."""
+    T_sensor_lidar_mm: np.ndarray
+
+    @property
+    def column_dtype(self) -> np.dtype:
+        channels = ("channels", CHANNELS[self.profile].dtype, len(self.altitude_rad))
+        stamped = [("stamp_ns", "<u8"), ("measurement", "<u2")]
+        if self.profile == "LEGACY":
+            return np.dtype([*stamped, ("frame", "<u2"), ("encoder", "<u4"), channels, ("status", "<u4")])
+        return np.dtype([*stamped, ("status", "<u2"), channels])
+
+    @property
+    def header_bytes(self) -> int:
+        return 0 if self.profile == "LEGACY" else HEADER_BYTES
+
+    def contradiction(self) -> str:
+        """What no sensor has; empty if there is nothing of the kind."""
+        numbers = (self.altitude_rad, self.azimuth_rad, self.T_sensor_lidar_mm, np.array(self.beam_origin_mm))
+        if not 1 <= self.columns_per_packet <= self.columns_per_frame <= MAX_COLUMNS:
+            return f"{self.columns_per_frame} columns per frame, {self.columns_per_packet} per packet"
+        if self.altitude_rad.shape != self.azimuth_rad.shape or not 1 <= self.altitude_rad.size <= MAX_BEAMS:
+            return f"{self.altitude_rad.size} elevations and {self.azimuth_rad.size} azimuths of beams"
+        if self.altitude_rad.ndim != 1 or not all(np.isfinite(each).all() for each in numbers):
+            return "angles or distances that are not numbers"
+        return ""
+
+    @property
+    def packet_bytes(self) -> int:
+        around = 0 if self.profile == "LEGACY" else HEADER_BYTES + FOOTER_BYTES
+        return around + self.columns_per_packet * self.column_dtype.itemsize
+
+
+class OusterFrames:
+    """The frames of a recording: points in the sensor's frame with their times. Replaces kiss_icp's reader.
+
+    Raises ValueError if the file is not a pcap or the metadata do not match its packets, FileNotFoundError if there are
+    no metadata.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._sensor = _read_sensor(_metadata_of(file))
+        with file.open("rb") as stream:
+            self._content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self._frames = self._find_frames()
+        self.stamp_ns = 0
+        """Stamp of the first column of the last frame read."""
+        self.intensities = np.empty(0)
+        """Reflectivity of each point of the last frame read, in the sensor's unit."""
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> tuple[Points, Vector]:
+        """(n, 3) points (m) of the beams that returned, and (n,) times (s) since the first column."""
+        columns = np.concatenate([self._columns(payload) for payload in self._frames[index]])
+        columns = columns[(columns["status"] & 1).astype(bool)]
+        if len(columns) == 0:
+            raise ValueError("no valid column in this frame")
+        self.stamp_ns = int(columns["stamp_ns"].min())
+        channel = CHANNELS[self._sensor.profile]
+        counts = columns["channels"]["range"] & ((1 << channel.range_bits) - 1)
+        ranges_mm = counts.astype(np.float64) * channel.mm_per_count
+        column, beam = np.nonzero(ranges_mm)
+        self.intensities = columns["channels"]["reflectivity"][column, beam].astype(np.float64)
+        rays, origins = self._rays_and_origins
+        measured = columns["measurement"][column].astype(np.intp)
+        points_mm = rays[measured, beam] * ranges_mm[column, beam, None] + origins[measured, beam]
+        times = (columns["stamp_ns"] - np.uint64(self.stamp_ns)) * 1e-9
+        return points_mm * 1e-3, times[column]
+
+    def get_frames_timestamps(self) -> list[float]:
+        """Start of the last frame read, in seconds of the sensor's clock."""
+        return [self.stamp_ns * 1e-9]
+
+    def _find_frames(self) -> list[list[list[slice]]]:
+        """Payloads by frame. A frame starts where the column number decreases by more than half a revolution."""
+        sensor = self._sensor
+        frames: list[list[list[slice]]] = []
+        last = sensor.columns_per_frame
+        payloads = udp_payloads(self._content, num_bytes=sensor.packet_bytes, port=sensor.port)
+        for payload in payloads:
+            number = int(self._columns(payload)["measurement"][0])
+            if not frames or last - number > sensor.columns_per_frame // 2:
+                frames.append([])
+            frames[-1].append(payload)
+            last = number
+        return frames
+
+    def _columns(self, payload: list[slice]) -> np.ndarray:
+        packet = b"".join(self._content[piece] for piece in payload)
+        sensor = self._sensor
+        return np.frombuffer(packet, sensor.column_dtype, sensor.columns_per_packet, offset=sensor.header_bytes)
+
+    @cached_property
+    def _rays_and_origins(self) -> tuple[np.ndarray, np.ndarray]:
+        """(columns, beams, 3) each: a point (mm) of the sensor's frame is its range (mm) times ray plus origin."""
+        sensor = self._sensor
+        encoder = 2 * np.pi * (1 - np.arange(sensor.columns_per_frame) / sensor.columns_per_frame)[:, None]
+        heading = encoder - sensor.azimuth_rad
+        level = np.cos(sensor.altitude_rad)
+        ray = [
+            np.cos(heading) * level,
+            np.sin(heading) * level,
+            np.broadcast_to(np.sin(sensor.altitude_rad), heading.shape),
+        ]
+        rays = np.stack(ray, axis=-1)
+        turned = np.broadcast_to(encoder, heading.shape)
+        axis = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
+        rotation, shift = sensor.T_sensor_lidar_mm[:3, :3], sensor.T_sensor_lidar_mm[:3, 3]
+        return rays @ rotation.T, (axis - rays) * sensor.beam_origin_mm @ rotation.T + shift
+
+
+def _metadata_of(file: Path) -> Path:
+    """The JSON file in the same folder whose name starts like the recording's, or the only JSON file."""
+    beside = sorted(file.resolve().parent.glob("*.json"))
+    alike = [path for path in beside if path.stem.startswith(file.stem) or file.stem.startswith(path.stem)]
+    found = alike or beside
+    if len(found) != 1 and file.with_suffix(".json") not in found:
+        raise FileNotFoundError(f"the sensor's metadata are missing: put them beside the recording as {file.stem}.json")
+    return found[0] if len(found) == 1 else file.with_suffix(".json")
+
+
+def _read_sensor(file: Path) -> _Sensor:
+    """Raises ValueError, naming the file, for metadata that no sensor has."""
+    try:
+        values = _flat(json.loads(file.read_text(encoding="utf-8")))
+        profile = str(values.get("udp_profile_lidar", "LEGACY"))
+        if profile not in CHANNELS:
+            raise ValueError(f"packets of profile {profile}; known: {', '.join(CHANNELS)}")
+        sensor = _Sensor(
+            profile=profile,
+            port=int(values.get("udp_port_lidar") or 0) or None,
+            columns_per_frame=int(values["columns_per_frame"]),
+            columns_per_packet=int(values["columns_per_packet"]),
+            altitude_rad=np.radians(values["beam_altitude_angles"]),
+            azimuth_rad=np.radians(values["beam_azimuth_angles"]),
+            beam_origin_mm=float(values["lidar_origin_to_beam_origin_mm"]),
+            T_sensor_lidar_mm=np.asarray(values["lidar_to_sensor_transform"], dtype=float).reshape(4, 4),
+        )
+    except KeyError as error:
+        raise ValueError(f"{file.name} has no key {error}; it must be the metadata of an Ouster sensor") from error
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{file.name} is not the metadata of an Ouster sensor ({error})") from error
+    wrong = sensor.contradiction()
+    if wrong:
+        raise ValueError(f"{file.name} is not the metadata of an Ouster sensor ({wrong})")
+    return sensor
+
+
+def _flat(values: dict[str, Any]) -> dict[str, Any]:
+    """The keys of all sections in one mapping; older metadata have no sections."""
+    inner = [_flat(value) for value in values.values() if isinstance(value, dict)]
+    flat = {key: value for key, value in values.items() if not isinstance(value, dict)}
+    for section in inner:
+        flat.update(section)
+    return flat

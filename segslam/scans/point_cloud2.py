@@ -1,0 +1,75 @@
+"""Points and times of ROS's PointCloud2 messages."""
+
+from typing import Any
+
+import numpy as np
+
+from segslam.core.types import Points, Vector
+
+TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time")
+"""Names that drivers (Ouster, Velodyne, Hesai, Robosense, Livox) use for the time of a point, in any unit."""
+INTENSITY_FIELDS = ("intensity", "reflectivity", "signal")
+"""Names that drivers and programs use for the intensity; the first that exists is used."""
+KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Types of sensor_msgs/PointField by number."""
+
+
+class CloudReader:
+    """Replaces kiss_icp's function, which misaligns points and times if a cloud contains a NaN."""
+
+    def __init__(self) -> None:
+        self.stamp_ns = 0
+        """Stamp in the last message's header; 0 if there was none."""
+        self.intensities: Vector | None = None
+        """Intensities of the last message's points; None if there were none."""
+
+    def __call__(self, message: Any) -> tuple[Points, Vector]:
+        """Points (n, 3) and times (n,) of a message; NaN for beams without return; no times if it has none.
+
+        Raises KeyError, TypeError or ValueError for an inconsistent message or one without x, y, z.
+        """
+        self.stamp_ns = stamp_ns_of(message)
+        rows = _rows(message)
+        points = np.column_stack([rows[axis].ravel() for axis in "xyz"]).astype(np.float64)
+        name = next((name for name in INTENSITY_FIELDS if name in (rows.dtype.names or ())), None)
+        self.intensities = rows[name].ravel().astype(np.float64) if name else None
+        time_field = next((field.name for field in message.fields if field.name in TIME_FIELDS), None)
+        return points, rows[time_field].ravel().astype(np.float64) if time_field else np.empty(0)
+
+
+def stamp_ns_of(message: Any) -> int:
+    """The stamp in the header of a message; 0 if it has none."""
+    stamp = message.header.stamp
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
+
+
+def _rows(message: Any) -> np.ndarray:
+    """(height, width) structured array with the fields of the message."""
+    order = ">" if message.is_bigendian else "<"
+    formats = [np.dtype(order + KINDS[field.datatype]) for field in message.fields]
+    _check_size(message, formats)
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in message.fields],
+            "formats": formats,
+            "offsets": [field.offset for field in message.fields],
+            "itemsize": message.point_step,
+        }
+    )
+    shape, strides = (message.height, message.width), (message.row_step, message.point_step)
+    return np.ndarray(shape, dtype, buffer=message.data, strides=strides)
+
+
+def _check_size(message: Any, formats: list[np.dtype]) -> None:
+    """Raises ValueError unless all fields lie in a point, and all points in the data, one after the other.
+
+    NumPy checks neither the bounds of empty data nor those of large offsets, and lets points overlap.
+    """
+    height, width, step = message.height, message.width, message.point_step
+    num_bytes = (height - 1) * message.row_step + width * step if height * width else 0
+    overlap = not 0 < step < 2**31 or (height > 1 and message.row_step < width * step)
+    if overlap or min(height, width) < 0 or num_bytes > len(message.data):
+        raise ValueError(f"{height} x {width} points of {step} bytes do not fit into {len(message.data)} bytes of data")
+    for field, kind in zip(message.fields, formats, strict=True):
+        if not 0 <= field.offset <= step - kind.itemsize:
+            raise ValueError(f"the field {field.name[:40]} at {field.offset} is not in a point of {step} bytes")

@@ -1,0 +1,265 @@
+"""Folders of scan files, rosbag, mcap and pcap recordings, and the data sets that kiss_icp reads.
+
+The number of a scan is its position in the recording.
+"""
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from segslam.core.errors import brief
+from segslam.core.trajectory import read_poses
+from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory, Vector
+from segslam.labels.encodings import Encoding
+from segslam.labels.label_files import LabelSource, open_labels
+from segslam.scans.bag_clouds import BagClouds
+from segslam.scans.clouds import read_intensities
+from segslam.scans.dataset import (
+    ASSUMED_PERIOD_NS,
+    check_num_poses,
+    make_scan,
+    read_stamps,
+    selected_rows,
+    usable_scans,
+)
+from segslam.scans.mcap_clouds import McapClouds
+from segslam.scans.message_clouds import MessageClouds
+from segslam.scans.ouster import OusterFrames
+from segslam.scans.scan_folder import ScanFolder, scan_files
+from segslam.scans.sweep_times import sweep_times
+
+KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
+WITH_TOPICS = ("mcap", "rosbag")
+REMEDIES = {
+    "mcap": "; `mcap recover IN -o OUT` copies what can be read",
+    "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",
+}
+FOREIGN_ERRORS = (Exception, SystemExit)
+"""Readers of other projects raise anything for damaged data; it becomes an error that names the file."""
+
+
+class Recording:
+    """The selected scans of a recording. If it can only be read in order, going back restarts it."""
+
+    T_camera_lidar = None
+
+    def __init__(
+        self,
+        kind: str,
+        source: Path,
+        loader: Any,
+        *,
+        labels: str,
+        encoding: Encoding | None,
+        frames: str | None,
+        intensities: bool,
+        vertical_angle_deg: float,
+    ) -> None:
+        beside = _beside(source)
+        self.name = f"{kind}/{beside.resolve().name}"
+        self._source = source
+        self._loader = loader
+        self._has_intensities = intensities
+        self.vertical_angle_deg = vertical_angle_deg
+        self.is_sequential = bool(getattr(loader, "is_sequential", False))
+        self._stamps = _whole_stamps(beside / "times.txt", len(loader)) if kind == "generic" else None
+        self.num_recorded = len(loader)
+        self.scan_index = selected_rows(np.arange(len(loader)), frames, source)
+        self.names = [self._file(int(index)).stem for index in self.scan_index]
+        self.labels: LabelSource = open_labels(labels, beside=beside, scan_names=self.names, encoding=encoding)
+        self.reference = self._reference(beside / "poses.txt" if kind == "generic" else None)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
+
+    def __len__(self) -> int:
+        return len(self.scan_index)
+
+    def __getitem__(self, row: int) -> Scan:
+        """The scan. Raises BadScan if its reader fails on it or its labels cannot be used."""
+        index = int(self.scan_index[row])
+        file = self._file(index)
+        points, times = self._read(index, file)
+        intensities = self._intensities(file, len(points))
+        stamp_ns = self._stamp_ns(index)
+        if abs(stamp_ns) >= 2**63:
+            raise BadScan(f"{file}: its stamp {stamp_ns} ns is more than 292 years; correct the sensor's clock")
+        return make_scan(
+            file,
+            index,
+            stamp_ns,
+            points,
+            self.labels.read(file.stem, points, intensities),
+            sweep_times(times, len(points), stamp_ns * 1e-9),
+            intensities=intensities if self._has_intensities else None,
+            vertical_angle_deg=self.vertical_angle_deg,
+        )
+
+    def __iter__(self) -> Iterator[Scan]:
+        return usable_scans(self)
+
+    def _read(self, index: int, file: Path) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):
+                item = self._loader[index]
+            points, times = item if isinstance(item, tuple) else (item, np.empty(0))
+            points = np.asarray(points).reshape(-1, 3)
+            points = points if points.dtype == np.float32 else points.astype(np.float64)
+            return points, np.asarray(times, dtype=np.float64).ravel()
+        except BadScan:
+            raise
+        except FOREIGN_ERRORS as error:
+            raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
+
+    def _intensities(self, file: Path, num_points: int) -> Vector | None:
+        """Intensities of the scan read last, if requested and known."""
+        if not self._has_intensities and self.labels.network is None:
+            return None
+        known = getattr(self._loader, "intensities", None)
+        if not hasattr(self._loader, "intensities"):
+            with contextlib.suppress(SegslamError):  # a file with another layout than KITTI's
+                known = read_intensities(file)
+        return known if known is not None and len(known) == num_points else None
+
+    def _stamp_ns(self, index: int) -> int:
+        """Stamp of the scan that was read last; some readers know it only then."""
+        if self._stamps is not None:
+            return int(self._stamps[index])
+        if hasattr(self._loader, "stamp_ns"):
+            return int(self._loader.stamp_ns)
+        if not hasattr(self._loader, "get_frames_timestamps"):
+            return index * ASSUMED_PERIOD_NS
+        return round(float(np.squeeze(self._loader.get_frames_timestamps()[index])) * 1e9)
+
+    def _file(self, index: int) -> Path:
+        """The file of a scan; a name with its number for recordings of many scans."""
+        files = getattr(self._loader, "scan_files", None)
+        return Path(str(files[index])) if files is not None else self._source / f"{index:06d}"
+
+    def _reference(self, poses_file: Path | None) -> Trajectory | None:
+        if poses_file is not None and poses_file.exists():
+            poses = read_poses(poses_file, format="kitti").T_a_b
+            check_num_poses(poses_file, len(poses), self.num_recorded)
+        else:
+            poses = np.asarray(getattr(self._loader, "gt_poses", np.empty((0, 4, 4))), dtype=float)
+        posed = self.scan_index[self.scan_index < len(poses)]
+        if len(posed) == 0:
+            return None
+        return Trajectory(posed, np.array([self._stamp_ns(int(index)) for index in posed]), poses[posed])
+
+
+def open_recording(
+    data: Path,
+    *,
+    kind: str | None,
+    sequence: str,
+    topic: str,
+    labels: str,
+    encoding: Encoding | None,
+    frames: str | None,
+    intensities: bool = False,
+    vertical_angle_deg: float = 0.0,
+) -> Recording:
+    """A recording by the name of its kind, or by detecting the kind from the file or folder.
+
+    Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan.
+    """
+    kinds = known_kinds()
+    if kind is not None and kind not in kinds:
+        raise SegslamError(f"--dataset {kind}: no such kind of data; known: {', '.join(kinds)}")
+    kind = kind or _kind_of(data)
+    if topic and kind not in WITH_TOPICS:
+        raise SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); omit the option")
+    source = _scans_folder(data) if kind == "generic" else data
+    printed = io.StringIO()
+    try:
+        silence = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO())
+        with silence[0], silence[1], warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # warnings about kiss_icp's sources, which it parses to find its readers
+            loader = _loader(kind, source, sequence, topic)
+            num_scans = len(loader)
+    except SegslamError:
+        raise
+    except FOREIGN_ERRORS as error:
+        complaint = " ".join(printed.getvalue().split()) if isinstance(error, SystemExit) else _reason(error)
+        remedy = REMEDIES.get(kind, "") if "mcap recover" not in complaint else ""
+        raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset{remedy}") from error
+    if num_scans == 0:
+        raise SegslamError(f"{data}: the reader for {kind} data finds no scan in it; see --dataset")
+    return Recording(
+        kind,
+        source,
+        loader,
+        labels=labels,
+        encoding=encoding,
+        frames=frames,
+        intensities=intensities,
+        vertical_angle_deg=vertical_angle_deg,
+    )
+
+
+def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
+    """The reader of a kind of data: scans by their number, as points and times, or as points alone."""
+    match kind:
+        case "generic":
+            return ScanFolder(source)
+        case "mcap":
+            return MessageClouds(McapClouds(source, topic))
+        case "rosbag":
+            return MessageClouds(BagClouds(source, topic))
+        case "ouster":
+            return OusterFrames(source)
+    from kiss_icp.datasets import dataset_factory
+
+    return dataset_factory(kind, source, sequence=sequence, topic=topic)
+
+
+def _kind_of(data: Path) -> str:
+    if data.is_file() and data.suffix in KIND_OF_SUFFIX:
+        return KIND_OF_SUFFIX[data.suffix]
+    if (data / "metadata.yaml").exists() or any(data.glob("*.bag")):
+        return "rosbag"
+    if data.is_dir() and _has_clouds(_scans_folder(data)):
+        return "generic"
+    raise SegslamError(
+        f"{data}: found neither sequences/ nor velodyne/ (KITTI), nor clouds (.bin .ply .pcd ...), nor a rosbag, .mcap "
+        "or .pcap; give the folder that contains them, or the kind by --dataset"
+    )
+
+
+def _scans_folder(data: Path) -> Path:
+    return data / "velodyne" if not _has_clouds(data) and (data / "velodyne").is_dir() else data
+
+
+def _has_clouds(folder: Path) -> bool:
+    return bool(scan_files(folder))
+
+
+def _beside(source: Path) -> Path:
+    """Folder in which the times, poses and labels of a folder of scans are searched."""
+    return source.resolve().parent if source.resolve().name == "velodyne" else source
+
+
+def _whole_stamps(times_file: Path, num_scans: int) -> Indices | None:
+    if not times_file.exists():
+        return None
+    stamps = read_stamps(times_file)
+    if len(stamps) != num_scans:
+        raise SegslamError(f"{times_file}: {len(stamps)} lines for {num_scans} scans; correct or remove the file")
+    return stamps
+
+
+def _reason(error: BaseException) -> str:
+    return brief(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__, 300)
+
+
+def known_kinds() -> list[str]:
+    """Names for `dataset`: kitti, and those of kiss_icp's readers."""
+    from kiss_icp.datasets import available_dataloaders
+
+    return sorted({"kitti", *available_dataloaders()})

@@ -1,0 +1,132 @@
+"""Content of a scan file, its header, and its rows as columns. All parsers raise ValueError with what is wrong."""
+
+import os
+import stat
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from segslam.core.types import BadScan
+from segslam.scans.numbers import parse_numbers
+
+MAX_SCAN_BYTES = 2**30
+"""Largest file that is read as one scan. Chosen: 60 million points of 16 bytes, 200 times the largest known sweep."""
+MAX_HEADER_BYTES = 65_536
+"""Largest header in which its last line is searched. Chosen: 1,000 comments; usual headers have 300 bytes."""
+Columns = dict[str, np.ndarray]
+"""One array (n,) per field, by its name in the file."""
+
+
+class Field(NamedTuple):
+    """A field of each row: `num_values` values of one type (with byte order)."""
+
+    name: str
+    dtype: np.dtype
+    num_values: int = 1
+
+
+def read_bytes(file: Path) -> bytes:
+    """The content of a scan file. Raises BadScan if it cannot be read, or has more than MAX_SCAN_BYTES."""
+    try:
+        with open(file, "rb", opener=_without_waiting) as stream:
+            status = os.fstat(stream.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise BadScan(f"{file}: not a regular file; give a scan")
+            if status.st_size > MAX_SCAN_BYTES:
+                raise BadScan(f"{file}: {status.st_size} bytes are too many for one scan (at most {MAX_SCAN_BYTES})")
+            return stream.read()
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise BadScan(f"{file}: cannot read the scan ({error})") from error
+
+
+def read_header(content: bytes, last: str) -> tuple[list[list[str]], int]:
+    """The words of each line up to the line that begins with `last`, and the position of the data after it."""
+    lines: list[list[str]] = []
+    start = 0
+    while (end := content.find(b"\n", start, MAX_HEADER_BYTES)) >= 0:
+        words = content[start:end].decode("latin-1").split()
+        start = end + 1
+        if words:
+            lines.append(words)
+            if words[0] == last:
+                return lines, start
+    raise ValueError(f"its header has no line {last}")
+
+
+def number(text: str) -> int:
+    """A count in a header."""
+    if not (text.isascii() and text.isdigit() and len(text) < 19):
+        raise ValueError(f"its header has {text[:40]!r} where a number is expected")
+    return int(text)
+
+
+def binary_columns(
+    content: bytes | memoryview, start: int, num_rows: int, fields: Sequence[Field], *, is_last: bool
+) -> Columns:
+    """The fields of rows that follow one another, as views; `is_last`: nothing follows the rows."""
+    row_bytes = sum(field.dtype.itemsize * field.num_values for field in fields)
+    check_size(len(content) - start, num_rows * row_bytes, num_rows, tolerated=row_bytes - 1 if is_last else None)
+    if num_rows == 0:
+        return _empty(fields)
+    ends = np.cumsum([field.dtype.itemsize * field.num_values for field in fields])
+    columns = []
+    for field, end in zip(fields, ends, strict=True):
+        begin = int(end) - field.dtype.itemsize * field.num_values
+        one = np.dtype({"names": ["value"], "formats": [field.dtype], "offsets": [begin], "itemsize": row_bytes})
+        if field.num_values == 1:
+            columns.append((field.name, np.frombuffer(content, one, num_rows, start)["value"]))
+    return _by_name(columns)
+
+
+def text_columns(content: bytes, start: int, num_rows: int, fields: Sequence[Field], *, is_last: bool) -> Columns:
+    """The fields of rows in text, as float32 or float64; `is_last`: nothing follows the rows."""
+    if num_rows == 0:
+        return _empty(fields)
+    num_columns = sum(field.num_values for field in fields)
+    wanted = num_rows * num_columns
+    if 2 * wanted > len(content) - start:
+        raise ValueError(
+            f"it is truncated: its header claims {wanted} numbers, but {len(content) - start} bytes follow"
+        )
+    numbers, end = parse_numbers(content, start, wanted + int(is_last))
+    if len(numbers) != wanted or (end == len(content) > 0 and not content[-1:].isspace()):
+        raise ValueError(f"it is truncated or damaged: its header claims {wanted} numbers, the file has {len(numbers)}")
+    rows = numbers.reshape(num_rows, num_columns)
+    ends = np.cumsum([field.num_values for field in fields])
+    last = zip(fields, ends, strict=True)
+    with np.errstate(over="ignore"):
+        return _by_name([(one.name, rows[:, end - 1].astype(_kept(one))) for one, end in last if one.num_values == 1])
+
+
+def _kept(field: Field) -> type[np.floating]:
+    return np.float32 if field.dtype.kind == "f" and field.dtype.itemsize == 4 else np.float64
+
+
+def check_size(num_bytes: int, expected: int, num_rows: int, *, tolerated: int | None) -> None:
+    """Raises ValueError for fewer bytes than expected, or more than the `tolerated` bytes after them (None: any)."""
+    if num_bytes < expected or (tolerated is not None and num_bytes > expected + tolerated):
+        what = "truncated" if num_bytes < expected else "damaged"
+        raise ValueError(
+            f"it is {what}: its header claims {num_rows} points, {expected} bytes, but {num_bytes} bytes follow"
+        )
+
+
+def _by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
+    """The columns by name. Padding may have a name several times."""
+    named: Columns = {}
+    for name, values in columns:
+        if name in named and name in ("x", "y", "z"):
+            raise ValueError(f"its header has the field {name} twice")
+        named.setdefault(name, values)
+    return named
+
+
+def _empty(fields: Sequence[Field]) -> Columns:
+    return {field.name: np.empty(0, field.dtype) for field in fields}
+
+
+def _without_waiting(name: str, flags: int) -> int:
+    """Opens a pipe without waiting for its writer."""
+    return os.open(name, flags | os.O_NONBLOCK)

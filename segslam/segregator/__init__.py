@@ -1,7 +1,0 @@
-"""Segregator: global registration of two labelled scans from semantic clusters and point features."""
-
-from segslam.segregator.describe import describe
-from segslam.segregator.match import hypotheses, match, vertical
-from segslam.segregator.plan import FloorPlan, plan_hypotheses
-
-__all__ = ["FloorPlan", "describe", "hypotheses", "match", "plan_hypotheses", "vertical"]

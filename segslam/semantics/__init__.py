@@ -1,5 +1,0 @@
-"""Point labels from files, from geometry or from a neural network."""
-
-from segslam.semantics.geometric import geometric_labels
-
-__all__ = ["geometric_labels"]

@@ -1,0 +1,121 @@
+"""Alignment of two submaps: point to plane, robust against surfaces that only one of them contains.
+
+Each point of the source is paired with the nearest point of the target. Its squared distance to the plane there counts
+under the Geman-McClure kernel, which is wide at first and then as wide as surfaces are rough.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.kernels import kernel
+from segslam.core.types import Information, Transform, Vector
+from segslam.slam.adjustment.submaps import Submap
+
+SEARCH_M = (1.0, 0.8, 0.7)
+"""Chosen: search distance of each iteration, the last one for all others; odometry errs by less over 30 m."""
+KERNEL_M = (0.6, 0.4, 0.25, 0.15)
+"""Chosen on KITTI 00: distance to a plane at which the weight of a point is a quarter, for each iteration."""
+SAME_NORMAL = 0.9
+"""Chosen: smallest cosine between the normals of a pair; others are edges and foliage."""
+MOST_ITERATIONS = 20
+CONVERGED = 1e-3
+"""Chosen: the iteration ends after a step smaller than this (rad, m), below the noise of an alignment."""
+SETTLED = 1e-2
+"""Chosen: an alignment whose last step is larger did not converge (rad, m)."""
+MOST_POINTS = 3000
+"""Chosen: number of points of the source, evenly among all."""
+MIN_PAIRED = 100
+"""Chosen: fewer pairs of points do not determine a pose."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """The pose of one submap in another."""
+
+    T_target_source: Transform
+    information: Information
+    """Inverse covariance for independent errors of the points."""
+    overlap: float
+    """Share of the source's points that are paired."""
+
+
+def align(source: Submap, target: Submap, T_target_source: Transform) -> Alignment | None:
+    """The pose that aligns source and target near an initial guess; None if it does not converge."""
+    fit = _Fit(source, target)
+    length = np.inf
+    for iteration in range(MOST_ITERATIONS):
+        step = fit.step(T_target_source, iteration)
+        if step is None:
+            return None
+        length = float(np.linalg.norm(step))
+        T_target_source = T_target_source @ geometry.exp(step)
+        if length < CONVERGED and iteration >= len(KERNEL_M) - 1:
+            break
+    if length > SETTLED:
+        return None
+    return Alignment(T_target_source, fit.hessian / fit.variance, fit.num / len(fit.points))
+
+
+class _Fit:
+    """Steps of Gauss and Newton for one pair, and the system of the last of them."""
+
+    def __init__(self, source: Submap, target: Submap) -> None:
+        rows = slice(None, None, max(1, -(-len(source.points) // MOST_POINTS)))
+        self.points, self._normals = source.points[rows], source.normals[rows]
+        self._target = target
+
+    def step(self, T_target_source: Transform, iteration: int) -> Vector | None:
+        """The next step of the pose (right perturbation); None with few pairs."""
+        target = self._target
+        nearest, distance_m = target.surface.nearest(geometry.apply(T_target_source, self.points))
+        self.hessian, gradient, squares, weights, self.num = _normal_equations(
+            self.points,
+            self._normals,
+            target.points,
+            target.normals,
+            nearest,
+            distance_m < SEARCH_M[min(iteration, len(SEARCH_M) - 1)],
+            np.ascontiguousarray(T_target_source),
+            KERNEL_M[min(iteration, len(KERNEL_M) - 1)],
+        )
+        if self.num < MIN_PAIRED or weights == 0.0:
+            return None
+        self.variance = squares / weights
+        return -np.linalg.lstsq(self.hessian, gradient)[0]
+
+
+@kernel(
+    "Tuple((float64[:, ::1], float64[::1], float64, float64, int64))(float64[:, :], float64[:, :], "
+    "float64[:, :], float64[:, :], int64[:], boolean[:], float64[:, ::1], float64)"
+)
+def _normal_equations(source, normals, target, target_normals, nearest, near, T, width):
+    """Hessian and gradient of half the weighted squares by the pose; weighted squares, weights, paired points."""
+    hessian, gradient, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
+    squares = weights = 0.0
+    num = 0
+    for k in range(len(source)):
+        if not near[k]:
+            continue
+        j = nearest[k]
+        n, m, p = target_normals[j], normals[k], source[k]
+        a = T[0, 0] * n[0] + T[1, 0] * n[1] + T[2, 0] * n[2]  # the normal in the source's frame
+        b = T[0, 1] * n[0] + T[1, 1] * n[1] + T[2, 1] * n[2]
+        c = T[0, 2] * n[0] + T[1, 2] * n[1] + T[2, 2] * n[2]
+        if abs(a * m[0] + b * m[1] + c * m[2]) < SAME_NORMAL:
+            continue
+        e = a * p[0] + b * p[1] + c * p[2]
+        for i in range(3):
+            e += n[i] * (T[i, 3] - target[j, i])
+        row[0], row[1], row[2] = p[1] * c - p[2] * b, p[2] * a - p[0] * c, p[0] * b - p[1] * a
+        row[3], row[4], row[5] = a, b, c
+        w = (1.0 + (e / width) ** 2) ** -2.0
+        for i in range(6):
+            gradient[i] += w * e * row[i]
+            for k2 in range(6):
+                hessian[i, k2] += w * row[i] * row[k2]
+        squares += w * e * e
+        weights += w
+        num += 1
+    return hessian, gradient, squares, weights, num

@@ -1,0 +1,70 @@
+"""Submaps: the cloud of a keyframe merged with those of its neighbours along the drive, as a surface."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.core import geometry
+from segslam.core.config import RefineConfig
+from segslam.core.points import cell_keys, group_means, hash_keys
+from segslam.core.trajectory import Poses
+from segslam.core.types import Points, Vector
+from segslam.registration.refinement import Surface, downsample, make_surface
+from segslam.slam.adjustment.pairs import EVERY
+
+REACH = 2
+"""Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
+
+PointsOf = Callable[[int], Points]
+"""Returns the points of a keyframe, by id, in its own frame."""
+
+MOST_SUBMAPS = 16
+"""Chosen: submaps in memory, about 1.5 MB each; a drive needs 6, and 2 more for each other pass beside it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Submap:
+    """The surface around a keyframe, in its frame."""
+
+    surface: Surface
+    points: Points
+    normals: Points
+
+
+class Submaps:
+    """Submaps by the id of their keyframe, made when they are needed."""
+
+    def __init__(
+        self,
+        points_of: PointsOf,
+        T_world: Poses,
+        travel_m: Vector,
+        *,
+        config: RefineConfig,
+    ) -> None:
+        self._points_of, self._T_world, self._travel_m = points_of, T_world, travel_m
+        self._refine = config
+        self._scan = lru_cache(4 * REACH + EVERY + 2)(self._scan_of)
+        self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
+
+    def _scan_of(self, keyframe_id: int) -> Points:
+        return downsample(self._points_of(keyframe_id), config=self._refine).astype(np.float64)
+
+    def _submap(self, keyframe_id: int) -> Submap:
+        T_keyframe_world = geometry.inverse(self._T_world[keyframe_id])
+        near = members(keyframe_id, self._travel_m, reach=REACH)
+        points = np.vstack([geometry.apply(T_keyframe_world @ self._T_world[one], self._scan(one)) for one in near])
+        keys, _ = cell_keys(points, self._refine.voxel_m)
+        voxels, group = np.unique(hash_keys(keys)[1], return_inverse=True)
+        merged = group_means(points, group, len(voxels)) if len(points) else points
+        surface = make_surface(merged, config=self._refine)
+        return Submap(surface, surface.points.copy(), surface.normals.copy())
+
+
+def members(keyframe_id: int, travel_m: Vector, *, reach: int) -> list[int]:
+    """The keyframes of a submap: up to `reach` before and after one, without those beyond a break."""
+    near = range(max(0, keyframe_id - reach), min(len(travel_m), keyframe_id + reach + 1))
+    return [other for other in near if abs(travel_m[other] - travel_m[keyframe_id]) < BREAK_TRAVEL_M]

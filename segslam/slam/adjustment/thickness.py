@@ -1,0 +1,83 @@
+"""Thickness of the surfaces of a map: a figure of its sharpness that needs no ground truth.
+
+Flat patches that two scans of different places, or of different passes, both observe are thin if the poses of the scans
+are right. The patch and its normal come from one scan alone, so that a bad pose cannot change which patches count.
+"""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from jaxtyping import Float
+
+from segslam.core import geometry
+from segslam.core.points import cell_keys, within_range
+from segslam.core.trajectory import Poses
+from segslam.core.types import IndexPairs, Indices, Points, Vector
+
+CELL_M = 1.0
+"""Chosen: edge of the cells that hold a patch; walls and roads are flat over it."""
+WITHIN_M = 30.0
+"""Chosen: points farther from their sensor are too sparse for a cell."""
+MIN_POINTS = 5
+"""Chosen: points of each scan in a patch."""
+FLAT = 0.05
+"""Chosen: a patch is flat if its standard deviation along the normal is below this share of the next larger one."""
+MOST_PAIRS = 100
+"""Chosen: number of pairs of scans, evenly among those given; 2 s."""
+MIN_PATCHES = 20
+"""Chosen: the median of fewer is too uncertain."""
+
+
+def map_thickness_m(
+    points_of: Callable[[int], Points], T_world: Poses, pairs: IndexPairs, *, within_m: float = WITHIN_M
+) -> float | None:
+    """Median standard deviation of points about planes, over patches that both scans of a pair observe (m).
+
+    `pairs` (k, 2): keyframes that see the same surfaces. None if there are too few patches.
+    """
+    chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS)).astype(int))]
+    return _median(
+        patch_thickness_m(points_of(int(a)), points_of(int(b)), geometry.inverse(T_world[a]) @ T_world[b], within_m)
+        for a, b in chosen
+    )
+
+
+def _median(found: Iterable[Vector]) -> float | None:
+    patches = np.concatenate([np.empty(0), *found])
+    return float(np.median(patches)) if len(patches) >= MIN_PATCHES else None
+
+
+def patch_thickness_m(points_a: Points, points_b: Points, T_a_b: np.ndarray, within_m: float = WITHIN_M) -> Vector:
+    """(k,) root mean square distance of the points of two scans to the plane of each flat patch that both observe (m).
+
+    The normal of the plane is that of the points of scan a, its position the mean of all points.
+    """
+    a = points_a[within_range(points_a, 0.0, within_m)].astype(np.float64)
+    b = geometry.apply(T_a_b, points_b[within_range(points_b, 0.0, within_m)].astype(np.float64))
+    keys, _ = cell_keys(np.vstack([a, b]), CELL_M)
+    _, cell = np.unique(keys, return_inverse=True)
+    in_a, in_b = cell[: len(a)], cell[len(a) :]
+    num = int(cell.max(initial=-1)) + 1
+    counts = np.column_stack([np.bincount(in_a, minlength=num), np.bincount(in_b, minlength=num)])
+    means, covariances = _moments(a, in_a, num)
+    shared = np.flatnonzero((counts >= MIN_POINTS).all(axis=1))
+    variances, directions = np.linalg.eigh(covariances[shared])
+    flat = variances[:, 0] < FLAT**2 * variances[:, 1]
+    normals = np.zeros((num, 3))
+    normals[shared[flat]] = directions[flat, :, 0]
+    heights = np.concatenate([np.einsum("ij,ij->i", p - means[c], normals[c]) for p, c in ((a, in_a), (b, in_b))])
+    first, second = (np.bincount(cell, heights**power, num)[shared[flat]] for power in (1, 2))
+    total = counts.sum(axis=1)[shared[flat]]
+    return np.sqrt(np.maximum(second / total - (first / total) ** 2, 0.0))
+
+
+def _moments(points: Points, cell: Indices, num: int) -> tuple[Points, Float[np.ndarray, "n 3 3"]]:
+    """Mean and covariance of the points in each cell; zeros for an empty cell."""
+    count = np.maximum(np.bincount(cell, minlength=num), 1)
+    means = np.column_stack([np.bincount(cell, column, num) for column in points.T]) / count[:, None]
+    centred = points - means[cell]
+    covariances = np.empty((num, 3, 3))
+    for i in range(3):
+        for j in range(3):
+            covariances[:, i, j] = np.bincount(cell, centred[:, i] * centred[:, j], num) / count
+    return means, covariances

@@ -1,0 +1,184 @@
+"""Loop closing: candidates for each keyframe are registered and verified; a second search uses the final poses."""
+
+import math
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+from time import monotonic
+
+from segslam.candidates import PlaceSignature, signature_of
+from segslam.candidates.prior import far_from_prior
+from segslam.candidates.proximity import BREAK_TRAVEL_M, ProximityDetector
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import at_once
+from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
+from segslam.graph import Graph
+from segslam.graph.confirmation import Confirmation
+from segslam.keyframes.keyframes import Clouds
+from segslam.keyframes.submaps import Submaps
+from segslam.registration.hypotheses import Gate, anywhere
+from segslam.registration.prepared import Labeller, PreparedScan
+from segslam.slam.far_loops import FarLoops
+from segslam.slam.loop_edits import LoopEdits
+from segslam.verification import register_near, register_prepared
+
+NO_EDITS = LoopEdits()
+NUM_PREPARED = 64
+"""Number of prepared keyframes in memory, about 2 MB each; preparing another takes about 40 ms."""
+ROUNDS = 3
+"""Chosen: largest number of searches after the final optimisation; they end with the first that finds no loop."""
+MOST_AGAIN = 0.5
+"""Chosen: number of attempts in such a search, as a share of all earlier attempts; limits its time."""
+LEAST_AGAIN = 40
+
+
+class LoopCloser:
+    """Proposes loops from the poses of the graph, and adds the verified ones to the graph."""
+
+    def __init__(
+        self,
+        config: Config,
+        graph: Graph,
+        clouds: Callable[[], Clouds],
+        labeller: Labeller,
+        edits: LoopEdits = NO_EDITS,
+    ) -> None:
+        """`clouds` provides the points of keyframes; `labeller` computes geometric labels of gathered clouds."""
+        self._edits = edits
+        self._config = config
+        self._graph = graph
+        self._detector = ProximityDetector(config.proximity)
+        self.submaps = Submaps(config, clouds, labeller, lambda: graph.travel_m)
+        self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
+        self._confirmation = Confirmation(graph, lambda number: self.submaps.T_odom[number])
+        self._far = FarLoops(config, graph, self._prepared, self._confirmation, edits.forbidden)
+        self._tried: set[tuple[int, int]] = set(edits.forbidden)
+        self._unsearched: set[int] = set()
+        """Keyframes for which no loop was searched when they were added, because the machine was too slow."""
+
+    def add(
+        self, T_odom_keyframe: Transform, *, labelled_by_shape: bool, recorded: bytes | None = None
+    ) -> PlaceSignature | None:
+        """Add the newest keyframe, which graph and clouds contain already; returns the signature of its place.
+
+        `recorded`: this signature, if it is known from a log.
+        """
+        newest_id = len(self.submaps.T_odom)
+        self._unsearched.add(newest_id)
+        self.submaps.add(T_odom_keyframe, labelled_by_shape=labelled_by_shape)
+        if not self._config.retrieval.enabled:
+            return None
+        if recorded is None:
+            made = self.submaps.gathered(newest_id)
+            signature = signature_of(made.points, made.labels)
+        else:
+            signature = PlaceSignature.from_bytes(recorded)
+        self._far.add(newest_id, signature)
+        return signature
+
+    def attempt(self, keyframe_id: int, watch: Stopwatch, *, below: int | None = None) -> tuple[LoopAttempt, ...]:
+        """Propose and try loops for a keyframe.
+
+        With `below`, only with smaller ids, those of earlier sessions whose relative poses are known: such a loop is
+        refined from the estimate first.
+        """
+        with watch("propose"):
+            candidates = self._detector.candidates(
+                keyframe_id, self._graph.T_world_keyframes, self._graph.travel_m, below=below
+            )
+        by_hand = [self._far.candidate(keyframe_id, target_id) for target_id in self._edits.targets(keyframe_id)]
+        new = [c for c in (*by_hand, *candidates) if (c.source_id, c.target_id) not in self._tried]
+        near = self._tried_in_turn(_once_each(new), watch, is_known=below is not None)
+        is_first_time = below is None and keyframe_id in self._unsearched
+        self._unsearched.discard(keyframe_id)
+        return (*near, *self._far_loops(keyframe_id, watch)) if is_first_time and not _has_closure(near) else near
+
+    def note_estimate(self, weights: dict[tuple[int, int], float]) -> None:
+        """Note the result of an optimisation: closures with weight shorten the chains between keyframes."""
+        self._detector.note_estimate(weights)
+
+    def search_again(self, watch: Stopwatch, *, end_s: float = math.inf) -> Iterator[LoopAttempt]:
+        """Try the pairs proposed from the final poses that were not tried before, up to a limit of their number.
+
+        No further keyframe is started after `end_s`, by time.monotonic.
+        """
+        most = max(LEAST_AGAIN, int(MOST_AGAIN * len(self._tried)))
+        for keyframe_id in range(len(self.submaps.T_odom)):
+            for attempt in self.attempt(keyframe_id, watch):
+                yield attempt
+                most -= 1
+            if most <= 0 or monotonic() > end_s:
+                return
+
+    def _far_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+        """Loops found by place recognition; the noise of contradicting odometry is increased."""
+        if not self._config.retrieval.enabled:
+            return ()
+        attempts = self._far.attempt(keyframe_id, watch)
+        closures = [attempt.outcome for attempt in attempts if isinstance(attempt.outcome, LoopClosure)]
+        if closures:
+            self._graph.weigh_odometry_by(closures[-1])
+        self._take(attempts)
+        return attempts
+
+    def _tried_in_turn(
+        self, candidates: list[LoopCandidate], watch: Stopwatch, *, is_known: bool
+    ) -> tuple[LoopAttempt, ...]:
+        attempts = tuple(
+            attempt for candidate in candidates for attempt in self._attempts(candidate, watch, is_known=is_known)
+        )
+        self._take(attempts)
+        return attempts
+
+    def take(self, attempts: tuple[LoopAttempt, ...]) -> None:
+        """Add the loops of the newest keyframe that were tried in an earlier run; they are not tried again."""
+        self._unsearched.discard(len(self.submaps.T_odom) - 1)
+        self._take(attempts)
+
+    def _take(self, attempts: tuple[LoopAttempt, ...]) -> None:
+        for attempt in attempts:
+            self._tried.add((attempt.candidate.source_id, attempt.candidate.target_id))
+            if isinstance(attempt.outcome, LoopClosure):
+                self._graph.add_closure(attempt.outcome)
+                self._detector.note_closure(attempt.outcome)
+
+    def _attempts(self, candidate: LoopCandidate, watch: Stopwatch, *, is_known: bool) -> tuple[LoopAttempt, ...]:
+        own = Stopwatch()
+        with own("prepare"):
+            source, target = at_once(
+                lambda: self._prepared(candidate.source_id), lambda: self._prepared(candidate.target_id)
+            )
+        outcome: Alignment | Rejected | None = None
+        is_by_hand = (candidate.source_id, candidate.target_id) in self._edits.added
+        if is_known:
+            prior = candidate.T_target_source_prior
+            outcome = register_near(source, target, prior, config=self._config, watch=own)
+        if not isinstance(outcome, Alignment):
+            outcome = register_prepared(
+                source,
+                target,
+                config=self._config,
+                gate=anywhere if is_by_hand else self._near_prior(candidate),
+                watch=own,
+            )
+        for stage, seconds in own.seconds.items():
+            watch.add(stage, seconds)
+        if isinstance(outcome, Rejected):
+            return (LoopAttempt(candidate, outcome, own.seconds),)
+        closure = LoopClosure.of(candidate.source_id, candidate.target_id, outcome)
+        if candidate.chain_m >= BREAK_TRAVEL_M and not is_known and not is_by_hand:
+            return self._confirmation.attempts(candidate, closure, own.seconds)
+        return (LoopAttempt(candidate, closure, own.seconds),)
+
+    def _near_prior(self, candidate: LoopCandidate) -> Gate:
+        R_world_target = self._graph.T_world_keyframes[candidate.target_id][:3, :3]
+        return partial(far_from_prior, candidate=candidate, R_world_target=R_world_target, config=self._config)
+
+
+def _once_each(candidates: list[LoopCandidate]) -> list[LoopCandidate]:
+    """The first candidate of each pair."""
+    return list({(one.source_id, one.target_id): one for one in reversed(candidates)}.values())[::-1]
+
+
+def _has_closure(attempts: tuple[LoopAttempt, ...]) -> bool:
+    return any(isinstance(attempt.outcome, LoopClosure) for attempt in attempts)

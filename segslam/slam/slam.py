@@ -1,0 +1,300 @@
+"""The whole pipeline, with one call per scan.
+
+It uses no files and no viewers; these consume the Steps that it returns.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from time import monotonic
+
+import numpy as np
+
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.trajectory import corrected_poses
+from segslam.core.types import (
+    GraphEstimate,
+    Indices,
+    Keyframe,
+    LoopAttempt,
+    LoopClosure,
+    Motion,
+    MotionState,
+    Points,
+    Scan,
+    SegslamError,
+    Step,
+    Trajectory,
+    Transform,
+)
+from segslam.graph import Graph, PoseGraph
+from segslam.keyframes.keyframes import Clouds, CloudStore, downsample_keyframe
+from segslam.labels import geometric_labels
+from segslam.labels.late import computed
+from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
+from segslam.odometry import Tracked as Tracked
+from segslam.registration.prepared import Labeller
+from segslam.slam.adjustment import Adjusted, Progress, adjust, no_progress
+from segslam.slam.loop_edits import LoopEdits
+from segslam.slam.loops import NO_EDITS, ROUNDS, LoopCloser
+from segslam.slam.slam_result import SlamResult as SlamResult
+
+
+class Slam:
+    """Odometry, keyframes, loops and graph. `process` each scan in order of time, then `finish`.
+
+    `process` is `track` followed by `close_loops`. `track` does not use results of `close_loops`, so the two may run in
+    two threads, with one call per scan in order; the steps are the same.
+    """
+
+    def __init__(
+        self,
+        config: Config | None = None,
+        *,
+        odometry: Odometry | None = None,
+        labeller: Labeller | None = None,
+        edits: LoopEdits = NO_EDITS,
+    ) -> None:
+        """`odometry` replaces KISS-ICP; `labeller` replaces the geometric labels of scans without labels.
+
+        `edits` forbids loops between keyframes, or has them tried.
+        """
+        self.config = config or Config()
+        by_shape = geometric_labels
+        self._tracker = Tracker(self.config, odometry=odometry)
+        self._labeller = labeller or by_shape
+        self._labels_by_shape = labeller is None
+        self.graph = self._new_graph()
+        self._clouds: Clouds = CloudStore(self.config.keyframes.resolution_m)
+        self._loops = LoopCloser(self.config, self.graph, lambda: self._clouds, by_shape, edits)
+        self._steps: list[tuple[int, int, Transform]] = []
+        self._motions: list[Motion] = []
+        self._since_keyframe: list[Motion] = []
+        self._keyframe_rows: list[int] = []
+        self._attempts: list[LoopAttempt] = []
+        self._is_finished = False
+
+    def __repr__(self) -> str:
+        loops = sum(isinstance(attempt.outcome, LoopClosure) for attempt in self._attempts)
+        state = "finished" if self._is_finished else "running"
+        return f"Slam({len(self._steps)} scans, {len(self._keyframe_rows)} keyframes, {loops} loops, {state})"
+
+    def _new_graph(self) -> Graph:
+        return PoseGraph(self.config.graph)
+
+    def keep_clouds_in(self, clouds: Clouds) -> None:
+        """Store the points of keyframes in `clouds` instead of memory. Call it before the first scan."""
+        self._clouds = clouds
+
+    def process(self, scan: Scan) -> Step:
+        """Process one scan; returns a Step with all results that it caused.
+
+        Raises BadScan, and ignores the scan, if it cannot be used or is not later than the previous scan. Raises
+        SegslamError after `finish`.
+        """
+        return self.close_loops(self.track(scan))
+
+    def track(self, scan: Scan) -> Tracked:
+        """Estimate the pose of a scan, and decide whether it becomes a keyframe. Raises BadScan as `process` does."""
+        if self._is_finished:
+            raise SegslamError(f"scan {scan.index}: the run is finished; map further scans with a new Slam")
+        return self._tracker.track(scan)
+
+    def close_loops(self, tracked: Tracked, *, tries_loops: bool = True) -> Step:
+        """Close the loops of a tracked scan. Loops that are not tried now may be tried in the search of `finish`."""
+        keyframe = None
+        if tracked.registered is not None:
+            keyframe = self._cut(tracked, tracked.registered)
+        return self._advance(
+            tracked.scan_index,
+            tracked.stamp_ns,
+            tracked.T_odom_lidar,
+            tracked.motion,
+            keyframe,
+            tracked.watch,
+            tries_loops=tries_loops,
+        )
+
+    def repeat(self, recorded: Step) -> Step:
+        """As `process`, but from a recorded Step: repeat everything after the selection of the keyframe."""
+        motion = recorded.motion or Motion(MotionState.UNCHECKED)
+        keyframe = None if recorded.keyframe is None else replace(recorded.keyframe, place=None)
+        self._tracker.note(recorded)
+        return self._advance(
+            recorded.scan_index, recorded.stamp_ns, recorded.T_odom_lidar, motion, keyframe, Stopwatch()
+        )
+
+    def take(self, recorded: Step, *, below: int = 0, optimize: bool = False) -> Step:
+        """As `repeat`, but with the recorded loops and places.
+
+        Further loops are searched among keyframes with ids below `below`. The graph is optimised only with `optimize`.
+        """
+
+        def attempts(keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+            self._loops.take(recorded.attempts)
+            return (*recorded.attempts, *(self._loops.attempt(keyframe_id, watch, below=below) if below else ()))
+
+        return self._advance(
+            recorded.scan_index,
+            recorded.stamp_ns,
+            recorded.T_odom_lidar,
+            recorded.motion or Motion(MotionState.UNCHECKED),
+            recorded.keyframe,
+            Stopwatch(),
+            attempts_of=attempts,
+            is_due=lambda: optimize,
+        )
+
+    def resume(self, scan_of: Callable[[int], Scan]) -> None:
+        """Prepare `process` to continue after `repeat`.
+
+        `scan_of` reads the scan of a step, counted from 0, if needed.
+        """
+        if self._steps:
+            T_odom_lidar = np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps])
+            self._tracker.resume(T_odom_lidar, self._stamps(), scan_of)
+
+    def finish(self, *, search_s: float = math.inf, progress: Progress = no_progress) -> SlamResult:
+        """Final optimisation; returns the pose of every scan. Raises ValueError before the first scan.
+
+        Loops are then searched again with the final poses, for at most `search_s` seconds. The adjustment of the whole
+        map follows, with `progress`.
+        """
+        if not self._steps:
+            raise ValueError("no scan was processed")
+        self._is_finished = True
+        estimate, late = self._settle(monotonic() + search_s)
+        adjusted = self._adjust(estimate, progress)
+        odometry = Trajectory(
+            scan_index=np.array([index for index, _, _ in self._steps]),
+            stamp_ns=self._stamps(),
+            T_world_lidar=np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]),
+        )
+        rows = np.array(self._keyframe_rows)
+        T_world_lidar = corrected_poses(
+            odometry.T_world_lidar,
+            rows,
+            self.graph.T_world_keyframes,
+            after_break=np.array([self._motions[row].is_break for row in self._keyframe_rows]),
+        )
+        trajectory = replace(odometry, T_world_lidar=T_world_lidar)
+        attempts = (*self._attempts, *late)
+        return SlamResult(
+            trajectory,
+            odometry,
+            estimate if adjusted is None else adjusted.after,
+            rows,
+            attempts,
+            tuple(self._motions),
+            len(late),
+            adjusted=adjusted,
+            alone=self._alone(odometry),
+        )
+
+    def _alone(self, odometry: Trajectory) -> Trajectory | None:
+        """The poses by KISS-ICP alone; None if they were not kept, as after `resume`."""
+        poses = self._tracker.alone()[: len(odometry)]  # tracking may be ahead when a run is stopped
+        return replace(odometry, T_world_lidar=np.stack(poses)) if len(poses) == len(odometry) else None
+
+    def _adjust(self, estimate: GraphEstimate, progress: Progress) -> Adjusted | None:
+        """The adjustment of the whole map; None if it is off, or for a graph in the frame of an existing map."""
+        if not isinstance(self.graph, PoseGraph):
+            return None
+
+        def points_of(keyframe_id: int) -> Points:
+            return self._clouds.cloud(keyframe_id)[0]
+
+        return adjust(self.graph, estimate, points_of, config=self.config, progress=progress)
+
+    def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
+        """The final estimate, after a second search for loops with better poses; and the attempts of that search.
+
+        The search ends at `end_s`, by time.monotonic.
+        """
+        late: list[LoopAttempt] = []
+        estimate = self.graph.finish()
+        for _ in range(ROUNDS):
+            if monotonic() >= end_s:
+                break
+            self._loops.note_estimate(estimate.closure_weights)
+            found = list(self._loops.search_again(Stopwatch(), end_s=end_s))
+            late += found
+            if not any(isinstance(attempt.outcome, LoopClosure) for attempt in found):
+                break
+            estimate = self.graph.finish()
+        return estimate, late
+
+    def _stamps(self) -> Indices:
+        return np.array([stamp_ns for _, stamp_ns, _ in self._steps])
+
+    def _advance(
+        self,
+        scan_index: int,
+        stamp_ns: int,
+        T_odom_lidar: Transform,
+        motion: Motion,
+        keyframe: Keyframe | None,
+        watch: Stopwatch,
+        *,
+        tries_loops: bool = True,
+        attempts_of: Callable[[int, Stopwatch], tuple[LoopAttempt, ...]] | None = None,
+        is_due: Callable[[], bool] | None = None,
+    ) -> Step:
+        self._steps.append((scan_index, stamp_ns, T_odom_lidar))
+        self._motions.append(motion)
+        self._since_keyframe.append(motion)
+        attempts: tuple[LoopAttempt, ...] = ()
+        estimate = None
+        if keyframe is not None:
+            self._clouds.keep(keyframe)
+            self._keyframe_rows.append(len(self._steps) - 1)
+            self.graph.add_keyframe(
+                keyframe.id,
+                keyframe.T_odom_keyframe,
+                keyframe.travel_m,
+                information=information_of(self._since_keyframe),
+                stamp_ns=keyframe.stamp_ns,
+            )
+            self._since_keyframe = []
+            with watch("recognise"):
+                place = self._loops.add(
+                    keyframe.T_odom_keyframe,
+                    labelled_by_shape=bool(keyframe.labelled_by_shape),
+                    recorded=keyframe.place,
+                )
+            keyframe = replace(keyframe, place=None if place is None else place.to_bytes())
+            if tries_loops:
+                attempts = (attempts_of or self._loops.attempt)(keyframe.id, watch)
+                self._attempts += attempts
+            if is_due() if is_due else self.graph.is_due:
+                with watch("optimize"):
+                    estimate = self.graph.optimize()
+                self._loops.note_estimate(estimate.closure_weights)
+        return Step(scan_index, stamp_ns, T_odom_lidar, keyframe, attempts, estimate, watch.seconds, motion)
+
+    def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:
+        """A keyframe of this scan, downsampled; geometric labels are computed if it has none."""
+        with tracked.watch("label"):
+            labels = computed(registered.labels)
+            is_unlabelled = not labels.any()
+            if is_unlabelled:
+                labels = self._labeller(registered.points)
+        with tracked.watch("keyframe"):
+            points, labels, rows = downsample_keyframe(
+                registered.points,
+                labels,
+                config=self.config.keyframes,
+                whole_classes=tuple(self.config.segregator.cluster_min_points),
+            )
+        return Keyframe(
+            id=self.graph.num_keyframes,
+            scan_index=tracked.scan_index,
+            stamp_ns=tracked.stamp_ns,
+            T_odom_keyframe=tracked.T_odom_lidar,
+            travel_m=tracked.travel_m,
+            points=points,
+            labels=labels,
+            intensities=None if registered.intensities is None else registered.intensities[rows],
+            labelled_by_shape=True if is_unlabelled and self._labels_by_shape else None,
+        )

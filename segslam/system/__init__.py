@@ -1,1 +1,0 @@
-"""Operating system and machine: Ctrl-C, threads, memory, atomic files, compiled kernels."""

@@ -1,0 +1,141 @@
+"""Registration of two scans: hypotheses are tried in turn; the first that is no chance fit is compared with rivals."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from numpy.typing import ArrayLike
+
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import at_once
+from segslam.core.types import Alignment, Labels, Registration, Rejected, RejectReason, Transform, as_points
+from segslam.labels import geometric_labels
+from segslam.registration import refinement
+from segslam.registration.hypotheses import Gate, anywhere, coarse_poses
+from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.verification import score
+from segslam.verification.rivals import differs, rivals_of
+from segslam.verification.trial import EQUAL_M, EQUAL_RAD, Found, Trial, is_near
+
+KNOWN_M, KNOWN_RAD = 1.0, math.radians(3.0)
+"""Chosen: largest error of a known pose. A rival this near is mostly the same pose (`rivals.SAME_POSE_M`)."""
+
+
+def register(
+    source_points: ArrayLike,
+    target_points: ArrayLike,
+    *,
+    source_labels: Labels | None = None,
+    target_labels: Labels | None = None,
+    config: Config | None = None,
+) -> Alignment | Rejected:
+    """The pose of one scan in another without an initial guess, each in its own sensor's frame (z up, metres).
+
+    Points are rows of x, y, z; further columns, such as intensities, are ignored. Labels are learning ids, one per
+    point; for a scan without labels, geometric labels are computed. The pose is `fine.T_target_source` of the result,
+    or the result is `Rejected`. Raises SegslamError for arrays of another shape.
+    """
+    config = config or Config()
+
+    def prepared(given: ArrayLike, labels: Labels | None) -> PreparedScan:
+        points = as_points(given)
+        return prepare_scan(points, geometric_labels(points) if labels is None else labels, config=config)
+
+    source, target = at_once(
+        lambda: prepared(source_points, source_labels), lambda: prepared(target_points, target_labels)
+    )
+    return register_prepared(source, target, config=config)
+
+
+def register_prepared(
+    source: PreparedScan,
+    target: PreparedScan,
+    *,
+    config: Config,
+    gate: Gate = anywhere,
+    watch: Stopwatch | None = None,
+) -> Alignment | Rejected:
+    """The refined and verified pose of the source in the target without an initial guess, or the reason of rejection.
+
+    Hypotheses are tried from best to worst until one is probably no chance fit. It is compared with all other poses
+    that were tried and with rivals; the best of them is returned if it is as probable as `verify.max_false_share`
+    asks. `gate` may reject a pose before and after refinement. If no hypothesis leads anywhere, the rejection of the
+    best one is returned.
+    """
+    trial = Trial(source, target, config, gate, watch or Stopwatch(), score.shipped())
+    tried = tried_poses(trial)
+    if isinstance(tried, Rejected):
+        return tried
+    best, *others = tried
+    return trial.judge(best, others)
+
+
+def tried_poses(trial: Trial) -> list[Found] | Rejected:
+    """The best pose that the prior allows, then all that differ from it; or the rejection of the best hypothesis.
+
+    Rivals are searched unless the best pose is a chance fit already.
+    """
+    rejections: list[Rejected] = []
+    found: list[Found] = []
+    for coarse in coarse_poses(trial.pair):
+        outcome = coarse if isinstance(coarse, Rejected) else _outcome(trial, coarse, found)
+        if isinstance(outcome, Found):
+            found.append(outcome)
+            if trial.match_odds(outcome) >= trial.least_odds:
+                break
+        elif outcome is not None:
+            rejections.append(outcome)
+    allowed = [pose for pose in found if trial.gate(pose.T_target_source, slack_m=0.0) is None]
+    if not allowed:
+        excluded = [trial.gate(pose.T_target_source, slack_m=0.0) for pose in found]
+        return [*(rejected for rejected in excluded if rejected is not None), *rejections][0]
+    best = max(allowed, key=trial.match_odds)
+    if trial.match_odds(best) >= trial.least_odds:
+        rivals = rivals_of(best, found, trial)
+        found += rivals
+        allowed += [pose for pose in rivals if trial.gate(pose.T_target_source, slack_m=0.0) is None]
+        best = max(allowed, key=trial.match_odds)
+    return [best, *(pose for pose in found if differs(pose, best))]
+
+
+def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Found | Rejected | None:
+    """A hypothesis, refined with few points, then with all; None if few points lead to a pose of `found`."""
+    begun = trial.begin(coarse)
+    if isinstance(begun, Rejected):
+        return begun
+    if is_near(begun, [pose.T_target_source for pose in found], within_m=EQUAL_M, within_rad=EQUAL_RAD):
+        return None
+    outcome = trial.refined(coarse, begun)
+    if isinstance(outcome, Found):
+        moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ outcome.T_target_source)
+        most_m = trial.config.verify.max_coarse_fine_m
+        if moved_m > most_m:
+            return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m")
+    return outcome
+
+
+def register_near(
+    source: PreparedScan,
+    target: PreparedScan,
+    T_target_source: Transform,
+    *,
+    config: Config,
+    watch: Stopwatch,
+) -> Alignment | Rejected:
+    """The refined and verified pose near one that is known to `KNOWN_M` and `KNOWN_RAD`; no other poses are tried.
+
+    Rejects FAR_FROM_PRIOR if refinement moves the pose farther.
+    """
+    trial = Trial(source, target, config, anywhere, watch, score.shipped())
+    with watch("refine"):
+        fine = refinement.refine(source.surface, target.surface, T_target_source, config=config.refine)
+    if isinstance(fine, Rejected):
+        return fine
+    moved = geometry.inverse(T_target_source) @ fine.T_target_source
+    if geometry.distance(moved) > KNOWN_M or geometry.angle(moved) > KNOWN_RAD:
+        detail = f"moved {geometry.distance(moved):.2f} m, {math.degrees(geometry.angle(moved)):.1f} degrees"
+        return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
+    coarse = replace(fine, T_target_source=T_target_source, num_inliers=0, num_correspondences=0)
+    return trial.judge(trial.found(coarse, fine), None)

@@ -1,0 +1,89 @@
+"""A post among columns, and the kernel against sets of occupied cells."""
+
+import numpy as np
+import pytest
+
+from segslam.labels.uprights import NUM_SLICES, on_thin_uprights
+
+SIDE = 60
+RULE = {"core": 3, "ring": 6, "min_slices": 6, "min_share": 0.7}
+
+
+def _found(cells, slices, **changes):
+    rule = RULE | changes
+    return on_thin_uprights(
+        np.asarray(cells),
+        np.asarray(slices),
+        (SIDE, SIDE),
+        rule["core"],
+        rule["ring"],
+        rule["min_slices"],
+        rule["min_share"],
+    )
+
+
+def _post(i, j, slices):
+    return [(i, j)] * len(slices), list(slices)
+
+
+def _by_sets(cells, slices, core, ring, min_slices, min_share):
+    """The same rule by sets: which slices each column, its core and its ring hold."""
+    held = {}
+    for cell, s in zip(map(tuple, cells), slices, strict=True):
+        held.setdefault(cell, set()).add(s)
+    marked = {}
+    for i, j in held:
+        if not (ring <= i < SIDE - ring and ring <= j < SIDE - ring):
+            continue
+        squared = {cell: (cell[0] - i) ** 2 + (cell[1] - j) ** 2 for cell in held}
+        inside = set().union(*(held[c] for c in held if squared[c] <= core**2))
+        around = set().union(*(held[c] for c in held if core**2 < squared[c] <= ring**2))
+        clear = inside - around
+        if clear and max(clear) - min(clear) + 1 >= min_slices and len(clear) >= min_share * len(inside):
+            for cell in held:
+                if squared[cell] <= core**2:
+                    marked.setdefault(cell, set()).update(clear)
+    return np.array([s in marked.get(tuple(c), ()) for c, s in zip(cells, slices, strict=True)])
+
+
+def test_a_free_standing_post_is_found():
+    assert _found(*_post(30, 30, range(10))).all()
+
+
+def test_a_post_beside_a_wall_is_not():
+    wall = [(i, 34) for i in range(20, 40) for _ in range(10)]
+    cells, slices = _post(30, 30, range(10))
+    assert not _found(cells + wall, slices + list(range(10)) * 20).any()
+
+
+def test_a_short_post_is_not():
+    assert not _found(*_post(30, 30, range(5))).any()
+
+
+def test_only_the_trunk_of_a_tree_is_found():
+    trunk_cells, trunk_slices = _post(30, 30, range(12))
+    crown = [(30 + a, 30 + b) for a in range(-6, 7) for b in range(-6, 7)]
+    cells, slices = trunk_cells + crown * 3, trunk_slices + [9] * len(crown) + [10] * len(crown) + [11] * len(crown)
+    found = _found(cells, slices, min_share=0.6)
+    np.testing.assert_array_equal(found, np.r_[np.arange(12) < 9, np.zeros(3 * len(crown), bool)])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_kernel_agrees_with_sets_of_cells(seed):
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, SIDE, (40, 2)).repeat(8, axis=0)
+    slices = rng.integers(0, NUM_SLICES, len(cells))
+    expected = _by_sets(cells, slices, **RULE)
+    assert expected.any()
+    np.testing.assert_array_equal(_found(cells, slices), expected)
+
+
+def test_points_outside_the_grid_or_the_slices_take_no_part():
+    cells, slices = _post(30, 30, range(10))
+    outside = [(-1, 30), (30, SIDE), (30, 33), (30, 35)]
+    found = _found(cells + outside, [*slices, 3, 3, -1, NUM_SLICES])
+    np.testing.assert_array_equal(found, np.arange(14) < 10)
+
+
+def test_nothing_is_found_among_no_points():
+    assert _found(np.empty((0, 2), np.int64), np.empty(0, np.int64)).shape == (0,)

@@ -1,0 +1,94 @@
+"""Ceilings over the path are cut from pictures, and nothing below the open sky."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.rooms import HALF_M, SENSOR_M, placed_keyframes
+from matplotlib.image import imread
+
+from segslam import open_dataset
+from segslam.core import geometry
+from segslam.core.config import MapConfig
+from segslam.core.types import GraphEstimate, Keyframe, Label, Transform
+from segslam.labels.class_colors import COLORS
+from segslam.output.map import write_map
+from segslam.output.map.before_after import BeforeAfter
+from segslam.output.map.from_above import LEAST_PX
+from segslam.output.map.overhead import cut_heights, visible
+from segslam.output.map.picture import MARGIN_M
+
+CEILING_M = 2.6 - SENSOR_M
+PATH = np.column_stack([np.arange(0.0, 60.0, 2.0), np.zeros(30), np.zeros(30)])
+
+
+def _slab(height_m: float, first_m: float = -5.0, last_m: float = 65.0) -> np.ndarray:
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(first_m, last_m, 0.2), np.arange(-5.0, 5.0, 0.2)))
+    return np.column_stack([x, y, np.full(len(x), height_m)])
+
+
+def _roofed() -> list[tuple[Keyframe, Transform]]:
+    """The yard below a ceiling."""
+    along = np.arange(-HALF_M, HALF_M, 0.15)
+    x, y = (axis.ravel() for axis in np.meshgrid(along, along))
+    ceiling = np.column_stack([x, y, np.full(len(x), CEILING_M)])
+    roofed = []
+    for keyframe, T in placed_keyframes(None):
+        seen = geometry.apply(geometry.inverse(T), ceiling).astype(np.float32)
+        labels = np.append(keyframe.labels, np.full(len(seen), Label.BUILDING, np.uint8))
+        roofed.append((replace(keyframe, points=np.concatenate([keyframe.points, seen]), labels=labels), T))
+    return roofed
+
+
+def test_the_cut_is_half_way_up_to_the_ceiling_and_the_floor_stays_visible() -> None:
+    cut_m = cut_heights(PATH, [_slab(-1.5), _slab(1.0)])
+    np.testing.assert_allclose(cut_m, 0.5)
+    assert visible(_slab(-1.5), PATH, cut_m).all()
+    assert not visible(_slab(1.0), PATH, cut_m).any()
+
+
+def test_where_the_sky_is_open_nothing_is_cut() -> None:
+    trees = [_slab(3.0, x - 1.0, x + 1.0) for x in (10.0, 30.0, 50.0)]
+    mount = [_slab(0.4)]
+    cut_m = cut_heights(PATH, [_slab(-1.5), *trees, *mount])
+    assert np.isinf(cut_m).all()
+    assert visible(_slab(9.0), PATH, cut_m).all()
+
+
+def test_a_building_on_the_way_is_cut_and_the_street_is_not() -> None:
+    cut_m = cut_heights(PATH, [_slab(2.0, 20.0, 65.0)])
+    assert np.isinf(cut_m[:8]).all()
+    np.testing.assert_allclose(cut_m[12:], 1.0)
+
+
+def test_both_pictures_show_the_floor_below_a_ceiling(tmp_path: Path) -> None:
+    write_map(_roofed(), [tmp_path / "map.png"], config=MapConfig())
+    picture = np.rint(255 * imread(tmp_path / "map.png")[:, :, :3]).astype(int)
+    middle, px_per_m = LEAST_PX / 2, LEAST_PX / (2 * (HALF_M + MARGIN_M))
+    floor = picture[round(middle - 8.0 * px_per_m), round(middle + 8.0 * px_per_m)]
+    road = np.array(list(bytes.fromhex(COLORS[Label.ROAD][1:])))
+    assert np.abs(floor - road).max() <= 3
+    drawn = []
+    for yard in (_roofed(), placed_keyframes(None)):
+        poses = {keyframe.id: T for keyframe, T in yard}
+        keyframes = [replace(keyframe, T_odom_keyframe=T) for keyframe, T in yard]
+        both = BeforeAfter(poses, GraphEstimate(poses, 0.0, {}), keyframes)
+        for keyframe in keyframes:
+            both.add(keyframe)
+        (tmp_path / "both.png").write_bytes(both.draw())
+        drawn.append((imread(tmp_path / "both.png")[40:, :, :3].mean(axis=2) > 0.3).mean())
+    assert drawn[0] < drawn[1] + 0.01  # without the cut, the ceiling would fill the yard
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "frames", "share"), [("courtyard", "0:100:5", 1.0), ("nclt", "0:150", 0.0)])
+def test_a_roofed_courtyard_is_cut_everywhere_and_a_campus_nowhere(
+    data_dir: Path, name: str, frames: str, share: float
+) -> None:
+    rows = np.loadtxt(data_dir / name / "poses.txt").reshape(-1, 3, 4)
+    poses = [geometry.transform(row[:, :3], row[:, 3]) for row in rows]
+    scans = open_dataset(data_dir / name, labels="none", frames=frames)
+    placed = [geometry.apply(poses[int(scan.index or 0)], scan.points.astype(float)) for scan in scans]
+    path_m = np.array([poses[int(scan.index or 0)][:3, 3] for scan in scans])
+    assert np.isfinite(cut_heights(path_m, placed)).mean() == share

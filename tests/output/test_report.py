@@ -1,0 +1,242 @@
+"""The report: one complete HTML file with the figures of the run's files."""
+
+import base64
+import re
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from helpers.finished_run import make_run
+from PIL import Image
+
+from segslam import cli
+from segslam.core import geometry
+from segslam.core.config import Config, load_config
+from segslam.core.types import SegslamError
+from segslam.output.accuracy import accuracy
+from segslam.output.finished import FIGURES, read_run
+from segslam.output.folder import write_alone, write_metrics
+from segslam.output.map.from_above import small_png
+from segslam.output.report import write_report
+from segslam.output.report.figures import draw_loops, paths_of
+from segslam.output.report.gallery import choose, outcome_text
+from segslam.output.report.page import number, page, settings_not_default
+
+VOID = {"meta", "img"}
+
+
+class _Tags(HTMLParser):
+    """Checks that every tag is closed in its turn, and collects what the page would load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loads: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.loads += [value or "" for name, value in attrs if name in ("src", "href")]
+        assert tag not in ("link", "iframe")
+        assert tag != "script" or "src" not in dict(attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def _plots(html: str) -> dict[str, str]:
+    """Caption -> the SVG's text."""
+    found = re.findall(r'<img alt="([^"]*)" src="data:image/svg\+xml;base64,([^"]*)">', html)
+    return {caption: base64.b64decode(data).decode() for caption, data in found}
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of a run with ground truth."""
+    made = make_run(tmp_path_factory.mktemp("scored") / "run")
+    run = read_run(made.folder)
+    assert run.reference is not None
+    write_metrics(made.folder, run.metrics | accuracy(run.result, run.reference))
+    return write_report(made.folder)
+
+
+def test_a_map_from_above_is_on_the_page(scored: Path, tmp_path: Path) -> None:
+    assert "Map in top view" not in scored.read_text()
+    folder = shutil.copytree(scored.parent, tmp_path / "run")
+    Image.new("RGB", (300, 200)).save(folder / "map.png")
+    html = write_report(folder).read_text()
+    [data] = re.findall(r'alt="Map in top view" src="data:image/png;base64,([^"]*)">', html)
+    assert base64.b64decode(data) == (folder / "map.png").read_bytes()
+    assert html.index("Map by odometry, and corrected") < html.index("Map in top view") < html.index("Trajectory, top")
+
+
+def test_a_large_map_is_reduced_on_the_page(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (2000, 3000, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "map.png")
+    (tmp_path / "small.png").write_bytes(small_png(tmp_path / "map.png"))
+    with Image.open(tmp_path / "small.png") as small:
+        assert small.size == (1500, 1000)
+
+
+def test_page_is_whole_and_loads_nothing(scored: Path) -> None:
+    assert scored.name == "report.html"
+    html = scored.read_text()
+    tags = _Tags()
+    tags.feed(html)
+    assert tags.open == []
+    links = [target for target in tags.loads if not target.startswith("data:")]
+    assert {"poses_tum.txt", "log.mcap"} & set(links) == {"log.mcap"}  # this run has no poses_tum.txt
+    assert all((scored.parent / link).is_file() for link in links)
+    assert len(tags.loads) - len(links) == 1 + 5 + 2  # the map, the plots, an accepted loop and a missed one
+    for svg in _plots(html).values():
+        ElementTree.fromstring(svg)
+        assert not re.search(r'href="(?!#)', svg)
+
+
+def test_loops_are_counted_by_outcome_and_the_false_one_is_shown(scored: Path) -> None:
+    plots = _plots(scored.read_text())
+    loops = plots["Loops by outcome"]
+    for label in ("accepted (3)", "false (1)", "small clique (5)", "low overlap (1)"):
+        assert label in loops
+    assert "rejected by the optimiser" not in loops  # the low weight of the false one adds nothing
+
+
+def test_all_plots_are_in_the_frame_of_the_run(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    assert run.reference is not None
+    T_other_world = geometry.transform(geometry.yaw(2.0), [300.0, -80.0, 5.0])
+    moved = replace(run, reference=replace(run.reference, T_world_lidar=T_other_world @ run.reference.T_world_lidar))
+    truth, _, corrected = paths_of(moved)
+    np.testing.assert_array_equal(corrected.poses, run.result.trajectory.T_world_lidar)
+    np.testing.assert_allclose(truth.poses[:, :3, 3], run.reference.T_world_lidar[:, :3, 3], atol=0.05)
+
+
+def test_kiss_icp_alone_is_drawn_and_scored_beside_the_repaired_odometry(tmp_path: Path) -> None:
+    made = make_run(tmp_path / "run")
+    off = made.result.odometry.T_world_lidar.copy()
+    off[60:, 1, 3] += 8.0
+    write_alone(made.folder, replace(made.result.odometry, T_world_lidar=off), None)
+    run = read_run(made.folder)
+    assert run.reference is not None
+    figures = accuracy(run.result, run.reference)
+    assert figures["kiss_icp_ate_m"] > 2 * figures["odometry_ate_m"]
+    write_metrics(made.folder, run.metrics | figures)
+    html = write_report(made.folder).read_text()
+    plots = _plots(html)
+    assert "KISS-ICP alone" in plots["Trajectory, top view and height"]
+    errors = plots["Error along the drive, after alignment"]
+    assert f"KISS-ICP alone, rms {figures['kiss_icp_ate_m']:.2f} m" in errors
+    assert "odometry after repairs, rms" in errors
+    assert number(figures["kiss_icp_ate_m"]) in html
+
+
+def test_poses_of_kiss_icp_alone_of_other_scans_are_refused(tmp_path: Path) -> None:
+    made = make_run(tmp_path / "run")
+    later = replace(made.result.odometry, stamp_ns=made.result.odometry.stamp_ns + 1)
+    write_alone(made.folder, later, None)
+    with pytest.raises(SegslamError, match=r"kiss_icp_tum\.txt: not of the scans of this run; remove the file"):
+        read_run(made.folder)
+
+
+def test_without_truth_nothing_is_compared_with_it(tmp_path: Path) -> None:
+    html = write_report(make_run(tmp_path / "run", with_truth=False).folder).read_text()
+    plots = _plots(html)
+    assert "Error along the drive, after alignment" not in plots
+    assert "truth" not in plots["Trajectory, top view and height"]
+    assert "rejected by the optimiser (1)" in plots["Loops by outcome"]
+    assert "error after alignment" not in html
+
+
+def test_every_figure_is_in_the_table_with_its_meaning(scored: Path) -> None:
+    html = scored.read_text()
+    metrics = read_run(scored.parent).metrics
+    for key in metrics:
+        if key != "stage_ms" and not key.startswith("odometry_"):
+            assert f"<code>{key}</code>" in html
+    assert number(metrics["odometry_ate_m"]) in html
+    assert FIGURES["ate_m"] in html
+
+
+def test_changed_settings_are_marked_and_shown_open(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    assert '<tr class="changed">' not in page(run, {})
+    changed = page(replace(run, config=load_config(None, ["keyframes.distance_m=1.25"])), {})
+    assert re.search(r'<details open><summary>keyframes</summary>.*<tr class="changed"><td><code>distance_m', changed)
+    assert changed.count('<tr class="changed">') == 1
+    for section in Config.model_fields:
+        assert f"<summary>{section}</summary>" in changed
+
+
+def test_names_are_not_taken_for_markup(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    assert "<script>" not in page(replace(run, dataset="<script>alert(1)</script>"), {"<script>": "<svg/>"})
+
+
+def test_same_run_gives_the_same_page(scored: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(scored.parent, tmp_path / "run")
+    assert write_report(folder).read_text() == scored.read_text()
+
+
+def test_run_without_loops_is_drawn(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    bare = replace(run, metrics={}, result=replace(run.result, attempts=()))
+    html = page(bare, {"Loops": draw_loops(bare)})
+    assert "No place was visited twice" in html
+    assert "accepted" not in _plots(html)["Loops"]
+
+
+def test_folder_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run").folder
+    (folder / "report.html").mkdir()
+    with pytest.raises(SegslamError, match=r"report\.html: exists and is not a regular file"):
+        write_report(folder)
+
+
+def test_unfinished_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match="did not finish"):
+        write_report(make_run(tmp_path / "run", finished=False).folder)
+
+
+def test_command_writes_the_page_and_prints_its_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = make_run(tmp_path / "run").folder
+    for arguments, status, expected in (
+        (["report", str(folder)], 0, f"report written to {folder / 'report.html'}\n"),
+        (["report", str(tmp_path / "nowhere")], 2, "nowhere: no such folder"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(arguments)
+        assert int(ended.value.code or 0) == status
+        assert expected in capsys.readouterr().err
+    assert (folder / "report.html").stat().st_size > 10_000
+
+
+def test_conditions_name_when_where_and_how_the_run_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/usr/bin/segslam", "map", "my_drive"])
+    html = write_report(make_run(tmp_path / "run").folder).read_text()
+    conditions = dict(re.findall(r"<tr><td>([^<]*)</td><td>([^<]*)</td></tr>", html.split("<h2>Conditions</h2>")[1]))
+    assert abs(datetime.now(UTC) - datetime.fromisoformat(conditions["started (UTC)"])) < timedelta(hours=1)
+    assert conditions["command"] == "segslam map my_drive"
+    assert "cores" in conditions["processor"]
+    assert conditions["settings other than the defaults"] == "none"
+    assert settings_not_default(load_config(None, ["map.color=height"])) == "map.color=height"
+
+
+def test_the_gallery_has_the_best_accepted_and_the_nearest_missed_loops(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    loops = [attempt for attempt in run.result.attempts if attempt.candidate.source_id in (50, 51, 58)]
+    chosen = choose(loops)
+    assert [attempt.candidate.source_id for attempt in chosen] == [50, 58]  # 51, near 58, failed earlier
+    assert outcome_text(run, chosen[0]) == "accepted, overlap 0.80, residual 0.10 m, weight 1.00"
+    assert outcome_text(run, chosen[1]) == "rejected, low overlap (3 < 5)"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(2.3514, "2.35"), (0.33712, "0.337"), (23.14, "23.1"), (412.6, "413"), (7, "7")]
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert number(value) == text

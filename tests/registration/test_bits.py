@@ -1,0 +1,59 @@
+"""Bit kernels against plain Python."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from segslam.registration.cliques.bits import (
+    count_bits,
+    lowest_bit,
+    members,
+    pack_flags,
+    pack_rows,
+    pairs,
+    part,
+)
+
+WORDS = st.integers(0, 2**64 - 1)
+
+
+def random_graph(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Adjacency as flags and as bits."""
+    upper = np.triu(np.random.default_rng(seed).random((count, count)) < 0.2, 1)
+    flags = upper | upper.T
+    return flags, pack_rows(flags)
+
+
+@given(word=WORDS)
+def test_bits_are_counted_as_python_counts_them(word: int) -> None:
+    assert count_bits(np.uint64(word)) == word.bit_count()
+
+
+@given(word=WORDS.filter(bool))
+def test_lowest_bit_is_the_number_of_zeros_below_it(word: int) -> None:
+    assert lowest_bit(np.uint64(word)) == (word & -word).bit_length() - 1
+
+
+@given(word=WORDS)
+def test_flags_are_packed_first_in_the_lowest_bit(word: int) -> None:
+    flags = np.array([word >> k & 1 for k in range(64)], np.uint8)
+    assert int(pack_flags(flags.view(np.uint64))) == word
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 200])
+def test_members_and_pairs_are_those_of_the_flags(count: int) -> None:
+    flags, adjacency = random_graph(count, count)
+    out = np.empty(count, np.int64)
+    for row in range(count):
+        number = members(adjacency[row], out)
+        assert out[:number].tolist() == np.flatnonzero(flags[row]).tolist()
+    assert pairs(adjacency).tolist() == np.argwhere(np.triu(flags)).tolist()
+
+
+def test_parted_vertices_are_no_longer_joined_and_all_others_are() -> None:
+    flags, adjacency = random_graph(0, 100)
+    parted = np.argwhere(np.triu(flags))[::3].copy()
+    part(adjacency, parted)
+    flags[parted[:, 0], parted[:, 1]] = flags[parted[:, 1], parted[:, 0]] = False
+    assert pairs(adjacency).tolist() == np.argwhere(np.triu(flags)).tolist()

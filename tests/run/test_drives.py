@@ -1,0 +1,72 @@
+"""The list of drives of a fleet."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from segslam.core.types import SegslamError
+from segslam.run.fleets import Drive, drives_of, read_drives
+from segslam.run.fleets.drives import with_settings
+
+LIST = """
+drives:
+  - monday.mcap
+  - data: week/friday
+    name: last
+    sequence: 00
+    frames: "0:240"
+    set: [odometry.max_range_m=60]
+  - {data: week/monday, preset: campus}
+"""
+
+
+def _written(folder: Path, text: str) -> Path:
+    file = folder / "drives é.yaml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_a_list_has_paths_relative_to_it_and_the_options_of_map(tmp_path: Path) -> None:
+    first, second, third = read_drives(_written(tmp_path, LIST))
+    assert first == Drive("monday-1", str(tmp_path / "monday.mcap"))
+    settings = ("odometry.max_range_m=60",)
+    assert second == Drive("last", str(tmp_path / "week" / "friday"), sequence="00", frames="0:240", set=settings)
+    assert (third.name, third.preset) == ("monday-2", "campus")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected a list of drives"),
+        ("- 1", "drive 1: expected a path or options with data"),
+        ("- a\n- {name: b}", "drive 2: expected a path or options with data"),
+        ("- {data: a, frame: '0:3'}", "drive 1: unknown option 'frame'; known: name, data"),
+        ("- {data: a, set: 3}", "drive 1: set: expected texts"),
+        ("- {data: a, name: ../b}", "drive 1: name '../b': use letters"),
+        ("- {data: a, topic: [1]}", "drive 1: topic: expected a text"),
+        ("- {data: a, name: b}\n- {data: c, name: b}\n- {data: d, name: b-2}", "b-2: two drives have this name"),
+        ("- [", "not valid YAML"),
+    ],
+)
+def test_a_wrong_list_is_one_line_with_the_entry(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(SegslamError, match=re.escape(message)) as raised:
+        read_drives(_written(tmp_path, text))
+    assert "\n" not in str(raised.value)
+
+
+def test_the_key_changes_with_recording_options_and_version_but_not_with_the_name(tmp_path: Path) -> None:
+    scan = tmp_path / "000000.bin"
+    scan.write_bytes(bytes(16))
+    (drive,) = drives_of([tmp_path])
+    key = drive.key("1")
+    assert Drive("other", drive.data).key("1") == key
+    assert drive.key("2") != key
+    assert with_settings([drive], ["odometry.max_range_m=60"])[0].key("1") != key
+    scan.write_bytes(bytes(32))
+    assert drive.key("1") != key
+
+
+def test_a_missing_recording_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match="nothing: cannot be read"):
+        drives_of([tmp_path / "nothing"])[0].key("1")

@@ -1,0 +1,218 @@
+"""A fleet of two days in one place, a stranger and a damaged recording: joined, gone on with, and on a cluster."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.commands import run
+from helpers.gnss_drive import ORIGIN, write_fixes
+from helpers.recorded_drive import TOPIC, clouds, write_mcap
+from helpers.sessions import write_day
+from helpers.terminal import in_terminal
+
+import segslam.run.fleets.orchestrate
+from segslam.core.trajectory import read_poses
+from segslam.core.types import SegslamError
+from segslam.gnss import enu_from_geodetic
+from segslam.output.finished import read_run
+from segslam.run.fleets import Drive, FleetResult, fleet, read_drives, workers
+from segslam.run.fleets.orchestrate import FILE
+from segslam.run.fleets.steps import map_drive
+from segslam.run.sessions import session_pose
+from segslam.scans import open_dataset
+
+pytestmark = pytest.mark.usefixtures("short_runs")
+SETTINGS = ("adjustment.max_minutes=0",)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Monday, a stranger, a damaged one, and friday."""
+    root = tmp_path_factory.mktemp("recordings")
+    monday = write_day(root / "monday", day=0, first=0, num_scans=22)
+    friday = write_day(root / "friday", day=1, first=6, num_scans=22)
+    damaged = root / "damaged.mcap"
+    damaged.write_bytes(b"no recording")
+    return [monday, write_mcap(root / "stranger.mcap", clouds(8)), damaged, friday]
+
+
+def _drives(recordings: list[Path]) -> list[Drive]:
+    """From a list in YAML; the fixes of the recordings in one file are too few for a place."""
+    file = recordings[0].parent / "drives.yaml"
+    reference = open_dataset(recordings[0]).reference
+    assert reference is not None
+    write_fixes(file.with_name("few.csv"), reference.stamp_ns[:2], reference.T_world_lidar[:2])
+    in_file = {"topic": TOPIC, "gnss": "few.csv"}
+    entries = [{"data": path.name} | in_file if path.suffix else _on_globe(path) for path in recordings]
+    file.write_text(json.dumps(entries))
+    return read_drives(file)
+
+
+def _on_globe(data: Path) -> dict[str, str]:
+    """A recording with the fixes of a receiver beside it."""
+    fixes = data.with_suffix(".csv")
+    reference = open_dataset(data).reference
+    if not fixes.exists() and reference is not None:
+        write_fixes(fixes, reference.stamp_ns, reference.T_world_lidar)
+    return {"data": data.name, "gnss": fixes.name}
+
+
+@pytest.fixture(scope="module")
+def joined(recordings: list[Path], tmp_path_factory: pytest.TempPathFactory) -> FleetResult:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session_pose, "NUM_ENOUGH", 5)
+        out = tmp_path_factory.mktemp("fleets") / "city é"
+        return fleet(_drives(recordings), out, same_reference=True, settings=SETTINGS)
+
+
+def test_drives_that_share_places_are_in_one_frame_and_the_others_alone(joined: FleetResult) -> None:
+    values = json.loads((joined.folder / FILE).read_text())
+    assert {name: one["state"] for name, one in values["drives"].items()} == {
+        "monday": "mapped",
+        "stranger": "mapped",
+        "damaged": "failed",
+        "friday": "mapped",
+    }
+    assert [one["drives"] for one in values["components"]] == [["monday", "friday"], ["stranger"]]
+    assert values["drives"]["friday"]["component"] == 0
+    assert values["drives"]["damaged"]["component"] is None
+    assert "damaged.mcap" in values["drives"]["damaged"]["reason"]
+    assert values["num_loops_between"] >= 3
+    assert values["components"][0]["ate_m"] < 0.15
+    assert set(values["seconds"]) == {"map", "index", "propose", "relate", "join"}
+    assert "damaged.mcap" in (joined.folder / "report.html").read_text()
+
+
+def test_a_component_is_a_run_with_the_poses_of_each_drive(joined: FleetResult) -> None:
+    component = read_run(joined.folder / "component_0")
+    friday = read_run(joined.folder / "runs" / "friday")
+    own = read_poses(component.folder / "drives" / "friday_tum.txt")
+    assert own.stamp_ns is not None
+    np.testing.assert_allclose(own.stamp_ns, friday.result.trajectory.stamp_ns, atol=1000)
+    last = component.result.trajectory.T_world_lidar[-len(own) :]
+    np.testing.assert_allclose(own.T_a_b, last, atol=1e-5)
+    alone = read_run(joined.folder / "component_1")
+    assert alone.dataset == read_run(joined.folder / "runs" / "stranger").dataset
+
+
+def test_drives_with_fixes_are_on_the_globe_alone_and_together(joined: FleetResult) -> None:
+    """Both drives end where they were: the fixes of both place the component."""
+    component = np.loadtxt(joined.folder / "component_0" / "poses_geodetic.csv", delimiter=",", skiprows=1)
+    alone = [
+        np.loadtxt(joined.folder / "runs" / name / "poses_geodetic.csv", delimiter=",", skiprows=1)
+        for name in ("monday", "friday")
+    ]
+    apart_m = enu_from_geodetic(component[:, 1:4], ORIGIN) - enu_from_geodetic(np.vstack(alone)[:, 1:4], ORIGIN)
+    assert np.hypot(*apart_m[:, :2].T).max() < 0.4
+    values = json.loads((joined.folder / "component_0" / "georeference.json").read_text())
+    assert values["num_fixes"] == len(component)
+    assert not (joined.folder / "component_1" / "georeference.json").exists()
+
+
+def test_fixes_that_cannot_be_read_end_a_drive_before_it_is_mapped(recordings: list[Path], tmp_path: Path) -> None:
+    drive = Drive("monday", str(recordings[0]), gnss=str(tmp_path / "none.csv"))
+    with pytest.raises(SegslamError, match=r"none\.csv"):
+        map_drive(tmp_path, drive, "key")
+    assert list(tmp_path.iterdir()) == []
+
+
+def _made(folder: Path) -> dict[str, int]:
+    """All files but those that each call writes, with their times."""
+    files = (file for file in folder.rglob("*") if file.is_file())
+    return {str(file): file.stat().st_mtime_ns for file in files if file.name not in (FILE, "report.html")}
+
+
+@pytest.mark.slow
+def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
+    joined: FleetResult, recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_pose, "NUM_ENOUGH", 5)
+    folder = tmp_path / "again"
+    shutil.copytree(joined.folder, folder)
+    (folder / "runs" / ".friday.0123.part").mkdir()
+    before = _made(folder)
+    tried = []
+    map_folder = segslam.run.fleets.steps.map_folder
+
+    def mapped(data: Path, *arguments: Any, **options: Any) -> Any:
+        tried.append(data.name)
+        return map_folder(data, *arguments, **options)
+
+    monkeypatch.setattr("segslam.run.fleets.steps.map_folder", mapped)
+    again = fleet(_drives(recordings), folder, same_reference=True, settings=SETTINGS)
+    assert again.drives == joined.drives
+    assert _made(folder) == before
+    assert tried == [], "the damaged drive fails before it is mapped"
+    assert not (folder / "runs" / ".friday.0123.part").exists()
+    (recordings[2].parent / "damaged.mcap").rename(recordings[2].parent / "kept")
+    try:
+        write_mcap(recordings[2], clouds(8))
+        whole = fleet(_drives(recordings), folder, same_reference=True, settings=SETTINGS)
+    finally:
+        (recordings[2].parent / "kept").replace(recordings[2])
+    assert whole.drives["damaged"]["state"] == "mapped"
+    assert tried == ["damaged.mcap"]
+
+
+@pytest.mark.slow
+def test_two_processes_write_the_same_poses(
+    joined: FleetResult, recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    one, two = (
+        fleet(_drives(recordings), tmp_path / str(number), num_workers=number, settings=SETTINGS) for number in (1, 2)
+    )
+    assert one.drives == two.drives
+    for name in ("poses_tum.txt", "loops.csv", "graph.g2o"):
+        first, second = ((result.folder / "component_0" / name).read_bytes() for result in (one, two))
+        if name == "loops.csv":  # which has times
+            first, second = (
+                b"\n".join(line.rsplit(b",", 4)[0] for line in text.splitlines()) for text in (first, second)
+            )
+        assert first == second, name
+
+
+class _Client:
+    """Workers that answer with a version, and see the folder or not."""
+
+    def __init__(self, found: Any, sees: bool = True) -> None:
+        self._answers = [{"tcp://a": found}, {"tcp://a": sees}]
+
+    def run(self, *_: Any, **__: Any) -> Any:
+        return self._answers.pop(0)
+
+
+@pytest.mark.parametrize(
+    ("client", "message"),
+    [
+        (_Client("0.0.1"), r"worker tcp://a: has segslam 0\.0\.1, this is .*; install the same version"),
+        (_Client(ModuleNotFoundError("segslam")), "cannot import segslam"),
+        (_Client(segslam.__version__, sees=False), "does not see .*; give a folder that all workers share"),
+    ],
+)
+def test_a_worker_that_cannot_take_part_is_refused(client: _Client, message: str, tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match=message):
+        workers._check(client, tmp_path, "tcp://b")
+
+
+def test_nothing_mapped_is_an_error_with_the_first_reason(
+    recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("fleet", recordings[2], "--out", tmp_path / "none", "-q") == 2
+    assert "no drive could be mapped; damaged: " in capsys.readouterr().err
+    assert run("fleet", tmp_path / "nothing.yaml", "--out", tmp_path / "none") == 2
+    assert run("fleet", recordings[0], "--out", tmp_path / "x", "--scheduler", "tcp://x:1", "--workers", "2") == 2
+    assert "--workers: " in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_shows_steps_and_components_in_a_terminal(recordings: list[Path], tmp_path: Path) -> None:
+    drives = [str(recordings[0]), str(recordings[3])]
+    settings = ("--set", SETTINGS[0])
+    status, output = in_terminal("-m", "segslam", "fleet", *drives, "--out", str(tmp_path / "city"), *settings)
+    assert status == 0, output
+    assert "friday is joined to monday by" in output
+    assert "component 0: monday, friday" in output

@@ -1,0 +1,335 @@
+"""Scans that arrive during mapping: waiting and dropped scans, gaps, and the end of a run."""
+
+import signal
+import threading
+from pathlib import Path
+from time import sleep
+
+import numpy as np
+import pytest
+from helpers.commands import run
+from helpers.drives import drifting_slam, round_drive
+from helpers.hanging_source import HangingSource
+from helpers.live_command import LiveCommand, record, write_scan
+from helpers.terminal import in_terminal
+
+from segslam.cli.live_status import too_slow
+from segslam.core import geometry
+from segslam.core.config import Config, OdometryConfig
+from segslam.core.evaluation import trajectory_metrics
+from segslam.core.types import BadScan, LoopClosure, Scan, SegslamError
+from segslam.odometry import KissOdometry, OdometryApart
+from segslam.output.finished import read_run
+from segslam.output.log import LogWriter, read_log
+from segslam.run.live import FolderSource, Front
+from segslam.run.live.folder import stamp_of_name
+from segslam.run.live.rhythm import Rhythm
+from segslam.run.live.waiting import Waiting
+
+INTERVAL_NS = 100_000_000
+SETTINGS = ("--set", "odometry.min_range_m=1")
+
+
+def _scan(index: int, stamp_ns: int) -> Scan:
+    return Scan(np.ones((1, 3)), stamp_ns, index)
+
+
+def test_the_oldest_that_waits_is_dropped_and_counted() -> None:
+    waiting = Waiting(most=3)
+    for number in range(5):
+        waiting.put(number * INTERVAL_NS, _scan)
+    taken = [waiting.take(0.0) for _ in range(4)]
+    assert [arrival.index if arrival else None for arrival in taken] == [2, 3, 4, None]
+    assert (waiting.num_arrived, waiting.num_dropped) == (5, 2)
+
+
+def test_a_closed_queue_gives_what_waits_and_takes_nothing_more() -> None:
+    waiting = Waiting()
+    waiting.put(0, _scan)
+    waiting.close()
+    waiting.put(INTERVAL_NS, _scan)
+    first = waiting.take(None)
+    assert first is not None
+    assert first.index == 0
+    assert waiting.take(None) is None
+    assert waiting.num_arrived == 1
+
+
+def test_gaps_are_counted_by_stamp_with_the_scans_that_they_lack() -> None:
+    rhythm = Rhythm()
+    for number in (0, 1, 2, 3, 6, 7, 8, 18):
+        rhythm.note(number * INTERVAL_NS)
+    assert (rhythm.num_gaps, rhythm.num_missing) == (2, 2 + 9)
+    assert rhythm.longest_gap_s == pytest.approx(1.0)
+    assert rhythm.intervals(0, 3 * INTERVAL_NS) == pytest.approx(3.0)
+    assert rhythm.intervals(0, int(1.2 * INTERVAL_NS)) == 1.0
+    assert rhythm.intervals(0, 1000 * INTERVAL_NS) == 10.0
+
+
+def test_stamps_continue_when_the_clock_of_the_sender_is_set_back() -> None:
+    rhythm = Rhythm()
+    stamps = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
+    again = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
+    assert np.all(np.diff([*stamps, *again]) == INTERVAL_NS)
+    assert (rhythm.num_clock_set, rhythm.num_gaps) == (1, 0)
+
+
+@pytest.mark.parametrize("ahead_ns", [25 * 3600 * 10**9, 2_000_000_000 * 10**9])
+def test_stamps_of_a_clock_that_is_set_forward_continue_and_count_no_missing_scans(ahead_ns: int) -> None:
+    """Also if it is set for one scan only, as by a damaged packet."""
+    first_ns, rhythm = 1_700_000_000 * 10**9, Rhythm()
+    sent = [first_ns + INTERVAL_NS * number for number in range(12)]
+    sent[4] += ahead_ns
+    sent[8:] = [stamp_ns + ahead_ns for stamp_ns in sent[8:]]
+    assert np.all(np.diff([rhythm.note(stamp_ns) for stamp_ns in sent]) == INTERVAL_NS)
+    assert (rhythm.num_clock_set, rhythm.num_gaps, rhythm.num_missing) == (3, 0, 0)
+
+
+def test_a_pause_of_an_hour_is_a_gap() -> None:
+    rhythm = Rhythm()
+    for stamp_s in (0, 1, 2, 3, 3603):
+        rhythm.note(stamp_s * 10**9)
+    assert (rhythm.num_clock_set, rhythm.num_gaps, rhythm.longest_gap_s) == (0, 1, 3600.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "stamp_ns"),
+    [
+        ("1700000000.25", 1_700_000_000_250_000_000),
+        ("1700000000_000000001", 1_700_000_000_000_000_001),
+        ("1700000000123456789", 1_700_000_000_123_456_789),
+        ("1700000000123456", 1_700_000_000_123_456_000),
+        ("000123", None),
+        ("scan_1700000000.25", None),
+    ],
+)
+def test_the_name_of_a_file_can_hold_its_stamp(name: str, stamp_ns: int | None) -> None:
+    assert stamp_of_name(name) == stamp_ns
+
+
+def test_a_file_is_read_once_when_it_is_closed_or_renamed(tmp_path: Path) -> None:
+    write_scan(tmp_path, _scan(0, 0), "before")
+    source, waiting, stopped = FolderSource(tmp_path), Waiting(most=9), threading.Event()
+    output: list[str] = []
+    source.open(output.append)
+    assert "1 scans already in" in output[0]
+    thread = threading.Thread(target=source.feed, args=(waiting, stopped))
+    thread.start()
+    try:
+        with (tmp_path / "1700000000.1.bin").open("wb") as unfinished:
+            unfinished.write(np.ones(40, "<f4").tobytes())
+            unfinished.flush()
+            assert waiting.take(0.5) is None
+        written = waiting.take(5.0)
+        write_scan(tmp_path, _scan(0, 0), "1700000000.2")
+        (tmp_path / "notes.txt").write_text("no scan")
+        with (tmp_path / "1700000000.1.bin").open("ab"):
+            pass  # the same file again
+        renamed, third = waiting.take(5.0), waiting.take(0.5)
+    finally:
+        stopped.set()
+        thread.join()
+        source.close()
+    assert written is not None
+    assert renamed is not None
+    assert third is None
+    assert [arrival.stamp_ns for arrival in (written, renamed)] == [
+        1_700_000_000_100_000_000,
+        1_700_000_000_200_000_000,
+    ]
+    scan = written.read(written.index, written.stamp_ns)
+    assert (scan.index, len(scan.points)) == (0, 10)
+
+
+def test_a_file_that_is_no_scan_is_a_bad_scan(tmp_path: Path) -> None:
+    source, waiting, stopped = FolderSource(tmp_path), Waiting(), threading.Event()
+    source.open(print)
+    threading.Thread(target=source.feed, args=(waiting, stopped)).start()
+    try:
+        (tmp_path / "a.npy").write_bytes(b"no array")
+        arrival = waiting.take(5.0)
+    finally:
+        stopped.set()
+    assert arrival is not None
+    with pytest.raises(BadScan, match=r"a\.npy: it is not a \.npy file"):
+        arrival.read(0, 0)
+
+
+def test_a_removed_folder_ends_the_stream_with_the_reason(tmp_path: Path) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    source = FolderSource(folder)
+    source.open(print)
+    folder.rmdir()
+    assert "was removed" in source.feed(Waiting(), threading.Event())
+
+
+def test_only_folders_can_be_watched(tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match="cannot be watched"):
+        FolderSource(tmp_path / "nowhere").open(print)
+
+
+def test_odometry_that_knows_of_a_gap_predicts_by_the_velocity() -> None:
+    """In an endless corridor, only the prediction determines the distance travelled; the walls determine the rest."""
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-60, 60, 20000)
+    side, height = rng.choice([-3.0, 3.0], 20000), rng.uniform(0, 3, 20000)
+    corridor = np.column_stack([along, side, height])
+    config = OdometryConfig(min_range_m=0.5)
+    with OdometryApart(config) as apart:
+        for odometry in (KissOdometry(config), apart):
+            odometry.follow([(np.eye(4), corridor.astype(np.float32))], np.eye(4), _ahead(1.0))
+            one, after_gap, next_one = (
+                odometry.register(Scan(corridor, stamp), gap=gap).T_odom_lidar
+                for stamp, gap in ((1, 1.0), (4, 3.0), (5, 1.0))
+            )
+            steps = [geometry.inverse(one) @ after_gap, geometry.inverse(after_gap) @ next_one]
+            np.testing.assert_allclose([step[0, 3] for step in steps], [3.0, 1.0], atol=0.4)
+
+
+def _ahead(distance_m: float) -> np.ndarray:
+    return geometry.transform(np.eye(3), [distance_m, 0, 0])
+
+
+@pytest.mark.slow
+def test_scans_are_mapped_as_they_appear_until_none_comes(tmp_path: Path) -> None:
+    folder, run = tmp_path / "scans", tmp_path / "run"
+    folder.mkdir()
+    scans = list(round_drive()[0][:8])
+    with LiveCommand(folder, "--out", run, "--idle", "3", *SETTINGS) as command:
+        command.wait_for("waiting for scans")
+        record(folder, scans[:4], every_s=0.3)
+        (folder / "broken.bin").write_bytes(b"x" * 23)
+        record(folder, scans[4:], every_s=0.3, first=4)
+        status, metrics = command.ended()
+    assert status == 0, command.output
+    assert "no scan for 3 s" in command.output
+    assert metrics["num_scans_arrived"] == 9
+    assert metrics["num_scans"] + metrics["num_scans_skipped"] + metrics["num_scans_dropped"] == 9
+    assert metrics["latency_ms"]["median"] > 0
+    assert len(read_log(run / "log.mcap").result()[1]) == metrics["num_scans"]
+    assert (run / "report.html").is_file()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+def test_a_signal_ends_a_live_run_with_all_its_results(tmp_path: Path, number: int) -> None:
+    folder, run = tmp_path / "scans", tmp_path / "run"
+    folder.mkdir()
+    with LiveCommand(folder, "--out", run, *SETTINGS) as command:
+        command.wait_for("waiting for scans")
+        record(folder, list(round_drive()[0][:3]), every_s=0.5)
+        command.signal(number)
+        status, metrics = command.ended()
+    assert status == 0, command.output
+    assert metrics["num_scans"] + metrics["num_scans_dropped"] == 3
+    assert (run / "report.html").is_file()
+
+
+def test_without_a_scan_nothing_is_left_behind(tmp_path: Path) -> None:
+    with LiveCommand(tmp_path, "--out", tmp_path / "run", "--idle", "0.5", "--quiet") as command:
+        status, metrics = command.ended()
+    assert (status, metrics) == (2, {})
+    assert "no scan was mapped (no scan for 0.5 s)" in command.output
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_the_same_scans_live_and_offline_close_the_same_loops_on_the_same_trajectory(tmp_path: Path) -> None:
+    """Slow enough that none is dropped; on a machine too slow for that nothing can be compared."""
+    folder, scans = tmp_path / "scans", round_drive()[0]
+    folder.mkdir()
+    settings = (*SETTINGS, "--set", "proximity.min_travel_m=60")
+    with LiveCommand(folder, "--out", tmp_path / "live", *settings) as command:
+        command.wait_for("waiting for scans")
+        for scan in scans:
+            write_scan(folder, scan, f"{scan.stamp_ns:019d}")
+            sleep(1.5)
+        command.signal(signal.SIGINT)
+        status, metrics = command.ended()
+    assert status == 0, command.output
+    if metrics["num_scans_dropped"]:
+        pytest.skip("the machine dropped scans")
+    (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.9f}\n" for scan in scans))
+    assert run("map", folder, "--out", tmp_path / "map", "--preset", "driving", *settings, "--quiet") == 0
+    live, offline = (read_run(tmp_path / name).result for name in ("live", "map"))
+    assert live.estimate.closure_weights.keys() == offline.estimate.closure_weights.keys()
+    assert len(live.estimate.closure_weights) >= 3
+    apart_m = live.trajectory.T_world_lidar[:, :3, 3] - offline.trajectory.T_world_lidar[:, :3, 3]
+    assert np.abs(apart_m).max() < 0.05
+
+
+@pytest.mark.slow
+def test_a_live_run_shows_how_it_stands_in_a_terminal(tmp_path: Path) -> None:
+    folder, ended = tmp_path / "scans", threading.Event()
+    folder.mkdir()
+
+    def feed() -> None:
+        number = 0
+        while not ended.wait(0.5):
+            write_scan(folder, round_drive()[0][number % 2], f"{number:06d}")
+            if (tmp_path / "run" / "log.mcap").is_file() and number > 40:
+                return
+            number += 1
+
+    feeder = threading.Thread(target=feed)
+    feeder.start()
+    try:
+        words = ("live", str(folder), "--out", str(tmp_path / "run"), "--idle", "3", *SETTINGS)
+        status, shown = in_terminal("-m", "segslam", *words)
+    finally:
+        ended.set()
+        feeder.join()
+    assert status == 0, shown
+    assert "waiting for scans" in shown
+    assert "ms after the scan" in shown
+    assert "results in" in shown
+    assert "Traceback" not in shown
+
+
+def test_a_live_run_is_not_resumed_and_the_message_has_the_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = LogWriter(tmp_path / "log.mcap", config=Config(), dataset="live/scans", options={"live": "live/scans"})
+    log.close()
+    assert run("resume", tmp_path) == 2
+    assert f"segslam replay {tmp_path} --out NEW" in capsys.readouterr().err
+
+
+def test_without_ros_one_line_has_the_install_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("segslam.cli.live.find_spec", lambda name: None)
+    assert run("live", "--topic", "/points", "--out", tmp_path / "run") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--topic needs ROS 2" in line
+    assert "pip install" in line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_loops_that_are_not_tried_in_time_are_searched_at_the_end() -> None:
+    scans, truth = round_drive()
+    slam = drifting_slam()
+    steps = [slam.close_loops(slam.track(scan), tries_loops=False) for scan in scans]
+    assert not any(step.attempts for step in steps)
+    result = slam.finish()
+    assert sum(isinstance(attempt.outcome, LoopClosure) for attempt in result.attempts) >= 1
+    error_m = trajectory_metrics(result.trajectory.T_world_lidar, truth.T_world_lidar)["ate_m"]
+    assert error_m < trajectory_metrics(result.odometry.T_world_lidar, truth.T_world_lidar)["ate_m"] / 2
+
+
+def test_a_faster_odometry_is_recommended_where_many_scans_were_dropped() -> None:
+    assert too_slow({"num_scans_dropped": 1, "num_scans_arrived": 100}, 1.0) == ""
+    assert too_slow({"num_scans_dropped": 30, "num_scans_arrived": 100, "num_restarts": 1}, 0.4) == ""
+    advice = too_slow({"num_scans_dropped": 30, "num_scans_arrived": 100}, 0.4)
+    assert advice.startswith("30 of 100 scans were dropped")
+    assert "--set odometry.voxel_size_m=0.6 " in advice
+
+
+def test_a_source_that_hangs_does_not_keep_a_run_from_ending() -> None:
+    with Front(HangingSource(), Config(), tell=lambda text: None) as front:
+        front.wait_until_ready()
+        front.stop()
+        assert list(front) == []
+    assert not front.ended.failed
+    assert "did not end" in front.ended.why

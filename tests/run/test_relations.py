@@ -1,0 +1,98 @@
+"""Relative poses of drives, and the components that they make."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from segslam.core import geometry
+from segslam.core.types import Alignment, Registration, SegslamError
+from segslam.run.fleets.relations import (
+    MOST_FAILED,
+    Components,
+    Relation,
+    inverted,
+    read_relation,
+    write_relation,
+)
+
+RNG = np.random.default_rng(3)
+
+
+def _pose() -> np.ndarray:
+    return geometry.exp(RNG.normal(size=6))
+
+
+def _registration(T: np.ndarray) -> Registration:
+    root = RNG.normal(size=(6, 6))
+    return Registration(T, 30, 20, 0.1, root @ root.T + np.eye(6))
+
+
+def _alignment(T: np.ndarray) -> Alignment:
+    return Alignment(_registration(T), _registration(T), 0.8, 0.05, 0.001, observability=0.5)
+
+
+def test_a_relation_is_read_as_it_was_written(tmp_path: Path) -> None:
+    file = tmp_path / "relation.json"
+    relation = Relation(_pose(), ((3, 5, _alignment(_pose())), (7, 9, _alignment(_pose()))))
+    write_relation(file, relation)
+    again = read_relation(file)
+    np.testing.assert_array_equal(again.T_earlier_later, relation.T_earlier_later)
+    for (own, target, found), (own_again, target_again, found_again) in zip(relation.found, again.found, strict=True):
+        assert (own, target) == (own_again, target_again)
+        for one, other in ((found.coarse, found_again.coarse), (found.fine, found_again.fine)):
+            np.testing.assert_array_equal(one.T_target_source, other.T_target_source)
+            np.testing.assert_array_equal(one.information, other.information)
+        assert found.observability == found_again.observability
+    write_relation(file, Relation(None, (), "0 of 9"))
+    assert read_relation(file).reason == "0 of 9"
+    file.write_text('{"found": 3}')
+    with pytest.raises(SegslamError, match="damaged"):
+        read_relation(file)
+
+
+def test_the_inverse_has_the_same_cost_for_the_same_motion() -> None:
+    """A tangent of a pose, and the tangent of the inverse that stands for the same pose, have equal chi-squares."""
+    pose = _registration(_pose())
+    back = inverted(Alignment(pose, pose, 0.8, 0.05, 0.001)).fine
+    np.testing.assert_allclose(back.T_target_source @ pose.T_target_source, np.eye(4), atol=1e-12)
+    tangent = 1e-4 * RNG.normal(size=6)
+    moved = geometry.inverse(pose.T_target_source @ geometry.exp(tangent))
+    tangent_back = geometry.log(geometry.inverse(back.T_target_source) @ moved)
+    np.testing.assert_allclose(
+        tangent_back @ back.information @ tangent_back, tangent @ pose.information @ tangent, rtol=1e-3
+    )
+
+
+def test_components_are_related_by_their_most_similar_pair_once() -> None:
+    components = Components(5)
+    similarity = {(1, 0): 4.0, (2, 0): 9.0, (2, 1): 7.0, (3, 1): 3.0, (4, 3): 5.0}
+    assert components.next_pairs(similarity) == [(2, 0), (2, 1), (4, 3)]
+    T_0_2, T_1_2 = _pose(), _pose()
+    components.add(2, 0, Relation(T_0_2, ((1, 1, _alignment(_pose())),)))
+    components.add(2, 1, Relation(T_1_2, ((2, 3, _alignment(_pose())),)))
+    components.add(4, 3, Relation(None, (), "not found"))
+    assert components.members() == [[0, 1, 2], [3], [4]]
+    assert components.next_pairs(similarity) == [(3, 1)]
+    order, poses = components.arranged([0, 1, 2])
+    assert order == [0, 2, 1]
+    assert poses[0] is None
+    assert poses[1] is not None
+    assert poses[2] is not None
+    np.testing.assert_allclose(poses[1].T_earlier_world, T_0_2)
+    np.testing.assert_allclose(poses[2].T_earlier_world, geometry.inverse(T_1_2))
+    assert poses[2].earlier == 1, "the second of the order"
+    assert poses[2].found[0][:2] == (3, 2), "keyframe of the drive, and of the one before it"
+
+
+def test_drives_that_several_others_do_not_fit_are_not_tried_with_all() -> None:
+    num_drives = 40
+    components = Components(num_drives)
+    similarity = {(later, earlier): 1.0 for later in range(num_drives) for earlier in range(later)}
+    num_tried = 0
+    while pairs := components.next_pairs(similarity):
+        for pair in pairs:
+            components.add(*pair, Relation(None, (), "not found"))
+            num_tried += 1
+    assert num_tried <= (MOST_FAILED + 1) * num_drives < 0.3 * len(similarity)
+    assert all(components._num_failed[drive] >= MOST_FAILED for drive in range(num_drives))

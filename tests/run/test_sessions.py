@@ -1,0 +1,254 @@
+"""Two simulated sessions on two days: merged into one run, and localised one in the map of the other."""
+
+import hashlib
+import json
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import run
+from helpers.gnss_drive import ORIGIN, T_ENU_MAP, write_fixes
+from helpers.sessions import write_day
+from helpers.terminal import in_terminal
+
+import segslam
+from segslam.core import geometry
+from segslam.core.config import Config, load_config
+from segslam.core.evaluation import align_positions
+from segslam.core.types import LoopClosure, MotionState, Trajectory
+from segslam.gnss import enu_from_geodetic
+from segslam.output.finished import FinishedRun, read_run
+from segslam.output.log import read_log
+from segslam.run.sessions import session_pose
+
+pytestmark = pytest.mark.usefixtures("short_runs")
+
+UNADJUSTED = load_config(None, ["adjustment.max_minutes=0"])
+"""Of a single day; both are adjusted together."""
+
+
+@dataclass(frozen=True)
+class Days:
+    monday: FinishedRun
+    friday: FinishedRun
+    friday_scans: Path
+
+
+@pytest.fixture(scope="module")
+def days(tmp_path_factory: pytest.TempPathFactory) -> Days:
+    """Runs of two drives that share two thirds of their ways."""
+    root = tmp_path_factory.mktemp("days")
+    scans = [
+        write_day(root / name, day=day, first=first, num_scans=22)
+        for name, day, first in (("monday", 0, 0), ("friday", 1, 6))
+    ]
+    runs = [segslam.map_folder(folder, root / f"{folder.name}_run", config=UNADJUSTED) for folder in scans]
+    return Days(runs[0], runs[1], scans[1])
+
+
+@pytest.fixture(scope="module")
+def merged(days: Days, tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    out = tmp_path_factory.mktemp("merged") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session_pose, "NUM_ENOUGH", 5)  # so few places take less time
+        return segslam.merge([days.monday.folder, days.friday.folder], out, config=Config(), same_reference=True)
+
+
+def _errors(estimate: Trajectory, truth: Trajectory, T_true_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance and angle (degrees) of each scan's pose from the true one, the map's frame given."""
+    rows = np.searchsorted(truth.scan_index, estimate.scan_index)
+    off = np.linalg.inv(truth.T_world_lidar[rows]) @ T_true_world @ estimate.T_world_lidar
+    cosines = (np.trace(off[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    return np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def _true_world(run: FinishedRun) -> np.ndarray:
+    assert run.reference is not None
+    own, truth = run.result.trajectory, run.reference
+    rows = np.searchsorted(truth.scan_index, own.scan_index)
+    return align_positions(own.T_world_lidar[:, :3, 3], truth.T_world_lidar[rows, :3, 3])
+
+
+def test_two_days_become_one_frame(days: Days, merged: FinishedRun) -> None:
+    """The frame of each day, fitted to its scans, is the same; nearly all scans are correct in that of the first."""
+    assert merged.reference is not None
+    whole, first = merged.result.trajectory, len(days.monday.result.trajectory)
+    positions = whole.T_world_lidar[:, :3, 3]
+    true = merged.reference.T_world_lidar[np.searchsorted(merged.reference.scan_index, whole.scan_index), :3, 3]
+    monday, friday = (align_positions(positions[day], true[day]) for day in (slice(first), slice(first, None)))
+    apart_m = np.linalg.norm(geometry.apply(monday, positions) - geometry.apply(friday, positions), axis=1)
+    assert apart_m.max() < 0.15
+    assert np.degrees(geometry.angle(geometry.inverse(monday) @ friday)) < 0.5
+    distance_m, angle_deg = _errors(whole, merged.reference, monday)
+    assert np.median(distance_m) < 0.1
+    assert distance_m.max() < 0.3
+    assert angle_deg.max() < 1.0
+    assert merged.metrics["num_sessions"] == 2
+    assert merged.metrics["num_loops_between"] >= 3
+    assert merged.metrics["num_loops_false"] == 0
+    assert merged.metrics["num_motions_broken"] == 0
+
+
+def test_scans_and_stamps_of_the_second_session_follow_the_first(days: Days, merged: FinishedRun) -> None:
+    whole = merged.result.trajectory
+    first, second = days.monday.result.trajectory, days.friday.result.trajectory
+    assert len(whole) == len(first) + len(second)
+    assert (np.diff(whole.stamp_ns) > 0).all()
+    np.testing.assert_array_equal(np.diff(whole.stamp_ns[len(first) :]), np.diff(second.stamp_ns))
+    np.testing.assert_array_equal(whole.scan_index[len(first) :], second.scan_index + first.scan_index[-1] + 1)
+    [_, shift] = json.loads(merged.options["sessions"])
+    assert shift["stamp_shift_ns"] == whole.stamp_ns[-1] - second.stamp_ns[-1]
+    states = [motion.state for motion in merged.result.motions]
+    assert states.index(MotionState.BEGUN) == len(first)
+
+
+@pytest.fixture(scope="module")
+def on_globe(days: Days, tmp_path_factory: pytest.TempPathFactory) -> Days:
+    """The same runs, each georeferenced by its own fixes in one true frame, Friday's with its clock 2 s off."""
+    root = tmp_path_factory.mktemp("on_globe")
+    made = []
+    for number, one in enumerate((days.monday, days.friday)):
+        folder = Path(shutil.copytree(one.folder, root / one.folder.name))
+        assert one.reference is not None
+        late_ns = 2_000_000_000 * number
+        write_fixes(root / "fixes.csv", one.reference.stamp_ns - late_ns, one.reference.T_world_lidar)
+        segslam.georeference(folder, root / "fixes.csv", offset_s=1e-9 * late_ns)
+        made.append(read_run(folder))
+    return Days(made[0], made[1], days.friday_scans)
+
+
+def _off_globe_m(folder: Path, truth: Trajectory) -> np.ndarray:
+    """Horizontal errors of the scans in `poses_geodetic.csv`."""
+    rows = np.loadtxt(folder / "poses_geodetic.csv", delimiter=",", skiprows=1)
+    own = np.searchsorted(truth.stamp_ns, np.rint(1e9 * rows[:, 0]).astype(np.int64) - 1000)
+    true_m = geometry.apply(T_ENU_MAP, truth.T_world_lidar[own, :3, 3])
+    return np.hypot(*(enu_from_geodetic(rows[:, 1:4], ORIGIN) - true_m)[:, :2].T)
+
+
+def test_a_merged_run_is_placed_by_the_fixes_of_all_sessions(
+    on_globe: Days, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_pose, "NUM_ENOUGH", 5)
+    made = segslam.merge([on_globe.monday.folder, on_globe.friday.folder], tmp_path / "both", same_reference=True)
+    values = json.loads((made.folder / "georeference.json").read_text())
+    assert values["num_fixes"] == len(made.result.trajectory)
+    assert values["num_fixes_kept"] > 0.9 * values["num_fixes"]
+    assert made.reference is not None
+    assert _off_globe_m(made.folder, made.reference).max() < 0.4
+
+
+@pytest.mark.slow
+def test_a_run_localised_in_a_georeferenced_map_is_on_the_globe(on_globe: Days, tmp_path: Path) -> None:
+    made = segslam.localise(on_globe.monday.folder, on_globe.friday_scans, tmp_path / "there", config=UNADJUSTED)
+    assert on_globe.friday.reference is not None
+    errors_m = _off_globe_m(made.folder, on_globe.friday.reference)
+    assert len(errors_m) == made.result.localised().sum()
+    assert errors_m.max() < 0.5
+    assert not (made.folder / "gnss.csv").exists()
+    assert run("export", made.folder, tmp_path / "track.geojson", "--quiet") == 0
+
+
+@pytest.mark.slow
+def test_every_command_works_in_a_terminal(days: Days, tmp_path: Path) -> None:
+    monday, friday = str(days.monday.folder), str(days.friday.folder)
+    first_scan = str(days.friday_scans / "sequences" / "00" / "velodyne" / "000000.bin")
+    shown = ""
+    for command in (
+        ("locate", monday, first_scan),
+        ("merge", monday, friday, "--out", str(tmp_path / "both"), "--map"),
+        ("localise", monday, str(days.friday_scans), "--out", str(tmp_path / "there")),
+    ):
+        status, output = in_terminal("-m", "segslam", *command)
+        assert status == 0, output
+        assert "Traceback" not in output
+        shown += output
+    for title, count in (("locate", 1), ("merge", 44), ("localise", 22)):
+        assert re.search(rf"{title} .*{count}/{count}", shown), title
+    assert "loops between sessions: " in shown
+    assert "localised in the old map: 100.0 %" in shown
+    assert (tmp_path / "both" / "map.ply").is_file()
+
+
+@pytest.mark.slow
+def test_a_merged_log_replays_and_finds_the_second_session_again(
+    days: Days, merged: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("replay", merged.folder, "--out", tmp_path / "again", "--json", "--quiet") == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["num_scans"] == merged.metrics["num_scans"]
+    assert metrics["ate_m"] < 0.3
+    first_id = int((days.monday.result.keyframe_rows >= 0).sum())
+    steps = read_log(tmp_path / "again" / "log.mcap").steps(clouds=False)
+    closures = [attempt.outcome for step in steps for attempt in step.attempts]
+    assert any(isinstance(one, LoopClosure) and one.target_id < first_id <= one.source_id for one in closures)
+
+
+@pytest.mark.slow
+def test_a_session_in_another_town_is_refused_and_nothing_is_left(
+    days: Days, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere = segslam.map_folder(
+        write_day(tmp_path / "scans", day=0, first=0, num_scans=6, seed=8), tmp_path / "elsewhere"
+    )
+    assert run("merge", days.monday.folder, elsewhere.folder, "--out", tmp_path / "both") == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert str(elsewhere.folder) in error
+    assert "not found in any other run" in error
+    assert not (tmp_path / "both").exists()
+
+
+def test_a_new_day_is_localised_in_the_old_map_which_is_only_read(
+    days: Days, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = _contents(days.monday.folder)
+    out = tmp_path / "run"
+    assert run("localise", days.monday.folder, days.friday_scans, "--out", out, "--json", "--quiet") == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["localised_percent"] == 100.0
+    assert "loop_recall" not in metrics, "loops within the drive are not searched"
+    assert _contents(days.monday.folder) == before
+    localised = segslam.read_run(out)
+    assert localised.reference is not None
+    shared = localised.result.trajectory.scan_index < 16  # then the map ends
+    distance_m, angle_deg = _errors(localised.result.trajectory, localised.reference, _true_world(days.monday))
+    assert (distance_m[shared] < 0.3).mean() >= 0.98
+    assert (angle_deg[shared] < 1.0).mean() >= 0.98
+    steps = list(read_log(out / "log.mcap").steps(clouds=False))
+    placed = [placement for step in steps for placement in step.placements]
+    assert placed[0].is_found
+    assert not placed[-1].is_found
+    assert len((out / "localised.csv").read_text().splitlines()) == 1 + metrics["num_scans"]
+    assert localised.result.from_map_m is not None
+    (out / "localised.csv").write_text("scan,stamp_ns\n0,0\n")
+    with pytest.raises(segslam.SegslamError, match=r"localised\.csv: damaged"):
+        segslam.read_run(out)
+
+
+def _contents(folder: Path) -> dict[str, str]:
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(folder.iterdir())}
+
+
+@pytest.mark.slow
+def test_missing_scans_do_not_affect_the_result(days: Days, tmp_path: Path) -> None:
+    gap = write_day(tmp_path / "gap", day=1, first=0, num_scans=18, without=range(6, 12))
+    run_there = segslam.localise(days.monday.folder, gap, tmp_path / "run")
+    assert run_there.reference is not None
+    assert run_there.metrics["localised_percent"] == 100.0
+    distance_m, angle_deg = _errors(run_there.result.trajectory, run_there.reference, _true_world(days.monday))
+    assert distance_m.max() < 0.3
+    assert angle_deg.max() < 1.0
+
+
+@pytest.mark.slow
+def test_a_drive_through_another_town_is_not_localised(
+    days: Days, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere = write_day(tmp_path / "scans", day=0, first=0, num_scans=5, seed=8)
+    assert run("localise", days.monday.folder, elsewhere, "--out", tmp_path / "run", "--quiet") == 1
+    assert "no scan was found in the map" in capsys.readouterr().err
+    assert (tmp_path / "run" / "poses_tum.txt").read_text() == ""
+    rows = (tmp_path / "run" / "localised.csv").read_text().splitlines()[1:]
+    assert [row.split(",")[2:] for row in rows] == 5 * [["0", ""]]

@@ -1,0 +1,109 @@
+"""Ouster's packets in a pcap file, read as scans."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.ouster_packets import (
+    CHANNEL_BYTES,
+    NUM_COLUMNS,
+    REFLECTIVITY,
+    START_NS,
+    datagrams,
+    frames,
+    metadata,
+    one_return,
+    record,
+    write,
+)
+
+from segslam.core.types import SegslamError
+from segslam.scans import open_dataset
+
+
+@pytest.mark.parametrize("profile", CHANNEL_BYTES)
+def test_beam_directions_are_those_of_the_manual(tmp_path: Path, profile: str) -> None:
+    """The turned sensor looks along +x at the middle of its turn, which goes clockwise; beams leave 15 mm out."""
+    file = record(tmp_path, profile, [one_return(8, 0, 2000), one_return(12, 0, 2000), one_return(8, 1, 2000)])
+    ahead, right, up = open_dataset(file)
+    np.testing.assert_allclose(ahead.points, [[2.0, 0.0, 0.036]], atol=1e-6)
+    np.testing.assert_allclose(right.points, [[0.0, -2.0, 0.036]], atol=1e-6)
+    along, height = 1.985 * np.cos(np.pi / 6) + 0.015, 1.985 * 0.5 + 0.036
+    np.testing.assert_allclose(up.points, [[along, 0.0, height]], atol=1e-6)
+    assert [scan.intensities for scan in open_dataset(file, intensities=True)] == [REFLECTIVITY] * 3
+
+
+def test_stamps_and_times_are_the_sensors(tmp_path: Path) -> None:
+    image = np.full((NUM_COLUMNS, 2), 3000)
+    scans = list(open_dataset(record(tmp_path, "RNG19_RFL8_SIG16_NIR16", [image, image])))
+    assert [scan.stamp_ns for scan in scans] == [START_NS, START_NS + 100_000_000]
+    np.testing.assert_allclose(scans[1].times, np.repeat(np.arange(16) / 15, 2))
+
+
+@pytest.mark.parametrize("how", [{"mtu": 64}, {"vlan": True}, {"mtu": 64, "vlan": True}])
+def test_split_and_tagged_packets_give_the_same_points(tmp_path: Path, how: dict) -> None:
+    image = np.arange(1000, 1000 + 2 * NUM_COLUMNS).reshape(NUM_COLUMNS, 2) * 8
+    whole = open_dataset(record(tmp_path / "whole", "RNG15_RFL8_NIR8_DUAL", [image] * 2))
+    other = open_dataset(record(tmp_path / "other", "RNG15_RFL8_NIR8_DUAL", [image] * 2, **how))
+    assert len(whole) == len(other) == 2
+    np.testing.assert_array_equal(whole[1].points, other[1].points)
+    assert len(whole[1].points) == 2 * NUM_COLUMNS
+
+
+def test_other_packets_and_lost_ones_are_left_out(tmp_path: Path) -> None:
+    """Inertial packets, another sensor's, a datagram that lost a fragment, and a column marked as not valid."""
+    image = np.full((NUM_COLUMNS, 2), 3000)
+    image[0] = -3000
+    packets = list(frames("LEGACY", [image, image]))
+    sent = [datagrams(b"inertia" * 7, port=7503), *(datagrams(p, number=i) for i, p in enumerate(packets))]
+    sent.append(datagrams(packets[0], port=7600))
+    split = datagrams(packets[5], number=5, mtu=64)
+    sent[6] = split[:1] + split[2:]
+    dataset = open_dataset(write(tmp_path, [frame for group in sent for frame in group], metadata("LEGACY")))
+    assert [len(scan.points) for scan in dataset] == [2 * 15, 2 * 11]
+
+
+def test_recording_cut_short_is_read_up_to_the_cut(tmp_path: Path) -> None:
+    file = record(tmp_path, "LEGACY", [np.full((NUM_COLUMNS, 2), 3000)] * 2)
+    file.write_bytes(file.read_bytes()[:-10])
+    assert [len(scan.points) for scan in open_dataset(file)] == [32, 24]
+
+
+def test_older_metadata_without_sections_are_read_as_well(tmp_path: Path) -> None:
+    file = record(tmp_path, "LEGACY", [one_return(8, 0, 2000)])
+    flat = {key: value for section in metadata("LEGACY").values() for key, value in section.items()}
+    del flat["udp_profile_lidar"], flat["udp_port_lidar"]
+    (tmp_path / "drive.json").write_text(json.dumps(flat))
+    np.testing.assert_allclose(open_dataset(file)[0].points, [[2.0, 0.0, 0.036]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "start", "message"),
+    [
+        (None, b"", r"metadata are missing: put them beside the recording as drive\.json"),
+        (metadata("RGB"), b"", "packets of profile RGB; known: LEGACY"),
+        (metadata("LEGACY", lidar_intrinsics={}), b"", "has no key 'lidar_to_sensor_transform'"),
+        (metadata("RNG19_RFL8_SIG16_NIR16"), b"", "finds no scan in it"),
+        (metadata("LEGACY"), b"\x0a\x0d\x0d\x0a", "not the classic pcap format; convert it with `editcap"),
+        (metadata("LEGACY"), b"nonsense", "not the classic pcap format"),
+    ],
+)
+def test_unusable_recordings_are_refused_with_the_reason(
+    tmp_path: Path, metadata: dict | None, start: bytes, message: str
+) -> None:
+    file = record(tmp_path, "LEGACY", [one_return(8, 0, 2000)])
+    file.write_bytes(start + file.read_bytes()[len(start) :])
+    (tmp_path / "drive.json").unlink()
+    if metadata is not None:
+        (tmp_path / "drive.json").write_text(json.dumps(metadata))
+    with pytest.raises(SegslamError, match=message):
+        open_dataset(file)
+
+
+def test_unknown_link_and_empty_file_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match="unknown link type 9"):
+        open_dataset(write(tmp_path, [], metadata("LEGACY"), link=9))
+    (tmp_path / "drive.pcap").write_bytes(b"")
+    with pytest.raises(SegslamError, match=r"drive\.pcap: cannot be opened as ouster data"):
+        open_dataset(tmp_path / "drive.pcap")

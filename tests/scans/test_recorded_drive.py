@@ -1,0 +1,99 @@
+"""Recordings made by others' writers, from the file to the map."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from helpers.commands import run
+from helpers.recorded_drive import (
+    FIRST_STAMP_NS,
+    OTHER_TOPIC,
+    SWEEP_NS,
+    TOPIC,
+    clouds,
+    truth,
+    write_bag1,
+    write_bag2,
+    write_mcap,
+)
+
+from segslam.core.evaluation import trajectory_metrics
+from segslam.core.trajectory import read_poses
+from segslam.core.types import SegslamError
+from segslam.scans import open_dataset
+
+pytestmark = pytest.mark.usefixtures("short_runs")
+
+
+@pytest.mark.parametrize(
+    ("write", "name"), [(write_mcap, "drive.mcap"), (write_bag1, "drive.bag"), (write_bag2, "drive")]
+)
+def test_a_recording_gives_its_points_with_times_in_step_and_its_stamps(
+    tmp_path: Path, write: Callable[[Path], Path], name: str
+) -> None:
+    dataset = open_dataset(write(tmp_path / name), topic=TOPIC)
+    assert len(dataset) == len(clouds())
+    for row in (0, 1, 7):
+        scan, (stamp_ns, rows) = dataset[row], clouds()[row]
+        returned = rows[np.isfinite(rows["x"])]
+        assert scan.stamp_ns == stamp_ns, "the header's, not when it was received"
+        np.testing.assert_array_equal(scan.points, np.column_stack([returned[axis] for axis in "xyz"]))
+        np.testing.assert_allclose(scan.times, returned["t"] / SWEEP_NS, atol=1e-12)
+
+
+def _ate_m(folder: Path) -> float:
+    """Error without the first scans: the recording starts at full speed, and the first sweeps cannot be deskewed."""
+    poses = read_poses(folder / "odometry_tum.txt")
+    return trajectory_metrics(poses.T_a_b[8:], truth().T_world_lidar[8:])["ate_m"]
+
+
+@pytest.mark.slow
+def test_times_of_points_make_the_map_of_a_recording_better(tmp_path: Path) -> None:
+    recording = write_mcap(tmp_path / "drive.mcap")
+    errors_m = {}
+    for deskew in (True, False):
+        out = tmp_path / f"deskew-{deskew}"
+        command = ("map", recording, "--topic", TOPIC, "--out", out, "--quiet")
+        assert run(*command, "--set", f"odometry.deskew={deskew}") == 0
+        errors_m[deskew] = _ate_m(out)
+    assert errors_m[True] < 0.8 * errors_m[False], "the first sweeps, which cannot be corrected, are in both"
+    stamps_ns = read_poses(out / "odometry_tum.txt").stamp_ns
+    np.testing.assert_allclose(stamps_ns, FIRST_STAMP_NS + SWEEP_NS * np.arange(len(clouds())), rtol=0, atol=1_000)
+
+
+def test_a_recording_with_several_topics_needs_the_option_topic(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write_mcap(tmp_path / "drive.mcap")
+    for options in ((), ("--topic", "/camera")):
+        assert run("map", recording, *options, "--out", tmp_path / "run") == 2
+        assert f"--topic {OTHER_TOPIC}, --topic {TOPIC}" in capsys.readouterr().err
+
+
+def test_a_recording_without_an_index_is_reported_with_the_remedy(tmp_path: Path) -> None:
+    recording = write_mcap(tmp_path / "drive.mcap")
+    recording.write_bytes(recording.read_bytes()[:-100])
+    with pytest.raises(SegslamError, match=r"drive\.mcap: .*no index.*mcap recover"):
+        open_dataset(recording, topic=TOPIC)
+
+
+def test_folders_of_clouds_are_mapped_as_the_recording_of_them(tmp_path: Path) -> None:
+    (tmp_path / "ply").mkdir()
+    (tmp_path / "pcd").mkdir()
+    for number, (_, rows) in enumerate(clouds()[:5]):
+        rows = rows[np.isfinite(rows["x"])]
+        cloud = o3d.t.geometry.PointCloud(np.column_stack([rows[axis] for axis in "xyz"]))
+        cloud.point["t"] = o3d.core.Tensor(rows["t"].astype(np.float32)[:, None])
+        for suffix in ("ply", "pcd"):
+            o3d.t.io.write_point_cloud(str(tmp_path / suffix / f"{number}.{suffix}"), cloud)
+    recording = write_mcap(tmp_path / "drive.mcap")
+    poses = []
+    for data, options in ((recording, ("--topic", TOPIC)), (tmp_path / "ply", ()), (tmp_path / "pcd", ())):
+        out = tmp_path / f"run-{data.name}"
+        words = ("map", data, "--out", out, "--frames", "0:5", "--quiet", *options)
+        assert run(*words, "--set", "adjustment.max_minutes=0") == 0
+        poses.append(read_poses(out / "odometry_tum.txt").T_a_b)
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-4)  # times in float32
+    np.testing.assert_allclose(poses[2], poses[0], atol=1e-4)

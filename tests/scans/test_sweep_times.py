@@ -1,0 +1,42 @@
+"""Times within a sweep, whatever the unit, the origin and the part of the sweep that has returns."""
+
+import numpy as np
+import pytest
+
+from segslam.scans.sweep_times import sweep_times
+
+SHARES = np.linspace(0.125, 0.875, 7)  # nothing is seen in the first and the last eighth of the turn
+
+
+@pytest.mark.parametrize("unit_s", [1.0, 1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("origin", ["start", "end", "absolute"])
+def test_a_sweep_without_returns_at_its_seam_is_not_stretched(unit_s: float, period_s: float, origin: str) -> None:
+    stamp_s = 1.7e9
+    start_s = {"start": 0.0, "end": -period_s, "absolute": stamp_s}[origin]
+    times = (start_s + SHARES * period_s) / unit_s
+    np.testing.assert_allclose(sweep_times(times, 7, stamp_s), SHARES, atol=1e-5)  # 1.7e9 s to 0.24 microseconds
+
+
+def test_shares_of_a_sweep_stay_as_they_are() -> None:
+    np.testing.assert_array_equal(sweep_times(SHARES, 7), SHARES)
+
+
+def test_times_that_fit_no_period_are_scaled_by_the_first_and_last_point() -> None:
+    for times in (np.array([10.0, 20.0, 15.0]), np.array([0.0, 0.0664, 0.0332])):  # 15 Hz
+        np.testing.assert_allclose(sweep_times(times, 3), [0.0, 1.0, 0.5])
+
+
+def test_a_full_sweep_begins_at_0_and_ends_within_the_period() -> None:
+    times = np.linspace(0.0, 0.1008, 11)  # the sensor turns a little slower than it should
+    shares = sweep_times(times, 11)
+    assert shares[0] == 0.0
+    assert shares[-1] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("times", "num_points"),
+    [([], 3), ([0.0, 0.1], 3), ([0.05, 0.05, 0.05], 3), ([0.0, np.nan, 0.1], 3), ([], 0)],
+)
+def test_missing_times_give_none(times: list[float], num_points: int) -> None:
+    assert len(sweep_times(np.array(times), num_points)) == 0

@@ -1,0 +1,74 @@
+"""Submaps of a yard."""
+
+import numpy as np
+import pytest
+from helpers.yards import seen
+
+from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.core import geometry
+from segslam.core.config import RefineConfig
+from segslam.slam.adjustment.alignment import _normal_equations, align
+from segslam.slam.adjustment.submaps import Submap, Submaps, members
+
+WAY_M = 12.0
+
+
+def submap(x_m: float, *, low_deg: float = 0.0, pitch_deg: float = 0.0, seed: int = 0) -> Submap:
+    """One scan."""
+    points = seen(x_m, low_deg=low_deg, pitch_deg=pitch_deg, seed=seed).astype(np.float32)
+    made = Submaps(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())
+    return made.submap(0)
+
+
+def guess() -> np.ndarray:
+    return geometry.transform(np.eye(3), [WAY_M + 0.2, 0.1, 0.05])
+
+
+def test_a_pitch_is_found() -> None:
+    found = align(submap(WAY_M / 2, pitch_deg=0.2, seed=1), submap(-WAY_M / 2), guess())
+    assert found is not None
+    assert np.degrees(geometry.log(found.T_target_source)[1]) == pytest.approx(0.2, abs=0.02)
+    np.testing.assert_allclose(found.T_target_source[:3, 3], [WAY_M, 0.0, 0.0], atol=0.02)
+
+
+def test_the_pose_of_low_beams_is_pitched() -> None:
+    found = align(submap(WAY_M / 2, low_deg=0.2, seed=1), submap(-WAY_M / 2, low_deg=0.2), guess())
+    assert found is not None
+    assert abs(np.degrees(geometry.log(found.T_target_source)[1])) > 0.05
+
+
+def test_swapped_submaps_have_the_inverse_pose() -> None:
+    source, target = submap(WAY_M / 2, seed=1), submap(-WAY_M / 2)
+    forwards, backwards = align(source, target, guess()), align(target, source, geometry.inverse(guess()))
+    assert forwards is not None
+    assert backwards is not None
+    np.testing.assert_allclose(forwards.T_target_source @ backwards.T_target_source, np.eye(4), atol=0.01)
+
+
+def test_submaps_that_share_nothing_are_not_aligned() -> None:
+    far = geometry.transform(np.eye(3), [200.0, 0.0, 0.0])
+    assert align(submap(0.0), submap(0.0, seed=1), far) is None
+
+
+def test_the_gradient_is_the_derivative_of_the_cost() -> None:
+    rng = np.random.default_rng(0)
+    source, target = rng.normal(scale=5.0, size=(2, 40, 3))
+    normals = rng.normal(size=(40, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    nearest, near = np.arange(40), np.ones(40, dtype=bool)
+    width = 1e3  # nearly least squares
+
+    def system(xi: np.ndarray) -> tuple:
+        T = np.ascontiguousarray(geometry.exp(xi))
+        return _normal_equations(source, normals @ T[:3, :3], target, normals, nearest, near, T, width)
+
+    _, gradient, *_ = system(np.zeros(6))
+    steps = 1e-6 * np.eye(6)
+    numeric = [(system(step)[2] - system(-step)[2]) / 4e-6 for step in steps]
+    np.testing.assert_allclose(gradient, numeric, rtol=1e-3, atol=1e-3 * np.abs(gradient).max())
+
+
+def test_a_submap_does_not_reach_across_a_break() -> None:
+    travel_m = np.array([0.0, 2.0, 4.0, BREAK_TRAVEL_M + 6.0, BREAK_TRAVEL_M + 8.0])
+    assert members(2, travel_m, reach=2) == [0, 1, 2]
+    assert members(3, travel_m, reach=2) == [3, 4]

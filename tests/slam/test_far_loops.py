@@ -1,0 +1,166 @@
+"""Loops found by place recognition only: the odometry error exceeds any search radius."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.drives import drifting, round_drive
+
+from segslam.core import geometry
+from segslam.core.config import OdometryConfig, load_config
+from segslam.core.types import (
+    LoopAttempt,
+    LoopClosure,
+    Motion,
+    MotionState,
+    Rejected,
+    RejectReason,
+    Scan,
+    Trajectory,
+)
+from segslam.odometry import GivenOdometry, OdometryResult
+from segslam.slam.slam import Slam
+from segslam.slam.slam_result import SlamResult
+
+PLAIN = ("health.check=false", "adjustment.max_minutes=0")
+"""Loops alone."""
+FAR_DEG = 1.0
+"""20 m off after a round of 113 m."""
+
+
+def mapped(turn_deg: float, *settings: str) -> SlamResult:
+    """The drive with an odometry that turns too far, by so much in each step of 2.2 m."""
+    return mapped_and_tried(turn_deg, *settings)[0]
+
+
+@cache
+def mapped_and_tried(turn_deg: float, *settings: str, tries_loops: bool = True) -> tuple[SlamResult, list[LoopAttempt]]:
+    """The same with the attempts as they came; without `tries_loops` they come at the end only."""
+    config = load_config(None, [*PLAIN, *settings])
+    odometry = drifting(round_drive()[1], turn_deg=turn_deg)
+    slam = Slam(config, odometry=GivenOdometry(odometry, config.odometry))
+    tried: list[LoopAttempt] = []
+    for scan in round_drive()[0]:
+        tried += slam.close_loops(slam.track(scan), tries_loops=tries_loops).attempts
+    return slam.finish(), tried
+
+
+@pytest.mark.slow
+def test_keyframes_that_were_skipped_are_searched_by_appearance_at_the_end() -> None:
+    result, tried = mapped_and_tried(FAR_DEG, tries_loops=False)
+    assert tried == []
+    assert len(result.closures()) >= 3
+    assert result.errors(round_drive()[1])["ate_m"] < 0.6
+
+
+def test_each_pair_has_the_last_of_its_outcomes() -> None:
+    result, tried = mapped_and_tried(FAR_DEG)
+    pairs = [(one.candidate.source_id, one.candidate.target_id) for one in result.attempts]
+    assert len(pairs) == len(set(pairs)) < len(tried)
+    closed = {(one.source_id, one.target_id) for one in result.closures()}
+    waited = {
+        (one.candidate.source_id, one.candidate.target_id)
+        for one in tried
+        if isinstance(one.outcome, Rejected) and one.outcome.reason is RejectReason.UNCONFIRMED
+    }
+    assert closed & waited
+    late = result.attempts[len(result.attempts) - result.num_late_attempts :]
+    assert {(one.candidate.source_id, one.candidate.target_id) for one in late} <= set(pairs)
+
+
+def test_a_drive_whose_odometry_is_far_off_closes_by_place_recognition() -> None:
+    truth = round_drive()[1]
+    blind = mapped(FAR_DEG, "retrieval.enabled=false")
+    assert not blind.closures()
+    result = mapped(FAR_DEG)
+    assert blind.errors(truth)["ate_m"] > 5.0
+    assert result.errors(truth)["ate_m"] < 0.4
+    assert len(result.closures()) >= 4
+    assert min(result.estimate.closure_weights.values()) > 0.5
+    for closure in result.closures():
+        rows = result.keyframe_rows[[closure.target_id, closure.source_id]]
+        T_true = np.linalg.inv(truth.T_world_lidar[rows[0]]) @ truth.T_world_lidar[rows[1]]
+        assert np.linalg.norm(closure.T_target_source[:3, 3] - T_true[:3, 3]) < 0.3
+
+
+def test_one_keyframe_alone_closes_no_far_loop() -> None:
+    _, tried = mapped_and_tried(FAR_DEG)
+    outcomes = [attempt.outcome for attempt in tried if attempt.candidate.search_radius_m > 20.0]
+    first_closure = next(k for k, outcome in enumerate(outcomes) if isinstance(outcome, LoopClosure))
+    unconfirmed = [
+        outcome
+        for outcome in outcomes[:first_closure]
+        if not isinstance(outcome, LoopClosure) and outcome.reason is RejectReason.UNCONFIRMED
+    ]
+    assert len(unconfirmed) >= 2
+
+
+def test_a_drive_whose_odometry_is_good_closes_by_proximity_as_before() -> None:
+    before, after = mapped(0.15, "retrieval.enabled=false"), mapped(0.15)
+    pairs = [[(closure.source_id, closure.target_id) for closure in run.closures()] for run in (before, after)]
+    assert pairs[0] == pairs[1]
+    assert pairs[0]
+    np.testing.assert_array_equal(before.trajectory.T_world_lidar, after.trajectory.T_world_lidar)
+
+
+class Carried(GivenOdometry):
+    """Odometry of a sensor that is carried elsewhere before one scan; that motion is unknown."""
+
+    def __init__(self, trajectory: Trajectory, config: OdometryConfig, *, first_after: int) -> None:
+        super().__init__(trajectory, config)
+        self._first_after = first_after
+
+    def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
+        found = super().register(scan, gap=gap)
+        if scan.index != self._first_after:
+            return found
+        return replace(found, motion=Motion(MotionState.BROKEN, information=1e-3 * np.eye(6)))
+
+
+BEFORE, AFTER = 30, 55
+"""The sensor is carried from one scan to the other, which is in the second round, near scan 4 of the first."""
+
+
+@cache
+def carried() -> tuple[SlamResult, list[LoopAttempt]]:
+    """The drive of a sensor that is carried."""
+    scans, truth = round_drive()
+    before, after = BEFORE, AFTER
+    kept = [*range(before), *range(after, len(scans))]
+    odometry = drifting(truth)
+    T_odom = odometry.T_world_lidar.copy()
+    T_odom[after:] = T_odom[before - 1] @ geometry.inverse(T_odom[after]) @ T_odom[after:]
+    config = load_config(None, [*PLAIN])
+    given = Carried(replace(odometry, T_world_lidar=T_odom), config.odometry, first_after=after)
+    slam = Slam(config, odometry=given)
+    tried = [attempt for number in kept for attempt in slam.process(scans[number]).attempts]
+    return slam.finish(), tried
+
+
+def test_a_sensor_that_was_carried_to_an_older_place_is_found_there() -> None:
+    (result, _), truth = carried(), round_drive()[1]
+    assert [motion.is_break for motion in result.motions].index(True) == BEFORE
+    assert len(result.closures()) >= 3
+    off_m = np.linalg.norm(result.trajectory.T_world_lidar[BEFORE:, :3, 3] - _from_first(truth)[AFTER:], axis=1)
+    assert off_m.max() < 1.0
+
+
+def test_a_loop_across_a_break_waits_for_two_others() -> None:
+    result, tried = carried()
+    across = [
+        attempt.outcome
+        for attempt in tried
+        if result.keyframe_rows[attempt.candidate.source_id]
+        >= BEFORE
+        > result.keyframe_rows[attempt.candidate.target_id]
+    ]
+    first_closure = next(k for k, outcome in enumerate(across) if isinstance(outcome, LoopClosure))
+    waited = [outcome.reason for outcome in across[:first_closure] if isinstance(outcome, Rejected)]
+    assert waited.count(RejectReason.UNCONFIRMED) >= 2
+    assert all(isinstance(outcome, LoopClosure) for outcome in across[first_closure : first_closure + 3])
+
+
+def _from_first(truth: Trajectory) -> np.ndarray:
+    """(n, 3) positions in the frame of the first scan."""
+    return (geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar)[:, :3, 3]

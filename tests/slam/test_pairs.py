@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+
+from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.slam.adjustment import pairs
+from segslam.slam.adjustment.pairs import all_pairs, pairs_along, pairs_between_passes
+
+RADIUS_M = 5.0
+
+
+@pytest.fixture(autouse=True)
+def _short_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Distances that suit the drives of these tests."""
+    monkeypatch.setattr(pairs, "STEPS", (3, 6))
+    monkeypatch.setattr(pairs, "RADIUS_M", RADIUS_M)
+
+
+def poses(places: np.ndarray) -> np.ndarray:
+    T_world = np.tile(np.eye(4), (len(places), 1, 1))
+    T_world[:, :3, 3] = places
+    return T_world
+
+
+def there_and_back(*, height_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """100 m ahead and back, 3 m beside."""
+    ahead = np.column_stack([np.arange(0.0, 100.0, 2.0), np.zeros((50, 2))])
+    back = ahead[::-1] + np.array([0.0, 3.0, height_m])
+    places = np.vstack([ahead, back])
+    return poses(places), np.arange(len(places)) * 2.0
+
+
+def test_pairs_along_the_drive_have_the_configured_distances_and_no_break_between() -> None:
+    travel_m = np.arange(12) * 2.0
+    assert pairs_along(travel_m).tolist() == [
+        [0, 3],
+        [2, 5],
+        [4, 7],
+        [6, 9],
+        [8, 11],
+        [0, 6],
+        [2, 8],
+        [4, 10],
+    ]
+    travel_m[5:] += BREAK_TRAVEL_M
+    assert pairs_along(travel_m).tolist() == [[0, 3], [6, 9], [8, 11]]
+
+
+def test_each_node_is_paired_with_the_nearest_of_another_pass() -> None:
+    T_world, travel_m = there_and_back()
+    pairs = pairs_between_passes(T_world, travel_m, min_travel_m=50.0)
+    assert len(pairs)
+    assert (travel_m[pairs[:, 1]] - travel_m[pairs[:, 0]] >= 50.0).all()
+    apart_m = np.linalg.norm(T_world[pairs[:, 0], :3, 3] - T_world[pairs[:, 1], :3, 3], axis=1)
+    assert apart_m.max() < RADIUS_M
+    assert len(np.unique(pairs[:, 1])) == len(pairs)
+
+
+def test_passes_on_two_storeys_are_not_paired() -> None:
+    T_world, travel_m = there_and_back(height_m=2.6)
+    assert not len(pairs_between_passes(T_world, travel_m, min_travel_m=50.0))
+
+
+def test_pairs_are_sorted_by_source_and_too_short_a_drive_has_none() -> None:
+    T_world, travel_m = there_and_back()
+    pairs = all_pairs(T_world, travel_m, min_travel_m=50.0)
+    assert (np.diff(pairs[:, 1]) >= 0).all()
+    assert all_pairs(T_world[:2], travel_m[:2], min_travel_m=50.0).shape == (0, 2)

@@ -1,0 +1,106 @@
+"""A drive along a walled yard, whose odometry bends."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.yards import seen
+
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.points import voxel_first
+from segslam.core.types import Alignment, LoopClosure, Registration
+from segslam.graph import PoseGraph
+from segslam.slam.adjustment import Adjusted, adjust
+
+STEP_M = 2.0
+NUM = 40
+CONFIG = Config()
+TRUE_M = np.arange(NUM) * STEP_M - NUM * STEP_M / 2
+T_TRUE = np.array([geometry.transform(np.eye(3), [x_m, 0.0, 0.0]) for x_m in TRUE_M])
+
+
+@cache
+def points(keyframe_id: int, low_deg: float = 0.0) -> np.ndarray:
+    made = seen(float(TRUE_M[keyframe_id]), low_deg=low_deg, seed=keyframe_id).astype(np.float32)
+    return made[voxel_first(made, 0.25)]
+
+
+def graph(*, pitch_deg: float = 0.02) -> PoseGraph:
+    """Each motion of the odometry is pitched a little, so that the drive bends upwards."""
+    bend = geometry.exp(geometry.tangent(rotation_rad=[0.0, np.radians(-pitch_deg), 0.0], translation_m=0.0))
+    T_step = geometry.transform(np.eye(3), [STEP_M, 0.0, 0.0]) @ bend
+    made, T_odom = PoseGraph(CONFIG.graph), np.eye(4)
+    for keyframe_id in range(NUM):
+        made.add_keyframe(keyframe_id, T_odom, STEP_M * keyframe_id)
+        T_odom = T_odom @ T_step
+    return made
+
+
+@cache
+def straightened() -> tuple[PoseGraph, Adjusted | None]:
+    """The adjusted graph of the bent drive; only read."""
+    made = graph()
+    return made, adjust(made, made.finish(), points, config=CONFIG)
+
+
+def error_m(made: PoseGraph) -> float:
+    """Of the last keyframe, seen from the first."""
+    T_first_last = geometry.inverse(made.T_world_keyframes[0]) @ made.T_world_keyframes[-1]
+    return geometry.distance(geometry.inverse(T_TRUE[0]) @ T_TRUE[-1] @ geometry.inverse(T_first_last))
+
+
+def test_submaps_straighten_a_bent_drive_and_its_surfaces_become_thinner() -> None:
+    before = error_m(graph())
+    made, found = straightened()
+    assert found is not None
+    assert error_m(made) < 0.4 * before
+    assert found.record.is_complete
+    assert found.record.correction_deg == 0.0
+    assert found.record.thickness_m is not None
+    assert found.record.thickness_before_m is not None
+    assert found.record.thickness_m < found.record.thickness_before_m
+    np.testing.assert_array_equal(found.after.T_world_keyframe[NUM - 1], made.T_world_keyframes[-1])
+
+
+def test_low_beams_are_measured_and_do_not_bend_the_drive() -> None:
+    made = graph(pitch_deg=0.0)
+    found = adjust(made, made.finish(), lambda keyframe_id: points(keyframe_id, 0.2), config=CONFIG)
+    assert found is not None
+    assert found.record.correction_deg == pytest.approx(0.2, abs=0.03)
+    assert error_m(made) < 0.05
+
+
+def test_the_adjustment_repeats_exactly() -> None:
+    again = graph()
+    adjust(again, again.finish(), points, config=CONFIG)
+    np.testing.assert_array_equal(again.T_world_keyframes, straightened()[0].T_world_keyframes)
+
+
+def test_one_wrong_loop_left_in_does_no_more_harm_than_without_the_adjustment() -> None:
+    T_wrong = geometry.inverse(T_TRUE[0]) @ T_TRUE[-1] @ geometry.transform(np.eye(3), [0.0, 2.5, 0.0])
+    information = np.eye(6) * 1e4
+    fine = Registration(T_wrong, 1000, 800, 0.05, information)
+    closure = LoopClosure(NUM - 1, 0, T_wrong, information, Alignment(fine, fine, 0.8, 0.05, 0.0))
+    errors = []
+    for minutes in (0.0, 60.0):
+        made = graph(pitch_deg=0.005)
+        made.add_closure(closure)
+        config = CONFIG.model_copy(update={"adjustment": CONFIG.adjustment.model_copy(update={"max_minutes": minutes})})
+        adjust(made, made.finish(), points, config=config)
+        errors.append(error_m(made))
+    assert errors[1] <= 1.02 * errors[0]
+
+
+def test_no_time_leaves_the_graph_unchanged() -> None:
+    made = graph()
+    before = made.finish()
+    off = CONFIG.model_copy(update={"adjustment": CONFIG.adjustment.model_copy(update={"max_minutes": 0.0})})
+    T_before = made.T_world_keyframes.copy()
+    assert adjust(made, before, points, config=off) is None
+    np.testing.assert_array_equal(made.T_world_keyframes, T_before)
+
+
+def test_keyframes_without_points_are_not_adjusted() -> None:
+    made = graph()
+    assert adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), config=CONFIG) is None

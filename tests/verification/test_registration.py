@@ -1,0 +1,209 @@
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.drives import round_drive
+from helpers.rooms import ground_and_walls
+
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.core.stopwatch import Stopwatch
+from segslam.core.types import Alignment, Label, Registration, Rejected, RejectReason
+from segslam.registration import refinement, segregator
+from segslam.registration.free_space import observe_free_space
+from segslam.registration.hypotheses import anywhere, coarse_poses
+from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.verification import register, register_near, register_prepared, rivals, score
+from segslam.verification.trial import Found, Trial
+
+CONFIG = Config()
+
+
+def _error(T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
+    T = geometry.inverse(T_a) @ T_b
+    return geometry.distance(T), float(np.degrees(geometry.angle(T)))
+
+
+def _round_pair() -> tuple[PreparedScan, PreparedScan, np.ndarray]:
+    scans, truth = round_drive()
+    source, target = (prepare_scan(scans[i].points, scans[i].labels, config=CONFIG) for i in (3, 0))
+    return source, target, geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[3]
+
+
+def test_a_stopwatch_can_be_sent_to_another_process() -> None:
+    watch = Stopwatch()
+    watch.add("refine", 0.5)
+    sent = pickle.loads(pickle.dumps(watch))
+    sent.add("refine", 0.25)
+    assert (watch.seconds, sent.seconds) == ({"refine": 0.5}, {"refine": 0.75})
+
+
+@pytest.mark.parametrize("turn_deg", [0, 90, 180])
+def test_two_scans_of_a_place_are_aligned_from_any_yaw(turn_deg: float) -> None:
+    scans, truth = round_drive()
+    T_turned_source = geometry.transform(geometry.yaw(np.radians(turn_deg)), [0.0, 0.0, 0.0])
+    source, target = scans[3], scans[0]
+    found = register(
+        geometry.apply(T_turned_source, source.points),
+        target.points,
+        source_labels=source.labels,
+        target_labels=target.labels,
+    )
+    T_target_source = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[3]
+    assert isinstance(found, Alignment)
+    metres, degrees = _error(T_target_source @ geometry.inverse(T_turned_source), found.fine.T_target_source)
+    assert metres < 0.05
+    assert degrees < 0.2
+
+
+def test_a_gate_rejects_a_coarse_pose_before_it_is_refined() -> None:
+    source, target, _ = _round_pair()
+    watch = Stopwatch()
+    no = Rejected(RejectReason.FAR_FROM_PRIOR)
+    assert register_prepared(source, target, config=CONFIG, gate=lambda pose, *, slack_m: no, watch=watch) is no
+    assert set(watch.seconds) == {"match"}
+
+
+def test_a_gate_sees_the_refined_pose_too_which_moves_no_farther() -> None:
+    source, target, T_target_source = _round_pair()
+    seen: list[tuple[float, float]] = []
+
+    def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
+        seen.append((slack_m, _error(T_target_source, pose)[0]))
+        return Rejected(RejectReason.FAR_FROM_PRIOR, "refined") if slack_m == 0.0 else None
+
+    found = register_prepared(source, target, config=CONFIG, gate=gate)
+    assert isinstance(found, Rejected)
+    assert found.detail == "refined"
+    slack_m, error_m = zip(*seen, strict=True)
+    assert slack_m[0] == CONFIG.verify.max_coarse_fine_m
+    assert error_m[slack_m.index(0.0)] < 0.05
+
+
+def test_poses_that_the_prior_excludes_do_not_use_up_the_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a corridor, where the poses that fit best are turned round."""
+    source, target, T_target_source = _round_pair()
+    (right, *_) = segregator.hypotheses(source.description, target.description, config=CONFIG.segregator)
+    turned = replace(right, T_target_source=right.T_target_source @ geometry.transform(geometry.yaw(np.pi), 0.0))
+    ranked = [turned] * CONFIG.verify.max_hypotheses + [right]
+    monkeypatch.setattr(segregator, "hypotheses", lambda *_, **__: ranked)
+    config = Config.model_validate({"verify": {"max_plan_hypotheses": 0}})
+
+    def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
+        turn_deg = _error(T_target_source, pose)[1]
+        return Rejected(RejectReason.FAR_FROM_PRIOR) if turn_deg > 20.0 else None
+
+    assert isinstance(register_prepared(source, target, config=config, gate=gate), Alignment)
+
+
+def test_poses_that_the_prior_excludes_are_rivals() -> None:
+    """A yard that looks the same turned by 180 degrees; the prior excludes the pose that is turned."""
+    points, labels = ground_and_walls()
+    rng = np.random.default_rng(0)
+    source, target = (
+        prepare_scan((points + rng.normal(0.0, 0.03, points.shape)).astype(np.float32), labels, config=CONFIG)
+        for _ in range(2)
+    )
+
+    def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
+        return Rejected(RejectReason.FAR_FROM_PRIOR) if geometry.angle(pose) > 0.5 else None
+
+    found = register_prepared(source, target, config=CONFIG, gate=gate)
+    assert isinstance(found, Rejected)
+    assert found.reason is RejectReason.AMBIGUOUS
+    assert found.probability is not None
+    assert found.probability < 0.999
+    assert found.evidence["other_pose"] < -5.0
+
+
+def test_shifts_that_others_led_past_are_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refinement that leads to the next multiple of 3 m below: 6 from 8 m, 3 from 5 m, 0 from 2 m."""
+    tried: list[float] = []
+
+    def led(coarse: Registration, *_: object) -> rivals._Start:
+        tried.append(float(coarse.T_target_source[0, 3]))
+        T_led = geometry.transform(np.eye(3), [tried[-1] // 3 * 3.0, 0.0, 0.0])
+        return rivals._Start(replace(coarse, T_target_source=T_led), 0.0)
+
+    monkeypatch.setattr(rivals, "_led", led)
+    trial, found = _found_pose()
+    found = found._replace(fine=Registration(np.eye(4), 1, 1, 0.1, np.eye(6)))
+    ends = [start.coarse.T_target_source[0, 3] for start in rivals._shifted(found, np.array([1.0, 0.0, 0.0]), trial)]
+    assert tried == [8.0, 5.0, 2.0]
+    assert ends == [6.0, 3.0, 0.0]
+
+
+@pytest.mark.parametrize(("off_m", "is_found"), [(0.4, True), (2.5, False)])
+def test_near_a_known_pose_no_others_are_tried(off_m: float, is_found: bool) -> None:
+    source, target, T_target_source = _round_pair()
+    T_known = T_target_source @ geometry.transform(np.eye(3), [off_m, 0.0, 0.0])
+    found = register_near(source, target, T_known, config=CONFIG, watch=Stopwatch())
+    assert isinstance(found, Alignment) == is_found
+    if isinstance(found, Alignment):
+        assert _error(T_target_source, found.fine.T_target_source)[0] < 0.05
+        assert "other_pose" not in found.evidence
+
+
+@pytest.mark.parametrize(("beside_m", "least", "num_refined", "leads"), [(0.9, 0, 1, True), (0.9, 99, 0, False)])
+def test_the_first_iterations_decide_whether_a_rival_is_refined(
+    beside_m: float, least: int, num_refined: int, leads: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pose from which refinement starts is beside the one to which it leads; `least` is added to its lead."""
+    trial, found = _found_pose()
+    monkeypatch.setattr(rivals, "_is_found", lambda *_: False)
+    lead = rivals._lead
+    monkeypatch.setattr(rivals, "_lead", lambda *given: lead(*given) + least)
+    refined = []
+    refine = refinement.refine
+    monkeypatch.setattr(refinement, "refine", lambda *given, **named: refined.append(1) or refine(*given, **named))
+    T_beside = found.T_target_source @ geometry.transform(np.eye(3), [beside_m, 0.0, 0.0])
+    led = rivals._led(replace(found.coarse, T_target_source=T_beside), found, trial)
+    assert (led is not None, len(refined)) == (leads, num_refined)
+
+
+def _found_pose() -> tuple[Trial, Found]:
+    source, target, _ = _round_pair()
+    trial = Trial(source, target, CONFIG, anywhere, Stopwatch(), score.shipped())
+    (coarse, *_) = (one for one in coarse_poses(trial.pair) if isinstance(one, Registration))
+    found = trial.refined(coarse, coarse.T_target_source)
+    assert isinstance(found, Found)
+    return trial, found
+
+
+def test_moving_classes_are_in_neither_surface_nor_free_space() -> None:
+    points = round_drive()[0][0].points
+    labels = np.full(len(points), Label.BUILDING, dtype=np.uint8)
+    ahead = points[:, 0] > 0.0
+    moving = prepare_scan(points, np.where(ahead, np.uint8(Label.MOVING_CAR), labels), config=CONFIG)
+    without = prepare_scan(points[~ahead], labels[~ahead], config=CONFIG)
+    assert moving.surface.points[:, 0].max() < 0.5
+    np.testing.assert_array_equal(moving.surface.points, without.surface.points)
+    np.testing.assert_array_equal(moving.free_space.nearest_m, without.free_space.nearest_m)
+
+
+def test_the_view_of_gathered_points_is_that_of_the_scan_in_their_middle() -> None:
+    scans, _ = round_drive()
+    gathered = np.concatenate([scans[0].points, scans[3].points])
+    labels = np.full(len(gathered), Label.BUILDING, dtype=np.uint8)
+    prepared = prepare_scan(gathered, labels, config=CONFIG, seen_from_here=scans[0].points)
+    np.testing.assert_array_equal(prepared.free_space.nearest_m, observe_free_space(scans[0].points).nearest_m)
+    assert len(prepared.surface) > len(prepare_scan(scans[0].points, scans[0].labels, config=CONFIG).surface)
+
+
+@pytest.mark.parametrize(
+    "points", [np.empty((0, 3)), np.zeros((50, 3)), np.column_stack([np.linspace(5, 50, 500), np.zeros((500, 2))])]
+)
+def test_scans_without_usable_points_are_rejected(points: np.ndarray) -> None:
+    labels = np.ones(len(points), dtype=np.uint8)
+    assert isinstance(register(points, points, source_labels=labels, target_labels=labels), Rejected)
+    assert isinstance(register(points, points), Rejected)
+
+
+@pytest.mark.data
+def test_real_scans_of_different_places_are_rejected(real_pairs) -> None:
+    outcomes = [
+        register(real_pairs.points(source), real_pairs.points(target))
+        for source, target in ((94, 0), (198, 4413), (95, 199), (30, 198))
+    ]
+    assert all(isinstance(outcome, Rejected) for outcome in outcomes), outcomes

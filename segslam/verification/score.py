@@ -1,8 +1,9 @@
 """The probability that a pose between two scans is right, and what it is made of.
 
-A pose can be wrong in two ways: as a chance fit of two places, or because another pose explains the scans as well. The
-first is judged by the patches of the scans (`patches`): how much more often do right poses show them than the wrong
-poses that resemble them most? The second by the lead over the best other pose that was tried. The likelier way counts.
+A pose can be wrong in three ways: as a chance fit of two places; because one scan stands where the other saw through;
+or because another pose explains the scans as well. The first is judged by the patches of the scans (`patches`): how
+much more often do right poses show them than the wrong poses that resemble them most? The second by the share of
+patches in free space, the third by the lead over each other pose that was tried. The likeliest way counts.
 `tools.benchmarks.score` measures all numbers in `score.json` on pairs of scans whose poses are known.
 """
 
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from segslam.core.config import VerifyConfig
 from segslam.core.types import Vector
 from segslam.verification.patches import BINS, Agreement, Counts, Shown
 
-NO_OTHER = 12.0
+NO_OTHER = 7.0
 """Lead of a pose (standard deviations) if no other pose was found, and at most."""
 LEAST_SCATTER = 1.0
 """Least standard deviation of the sum over all patches (nats), of poses that show the same."""
@@ -49,16 +50,35 @@ class Table:
     """log of how much more often right poses show a patch of each of `BINS` than wrong ones (nats)."""
     match: tuple[float, float]
     """Slope and offset of the log odds that a pose is no chance fit, by its mean ratio."""
+    free: tuple[float, float]
+    """The same that it does not contradict free space, by the root of the share of its patches that do."""
     lead: tuple[float, float]
-    """The same that no other pose is as good, by the least lead over another pose."""
+    """The same that no other pose is as good, by the square of the least lead over another pose, with its sign."""
+    margin: float = 0.0
+    """How much more the odds of all accepted poses together are than those of the least probable of them (nats)."""
+
+    def least_odds(self, config: VerifyConfig) -> float:
+        """Log odds that an accepted pose has at least, for a share of false ones of `max_false_share` in all."""
+        return math.log((1.0 - config.max_false_share) / config.max_false_share) - self.margin
 
     def mean_ratio(self, counts: Counts) -> float:
         """Mean log ratio of a patch (nats); 0 without patches."""
         return float(counts @ self.ratios / max(counts.sum(), 1.0))
 
     def match_odds(self, counts: Counts) -> float:
-        """Log odds that a pose is no chance fit; another pose can only lower them."""
+        """Log odds of a pose whatever other poses show, which can only lower them."""
+        return -float(np.logaddexp(-self._fit_odds(counts), -self._free_odds(counts)))
+
+    def _fit_odds(self, counts: Counts) -> float:
         return self.match[0] * self.mean_ratio(counts) + self.match[1]
+
+    def _free_odds(self, counts: Counts) -> float:
+        return self.free[1] - self.free[0] * violating_root(counts)
+
+    def lead_odds(self, lead: float) -> float:
+        """Log odds that no other pose is as good, by the least lead."""
+        capped = min(lead, NO_OTHER)
+        return self.lead[0] * capped * abs(capped) + self.lead[1]
 
     def lead_of(self, found: Agreement, other: Agreement) -> float:
         """How much more likely the patches are at one pose than at another, in standard deviations of the difference.
@@ -81,14 +101,15 @@ class Table:
         log_odds = match
         if others is not None:
             lead = min((self.lead_of(found, other) for other in others), default=NO_OTHER)
-            log_odds = -float(np.logaddexp(-match, -(self.lead[0] * min(lead, NO_OTHER) + self.lead[1])))
+            log_odds = -float(np.logaddexp(-match, -self.lead_odds(lead)))
         share = self.match[0] * counts * self.ratios / max(counts.sum(), 1.0)
         evidence = {name: float(share[bins].sum()) for name, bins in PARTS.items()} | {"usual": self.match[1]}
+        evidence["free_space"] += match - self._fit_odds(counts)
         return Judged(log_odds, evidence if others is None else evidence | {"other_pose": log_odds - match})
 
     def most_lead(self, least_odds: float) -> float:
         """Lead over another pose beyond which it cannot lower the odds of a pose below `least_odds`."""
-        return (least_odds + RIVAL_NATS - self.lead[1]) / self.lead[0]
+        return math.sqrt(max(least_odds + RIVAL_NATS - self.lead[1], 0.0) / self.lead[0])
 
 
 def paired_lead(ratios: Vector, pairs: Sequence[tuple[Shown, Shown]]) -> float:
@@ -100,13 +121,13 @@ def paired_lead(ratios: Vector, pairs: Sequence[tuple[Shown, Shown]]) -> float:
     return float(each.sum() / math.sqrt(float(each @ each) + LEAST_SCATTER**2))
 
 
+def violating_root(counts: Counts) -> float:
+    """Root of the share of the patches that are in free space; two more of four count, for scans with few patches."""
+    return math.sqrt((counts[0] + 2.0) / (counts.sum() + 4.0))
+
+
 RIVAL_NATS = 3.0
 """Poses that another makes so much likelier to be right than is asked are not compared with it."""
-
-
-def least_odds(config: VerifyConfig) -> float:
-    """Log odds that an accepted pose has at least."""
-    return math.log((1.0 - config.max_false_share) / config.max_false_share)
 
 
 @cache
@@ -117,9 +138,9 @@ def shipped() -> Table:
 
 
 def table_of(content: dict[str, object]) -> Table:
-    """A table from JSON: `ratios` by the name of the bin, `match` and `lead`. Raises KeyError for a missing bin."""
-    ratios, match, lead = content["ratios"], content["match"], content["lead"]
-    assert isinstance(ratios, dict)
-    assert isinstance(match, list)
-    assert isinstance(lead, list)
-    return Table(np.array([ratios[name] for name in BINS]), (match[0], match[1]), (lead[0], lead[1]))
+    """A table from JSON: `ratios` by the name of the bin, and three lines. Raises KeyError for a missing bin."""
+    ratios: Any = content["ratios"]
+    lines: list[Any] = [content[name] for name in ("match", "free", "lead")]
+    match, free, lead = ((float(slope), float(offset)) for slope, offset in lines)
+    margin: Any = content["margin"]
+    return Table(np.array([ratios[name] for name in BINS]), match, free, lead, float(margin))

@@ -64,7 +64,7 @@ class Trial(NamedTuple):
     @property
     def least_odds(self) -> float:
         """Log odds that an accepted pose has at least."""
-        return score.least_odds(self.config.verify)
+        return self.table.least_odds(self.config.verify)
 
     @property
     def least_ratio(self) -> float:

@@ -24,7 +24,7 @@ def judged(
     """
     table = table or score.shipped()
     judgement = table.judge(found, others)
-    least = score.least_odds(config.verify)
+    least = table.least_odds(config.verify)
     if judgement.log_odds < least:
         is_ambiguous = table.match_odds(found.counts) >= least
         reason = RejectReason.AMBIGUOUS if is_ambiguous else RejectReason.IMPROBABLE

@@ -1,45 +1,79 @@
-"""Residuals that a whole patch has in common: those of wrong poses, not of noise."""
+"""What the patches of two scans show at a pose."""
+
+import math
 
 import numpy as np
 import pytest
 
-from segslam.verification.patches import common_residual_m
+from segslam.core import geometry
+from segslam.core.config import Config
+from segslam.registration.prepared import Observed, prepare_observed
+from segslam.verification.patches import BINS, agreement, first_look, patches_of
 
-WALL = np.array([[5.0, y, z] for y in np.arange(-6.0, 6.0, 0.3) for z in np.arange(-1.5, 1.5, 0.3)])
-"""A wall across x, 5 m ahead of the sensor, in points 0.3 m apart."""
-TOWARDS = np.tile([-1.0, 0.0, 0.0], (len(WALL), 1))
-
-
-@pytest.mark.parametrize("noise_m", [0.01, 0.03, 0.1])
-def test_noise_has_no_common_part(noise_m: float) -> None:
-    noise = np.random.default_rng(0).normal(scale=noise_m, size=len(WALL))
-    assert common_residual_m(WALL, TOWARDS, noise) < 0.15 * noise_m
+CONFIG = Config()
 
 
-@pytest.mark.parametrize("noise_m", [0.0, 0.03, 0.1])
-def test_a_displaced_wall_shows_in_any_noise(noise_m: float) -> None:
-    noise = np.random.default_rng(1).normal(scale=noise_m, size=len(WALL))
-    assert common_residual_m(WALL, TOWARDS, 0.2 + noise) == pytest.approx(0.2, abs=0.02)
-    recess = np.where(np.abs(WALL[:, 1]) < 1.5, 0.2, 0.0)
-    share = np.mean(recess > 0)
-    assert common_residual_m(WALL, TOWARDS, recess + noise) == pytest.approx(0.2 * np.sqrt(share), abs=0.02)
+def _room(seed: int, length_m: float = 16.0) -> Observed:
+    """A scan from the middle of a room 8 m wide, with a pillar on one side; 1 cm of noise."""
+    rng = np.random.default_rng(seed)
+    side, end, ground = (rng.uniform(-1.0, 1.0, size=(4000, 3)) for _ in range(3))
+    side *= [length_m / 2, 1.0, 1.5]
+    side[:, 1] = np.sign(side[:, 1]) * 4.0
+    end *= [1.0, 4.0, 1.5]
+    end[:, 0] = np.sign(end[:, 0]) * length_m / 2
+    ground *= [length_m / 2, 4.0, 0.0]
+    pillar = rng.uniform(-1.0, 1.0, size=(800, 3)) * [0.6, 0.6, 1.5]
+    nearest = np.abs(pillar[:, :2]).argmax(axis=1)
+    rows = np.arange(len(pillar))
+    pillar[rows, nearest] = np.sign(pillar[rows, nearest]) * 0.6
+    points = np.concatenate([side, end, ground - np.array([0.0, 0.0, 1.5]), pillar + np.array([3.0, 2.0, 0.0])])
+    points += rng.normal(scale=0.01, size=points.shape)
+    return prepare_observed(points.astype(np.float32), np.zeros(len(points), np.uint8), config=CONFIG)
 
 
-def test_the_signs_of_the_normals_do_not_matter() -> None:
-    signs = np.random.default_rng(2).choice([-1.0, 1.0], size=len(WALL))
-    found = common_residual_m(WALL, signs[:, None] * TOWARDS, signs * 0.2)
-    assert found == pytest.approx(0.2)
+def _shares(T_target_source: np.ndarray) -> dict[str, float]:
+    """Shares of the patches, by what they show."""
+    counts = agreement(_room(1), _room(2), T_target_source, config=CONFIG.verify).counts
+    return dict(zip(BINS, counts / counts.sum(), strict=True))
 
 
-def test_two_sides_of_a_corner_are_two_patches() -> None:
-    """A scan rotated relative to a corner is in front of one wall and behind the other."""
-    side = np.column_stack([WALL[:, 1] - 1.0, np.full(len(WALL), 6.0), WALL[:, 2]])
-    points, normals = np.vstack([WALL, side]), np.vstack([TOWARDS, np.tile([0.0, -1.0, 0.0], (len(side), 1))])
-    residuals_m = np.concatenate([np.full(len(WALL), 0.2), np.full(len(side), -0.2)])
-    assert common_residual_m(points, normals, residuals_m) == pytest.approx(0.2)
+def test_at_the_true_pose_patches_lie_on_the_surfaces_of_the_other_scan() -> None:
+    shares = _shares(np.eye(4))
+    assert shares["free space"] < 0.02
+    assert sum(share for name, share in shares.items() if "same normal" in name) > 0.8
+    found = agreement(_room(1), _room(2), np.eye(4), config=CONFIG.verify)
+    assert found.overlap > 0.95
+    assert found.rms_m < 0.05
+    assert found.free_space_violation < 0.01
 
 
-def test_single_points_prove_nothing() -> None:
-    few = np.arange(0, len(WALL), 37)
-    assert common_residual_m(WALL[few], TOWARDS[few], np.full(len(few), 0.3)) == 0.0
-    assert common_residual_m(WALL[:0], TOWARDS[:0], np.empty(0)) == 0.0
+def test_patches_that_lie_where_the_other_scan_saw_through_are_in_free_space() -> None:
+    """Turned by 90 degrees, the ends of the room stand in its middle, or beyond its walls, out of sight."""
+    turned = geometry.transform(geometry.yaw(np.pi / 2), 0.0)
+    assert _shares(turned)["free space"] > 0.2
+    assert agreement(_room(1), _room(2), turned, config=CONFIG.verify).free_space_violation > 0.1
+
+
+def test_what_is_out_of_sight_or_out_of_range_counts_for_nothing() -> None:
+    far = agreement(_room(1), _room(2), geometry.transform(np.eye(3), [500.0, 0.0, 0.0]), config=CONFIG.verify)
+    assert far.counts.sum() == 0.0
+    assert far.overlap == 0.0
+    assert math.isinf(far.rms_m)
+
+
+def test_the_patches_are_the_same_in_both_directions() -> None:
+    T_target_source = geometry.transform(geometry.yaw(0.1), [0.2, 0.1, 0.0])
+    forth = agreement(_room(1), _room(2), T_target_source, config=CONFIG.verify)
+    back = agreement(_room(2), _room(1), geometry.inverse(T_target_source), config=CONFIG.verify)
+    np.testing.assert_array_equal(forth.of_source, back.of_target)
+    np.testing.assert_array_equal(forth.of_target, back.of_source)
+    assert forth.overlap == pytest.approx(back.overlap)
+    seen = first_look(_room(1), _room(2), T_target_source, config=CONFIG.verify)
+    np.testing.assert_array_equal(seen, forth.of_source)
+
+
+def test_a_patch_counts_once_however_many_points_it_has() -> None:
+    patches = patches_of(_room(1)[0])
+    assert patches.size.sum() == len(patches.points)
+    assert 50 < len(patches.size) < len(patches.points) / 5
+    assert agreement(_room(1), _room(2), np.eye(4), config=CONFIG.verify).of_source.shape == patches.size.shape

@@ -260,7 +260,7 @@ class VerifyConfig(Section):
         0.001,
         gt=0,
         lt=0.5,
-        description="share of false ones among loops that are as probable as the least probable one that is accepted "
+        description="share of false ones among the loops that are accepted, by what was measured on pairs of scans "
         "[the user's choice]",
     )
     max_hypotheses: int = Field(3, ge=1, description="number of coarse poses tried, the best first [chosen]")

@@ -5,6 +5,7 @@ import json
 import pickle
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -14,13 +15,14 @@ import numpy as np
 from segslam.bench.simulation.scenes import SCENES
 from segslam.core.config import Config, load_config
 from segslam.verification.patches import BINS
-from segslam.verification.score import Table, least_odds
+from segslam.verification.score import Table
 from tools.benchmarks import common, score
 from tools.benchmarks.score import ratio
 from tools.benchmarks.score.pairs import Task, described, of_drive, of_scene, of_towns
 from tools.benchmarks.score.ratio import Best, Pair
 
 DRIVES = ("kitti_whole", "nclt", "courtyard", "town")
+SHARE = Config().verify.max_false_share
 TENTHS = np.linspace(0.0, 1.0, 11)
 
 
@@ -82,38 +84,44 @@ def _learn(options: Namespace) -> None:
         "pairs": len(pairs),
         "ratios": {name: round(float(value), 3) for name, value in zip(BINS, table.ratios, strict=True)},
         "match": [round(value, 2) for value in table.match],
-        "lead": [round(value, 2) for value in table.lead],
+        "free": [round(value, 2) for value in table.free],
+        "lead": [round(value, 3) for value in table.lead],
+        "margin": round(table.margin, 2),
     }
     options.table.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     print(content)
 
 
 def _shipped(pairs: Sequence[Pair]) -> Table:
-    return ratio.calibrated(ratio.learnt(pairs), ratio.calibration(ratio.left_out(pairs)))
+    scored = ratio.left_out(pairs)
+    line = ratio.calibration(pairs, scored)
+    margin = ratio.margin(pairs, [(best, line[0] * odds + line[1]) for best, odds in scored], SHARE)
+    return replace(ratio.calibrated(ratio.learnt(pairs), line), margin=margin)
 
 
 def _test(options: Namespace) -> None:
     tested = _read(options.pairs)
     taught = tested if options.learnt is None else _read(options.learnt)
     scored: list[tuple[Best, float]] = []
+    accepted: list[Best] = []
     for part in sorted({pair.part for pair in tested}):
         table = _shipped([pair for pair in taught if pair.part != part])
         bests = ratio.bests([pair for pair in tested if pair.part == part], table)
         scored += [(best, ratio.odds_of(best, table)) for best in bests]
-    least = least_odds(Config().verify)
-    parts = [_row(part, tested, scored, least) for part in sorted({pair.part for pair in tested})]
-    figures = {"parts": [*parts, _row("", tested, scored, least)], "curve": curve(scored), "tenths": tenths(scored)}
+        accepted += [best for best in bests if ratio.odds_of(best, table) >= table.least_odds(Config().verify)]
+    parts = [_row(part, tested, accepted) for part in sorted({pair.part for pair in tested})]
+    figures = {"parts": [*parts, _row("", tested, accepted)], "curve": curve(scored), "tenths": tenths(scored)}
     for name, rows in figures.items():
         print(common.markdown(name, rows))
     common.write_report(options.out, figures)
 
 
-def _row(part: str, pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]], least: float) -> common.Row:
+def _row(part: str, pairs: Sequence[Pair], accepted: Sequence[Best]) -> common.Row:
     """What the package accepted, and what the table accepts that others taught; all parts if `part` is empty."""
     own = [pair for pair in pairs if not part or pair.part == part]
-    found = [(best, odds) for best, odds in scored if not part or best.pair.part == part]
+    found = [best for best in accepted if not part or best.pair.part == part]
     seen = [pair for pair in own if pair.overlap > 0.4]
-    right = [best.pair for best, odds in found if best.pose.is_right and odds >= least]
+    right = [best.pair for best in found if best.pose.is_right]
     return {
         "part": part or "all",
         "true": sum(pair.is_true for pair in own),
@@ -122,7 +130,7 @@ def _row(part: str, pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]],
         "package_right": sum(pair.verdict == "right" for pair in own),
         "package_wrong": sum(pair.verdict == "wrong" for pair in own),
         "right": len(right),
-        "wrong": sum(not best.pose.is_right and odds >= least for best, odds in found),
+        "wrong": len(found) - len(right),
         "overlapping": len(seen),
         "right_of_them": sum(pair.overlap > 0.4 for pair in right),
         "seconds": round(float(np.mean([pair.seconds for pair in own])), 3),

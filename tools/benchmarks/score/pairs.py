@@ -69,7 +69,9 @@ def described(task: Task, config: Config) -> Pair:
     if isinstance(found, Alignment) and is_right(found.fine.T_target_source):
         verdict = "right"
     searching = config.model_copy(update={"verify": config.verify.model_copy(update={"max_false_share": SEARCH_SHARE})})
-    tried = tried_poses(Trial(task.source, task.target, searching, task.gate, Stopwatch(), score.shipped()))
+    trial = Trial(task.source, task.target, searching, task.gate, Stopwatch(), score.shipped())
+    tried = tried_poses(trial)
+    tried = [] if isinstance(tried, Rejected) else tried
     poses = [
         Pose(
             one.T_target_source,
@@ -78,13 +80,14 @@ def described(task: Task, config: Config) -> Pair:
             is_right(one.T_target_source),
             task.gate(one.T_target_source, slack_m=0.0) is None,
         )
-        for one in ([] if isinstance(tried, Rejected) else tried)
+        for one in tried
     ]
     overlap = 0.0
     if task.is_true and task.T_target_source is not None:
         scans = task.source.observed, task.target.observed
         overlap = agreement(*scans, task.T_target_source, config=config.verify).overlap
-    return Pair(task.part, task.sensor, task.is_true, overlap, poses, verdict, seconds)
+    is_searched = bool(tried) and trial.match_odds(tried[0]) >= trial.least_odds
+    return Pair(task.part, task.sensor, task.is_true, overlap, poses, verdict, seconds, is_searched)
 
 
 def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, config: Config) -> Iterator[Task]:

@@ -1,0 +1,111 @@
+"""The probability of a pose: calibrated on stored pairs, and lowered by other poses that fit as well."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from segslam.core.config import VerifyConfig, load_config
+from segslam.core.types import Alignment, Registration, Rejected, RejectReason
+from segslam.verification.patches import BINS, Agreement
+from segslam.verification.score import NO_OTHER, Table, least_odds, shipped, table_of
+from segslam.verification.verdict import judged
+
+STORED = Path(__file__).with_name("judged_pairs.npz")
+"""Best poses of pairs of scenes, towns and real drives: patches in each bin, lead over other poses, right or not."""
+CONFIG = load_config()
+GOOD, BAD = BINS.index("far, same normal, residual 0"), BINS.index("free space")
+
+
+def _wrong_and_lost(table: Table) -> tuple[float, float]:
+    """Shares of the stored wrong poses that are accepted, and of the right ones that are not."""
+    with np.load(STORED) as stored:
+        counts, lead, is_right = stored["counts"].astype(float), stored["lead"], stored["is_right"]
+    match = np.array([table.match_odds(row) for row in counts])
+    odds = -np.logaddexp(-match, -(table.lead[0] * lead + table.lead[1]))
+    is_accepted = odds >= least_odds(CONFIG.verify)
+    return float(is_accepted[~is_right].mean()), float(1.0 - is_accepted[is_right].mean())
+
+
+def test_on_stored_pairs_no_wrong_pose_is_accepted_and_few_right_ones_are_lost() -> None:
+    wrong, lost = _wrong_and_lost(shipped())
+    assert wrong == 0.0
+    assert lost < 0.08
+
+
+@pytest.mark.parametrize("change", ["bins exchanged", "signs exchanged", "no lead", "too certain"])
+def test_a_wrong_table_fails_on_the_stored_pairs(change: str) -> None:
+    table = shipped()
+    wrong_table = {
+        "bins exchanged": replace(table, ratios=table.ratios[::-1]),
+        "signs exchanged": replace(table, ratios=-table.ratios),
+        "no lead": replace(table, lead=(0.0, 50.0)),
+        "too certain": replace(table, match=(table.match[0], table.match[1] + 50.0), lead=(table.lead[0], 10.0)),
+    }[change]
+    wrong, lost = _wrong_and_lost(wrong_table)
+    assert wrong > 0.0 or lost > 0.3
+
+
+def _agreement(good: int, bad: int, known: int = 200) -> Agreement:
+    """Of a source with so many patches that match a surface, and that are in free space; the others are unknown."""
+    shown = np.full(known, -1, np.int8)
+    shown[:good], shown[good : good + bad] = GOOD, BAD
+    return Agreement(0.5, 0.1, 0.0, shown, shown)
+
+
+def test_a_pose_that_fits_is_probable_unless_another_fits_as_well() -> None:
+    table = shipped()
+    found, poor = _agreement(190, 5), _agreement(60, 120)
+    assert table.judge(found, [poor]).probability > 0.999
+    assert table.judge(poor, []).probability < 0.001
+    ambiguous = table.judge(found, [poor, found])
+    assert ambiguous.probability < 0.5
+    assert ambiguous.evidence["other_pose"] < -5.0
+
+
+def test_the_evidence_adds_up_to_the_log_odds() -> None:
+    for others in (None, [], [_agreement(150, 20)]):
+        judgement = shipped().judge(_agreement(170, 10), others)
+        assert sum(judgement.evidence.values()) == pytest.approx(judgement.log_odds)
+        assert judgement.probability == pytest.approx(1.0 / (1.0 + math.exp(-judgement.log_odds)))
+        assert ("other_pose" in judgement.evidence) == (others is not None)
+        assert judgement.evidence["surfaces"] > 0.0 > judgement.evidence["free_space"]
+
+
+def test_the_lead_counts_differences_of_the_same_patches_in_their_scatter() -> None:
+    """Ten patches that differ prove as much among 20 as among 200; patches known at one pose only prove nothing."""
+    table = shipped()
+    leads = [table.lead_of(_agreement(n, 0, n), _agreement(n - 10, 10, n)) for n in (20, 200)]
+    assert leads[0] == pytest.approx(leads[1])
+    assert leads[0] == pytest.approx(-table.lead_of(_agreement(10, 10, 20), _agreement(20, 0, 20)))
+    assert table.lead_of(_agreement(100, 0), _agreement(0, 0)) == 0.0
+    assert table.judge(_agreement(190, 5), []).log_odds <= table.lead[0] * NO_OTHER + table.lead[1]
+
+
+def test_the_patches_of_another_place_are_not_compared() -> None:
+    elsewhere = _agreement(100, 50)._replace(of_target=np.empty(0, np.int8))
+    alone = shipped().lead_of(_agreement(190, 0), elsewhere)
+    assert 0.0 < alone < shipped().lead_of(_agreement(190, 0), _agreement(100, 50))
+
+
+def test_the_share_of_false_loops_is_the_one_threshold() -> None:
+    fine = Registration(np.eye(4), 9, 9, 0.1, np.eye(6))
+    found, others = _agreement(180, 20), [_agreement(165, 35)]
+    probability = shipped().judge(found, others).probability
+    assert 0.6 < probability < 1.0
+    for share, is_accepted in ((1.0 - 0.99 * probability, True), ((1.0 - probability) / 2.0, False)):
+        config = load_config(overrides=[f"verify.max_false_share={min(share, 0.49)}"])
+        outcome = judged(fine, fine, found, others, config=config)
+        assert isinstance(outcome, Alignment) == is_accepted
+        assert outcome.probability == pytest.approx(probability)
+        if isinstance(outcome, Rejected):
+            assert outcome.reason is RejectReason.AMBIGUOUS
+            assert "other pose" in outcome.detail
+    assert least_odds(VerifyConfig(max_false_share=0.01)) == pytest.approx(math.log(99.0))
+
+
+def test_a_table_without_a_bin_is_refused() -> None:
+    with pytest.raises(KeyError, match="no surface"):
+        table_of({"ratios": {"free space": -1.0}, "match": [1.0, 0.0], "lead": [1.0, 0.0]})

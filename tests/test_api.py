@@ -142,8 +142,8 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
 def test_a_run_is_replayed_with_other_settings(tmp_path: Path) -> None:
     write_kitti_sequence(tmp_path / "kitti", num_scans=5)
     first = segslam.map_folder(tmp_path / "kitti", tmp_path / "run")
-    again = segslam.replay(first.folder, tmp_path / "again", settings=["verify.min_overlap=0.45"])
-    assert again.config.verify.min_overlap == 0.45
+    again = segslam.replay(first.folder, tmp_path / "again", settings=["verify.max_false_share=0.01"])
+    assert again.config.verify.max_false_share == 0.01
     assert len(again.result.trajectory) == 5
     assert again.metrics["kiss_icp_ate_m"] == pytest.approx(first.metrics["kiss_icp_ate_m"])
     with pytest.raises(segslam.SegslamError, match="a replay uses the keyframes"):
@@ -153,8 +153,8 @@ def test_a_run_is_replayed_with_other_settings(tmp_path: Path) -> None:
 
 def test_representations_are_short_and_say_what_matters(made: MadeRun, tmp_path: Path) -> None:
     assert repr(segslam.Config()) == "Config()"
-    changed = segslam.load_config(None, ["verify.min_overlap=0.45", "graph.final=gnc"])
-    assert set(repr(changed)[7:-1].split(", ")) == {"verify.min_overlap=0.45", "graph.final='gnc'"}
+    changed = segslam.load_config(None, ["verify.max_false_share=0.01", "graph.final=gnc"])
+    assert set(repr(changed)[7:-1].split(", ")) == {"verify.max_false_share=0.01", "graph.final='gnc'"}
     slam = segslam.Slam()
     slam.process(round_drive()[0][0])
     assert repr(slam) == "Slam(1 scans, 1 keyframes, 0 loops, running)"

@@ -14,10 +14,10 @@ scan = segslam.Scan(np.random.default_rng(0).normal(size=(500, 3)), stamp_ns=1_0
 print(scan.points.shape)
 
 # %% load_config
-config = segslam.load_config(overrides=["keyframes.distance_m=1.0", "verify.min_overlap=0.4"])
+config = segslam.load_config(overrides=["keyframes.distance_m=1.0", "verify.max_false_share=0.01"])
 
 # %% Config
-print(config.verify.min_overlap, segslam.Config().verify.min_overlap)
+print(config.verify.max_false_share, segslam.Config().verify.max_false_share)
 
 # %% keep_freed_memory
 segslam.keep_freed_memory()  # once, before mapping many scans in your own program
@@ -72,7 +72,7 @@ page = segslam.report("runs/monday")
 segslam.export("runs/monday", ["map.ply", "map.png"])
 
 # %% replay
-strict = segslam.replay("runs/monday", "runs/strict", settings=["verify.min_overlap=0.6"])
+strict = segslam.replay("runs/monday", "runs/strict", settings=["verify.max_false_share=0.0001"])
 
 # %% locate
 pose = segslam.locate("runs/monday", scans[5].points)

@@ -49,7 +49,7 @@ def replay(
 ) -> None:
     """Repeat loop closing and optimisation from the log of a run, with some settings changed.
 
-    Example: segslam replay runs/00/log.mcap --out runs/00-strict --set verify.min_overlap=0.6
+    Example: segslam replay runs/00/log.mcap --out runs/00-strict --set verify.max_false_share=0.0001
     """
     check_exists(log, "give a run folder, or its log.mcap")
     announce(f"replay: reading {log}", quiet=quiet)

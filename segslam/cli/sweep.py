@@ -40,7 +40,7 @@ def sweep(
 ) -> None:
     """Replay a run with every combination of some settings, and show the results in one table.
 
-    Example: segslam sweep runs/00 --set verify.min_overlap=0.2,0.4,0.6 --out sweeps/overlap
+    Example: segslam sweep runs/00 --set verify.max_false_share=0.01,0.001 --out sweeps/overlap
     """
     check_exists(run, "give a run folder, or its log.mcap")
     grid = grid_of(settings)
@@ -81,7 +81,7 @@ def grid_of(settings: Sequence[str]) -> dict[str, list[str]]:
     for text in settings:
         key, _, values = text.partition("=")
         if not key or not values:
-            raise SegslamError(f"--set {text}: give values, as in --set verify.min_overlap=0.2,0.4")
+            raise SegslamError(f"--set {text}: give values, as in --set verify.max_false_share=0.01,0.001")
         choices.append([f"{key}={value}" for value in values.split(",") if value])
     return {" ".join(combination): list(combination) for combination in product(*choices)}
 

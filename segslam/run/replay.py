@@ -23,7 +23,7 @@ def replay(
 ) -> FinishedRun:
     """Repeat loop closing and optimisation of a run into the new folder `out`, like `segslam replay` and `edit`.
 
-    `run`: its folder or log.mcap. `settings`: changes such as `"verify.min_overlap=0.4"`; `edits` forbids and adds
+    `run`: its folder or log.mcap. `settings`: changes such as `"verify.max_false_share=0.01"`; `edits` forbids and adds
     loops. Raises SegslamError for a setting that cannot be changed, and for a run localised in the map of another.
     """
     from segslam.output.report import write_report

@@ -10,10 +10,10 @@ from segslam.core.config import Config
 
 
 def test_keys_of_settings_and_their_values_are_completed() -> None:
-    assert settings("verify.min_over") == ["verify.min_overlap="]
+    assert settings("verify.max_fal") == ["verify.max_false_share="]
     assert len(settings("")) == sum(len(type(section).model_fields) for _, section in Config())
     assert settings("graph.final=") == ["graph.final=none", "graph.final=gnc", "graph.final=consistent"]
-    assert settings("verify.min_overlap=") == []
+    assert settings("verify.max_false_share=") == []
     assert settings("nothing") == []
     assert simulation_settings("world.ca") == ["world.cars="]
 

@@ -67,19 +67,19 @@ def test_info_shows_data_state_settings_and_files(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    assert run("replay", log, "--out", out, "--set", "verify.min_overlap=0.25", "--quiet") == 0
+    assert run("replay", log, "--out", out, "--set", "verify.max_false_share=0.01", "--quiet") == 0
     assert run("info", out, "--json", "--quiet") == 0
     found = json.loads(capsys.readouterr().out)
     metrics = json.loads((out / "metrics.json").read_text())
     assert found["state"] == "finished"
     assert found["num_steps"] == metrics["num_scans"]
     assert found["figures"]["ate_m"] == metrics["ate_m"]
-    assert found["changed_settings"]["verify.min_overlap"] == "0.25"
+    assert found["changed_settings"]["verify.max_false_share"] == "0.01"
     assert found["files"]["log.mcap"] == (out / "log.mcap").stat().st_size
     assert run("info", out) == 0
     shown = capsys.readouterr().out
     size = f"{(out / 'config.yaml').stat().st_size / 1e3:.1f} kB  config.yaml"
-    for text in ("finished", "verify.min_overlap=0.25", "loops accepted", "log.mcap", size):
+    for text in ("finished", "verify.max_false_share=0.01", "loops accepted", "log.mcap", size):
         assert text in shown
 
 

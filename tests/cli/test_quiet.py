@@ -71,7 +71,7 @@ COMMANDS: dict[str, Callable[[Path, Path, Path], Words]] = {
     "label": lambda data, _, out: [
         *(data, "--out", out, "--labels", "true_labels", "--truth", "true_labels", "--frames", "0:2")
     ],
-    "sweep": lambda _, finished, out: [finished, "--set", "verify.min_overlap=0.3", "--out", out],
+    "sweep": lambda _, finished, out: [finished, "--set", "verify.max_false_share=0.01", "--out", out],
     "convert": lambda data, _, out: [data / "poses" / "00.txt", out],
     "info": lambda _, finished, __: [finished],
     "edit": lambda _, finished, out: [finished, "--forbid", "2:0", "--out", out],

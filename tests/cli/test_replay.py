@@ -1,4 +1,5 @@
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from helpers.drives import SLAM_CONFIG
 
 from segslam.core.types import LoopAttempt, LoopClosure
 from segslam.output.log import read_log
+from segslam.verification.score import shipped
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 
@@ -46,9 +48,10 @@ def test_a_replay_with_the_same_settings_repeats_the_run(
 def test_other_settings_change_the_loops_and_the_change_is_printed(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    overlaps = [a.outcome.alignment.overlap for a in _attempts(log) if isinstance(a.outcome, LoopClosure)]
+    odds = [sum(a.outcome.alignment.evidence.values()) for a in _attempts(log) if isinstance(a.outcome, LoopClosure)]
+    share = 1.0 / (1.0 + math.exp(float(np.median(odds)) + shipped().margin + 1e-6))
     strict = tmp_path / "strict.yaml"
-    strict.write_text(yaml.safe_dump({"verify": {"min_overlap": float(np.median(overlaps)) + 1e-6}}))
+    strict.write_text(yaml.safe_dump({"verify": {"max_false_share": share}}))
     out = tmp_path / "strict"
     assert run("replay", log, "--out", out, "--config", strict) == 0
     metrics = json.loads((out / "metrics.json").read_text())
@@ -56,7 +59,7 @@ def test_other_settings_change_the_loops_and_the_change_is_printed(
     output = f"{metrics['num_loops_won']} loops more, {metrics['num_loops_lost']} fewer"
     assert output in capsys.readouterr().err
     settings = read_log(out / "log.mcap").config
-    assert settings.verify.min_overlap == pytest.approx(np.median(overlaps), abs=1e-5)
+    assert settings.verify.max_false_share == pytest.approx(share)
     assert settings.proximity == SLAM_CONFIG.proximity, "settings of the log that were not changed remain"
 
 

@@ -24,18 +24,18 @@ def test_a_sweep_replays_each_value_once_and_tables_it(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "sweep"
-    given = ["sweep", log, "--set", "verify.min_overlap=0.2,0.95", "--out", out, "--csv", tmp_path / "t.csv"]
+    given = ["sweep", log, "--set", "verify.max_false_share=0.2,1e-300", "--out", out, "--csv", tmp_path / "t.csv"]
     assert run(*given, "--json", "--quiet") == 0
     rows = json.loads(capsys.readouterr().out)["runs"]
-    loose, strict = rows["verify.min_overlap=0.2"], rows["verify.min_overlap=0.95"]
+    loose, strict = rows["verify.max_false_share=0.2"], rows["verify.max_false_share=1e-300"]
     assert loose["num_loops_accepted"] > strict["num_loops_accepted"]
-    assert read_run(out / "verify.min_overlap=0.95").config.verify.min_overlap == 0.95
+    assert read_run(out / "verify.max_false_share=1e-300").config.verify.max_false_share == 1e-300
     names = [row["name"] for row in csv.DictReader((tmp_path / "t.csv").read_text().splitlines())]
     assert names == list(rows)
-    before = (out / "verify.min_overlap=0.2" / "log.mcap").stat().st_mtime_ns
+    before = (out / "verify.max_false_share=0.2" / "log.mcap").stat().st_mtime_ns
     assert run(*given, "--overwrite") == 0
-    assert (out / "verify.min_overlap=0.2" / "log.mcap").stat().st_mtime_ns == before
-    assert "verify.min_overlap=0.95" in capsys.readouterr().out
+    assert (out / "verify.max_false_share=0.2" / "log.mcap").stat().st_mtime_ns == before
+    assert "verify.max_false_share=1e-300" in capsys.readouterr().out
 
 
 def test_a_wrong_setting_is_reported_before_anything_is_replayed(

@@ -57,7 +57,7 @@ def test_an_index_with_the_correct_checksum_and_wrong_places_is_not_followed(log
     path = tmp_path / "log.mcap"
     path.write_bytes(data)
     assert read_log(path).result() is not None
-    setting = data.index(b"min_overlap")
+    setting = data.index(b"max_false_share")
     data[setting + 14] ^= 1
     path.write_bytes(data)
     with pytest.raises(SegslamError, match=r"log\.mcap: the settings at its start are damaged"):

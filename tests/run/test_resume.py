@@ -217,7 +217,7 @@ def _one_line(metrics: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--set", "verify.min_overlap=0.77"], "verify.min_overlap: 0.77 now"),
+        (["--set", "verify.max_false_share=0.02"], "verify.max_false_share: 0.02 now"),
         (["--labels", "none"], "--labels: none now"),
         (["--frames", "0:20"], "--frames: 0:20 now"),
     ],

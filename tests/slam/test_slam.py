@@ -84,7 +84,9 @@ def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
 
 
 def test_other_gates_on_the_same_steps_reject_what_was_accepted(run: tuple[list[Step], SlamResult]) -> None:
-    slam = Slam(load_config(None, ["proximity.min_travel_m=60", "verify.min_overlap=1", "adjustment.max_minutes=0"]))
+    slam = Slam(
+        load_config(None, ["proximity.min_travel_m=60", "verify.max_false_share=1e-300", "adjustment.max_minutes=0"])
+    )
     for step in run[0]:
         slam.repeat(step)
     result = slam.finish()

@@ -10,7 +10,7 @@ import pytest
 from segslam.core.config import VerifyConfig, load_config
 from segslam.core.types import Alignment, Registration, Rejected, RejectReason
 from segslam.verification.patches import BINS, Agreement
-from segslam.verification.score import NO_OTHER, Table, least_odds, shipped, table_of
+from segslam.verification.score import NO_OTHER, Table, shipped, table_of
 from segslam.verification.verdict import judged
 
 STORED = Path(__file__).with_name("judged_pairs.npz")
@@ -24,8 +24,8 @@ def _wrong_and_lost(table: Table) -> tuple[float, float]:
     with np.load(STORED) as stored:
         counts, lead, is_right = stored["counts"].astype(float), stored["lead"], stored["is_right"]
     match = np.array([table.match_odds(row) for row in counts])
-    odds = -np.logaddexp(-match, -(table.lead[0] * lead + table.lead[1]))
-    is_accepted = odds >= least_odds(CONFIG.verify)
+    odds = -np.logaddexp(-match, -np.array([table.lead_odds(value) for value in lead.tolist()]))
+    is_accepted = odds >= table.least_odds(CONFIG.verify)
     return float(is_accepted[~is_right].mean()), float(1.0 - is_accepted[is_right].mean())
 
 
@@ -81,7 +81,7 @@ def test_the_lead_counts_differences_of_the_same_patches_in_their_scatter() -> N
     assert leads[0] == pytest.approx(leads[1])
     assert leads[0] == pytest.approx(-table.lead_of(_agreement(10, 10, 20), _agreement(20, 0, 20)))
     assert table.lead_of(_agreement(100, 0), _agreement(0, 0)) == 0.0
-    assert table.judge(_agreement(190, 5), []).log_odds <= table.lead[0] * NO_OTHER + table.lead[1]
+    assert table.lead_odds(99.0) == table.lead_odds(NO_OTHER) > table.lead_odds(0.0) > table.lead_odds(-1.0)
 
 
 def test_the_patches_of_another_place_are_not_compared() -> None:
@@ -92,18 +92,22 @@ def test_the_patches_of_another_place_are_not_compared() -> None:
 
 def test_the_share_of_false_loops_is_the_one_threshold() -> None:
     fine = Registration(np.eye(4), 9, 9, 0.1, np.eye(6))
-    found, others = _agreement(180, 20), [_agreement(165, 35)]
+    found = _agreement(198, 1)
+    tried = ([_agreement(198 - more, 1 + more)] for more in range(30))
+    others = next(other for other in tried if shipped().judge(found, other).probability > 0.9)
     probability = shipped().judge(found, others).probability
-    assert 0.6 < probability < 1.0
-    for share, is_accepted in ((1.0 - 0.99 * probability, True), ((1.0 - probability) / 2.0, False)):
-        config = load_config(overrides=[f"verify.max_false_share={min(share, 0.49)}"])
+    assert 0.9 < probability < 0.99999
+    odds, margin = shipped().judge(found, others).log_odds, shipped().margin
+    for least, is_accepted in ((odds + margin - 0.1, True), (odds + margin + 0.1, False)):
+        config = load_config(overrides=[f"verify.max_false_share={1.0 / (1.0 + math.exp(least))}"])
         outcome = judged(fine, fine, found, others, config=config)
         assert isinstance(outcome, Alignment) == is_accepted
         assert outcome.probability == pytest.approx(probability)
         if isinstance(outcome, Rejected):
             assert outcome.reason is RejectReason.AMBIGUOUS
             assert "other pose" in outcome.detail
-    assert least_odds(VerifyConfig(max_false_share=0.01)) == pytest.approx(math.log(99.0))
+    table = replace(shipped(), margin=1.0)
+    assert table.least_odds(VerifyConfig(max_false_share=0.01)) == pytest.approx(math.log(99.0) - 1.0)
 
 
 def test_a_table_without_a_bin_is_refused() -> None:

@@ -1,6 +1,6 @@
 """Pairs of submaps of a real drive (NCLT): 11 sparse scans merged around a keyframe, revisited in reverse.
 
-    python -m tools.benchmarks.submaps DATA [--pairs 45] [--negatives 45] [--seed 0] [--set verify.min_overlap=0.3]
+    python -m tools.benchmarks.submaps DATA [--pairs 45] [--negatives 45] [--seed 0] [--set verify.max_false_share=0.01]
 
 DATA is the folder of real data with `nclt/`. Right is below 0.5 m and 2 degrees of the optimised poses.
 Verification was tuned with seed 5; report other seeds.

@@ -232,7 +232,7 @@ def test_steps_are_counted_with_an_index_and_without(steps: list[Step], whole: P
 
 
 def test_settings_and_versions_are_in_the_metadata(steps: list[Step], tmp_path: Path) -> None:
-    config = Config.model_validate({"verify": {"min_overlap": 0.37}})
+    config = Config.model_validate({"verify": {"max_false_share": 0.037}})
     log = read_log(write_log(tmp_path / "log.mcap", steps[:1], config))
     assert log.config == config
     assert log.run["dataset"] == "kitti/00"

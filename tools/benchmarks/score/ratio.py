@@ -185,14 +185,15 @@ def calibration(pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]]) -> 
 def margin(pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]], share: float) -> float:
     """How far below the log odds of this share of false poses the least odds may be, of which all above have it.
 
-    The odds of wrong poses beyond the `TAIL` best of them are taken to fall exponentially.
+    The odds of wrong poses beyond the `TAIL` best of them are taken to fall exponentially; because few of them show
+    how fast, a third of the share is aimed at.
     """
     number = Counter(pair.is_true for pair in pairs)
     wrong = np.sort([odds for best, odds in scored if not best.pose.is_right])[::-1]
     right = np.array([odds for best, odds in scored if best.pose.is_right])
     start, scale = wrong[TAIL], float(np.mean(wrong[:TAIL] - wrong[TAIL]))
     accepted = float(np.mean(right > start)) * len(right) / number[True]
-    least = start + scale * np.log(TAIL / number[False] / (share * accepted))
+    least = start + scale * np.log(TAIL / number[False] / (share / 3.0 * accepted))
     return float(np.log((1.0 - share) / share) - least)
 
 

@@ -20,8 +20,8 @@ INTRODUCTION = """# Every setting
 Generated from `segslam/core/config/sections.py` by `python tools/options.py`; do not edit this page.
 
 Change settings with a YAML file that contains the differences from the defaults, `--config strict.yaml`, or one by one,
-`--set verify.max_false_share=0.01 --set map.color=height`. Unknown keys and values out of range are reported as errors. Each
-run stores its settings in `config.yaml`, which can be passed to `--config`.
+`--set verify.max_false_share=0.01 --set map.color=height`. Unknown keys and values out of range are
+reported as errors. Each run stores its settings in `config.yaml`, which can be passed to `--config`.
 
 ```yaml
 verify:

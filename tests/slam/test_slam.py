@@ -83,7 +83,9 @@ def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
     np.testing.assert_array_equal(slam.finish().trajectory.T_world_lidar, result.trajectory.T_world_lidar)
 
 
-def test_other_gates_on_the_same_steps_reject_what_was_accepted(run: tuple[list[Step], SlamResult]) -> None:
+def test_a_smaller_share_of_false_loops_on_the_same_steps_reject_what_was_accepted(
+    run: tuple[list[Step], SlamResult],
+) -> None:
     slam = Slam(
         load_config(None, ["proximity.min_travel_m=60", "verify.max_false_share=1e-300", "adjustment.max_minutes=0"])
     )

@@ -38,7 +38,7 @@ REASONS = {
     RejectReason.LOW_OVERLAP: "in older logs: too little of one scan lies on the other",
     RejectReason.HIGH_RESIDUAL: "in older logs: the points lie on the other scan not closely enough",
     RejectReason.FREE_SPACE_VIOLATED: "in older logs: one scan has points where the other saw through",
-    RejectReason.IMPROBABLE: "too few surfaces match for a probable pose, or points lie where the other scan saw through",
+    RejectReason.IMPROBABLE: "too few surfaces match, or points lie where the other scan saw through",
     RejectReason.AMBIGUOUS: "another pose, or another place, fits almost as well",
     RejectReason.NO_PLACE: "no place of the map is similar",
     RejectReason.UNCONFIRMED: "the loop waits until further loops agree with it",

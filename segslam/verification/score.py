@@ -127,7 +127,7 @@ def violating_root(counts: Counts) -> float:
 
 
 RIVAL_NATS = 3.0
-"""Poses that another makes so much likelier to be right than is asked are not compared with it."""
+"""Other poses are not looked for if their lead odds are more than this above the least odds of an accepted pose."""
 
 
 @cache

@@ -59,11 +59,11 @@ def test_the_best_pose_is_one_that_the_prior_allows_and_leads_over_all_others() 
     assert odds_of(alone, table) > odds_of(best, table)
 
 
-def test_parts_that_taught_nothing_are_separated_and_the_curve_says_so() -> None:
+def test_parts_that_taught_nothing_are_separated() -> None:
     scored = left_out(TAUGHT)
     (row,) = (row for row in curve(scored) if row["wrong_accepted"] == 0)
     assert row["right_accepted"] == row["of_right"] == 30
-    table = calibrated(learnt(TAUGHT), calibration(scored))
+    table = calibrated(learnt(TAUGHT), calibration(TAUGHT, scored))
     odds = {best.pose.is_right: odds_of(best, table) for best, _ in scored}
     assert odds[True] > 3.0 > -3.0 > odds[False]
 

@@ -112,4 +112,4 @@ def test_the_share_of_false_loops_is_the_one_threshold() -> None:
 
 def test_a_table_without_a_bin_is_refused() -> None:
     with pytest.raises(KeyError, match="no surface"):
-        table_of({"ratios": {"free space": -1.0}, "match": [1.0, 0.0], "lead": [1.0, 0.0]})
+        table_of({"ratios": {"free space": -1.0}, "match": [1, 0], "free": [1, 0], "lead": [1, 0], "margin": 0})

@@ -89,7 +89,7 @@ def test_mean_error_of_closures_of_one_place_matches_their_information() -> None
     means, singles = [], []
     for start in range(0, 36, len(SECOND_ROUND)):
         pairs = _pairs()[start : start + len(SECOND_ROUND)]
-        informations = [closure_information(alignment.fine.information, CONFIG.graph) for alignment, _ in pairs]
+        informations = [closure_information(alignment.fine.information) for alignment, _ in pairs]
         errors = [geometry.log(geometry.inverse(T) @ alignment.fine.T_target_source) for alignment, T in pairs]
         weighed = sum(information @ xi for information, xi in zip(informations, errors, strict=True))
         means.append(weighed @ np.linalg.solve(sum(informations), weighed))

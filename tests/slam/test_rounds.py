@@ -71,6 +71,7 @@ def test_low_beams_are_measured_and_do_not_bend_the_drive() -> None:
     assert error_m(made) < 0.05
 
 
+@pytest.mark.slow
 def test_the_adjustment_repeats_exactly() -> None:
     again = graph()
     adjust(again, again.finish(), points, config=CONFIG)

@@ -132,7 +132,8 @@ def _elsewhere(scan: Scan) -> Scan:
     return replace(scan, points=points.astype(np.float32), labels=np.zeros(20_000, np.uint8))
 
 
-@pytest.mark.parametrize("interval_s", [0.3, pytest.param(6.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("interval_s", [0.3, 6.0])
 def test_a_scan_from_another_town_is_a_break_though_the_odometry_is_steady(interval_s: float) -> None:
     scans, _ = round_drive()
     odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
@@ -350,6 +351,7 @@ def test_in_a_smooth_tunnel_the_motion_along_it_is_reported_as_uncertain() -> No
     assert sigmas_m[0] > 4.0 * max(sigmas_m[1:])
 
 
+@pytest.mark.slow
 def test_a_given_odometry_is_kept_in_a_smooth_tunnel() -> None:
     poses = round_drive()[1].T_world_lidar[:40].copy()
     for row in range(11, 40):

@@ -78,6 +78,7 @@ def test_the_adjustment_repeats_exactly() -> None:
     np.testing.assert_array_equal(again.T_world_keyframes, straightened()[0].T_world_keyframes)
 
 
+@pytest.mark.slow
 def test_one_wrong_loop_left_in_does_no_more_harm_than_without_the_adjustment() -> None:
     T_wrong = geometry.inverse(T_TRUE[0]) @ T_TRUE[-1] @ geometry.transform(np.eye(3), [0.0, 2.5, 0.0])
     information = np.eye(6) * 1e4

@@ -5,4 +5,4 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . tools/setup.sh dev
-exec "$PYTHON" -m pytest -n "$(nproc)" --maxprocesses 4 --dist worksteal --exitfirst "$@"
+exec "$PYTHON" -m pytest -n "$(nproc)" --maxprocesses 4 --dist loadfile --exitfirst "$@"

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -66,15 +67,23 @@ def as_latex(rows: Rows) -> str:
     return "\n".join([*parts, ""])
 
 
-def as_text(rows: Rows) -> str:
-    """The columns of `SHORT`, aligned."""
-    columns = _columns(rows)
-    width = max(map(len, rows), default=4)
-    widths = [max(len(SHORT[key]), 7) for key in columns]
-    lines = [" " * width + "".join(f"  {SHORT[key]:>{w}}" for key, w in zip(columns, widths, strict=True))]
+def as_text(rows: Rows, *, within: int | None = None) -> str:
+    """The columns of `SHORT`, aligned; those that do not fit `within` characters (of the terminal) follow below."""
+    within = within or shutil.get_terminal_size().columns
+    first = max(map(len, rows), default=4)
+    parts: list[list[tuple[str, int]]] = [[]]
+    for key in _columns(rows):
+        width = max(len(SHORT[key]), 7)
+        if parts[-1] and first + sum(2 + w for _, w in parts[-1]) + 2 + width > within:
+            parts.append([])
+        parts[-1].append((key, width))
+    return "\n\n".join(_aligned(rows, columns, first) for columns in parts)
+
+
+def _aligned(rows: Rows, columns: list[tuple[str, int]], first: int) -> str:
+    lines = [" " * first + "".join(f"  {SHORT[key]:>{width}}" for key, width in columns)]
     for name, row in rows.items():
-        cells = (f"  {_cell(row.get(key)):>{w}}" for key, w in zip(columns, widths, strict=True))
-        lines.append(f"{name:<{width}}" + "".join(cells))
+        lines.append(f"{name:<{first}}" + "".join(f"  {_cell(row.get(key)):>{width}}" for key, width in columns))
     return "\n".join(lines)
 
 

@@ -69,6 +69,7 @@ def test_a_worker_that_is_killed_changes_nothing_in_the_table(
     assert table(in_order(read_rows(tmp_path / "details.csv"), job, trials)) == table(here)
 
 
+@pytest.mark.slow
 def test_a_missing_cluster_is_reported(job: Job, trials: list[Trial]) -> None:
     with pytest.raises(SegslamError, match="no answer"):
         next(run(job, trials, pool=Pool(scheduler="tcp://127.0.0.1:9")))

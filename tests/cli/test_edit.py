@@ -11,6 +11,8 @@ from segslam.output.log import read_log
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 
+QUICK = ("--set", "adjustment.max_minutes=0", "--quiet")
+
 
 def _closures(log: Path) -> set[tuple[int, int]]:
     recorded = read_log(log)
@@ -21,12 +23,12 @@ def _closures(log: Path) -> set[tuple[int, int]]:
 
 def test_a_forbidden_loop_is_not_closed_by_this_replay_and_later_ones(log: Path, tmp_path: Path) -> None:
     newer, older = max(_closures(log))
-    assert run("edit", log, "--forbid", f"{older}:{newer}", "--out", tmp_path / "edited", "--quiet") == 0
+    assert run("edit", log, "--forbid", f"{older}:{newer}", "--out", tmp_path / "edited", *QUICK) == 0
     edited = tmp_path / "edited" / "log.mcap"
     assert (newer, older) not in _closures(edited)
-    assert run("replay", edited, "--out", tmp_path / "again", "--quiet") == 0
+    assert run("replay", edited, "--out", tmp_path / "again", *QUICK) == 0
     assert (newer, older) not in _closures(tmp_path / "again" / "log.mcap")
-    assert run("edit", edited, "--add", f"{newer}:{older}", "--out", tmp_path / "back", "--quiet") == 0
+    assert run("edit", edited, "--add", f"{newer}:{older}", "--out", tmp_path / "back", *QUICK) == 0
     assert (newer, older) in _closures(tmp_path / "back" / "log.mcap")
 
 
@@ -34,7 +36,7 @@ def test_an_added_loop_is_registered_though_no_search_proposes_it(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     newer, older = max(_closures(log))
-    none = ["--set", "proximity.base_radius_m=0.001", "--set", "proximity.drift_ratio=0"]
+    none = ["--set", "proximity.base_radius_m=0.001", "--set", "proximity.drift_ratio=0", *QUICK[:2]]
     assert run("edit", log, "--add", f"{newer}:{older}", "--out", tmp_path / "edited", *none) == 0
     assert f"added {newer}:{older}: accepted, probability" in capsys.readouterr().err
     assert _closures(tmp_path / "edited" / "log.mcap") == {(newer, older)}

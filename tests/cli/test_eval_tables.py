@@ -9,6 +9,7 @@ from helpers.commands import run
 from helpers.drives import drifting, round_drive
 from helpers.finished_run import make_run
 
+from segslam.cli.tables import SHORT, as_text
 from segslam.core.trajectory import write_kitti
 from segslam.output.scores import scores
 
@@ -80,3 +81,11 @@ def test_compare_writes_its_table(tmp_path: Path) -> None:
     assert run("compare", first, second, "--csv", tmp_path / "t.csv", "--latex", tmp_path / "t.tex", "-q") == 0
     assert [row["name"] for row in csv.DictReader((tmp_path / "t.csv").read_text().splitlines())] == ["a", "b_c"]
     assert r"b\_c & " in (tmp_path / "t.tex").read_text()
+
+
+def test_columns_that_do_not_fit_the_terminal_follow_below() -> None:
+    row = dict.fromkeys(SHORT, 1.25)
+    text = as_text({"graph.final=consistent": row, "graph.final=none": row}, within=80)
+    assert max(map(len, text.splitlines())) <= 80
+    assert all(title in text for title in SHORT.values())
+    assert text.count("graph.final=none") == text.count("\n\n") + 1 > 1

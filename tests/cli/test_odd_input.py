@@ -88,6 +88,7 @@ def test_a_home_folder_is_expanded_behind_an_option_and_an_unknown_user_is_refus
     assert "~nosuch/x: there is no such user" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_whose_data_has_an_odd_name_is_resumed(
     scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

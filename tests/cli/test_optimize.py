@@ -199,7 +199,8 @@ def test_published_graphs_reach_their_known_optimum(data_dir: Path, name: str, o
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("group", [pytest.param(1, marks=pytest.mark.slow), 10])
+@pytest.mark.slow
+@pytest.mark.parametrize("group", [1, 10])
 def test_three_hundred_false_edges_of_a_published_graph_are_all_found(data_dir: Path, group: int) -> None:
     """Relative poses drawn at random, alone or in groups of ten that are consistent with each other."""
     clean = read_g2o(data_dir / "g2o" / "sphere2500.g2o")

@@ -101,7 +101,6 @@ COMMANDS: dict[str, Callable[[Path, Path, Path], Words]] = {
 OF_MAPPED: dict[str, Callable[[Path, Path, Path], Words]] = {
     "locate": lambda data, mapped, _: [mapped, data / "sequences/00/velodyne/000003.bin", "--dataset", "kitti"],
     "localise": lambda data, mapped, out: [mapped, data, "--out", out],
-    "fleet": lambda data, _, out: [data, "--workers", 1, "--out", out],
     "resume": lambda _, mapped, __: [mapped],
 }
 """The same, given a run of the data."""

@@ -79,7 +79,7 @@ def test_a_drifted_drive_is_bent_by_good_fixes() -> None:
     assert fused.is_bent[0]
 
 
-@pytest.mark.parametrize("first", [20, 150])
+@pytest.mark.parametrize("first", [20, pytest.param(150, marks=pytest.mark.slow)])
 def test_a_run_of_wrong_fixes_is_not_kept_and_does_no_harm(first: int) -> None:
     truth = _truth()
     off = np.zeros((NUM, 3))
@@ -114,7 +114,9 @@ def test_fixes_that_cannot_place_a_drive_are_refused_with_the_reason() -> None:
         georeference(edges, drive, equal)
 
 
-@pytest.mark.parametrize("longitude", [11.9999, 179.9999, -180.0])
+@pytest.mark.parametrize(
+    "longitude", [179.9999, *(pytest.param(one, marks=pytest.mark.slow) for one in (11.9999, -180.0))]
+)
 def test_a_drive_across_the_edge_of_a_zone_or_the_date_line_is_placed(longitude: float) -> None:
     """One zone, that of the origin, is used for the whole map."""
     truth, origin = _truth(), Origin(17.0, longitude, 5.0)

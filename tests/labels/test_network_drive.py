@@ -106,6 +106,7 @@ def test_a_replay_labels_nothing(labelled_run: Mapped, tmp_path: Path) -> None:
     assert counts["scans"] == 0
 
 
+@pytest.mark.slow
 def test_a_resumed_run_labels_the_keyframes_that_its_log_has_not(
     drive: Path, network: str, labelled_run: Mapped, tmp_path: Path
 ) -> None:

@@ -69,7 +69,10 @@ def test_a_sound_odometry_is_left_as_it_is() -> None:
     assert MotionState.CONFIRMED in states
 
 
-@pytest.mark.parametrize(("metres", "degrees"), [(3.0, 0.0), (-1.0, 0.0), (0.0, 40.0), (0.4, 3.0)])
+@pytest.mark.parametrize(
+    ("metres", "degrees"),
+    [(3.0, 0.0), (0.0, 40.0), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((-1.0, 0.0), (0.4, 3.0)))],
+)
 def test_a_jump_of_the_odometry_is_repaired(metres: float, degrees: float) -> None:
     scans, _ = round_drive()
     results = _registered(_checked(_slipped(metres=metres, degrees=degrees)), scans[: SLIP_AT + 10])
@@ -90,7 +93,7 @@ class _LikeKiss(GivenOdometry):
     is_from_scans = True
 
 
-@pytest.mark.parametrize("metres", [-2.5, -STEP_M, 0.0])
+@pytest.mark.parametrize("metres", [-2.5, pytest.param(-STEP_M, marks=pytest.mark.slow), 0.0])
 def test_a_wrong_first_motion_is_repaired_and_a_right_one_is_kept(metres: float) -> None:
     scans, truth = round_drive()
     trajectory = replace(truth, T_world_lidar=_slipped(metres=metres, at=1))
@@ -129,7 +132,8 @@ def _elsewhere(scan: Scan) -> Scan:
     return replace(scan, points=points.astype(np.float32), labels=np.zeros(20_000, np.uint8))
 
 
-@pytest.mark.parametrize("interval_s", [0.3, pytest.param(6.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("interval_s", [0.3, 6.0])
 def test_a_scan_from_another_town_is_a_break_though_the_odometry_is_steady(interval_s: float) -> None:
     scans, _ = round_drive()
     odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
@@ -154,7 +158,8 @@ def test_a_long_pause_before_the_second_scan_does_not_set_the_usual_interval() -
     np.testing.assert_allclose(gaps, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 10.0, 1.0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("is_given", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("is_given", [True, False])
 def test_a_scan_that_nothing_explains_is_no_evidence_against_the_drive(is_given: bool) -> None:
     scans, truth = round_drive()
     given = [*scans[:20], _elsewhere(scans[20]), *scans[21:26]]
@@ -169,6 +174,7 @@ def test_a_scan_that_nothing_explains_is_no_evidence_against_the_drive(is_given:
     assert geometry.distance(geometry.inverse(T_true) @ T_found) < 0.1
 
 
+@pytest.mark.slow
 def test_a_sparse_first_scan_does_not_end_the_checks_of_a_drive() -> None:
     scans, _ = round_drive()
     thin = replace(scans[0], points=scans[0].points[::700], labels=scans[0].labels[::700])
@@ -177,7 +183,7 @@ def test_a_sparse_first_scan_does_not_end_the_checks_of_a_drive() -> None:
     assert _worst_step_m(results[1:]) < 0.2
 
 
-@pytest.mark.parametrize("degrees", [-25.0, 32.0])
+@pytest.mark.parametrize("degrees", [-25.0, pytest.param(32.0, marks=pytest.mark.slow)])
 def test_a_sudden_turn_is_found_by_the_search_around_the_last_pose(degrees: float) -> None:
     """Both the odometry and its prediction miss the turn, and no registration without initial guess is accepted."""
     scans, truth = round_drive()
@@ -345,6 +351,7 @@ def test_in_a_smooth_tunnel_the_motion_along_it_is_reported_as_uncertain() -> No
     assert sigmas_m[0] > 4.0 * max(sigmas_m[1:])
 
 
+@pytest.mark.slow
 def test_a_given_odometry_is_kept_in_a_smooth_tunnel() -> None:
     poses = round_drive()[1].T_world_lidar[:40].copy()
     for row in range(11, 40):

@@ -132,6 +132,7 @@ def test_a_replay_is_served_while_it_runs(tmp_path: Path) -> None:
     assert messages[schema.RESULT]
 
 
+@pytest.mark.slow
 def test_a_viewer_that_reads_nothing_delays_nothing() -> None:
     """64 MB, more than the system keeps for a connection; without end it would wait for the viewer."""
     with (

@@ -92,3 +92,13 @@ def test_a_roofed_courtyard_is_cut_everywhere_and_a_campus_nowhere(
     placed = [geometry.apply(poses[int(scan.index or 0)], scan.points.astype(float)) for scan in scans]
     path_m = np.array([poses[int(scan.index or 0)][:3, 3] for scan in scans])
     assert np.isfinite(cut_heights(path_m, placed)).mean() == share
+
+
+def test_the_clouds_of_a_loop_are_shown_without_the_ceiling() -> None:
+    roofed = _roofed()
+    poses = {keyframe.id: T for keyframe, T in roofed}
+    drawn = BeforeAfter(poses, GraphEstimate(poses, 0.0, {}), [keyframe for keyframe, _ in roofed])
+    for keyframe, _ in roofed:
+        below = drawn.below_ceiling(keyframe)
+        assert below.points[:, 2].max() < CEILING_M
+        assert len(below.points) == len(below.labels) > 0

@@ -225,6 +225,7 @@ def test_a_signal_ends_a_live_run_with_all_its_results(tmp_path: Path, number: i
     assert (run / "report.html").is_file()
 
 
+@pytest.mark.slow
 def test_without_a_scan_nothing_is_left_behind(tmp_path: Path) -> None:
     with LiveCommand(tmp_path, "--out", tmp_path / "run", "--idle", "0.5", "--quiet") as command:
         status, metrics = command.ended()
@@ -326,6 +327,7 @@ def test_a_faster_odometry_is_recommended_where_many_scans_were_dropped() -> Non
     assert "--set odometry.voxel_size_m=0.6 " in advice
 
 
+@pytest.mark.slow
 def test_a_source_that_hangs_does_not_keep_a_run_from_ending() -> None:
     with Front(HangingSource(), Config(), tell=lambda text: None) as front:
         front.wait_until_ready()

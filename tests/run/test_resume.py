@@ -158,8 +158,11 @@ def _head_of_log(tmp_path: Path, whole: Path) -> bytes:
 @pytest.mark.parametrize(
     "part",
     [
-        "all steps, no result",
-        *(pytest.param(part, marks=pytest.mark.slow) for part in ("no step", "half a step", "result, no files")),
+        "half a step",
+        *(
+            pytest.param(part, marks=pytest.mark.slow)
+            for part in ("no step", "all steps, no result", "result, no files")
+        ),
     ],
 )
 def test_a_run_that_lost_its_end_is_resumed(kitti: Path, whole: Path, tmp_path: Path, part: str) -> None:

@@ -79,6 +79,7 @@ def test_a_recording_without_an_index_is_reported_with_the_remedy(tmp_path: Path
         open_dataset(recording, topic=TOPIC)
 
 
+@pytest.mark.slow
 def test_folders_of_clouds_are_mapped_as_the_recording_of_them(tmp_path: Path) -> None:
     (tmp_path / "ply").mkdir()
     (tmp_path / "pcd").mkdir()

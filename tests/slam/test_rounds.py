@@ -71,12 +71,14 @@ def test_low_beams_are_measured_and_do_not_bend_the_drive() -> None:
     assert error_m(made) < 0.05
 
 
+@pytest.mark.slow
 def test_the_adjustment_repeats_exactly() -> None:
     again = graph()
     adjust(again, again.finish(), points, config=CONFIG)
     np.testing.assert_array_equal(again.T_world_keyframes, straightened()[0].T_world_keyframes)
 
 
+@pytest.mark.slow
 def test_one_wrong_loop_left_in_does_no_more_harm_than_without_the_adjustment() -> None:
     T_wrong = geometry.inverse(T_TRUE[0]) @ T_TRUE[-1] @ geometry.transform(np.eye(3), [0.0, 2.5, 0.0])
     information = np.eye(6) * 1e4

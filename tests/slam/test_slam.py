@@ -55,7 +55,8 @@ def test_repeating_the_steps_gives_the_same_attempts_and_poses(run: tuple[list[S
 
 
 @pytest.mark.parametrize(
-    ("max_waiting", "slow"), [(1, "tracking"), (8, "closing"), pytest.param(8, "neither", marks=pytest.mark.slow)]
+    ("max_waiting", "slow"),
+    [(1, "tracking"), *(pytest.param(8, one, marks=pytest.mark.slow) for one in ("closing", "neither"))],
 )
 def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
     run: tuple[list[Step], SlamResult], max_waiting: int, slow: str

@@ -46,6 +46,9 @@ REMOVED = {
 }
 """Settings of older versions, by section: they are ignored with a warning, also in files and `--set`."""
 
+MOST_NAMED = 3
+"""Number of settings that a warning names."""
+
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
     """The defaults, or `base`, changed by a YAML file and then by `section.key=value` texts.
@@ -88,7 +91,9 @@ def config_from_yaml(text: str, source: str) -> Config:
     """
     known, gone = _known(_parse_yaml(text, source))
     if gone:
-        logger.warning("%s: ignored settings that this version does not have: %s", source, ", ".join(gone))
+        more = f" and {len(gone) - MOST_NAMED} more" if len(gone) > MOST_NAMED else ""
+        named = ", ".join(gone[:MOST_NAMED])
+        logger.warning("%s: ignored settings that this version does not have: %s%s", source, named, more)
     return _validate(known, source)
 
 

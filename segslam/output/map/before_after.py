@@ -4,6 +4,7 @@ Each pixel counts the points in it, in top view: walls are sharp lines in an acc
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from segslam.core import geometry
 from segslam.core.points import within_range
-from segslam.core.types import GROUND_LABELS, GraphEstimate, Keyframe, Label, Points, Transform
+from segslam.core.types import GROUND_LABELS, GraphEstimate, Keyframe, Label, Mask, Points, Transform
 from segslam.output.map.from_above import draw_path, png, scale_bar
 from segslam.output.map.overhead import cut_heights, visible
 from segslam.output.map.part import Window
@@ -57,13 +58,21 @@ class BeforeAfter:
         """Draw a keyframe into both maps."""
         stands = ~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8)) & (keyframe.labels < Label.MOVING_CAR)
         stands &= within_range(keyframe.points, 0.0, REACH_M)
-        stands &= visible(self._placed(keyframe), self._path_m, self._cut_m)
+        stands &= self._is_visible(keyframe)
         points = keyframe.points[stands].astype(np.float64)
         for number, poses in enumerate(self._maps):
             placed = geometry.apply(poses[keyframe.id], points)
             for panels in (self._whole, self._detail):
                 if panels:
                     panels[number].add(placed)
+
+    def below_ceiling(self, keyframe: Keyframe) -> Keyframe:
+        """A keyframe without the points that hide the others in top view; without intensities."""
+        seen = self._is_visible(keyframe)
+        return replace(keyframe, points=keyframe.points[seen], labels=keyframe.labels[seen], intensities=None)
+
+    def _is_visible(self, keyframe: Keyframe) -> Mask:
+        return visible(self._placed(keyframe), self._path_m, self._cut_m)
 
     def _placed(self, keyframe: Keyframe) -> Points:
         return geometry.apply(self._maps[1][keyframe.id], keyframe.points.astype(np.float64))

@@ -93,7 +93,7 @@ def _keyframes_of(attempts: Iterable[LoopAttempt]) -> set[int]:
 
 
 def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:
-    """The map before and after, and the keyframes with these ids, in two passes over the log."""
+    """The map before and after, and the keyframes with these ids without ceilings, in two passes over the log."""
     poses = run.result.odometry.T_world_lidar[run.result.keyframe_rows]
     every = 1 + len(poses) // MOST_KEYFRAMES
     kept: dict[int, Keyframe] = {}
@@ -108,5 +108,5 @@ def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[
         if keyframe.id % every == 0:
             before_after.add(keyframe)
         if keyframe.id in wanted:
-            kept[keyframe.id] = keyframe
+            kept[keyframe.id] = before_after.below_ceiling(keyframe)
     return before_after.draw(), kept

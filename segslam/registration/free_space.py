@@ -47,11 +47,6 @@ class FreeSpace:
     free_path_m: float
     """Median range over the directions with a return: the scale of the place (m); 0 without returns."""
 
-    @property
-    def view(self) -> float:
-        """Share of the azimuths with a return, 0 to 1."""
-        return float(np.isfinite(self.nearest_m).any(axis=0).mean())
-
 
 def observe_free_space(points: Points) -> FreeSpace:
     """The spherical image of a scan; `points` (n, 3) in the sensor's frame."""
@@ -84,17 +79,13 @@ def _row_height(elevation_rad: Vector, column: Indices) -> float:
     return next((row_rad for row_rad, found in zip(ROWS_RAD, detail, strict=True) if found >= MIN_DETAIL), ROWS_RAD[-1])
 
 
-def violation(
-    points: Points, seen: FreeSpace, T_view_points: Transform, *, config: VerifyConfig, is_coarse: bool = False
-) -> float:
+def violation(points: Points, seen: FreeSpace, T_view_points: Transform, *, config: VerifyConfig) -> float:
     """Share, 0 to 1, of the points that lie in front of all returns around their direction.
 
-    Only directions with a return count; 0 where there is none. The margin of a coarse pose, which may be off by more
-    than a narrow place allows, is `free_space_margin_m` everywhere.
+    Only directions with a return count; 0 where there is none.
     """
     moved = geometry.apply(T_view_points, points).astype(np.float32)
-    margin_m = config.free_space_margin_m if is_coarse else _margin_m(seen, config)
-    margins = np.array([margin_m, config.free_space_margin_ratio])
+    margins = np.array([_margin_m(seen, config), config.free_space_margin_ratio])
     num_violations, num_seen = _count_violations(moved, seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
     return num_violations / num_seen if num_seen else 0.0
 

@@ -91,21 +91,25 @@ class Table:
             pairs.append((found.of_target, other.of_target))
         return paired_lead(self.ratios, pairs)
 
+    def judge_patches(self, counts: Counts) -> Judged:
+        """A pose by its patches alone, whatever other poses show."""
+        log_odds = self.match_odds(counts)
+        share = self.match[0] * counts * self.ratios / max(counts.sum(), 1.0)
+        evidence = {name: float(share[bins].sum()) for name, bins in PARTS.items()} | {"usual": self.match[1]}
+        evidence["free_space"] += log_odds - self._fit_odds(counts)
+        return Judged(log_odds, evidence)
+
     def judge(self, found: Agreement, others: Sequence[Agreement] | None = None) -> Judged:
         """A pose that shows `found`, where other poses that were tried show `others`.
 
         None for a pose that is known beforehand, so that no others were tried: it is judged by its patches alone.
         """
-        counts = found.counts
-        match = self.match_odds(counts)
-        log_odds = match
-        if others is not None:
-            lead = min((self.lead_of(found, other) for other in others), default=NO_OTHER)
-            log_odds = -float(np.logaddexp(-match, -self.lead_odds(lead)))
-        share = self.match[0] * counts * self.ratios / max(counts.sum(), 1.0)
-        evidence = {name: float(share[bins].sum()) for name, bins in PARTS.items()} | {"usual": self.match[1]}
-        evidence["free_space"] += match - self._fit_odds(counts)
-        return Judged(log_odds, evidence if others is None else evidence | {"other_pose": log_odds - match})
+        alone = self.judge_patches(found.counts)
+        if others is None:
+            return alone
+        lead = min((self.lead_of(found, other) for other in others), default=NO_OTHER)
+        log_odds = -float(np.logaddexp(-alone.log_odds, -self.lead_odds(lead)))
+        return Judged(log_odds, alone.evidence | {"other_pose": log_odds - alone.log_odds})
 
     def most_lead(self, least_odds: float) -> float:
         """Lead over another pose beyond which it cannot lower the odds of a pose below `least_odds`."""

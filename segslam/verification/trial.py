@@ -97,10 +97,13 @@ class Trial(NamedTuple):
         most_m = config.verify.max_coarse_fine_m + FEW_OFF_M
         if moved_m > most_m:
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m with few points")
-        ratio = self.table.mean_ratio(patches.counted(self.first_look(led.T_target_source)))
+        counts = patches.counted(self.first_look(led.T_target_source))
+        ratio = self.table.mean_ratio(counts)
         least = self.least_ratio - FEW_RATIO
         if ratio < least:
-            return Rejected(RejectReason.IMPROBABLE, f"{ratio:.2f} < {least:.2f} nats a patch with few points")
+            judgement = self.table.judge_patches(counts)
+            detail = f"{ratio:.2f} < {least:.2f} nats a patch with few points"
+            return Rejected(RejectReason.IMPROBABLE, detail, judgement.probability, judgement.evidence)
         return led.T_target_source
 
     def first_look(self, T_target_source: Transform) -> patches.Shown:

@@ -9,8 +9,10 @@ import math
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.config import Config
 from segslam.core.types import LoopCandidate, Rejected, RejectReason, Rotation, Transform, Vector
+
+PRIOR_GATE = 1.5
+"""Chosen: largest horizontal distance from the prior, in search radii."""
 
 BASE_HEIGHT_M = 1.0
 """Chosen: storeys are 3 m apart: largest height difference of two visits without drift (m)."""
@@ -33,7 +35,7 @@ def turn_bound_rad(chain_m: float) -> float:
 
 
 def far_from_prior(
-    T_target_source: Transform, candidate: LoopCandidate, R_world_target: Rotation, *, config: Config, slack_m: float
+    T_target_source: Transform, candidate: LoopCandidate, R_world_target: Rotation, *, slack_m: float
 ) -> Rejected | None:
     """Rejects with FAR_FROM_PRIOR a pose that the drift of odometry cannot explain; None if it can.
 
@@ -44,7 +46,7 @@ def far_from_prior(
     apart = R_world_target @ (T_target_source[:3, 3] - prior[:3, 3])
     (height_m,) = height_bounds_m(np.array([candidate.chain_m]))
     bounds = {
-        "distance": (math.hypot(*apart[:2]), config.verify.prior_gate * candidate.search_radius_m + slack_m, "m"),
+        "distance": (math.hypot(*apart[:2]), PRIOR_GATE * candidate.search_radius_m + slack_m, "m"),
         "height": (abs(float(apart[2])), float(height_m) + slack_m, "m"),
         "rotation": (
             math.degrees(geometry.angle(geometry.inverse(prior) @ T_target_source)),

@@ -12,10 +12,15 @@ import numpy as np
 from jaxtyping import Float
 
 from segslam.core import geometry
-from segslam.core.config import VerifyConfig
 from segslam.core.kernels import kernel
 from segslam.core.points import within_range
 from segslam.core.types import Indices, Mask, Points, Transform, Vector
+
+FREE_SPACE_MARGIN_M = 1.0
+"""Chosen for KITTI's streets: distance before a return at which a point violates free space; less in narrow places
+(m)."""
+FREE_SPACE_MARGIN_RATIO = 0.02
+"""Chosen: increase of that distance per metre of range."""
 
 NUM_COLUMNS = 360
 """A cell is one degree wide."""
@@ -79,29 +84,29 @@ def _row_height(elevation_rad: Vector, column: Indices) -> float:
     return next((row_rad for row_rad, found in zip(ROWS_RAD, detail, strict=True) if found >= MIN_DETAIL), ROWS_RAD[-1])
 
 
-def violation(points: Points, seen: FreeSpace, T_view_points: Transform, *, config: VerifyConfig) -> float:
+def violation(points: Points, seen: FreeSpace, T_view_points: Transform) -> float:
     """Share, 0 to 1, of the points that lie in front of all returns around their direction.
 
     Only directions with a return count; 0 where there is none.
     """
     moved = geometry.apply(T_view_points, points).astype(np.float32)
-    margins = np.array([_margin_m(seen, config), config.free_space_margin_ratio])
+    margins = np.array([_margin_m(seen), FREE_SPACE_MARGIN_RATIO])
     num_violations, num_seen = _count_violations(moved, seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
     return num_violations / num_seen if num_seen else 0.0
 
 
-def fates(points: Points, seen: FreeSpace, *, config: VerifyConfig) -> tuple[Mask, Mask]:
+def fates(points: Points, seen: FreeSpace) -> tuple[Mask, Mask]:
     """(n,) each: points that violate free space, and points behind all that was seen or where nothing was.
 
     `points` (n, 3) in the frame of the scan that sees.
     """
-    margins = np.array([_margin_m(seen, config), config.free_space_margin_ratio])
+    margins = np.array([_margin_m(seen), FREE_SPACE_MARGIN_RATIO])
     found = _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
     return found < 0, found > 0
 
 
-def _margin_m(seen: FreeSpace, config: VerifyConfig) -> float:
-    return min(max(SHARE_OF_PATH * seen.free_path_m, MIN_MARGIN_M), config.free_space_margin_m)
+def _margin_m(seen: FreeSpace) -> float:
+    return min(max(SHARE_OF_PATH * seen.free_path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
 
 
 @kernel("UniTuple(int64, 2)(float32, float32, float32, float64, float64)")

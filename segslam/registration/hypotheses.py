@@ -11,6 +11,13 @@ from segslam.core.types import Registration, Rejected, Transform
 from segslam.registration import segregator
 from segslam.registration.prepared import PreparedScan
 
+MAX_HYPOTHESES = 3
+"""Chosen: number of coarse poses tried, the best first."""
+MAX_PLAN_HYPOTHESES = 6
+"""Chosen: number of poses tried after these, from aligning the two floor plans."""
+MAX_COARSE_FINE_M = 2.0
+"""Chosen: largest correction of a coarse pose by refinement (m)."""
+
 MOST_PLANS = 24
 """Chosen: floor-plan poses looked through for those near the prior, 1 ms each."""
 
@@ -55,8 +62,8 @@ def coarse_poses(pair: Pair) -> Iterator[Registration | Rejected]:
         yield ranked
     else:
         possible = [coarse for coarse in ranked if _is_possible(coarse, pair)]
-        yield from (possible or ranked[:1])[: config.verify.max_hypotheses]
-    yield from plans_near(pair, num_poses=config.verify.max_plan_hypotheses)
+        yield from (possible or ranked[:1])[:MAX_HYPOTHESES]
+    yield from plans_near(pair, num_poses=MAX_PLAN_HYPOTHESES)
 
 
 def plans_near(pair: Pair, *, num_poses: int) -> list[Registration]:
@@ -75,4 +82,4 @@ def _floor_plan(scan: PreparedScan) -> segregator.FloorPlan:
 
 
 def _is_possible(coarse: Registration, pair: Pair) -> bool:
-    return pair.gate(coarse.T_target_source, slack_m=pair.config.verify.max_coarse_fine_m) is None
+    return pair.gate(coarse.T_target_source, slack_m=MAX_COARSE_FINE_M) is None

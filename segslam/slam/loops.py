@@ -172,7 +172,7 @@ class LoopCloser:
 
     def _near_prior(self, candidate: LoopCandidate) -> Gate:
         R_world_target = self._graph.T_world_keyframes[candidate.target_id][:3, :3]
-        return partial(far_from_prior, candidate=candidate, R_world_target=R_world_target, config=self._config)
+        return partial(far_from_prior, candidate=candidate, R_world_target=R_world_target)
 
 
 def _once_each(candidates: list[LoopCandidate]) -> list[LoopCandidate]:

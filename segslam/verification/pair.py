@@ -13,7 +13,7 @@ from segslam.core.threads import at_once
 from segslam.core.types import Alignment, Labels, Registration, Rejected, RejectReason, Transform, as_points
 from segslam.labels import geometric_labels
 from segslam.registration import refinement
-from segslam.registration.hypotheses import Gate, anywhere, coarse_poses
+from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Gate, anywhere, coarse_poses
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import score
 from segslam.verification.rivals import differs, rivals_of
@@ -110,7 +110,7 @@ def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Foun
     outcome = trial.refined(coarse, begun)
     if isinstance(outcome, Found):
         moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ outcome.T_target_source)
-        most_m = trial.config.verify.max_coarse_fine_m
+        most_m = MAX_COARSE_FINE_M
         if moved_m > most_m:
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m")
     return outcome

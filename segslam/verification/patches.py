@@ -13,12 +13,16 @@ import numpy as np
 from jaxtyping import Float, Int8
 
 from segslam.core import geometry
-from segslam.core.config import VerifyConfig
 from segslam.core.points import cell_keys, within_range
 from segslam.core.types import Indices, Points, Transform, Vector
 from segslam.registration.free_space import fates, violation
 from segslam.registration.prepared import Observed
 from segslam.registration.refinement import Surface
+
+INLIER_M = 0.5
+"""Chosen: refine.voxel_m: distance to the other scan within which a point overlaps it (m)."""
+MAX_RANGE_M = 50.0
+"""Chosen on simulated 00 and 08: points farther from the other sensor are out of its reach (m)."""
 
 NUM_SCANS = 16
 """Number of scans whose patches are in memory, about 0.4 MB each."""
@@ -89,21 +93,21 @@ def patches_of(surface: Surface) -> Patches:
     return Patches(points, normals, patch, np.bincount(patch).astype(np.float64))
 
 
-def agreement(source: Observed, target: Observed, T_target_source: Transform, *, config: VerifyConfig) -> Agreement:
+def agreement(source: Observed, target: Observed, T_target_source: Transform) -> Agreement:
     """Agreement of two scans at this pose of the source in the target."""
     roughness_m = max(source[0].roughness_m, target[0].roughness_m)
     ways = [
-        (*_seen_from(b, a, T_b_a, roughness_m, config), violation(a[0].points, b[1], T_b_a, config=config))
+        (*_seen_from(b, a, T_b_a, roughness_m), violation(a[0].points, b[1], T_b_a))
         for a, b, T_b_a in ((source, target, T_target_source), (target, source, geometry.inverse(T_target_source)))
     ]
     overlaps, residuals_m, shown, violations = zip(*ways, strict=True)
     return Agreement(min(overlaps), max(residuals_m), max(violations), *shown)
 
 
-def first_look(source: Observed, target: Observed, T_target_source: Transform, *, config: VerifyConfig) -> Shown:
+def first_look(source: Observed, target: Observed, T_target_source: Transform) -> Shown:
     """The patches of the source alone, in half of the time: a first look at a pose that may still be refined."""
     roughness_m = max(source[0].roughness_m, target[0].roughness_m)
-    return _seen_from(target, source, T_target_source, roughness_m, config)[2]
+    return _seen_from(target, source, T_target_source, roughness_m)[2]
 
 
 def counted(shown: Shown) -> Counts:
@@ -111,23 +115,21 @@ def counted(shown: Shown) -> Counts:
     return np.bincount(shown[shown >= 0], minlength=len(BINS)).astype(np.float64)
 
 
-def _seen_from(
-    b: Observed, a: Observed, T_b_a: Transform, roughness_m: float, config: VerifyConfig
-) -> tuple[float, float, Shown]:
+def _seen_from(b: Observed, a: Observed, T_b_a: Transform, roughness_m: float) -> tuple[float, float, Shown]:
     """Overlap, residual (m) and patches of a's standing points in the view of b."""
     surface, standing = b[0], patches_of(a[0])
     moved = geometry.apply(T_b_a, standing.points)
-    within = within_range(moved, 0.0, config.max_range_m)
+    within = within_range(moved, 0.0, MAX_RANGE_M)
     points, normals = moved[within], standing.normals[within] @ T_b_a[:3, :3].T
     if not len(points):
         return 0.0, math.inf, np.full(len(standing.size), -1, np.int8)
     rows, apart_m = surface.nearest(points)
     there = surface.normals[rows]
     to_plane_m = np.einsum("ij,ij->i", points - surface.points[rows], there)
-    is_near = apart_m < config.inlier_m
+    is_near = apart_m < INLIER_M
     rms_m = float(np.sqrt(np.mean(to_plane_m[is_near] ** 2))) if is_near.any() else math.inf
     is_same = np.abs(np.einsum("ij,ij->i", normals, there)) > SAME_NORMAL
-    violates, is_beyond = fates(points, b[1], config=config)
+    violates, is_beyond = fates(points, b[1])
     known, near, same, squared, violating, range_m = (
         np.bincount(standing.patch[within], weights, minlength=len(standing.size))
         for weights in (

@@ -14,6 +14,9 @@ from segslam.registration.hypotheses import anywhere, plans_near
 from segslam.verification import score
 from segslam.verification.trial import Found, Trial, few_points, is_near
 
+MAX_RIVALS = 6
+"""Chosen: number of floor-plan poses tried as rivals, besides shifts along the weak direction."""
+
 MOST_SHIFT_M = 8
 """Chosen: largest shift along the weak direction at which rivals are searched, in steps of 1 m; refinement finds rivals
 within 0.5 m."""
@@ -63,7 +66,7 @@ def _starts(found: Found, trial: Trial) -> list[_Start]:
     """Poses to which few points lead from shifts along the weak direction, and from floor plans."""
     weakest = refinement.weakest_level(found.fine.information)
     shifted = [start for sign in (-1.0, 1.0) for start in _shifted(found, sign * weakest, trial)]
-    plans = [_led(coarse, found, trial) for coarse in plans_near(trial.pair, num_poses=trial.config.verify.max_rivals)]
+    plans = [_led(coarse, found, trial) for coarse in plans_near(trial.pair, num_poses=MAX_RIVALS)]
     return [start for start in (*shifted, *plans) if start is not None and not _is_found(start.coarse, found)]
 
 

@@ -10,10 +10,13 @@ from segslam.core.config import Config, RefineConfig
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.types import Alignment, Registration, Rejected, RejectReason, Transform
 from segslam.registration import refinement
-from segslam.registration.hypotheses import Gate, Pair
+from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Gate, Pair
 from segslam.registration.prepared import PreparedScan
 from segslam.verification import patches, score
 from segslam.verification.verdict import judged
+
+MIN_INLIERS = 3
+"""Chosen: smallest number of clique members consistent with a coarse pose."""
 
 NUM_FEW = 4
 """Number of sources of which few points are in memory."""
@@ -78,9 +81,9 @@ class Trial(NamedTuple):
         time of a refinement with all points, which most wrong hypotheses do not need.
         """
         config = self.config
-        if coarse.num_inliers < config.verify.min_inliers:
-            return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {config.verify.min_inliers}")
-        rejected = self.gate(coarse.T_target_source, slack_m=config.verify.max_coarse_fine_m)
+        if coarse.num_inliers < MIN_INLIERS:
+            return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {MIN_INLIERS}")
+        rejected = self.gate(coarse.T_target_source, slack_m=MAX_COARSE_FINE_M)
         if rejected is not None:
             return rejected
         with self.watch("refine"):
@@ -94,7 +97,7 @@ class Trial(NamedTuple):
         if isinstance(led, Rejected):
             return led
         moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ led.T_target_source)
-        most_m = config.verify.max_coarse_fine_m + FEW_OFF_M
+        most_m = MAX_COARSE_FINE_M + FEW_OFF_M
         if moved_m > most_m:
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m with few points")
         counts = patches.counted(self.first_look(led.T_target_source))
@@ -110,7 +113,7 @@ class Trial(NamedTuple):
         """What the patches of the source show at this pose; takes 2 ms."""
         scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            return patches.first_look(*scans, T_target_source, config=self.config.verify)
+            return patches.first_look(*scans, T_target_source)
 
     def refined(self, coarse: Registration, T_begun: Transform) -> Found | Rejected:
         """A hypothesis refined with all points from `T_begun`, and what the scans show there."""
@@ -122,7 +125,7 @@ class Trial(NamedTuple):
         """A refined pose, and what the scans show there."""
         scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            return Found(coarse, fine, patches.agreement(*scans, fine.T_target_source, config=self.config.verify))
+            return Found(coarse, fine, patches.agreement(*scans, fine.T_target_source))
 
     def match_odds(self, pose: Found) -> float:
         """Log odds that a pose is no chance fit, whatever other poses show."""

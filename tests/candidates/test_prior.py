@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from segslam.candidates.prior import far_from_prior
+from segslam.candidates.prior import PRIOR_GATE, far_from_prior
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import LoopCandidate, Rejected, RejectReason
@@ -15,7 +15,7 @@ def _outcome(
     prior = geometry.transform(geometry.yaw(0.7), [5.0, -3.0, 0.2])
     candidate = LoopCandidate(1, 0, prior, 5.0, search_radius_m=7.5, chain_m=chain_m)
     R = np.eye(3) if R_world_target is None else R_world_target
-    return far_from_prior(prior @ T_prior_pose, candidate, R, config=CONFIG, slack_m=slack_m)
+    return far_from_prior(prior @ T_prior_pose, candidate, R, slack_m=slack_m)
 
 
 def _moved(*shift_m: float) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_heights_are_the_worlds_whatever_the_attitude_of_the_target() -> None:
     prior = geometry.transform(np.eye(3), 0.0)
     candidate = LoopCandidate(1, 0, prior, 0.0, search_radius_m=7.5, chain_m=100.0)
     judged = [
-        far_from_prior(_moved(*shift), candidate, R_world_target, config=CONFIG, slack_m=0.0)
+        far_from_prior(_moved(*shift), candidate, R_world_target, slack_m=0.0)
         for shift in ([3.0, 0.0, 0.0], [0.0, 0.0, 3.0])
     ]
     assert _is_rejected_for("height", judged[0])
@@ -67,6 +67,6 @@ def test_heights_are_the_worlds_whatever_the_attitude_of_the_target() -> None:
 
 @pytest.mark.parametrize("shift_m", [11.0, 12.0])
 def test_a_pose_beyond_the_search_radius_and_its_slack_is_rejected_for_its_distance(shift_m: float) -> None:
-    allowed_m = CONFIG.verify.prior_gate * 7.5  # 11.25
+    allowed_m = PRIOR_GATE * 7.5  # 11.25
     assert _is_rejected_for("distance", _outcome(_moved(shift_m, 0.0, 0.0))) is (shift_m > allowed_m)
     assert _outcome(_moved(shift_m, 0.0, 0.0), slack_m=2.0) is None

@@ -61,7 +61,7 @@ def test_shipped_configurations_load(file: Path) -> None:
         ("keyframes.distance_m=[", "--set keyframes.distance_m"),
         ("refine.correspondence_m=[]", "refine.correspondence_m"),
         ("refine.correspondence_m=[1.0, -0.5]", "refine.correspondence_m.1"),
-        ("segregator.feature_classes=[hovercraft]", "feature_classes"),
+        ("segregator.foot_classes=[hovercraft]", "foot_classes"),
         ("distance_m=1", "section.key=value"),
         ("keyframes.distance_m", "section.key=value"),
     ],

@@ -42,15 +42,15 @@ def test_a_pattern_that_never_repeats_and_a_narrow_view_are_seen_whole() -> None
     seen = observe_free_space(points)
     assert math.degrees(seen.row_rad) <= 1.0
     assert np.isfinite(seen.nearest_m).any(axis=0).sum() == pytest.approx(70, abs=2), "columns of one degree"
-    assert violation(0.5 * points, seen, np.eye(4), config=CONFIG) > 0.99
-    assert violation(points, seen, np.eye(4), config=CONFIG) == 0.0
+    assert violation(0.5 * points, seen, np.eye(4)) > 0.99
+    assert violation(points, seen, np.eye(4)) == 0.0
 
 
 def test_what_stands_near_a_sensor_that_looks_steeply_up_counts() -> None:
     """At 40 degrees and 2 m: beyond 30 degrees and nearer than 3 m, where nothing may be taken for granted."""
     ceiling = _dome(np.linspace(-45.0, 45.0, 64), radius_m=6.0)
     near = _dome(np.array([40.0]), radius_m=2.0)
-    assert violation(near, observe_free_space(ceiling), np.eye(4), config=CONFIG) == 1.0
+    assert violation(near, observe_free_space(ceiling), np.eye(4)) == 1.0
 
 
 def test_the_margin_shrinks_with_the_place() -> None:
@@ -58,7 +58,7 @@ def test_the_margin_shrinks_with_the_place() -> None:
     for radius_m, share in ((20.0, 0.0), (2.4, 1.0)):
         seen = observe_free_space(_dome(np.linspace(-22.5, 22.5, 64), radius_m=radius_m))
         before = _dome(np.linspace(-20.0, 20.0, 64), radius_m=radius_m - 0.6)
-        assert violation(before, seen, np.eye(4), config=CONFIG) == share, radius_m
+        assert violation(before, seen, np.eye(4)) == share, radius_m
 
 
 def test_a_view_holds_the_nearest_return_around_each_direction_that_has_one() -> None:
@@ -73,7 +73,7 @@ def test_a_view_holds_the_nearest_return_around_each_direction_that_has_one() ->
 def test_a_scan_without_returns_sees_nothing(points: np.ndarray) -> None:
     seen = observe_free_space(points)
     assert not np.isfinite(seen.nearest_m).any()
-    assert violation(_ring(10.0), seen, np.eye(4), config=CONFIG) == 0.0
+    assert violation(_ring(10.0), seen, np.eye(4)) == 0.0
 
 
 def test_a_view_wraps_behind_the_sensor() -> None:
@@ -86,18 +86,18 @@ def test_ground_whose_grazing_rays_were_lost_does_not_stand_in_the_way_to_the_wa
     far_ground = np.array([[17.0, 0.0, -1.34]])  # 4.5 degrees down, in the row below the lowest of the wall
     seen = observe_free_space(wall[wall[:, 2] > -1.35])  # down to 3.7 degrees
     assert np.isfinite(seen.nearest_m).any()
-    assert violation(far_ground, seen, np.eye(4), config=CONFIG) == 0.0
+    assert violation(far_ground, seen, np.eye(4)) == 0.0
 
 
 def test_points_before_a_wall_that_was_seen_violate_and_points_behind_it_do_not() -> None:
     wall = observe_free_space(_ring(20.0))
-    assert violation(_ring(10.0), wall, np.eye(4), config=CONFIG) == 1.0
-    assert violation(_ring(30.0), wall, np.eye(4), config=CONFIG) == 0.0
-    assert violation(_ring(20.0), wall, np.eye(4), config=CONFIG) == 0.0
+    assert violation(_ring(10.0), wall, np.eye(4)) == 1.0
+    assert violation(_ring(30.0), wall, np.eye(4)) == 0.0
+    assert violation(_ring(20.0), wall, np.eye(4)) == 0.0
 
 
 def test_the_share_is_of_points_where_something_returned() -> None:
     half_seen = observe_free_space(_ring(20.0, azimuths_deg=(0.0, 90.0)))
-    assert violation(_ring(10.0), half_seen, np.eye(4), config=CONFIG) == 1.0
+    assert violation(_ring(10.0), half_seen, np.eye(4)) == 1.0
     ahead_only = _ring(10.0, azimuths_deg=(180.0, 270.0))
-    assert violation(ahead_only, half_seen, np.eye(4), config=CONFIG) == 0.0
+    assert violation(ahead_only, half_seen, np.eye(4)) == 0.0

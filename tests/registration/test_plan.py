@@ -8,6 +8,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.types import Alignment, Label, Points, Registration, Transform
+from segslam.registration import hypotheses
 from segslam.registration.segregator.plan import CELL_M, NUM_YAWS, FloorPlan, plan_hypotheses
 from segslam.verification import register
 
@@ -92,8 +93,11 @@ def test_nothing_upright_gives_no_pose() -> None:
 
 
 @pytest.mark.parametrize(("num_plans", "aligned"), [(2, True), (0, False)])
-def test_scans_that_share_nothing_but_walls_are_aligned_by_these(num_plans: int, aligned: bool) -> None:
-    config = load_config(overrides=["segregator.features=never", f"verify.max_plan_hypotheses={num_plans}"])
+def test_scans_that_share_nothing_but_walls_are_aligned_by_these(
+    num_plans: int, aligned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hypotheses, "MAX_PLAN_HYPOTHESES", num_plans)
+    config = load_config(overrides=["segregator.features=never"])
     ground = np.column_stack([column.ravel() for column in np.mgrid[-4:14:0.3, -6:20:0.3, -1.7:-1.6:1]])
     walls = _court(points_per_metre=60)
     labels = np.repeat(np.array([Label.ROAD, Label.BUILDING], np.uint8), [len(ground), len(walls)])

@@ -33,7 +33,7 @@ def _room(seed: int, length_m: float = 16.0) -> Observed:
 
 def _shares(T_target_source: np.ndarray) -> dict[str, float]:
     """Shares of the patches, by what they show."""
-    counts = agreement(_room(1), _room(2), T_target_source, config=CONFIG.verify).counts
+    counts = agreement(_room(1), _room(2), T_target_source).counts
     return dict(zip(BINS, counts / counts.sum(), strict=True))
 
 
@@ -41,7 +41,7 @@ def test_at_the_true_pose_patches_lie_on_the_surfaces_of_the_other_scan() -> Non
     shares = _shares(np.eye(4))
     assert shares["free space"] < 0.02
     assert sum(share for name, share in shares.items() if "same normal" in name) > 0.8
-    found = agreement(_room(1), _room(2), np.eye(4), config=CONFIG.verify)
+    found = agreement(_room(1), _room(2), np.eye(4))
     assert found.overlap > 0.95
     assert found.rms_m < 0.05
     assert found.free_space_violation < 0.01
@@ -51,11 +51,11 @@ def test_patches_that_lie_where_the_other_scan_saw_through_are_in_free_space() -
     """Turned by 90 degrees, the ends of the room stand in its middle, or beyond its walls, out of sight."""
     turned = geometry.transform(geometry.yaw(np.pi / 2), 0.0)
     assert _shares(turned)["free space"] > 0.2
-    assert agreement(_room(1), _room(2), turned, config=CONFIG.verify).free_space_violation > 0.1
+    assert agreement(_room(1), _room(2), turned).free_space_violation > 0.1
 
 
 def test_what_is_out_of_sight_or_out_of_range_counts_for_nothing() -> None:
-    far = agreement(_room(1), _room(2), geometry.transform(np.eye(3), [500.0, 0.0, 0.0]), config=CONFIG.verify)
+    far = agreement(_room(1), _room(2), geometry.transform(np.eye(3), [500.0, 0.0, 0.0]))
     assert far.counts.sum() == 0.0
     assert far.overlap == 0.0
     assert math.isinf(far.rms_m)
@@ -63,12 +63,12 @@ def test_what_is_out_of_sight_or_out_of_range_counts_for_nothing() -> None:
 
 def test_the_patches_are_the_same_in_both_directions() -> None:
     T_target_source = geometry.transform(geometry.yaw(0.1), [0.2, 0.1, 0.0])
-    forth = agreement(_room(1), _room(2), T_target_source, config=CONFIG.verify)
-    back = agreement(_room(2), _room(1), geometry.inverse(T_target_source), config=CONFIG.verify)
+    forth = agreement(_room(1), _room(2), T_target_source)
+    back = agreement(_room(2), _room(1), geometry.inverse(T_target_source))
     np.testing.assert_array_equal(forth.of_source, back.of_target)
     np.testing.assert_array_equal(forth.of_target, back.of_source)
     assert forth.overlap == pytest.approx(back.overlap)
-    seen = first_look(_room(1), _room(2), T_target_source, config=CONFIG.verify)
+    seen = first_look(_room(1), _room(2), T_target_source)
     np.testing.assert_array_equal(seen, forth.of_source)
 
 
@@ -76,4 +76,4 @@ def test_a_patch_counts_once_however_many_points_it_has() -> None:
     patches = patches_of(_room(1)[0])
     assert patches.size.sum() == len(patches.points)
     assert 50 < len(patches.size) < len(patches.points) / 5
-    assert agreement(_room(1), _room(2), np.eye(4), config=CONFIG.verify).of_source.shape == patches.size.shape
+    assert agreement(_room(1), _room(2), np.eye(4)).of_source.shape == patches.size.shape

@@ -10,9 +10,9 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.types import Alignment, Label, Registration, Rejected, RejectReason
-from segslam.registration import refinement, segregator
+from segslam.registration import hypotheses, refinement, segregator
 from segslam.registration.free_space import observe_free_space
-from segslam.registration.hypotheses import anywhere, coarse_poses
+from segslam.registration.hypotheses import MAX_COARSE_FINE_M, MAX_HYPOTHESES, anywhere, coarse_poses
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register, register_near, register_prepared, rivals, score
 from segslam.verification.trial import Found, Trial
@@ -77,7 +77,7 @@ def test_a_gate_sees_the_refined_pose_too_which_moves_no_farther() -> None:
     assert isinstance(found, Rejected)
     assert found.detail == "refined"
     slack_m, error_m = zip(*seen, strict=True)
-    assert slack_m[0] == CONFIG.verify.max_coarse_fine_m
+    assert slack_m[0] == MAX_COARSE_FINE_M
     assert error_m[slack_m.index(0.0)] < 0.05
 
 
@@ -86,15 +86,15 @@ def test_poses_that_the_prior_excludes_do_not_use_up_the_attempts(monkeypatch: p
     source, target, T_target_source = _round_pair()
     (right, *_) = segregator.hypotheses(source.description, target.description, config=CONFIG.segregator)
     turned = replace(right, T_target_source=right.T_target_source @ geometry.transform(geometry.yaw(np.pi), 0.0))
-    ranked = [turned] * CONFIG.verify.max_hypotheses + [right]
+    ranked = [turned] * MAX_HYPOTHESES + [right]
     monkeypatch.setattr(segregator, "hypotheses", lambda *_, **__: ranked)
-    config = Config.model_validate({"verify": {"max_plan_hypotheses": 0}})
+    monkeypatch.setattr(hypotheses, "MAX_PLAN_HYPOTHESES", 0)
 
     def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
         turn_deg = _error(T_target_source, pose)[1]
         return Rejected(RejectReason.FAR_FROM_PRIOR) if turn_deg > 20.0 else None
 
-    assert isinstance(register_prepared(source, target, config=config, gate=gate), Alignment)
+    assert isinstance(register_prepared(source, target, config=CONFIG, gate=gate), Alignment)
 
 
 def test_poses_that_the_prior_excludes_are_rivals() -> None:

@@ -83,7 +83,7 @@ class Judge:
         self, source: PreparedScan, target: PreparedScan, T_prior: Transform, R_world_target: Rotation
     ) -> Alignment | Rejected:
         candidate = LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), RADIUS_M, CHAIN_M)
-        gate = partial(far_from_prior, candidate=candidate, R_world_target=R_world_target, config=self._config)
+        gate = partial(far_from_prior, candidate=candidate, R_world_target=R_world_target)
         return register_prepared(source, target, config=self._config, gate=gate)
 
 
@@ -121,7 +121,7 @@ def _true(place: Place, judge: Judge, count: int, rng: np.random.Generator, conf
         T_source, T_target = place.pose(source, visits[0]), place.pose(target, visits[1])
         one, other = place.prepared(source, visits[0]), place.prepared(target, visits[1])
         T_true = geometry.inverse(T_target) @ T_source
-        counts = agreement(one.observed, other.observed, T_true, config=config.verify).overlap > 0.4
+        counts = agreement(one.observed, other.observed, T_true).overlap > 0.4
         found = judge(one, other, prior(T_true, rng), T_target[:3, :3])
         right = isinstance(found, Alignment) and common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
         wrong += isinstance(found, Alignment) and not right

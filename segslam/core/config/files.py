@@ -37,11 +37,12 @@ REMOVED = {
         "foot_max_distance_m few_clusters dcvc_start_radius_m dcvc_radius_step_m dcvc_azimuth_deg min_range_m "
         "max_range_m tuple_similarity tuple_trials_per_pair tuple_seed clique_max_nodes certain_inliers "
         "centroid_noise_m centroid_noise_share shared_noise_m shared_noise_deg ground_noise_m ground_weight "
-        "gnc_factor gnc_max_iterations gnc_cost_tolerance"
+        "gnc_factor gnc_max_iterations gnc_cost_tolerance feature_classes"
     ),
     "verify": (
         "min_overlap max_residual_ratio min_weak_support min_second_support max_free_space_violation "
-        "max_violation_ratio well_observed rival_ratio"
+        "max_violation_ratio well_observed rival_ratio max_hypotheses max_plan_hypotheses max_coarse_fine_m "
+        "min_inliers inlier_m max_range_m free_space_margin_m free_space_margin_ratio max_rivals prior_gate"
     ),
 }
 """Settings of older versions, by section: they are ignored with a warning, also in files and `--set`."""

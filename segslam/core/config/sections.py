@@ -194,9 +194,6 @@ class SegregatorConfig(Section):
         le=90,
         description="pitch bin of DCVC, at least the spacing of the beams (degrees) [authors: 1.2; chosen]",
     )
-    feature_classes: tuple[StaticLabel, ...] = Field(
-        (Label.BUILDING, Label.VEGETATION), description="classes that give FPFH key points [paper: L_F]"
-    )
     feature_voxel_m: float = Field(
         0.35, ge=0.01, description="voxel size of the class clouds (m) [authors: 0.5; chosen]"
     )
@@ -262,43 +259,6 @@ class VerifyConfig(Section):
         lt=0.5,
         description="share of false ones among the loops that are accepted, by what was measured on pairs of scans "
         "[the user's choice]",
-    )
-    max_hypotheses: int = Field(3, ge=1, description="number of coarse poses tried, the best first [chosen]")
-    max_plan_hypotheses: int = Field(
-        6, ge=0, description="number of poses tried after these, from aligning the two floor plans [chosen]"
-    )
-    min_inliers: int = Field(
-        3, ge=0, description="smallest number of clique members consistent with a coarse pose [chosen]"
-    )
-    inlier_m: float = Field(
-        0.5,
-        gt=0,
-        description="distance to the other scan within which a point overlaps it (m) [chosen: refine.voxel_m]",
-    )
-    max_range_m: float = Field(
-        50.0,
-        gt=0,
-        description="points farther from the other sensor are out of its reach (m) [chosen on simulated 00 and 08]",
-    )
-    free_space_margin_m: float = Field(
-        1.0,
-        gt=0,
-        description="distance before a return at which a point violates free space; less in narrow places (m) "
-        "[chosen for KITTI's streets]",
-    )
-    free_space_margin_ratio: float = Field(
-        0.02, ge=0, description="increase of that distance per metre of range [chosen]"
-    )
-    max_coarse_fine_m: float = Field(
-        2.0, gt=0, description="largest correction of a coarse pose by refinement (m) [chosen]"
-    )
-    max_rivals: int = Field(
-        6,
-        ge=0,
-        description="number of floor-plan poses tried as rivals, besides shifts along the weak direction [chosen]",
-    )
-    prior_gate: float = Field(
-        1.5, gt=0, description="largest horizontal distance from the prior, in search radii [chosen]"
     )
 
 

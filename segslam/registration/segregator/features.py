@@ -15,9 +15,12 @@ from jaxtyping import Float
 
 from segslam.core.config import SegregatorConfig
 from segslam.core.points import normals, patch_covariances, radius_neighbours, voxel_means, within_range
-from segslam.core.types import Covariances, Labels, Points
+from segslam.core.types import Covariances, Label, Labels, Points
 from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M
 from segslam.registration.segregator.fpfh import fpfh
+
+FEATURE_CLASSES = (Label.BUILDING, Label.VEGETATION)
+"""Classes that give FPFH key points (paper: L_F)."""
 
 MIN_PATCH_POINTS = 4
 """Chosen: three points always lie on a plane, so a normal needs at least four."""
@@ -44,12 +47,12 @@ NO_FEATURES = Features(
 
 
 def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) -> Features:
-    """The key points of each class in `config.feature_classes`, in the frame of `points`; the sensor is at its origin.
+    """The key points of each class in `FEATURE_CLASSES`, in the frame of `points`; the sensor is at its origin.
 
     Points that are NaN or out of range are ignored. The result does not depend on the order of the points.
     """
     parts = []
-    for label in config.feature_classes:
+    for label in FEATURE_CLASSES:
         cloud = points[labels == label]
         cloud = cloud[within_range(cloud, MIN_RANGE_M, MAX_RANGE_M)].astype(np.float32)
         parts.append(_class_features(_voxelised(cloud, config.feature_voxel_m), int(label), config))

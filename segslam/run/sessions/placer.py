@@ -136,7 +136,7 @@ class Placer:
             detail = f"{geometry.distance(moved):.1f} m, {np.degrees(geometry.angle(moved)):.1f} degrees"
             return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
         with watch("verify"):
-            found = agreement(own, target, fine.T_target_source, config=self._config.verify)
+            found = agreement(own, target, fine.T_target_source)
         coarse = replace(fine, T_target_source=T_target_predicted, num_inliers=0, num_correspondences=0)
         alignment = judged(coarse, fine, found, None, config=self._config)
         if isinstance(alignment, Rejected):

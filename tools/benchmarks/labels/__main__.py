@@ -1,6 +1,6 @@
 """Accuracy of geometric labels: per class, and by the registrations with them.
 
-    python -m tools.benchmarks.labels DATA [--set verify.max_plan_hypotheses=0] [--pictures FOLDER] --out FILE.json
+    python -m tools.benchmarks.labels DATA [--set segregator.features=never] [--pictures FOLDER] --out FILE.json
 
 DATA is the folder of real data: `kitti/` with ground-truth labels of scans 0-2, predicted ones, and
 `reference_pairs.json`, and `courtyard/`. Writes JSON, and the tables as FILE.md. The numbers of `labels/geometric.py`

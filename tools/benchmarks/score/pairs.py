@@ -85,7 +85,7 @@ def described(task: Task, config: Config) -> Pair:
     overlap = 0.0
     if task.is_true and task.T_target_source is not None:
         scans = task.source.observed, task.target.observed
-        overlap = agreement(*scans, task.T_target_source, config=config.verify).overlap
+        overlap = agreement(*scans, task.T_target_source).overlap
     is_searched = bool(tried) and trial.match_odds(tried[0]) >= trial.least_odds
     return Pair(task.part, task.sensor, task.is_true, overlap, poses, verdict, seconds, is_searched)
 
@@ -99,7 +99,7 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
 
     def gate(T_prior: Transform, R_world_target: Rotation) -> Gate:
         candidate = LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), scenes.RADIUS_M, scenes.CHAIN_M)
-        return partial(far_from_prior, candidate=candidate, R_world_target=R_world_target, config=config)
+        return partial(far_from_prior, candidate=candidate, R_world_target=R_world_target)
 
     def visits() -> tuple[int, int]:
         return int(rng.integers(2)), int(rng.integers(2)) + 2

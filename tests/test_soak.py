@@ -40,6 +40,10 @@ class Rounds:
     reference = None
     T_camera_lidar = None
     scan_index = np.arange(200_000)
+    is_sequential = False
+    vertical_angle_deg = 0.0
+    names: tuple[str, ...] = ()
+    num_recorded = len(scan_index)
 
     def __init__(self, seconds: float) -> None:
         self._end = monotonic() + seconds

@@ -59,7 +59,7 @@ def register_prepared(
 ) -> Alignment | Rejected:
     """The refined and verified pose of the source in the target without an initial guess, or the reason of rejection.
 
-    Hypotheses are tried from best to worst until one is probably no chance fit. It is compared with all other poses
+    Hypotheses are tried from best to worst until one is no chance fit. It is compared with all other poses
     that were tried and with rivals; the best of them is returned if it is as probable as `verify.max_false_share`
     asks. `gate` may reject a pose before and after refinement. If no hypothesis leads anywhere, the rejection of the
     best one is returned.
@@ -83,7 +83,7 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
         outcome = coarse if isinstance(coarse, Rejected) else _outcome(trial, coarse, found)
         if isinstance(outcome, Found):
             found.append(outcome)
-            if trial.match_odds(outcome) >= trial.least_odds:
+            if trial.fits(outcome):
                 break
         elif outcome is not None:
             rejections.append(outcome)
@@ -91,12 +91,12 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
     if not allowed:
         excluded = [trial.gate(pose.T_target_source, slack_m=0.0) for pose in found]
         return [*(rejected for rejected in excluded if rejected is not None), *rejections][0]
-    best = max(allowed, key=trial.match_odds)
-    if trial.match_odds(best) >= trial.least_odds:
+    best = max(allowed, key=trial.mean_ratio)
+    if trial.fits(best):
         rivals = rivals_of(best, found, trial)
         found += rivals
         allowed += [pose for pose in rivals if trial.gate(pose.T_target_source, slack_m=0.0) is None]
-        best = max(allowed, key=trial.match_odds)
+        best = max(allowed, key=trial.mean_ratio)
     return [best, *(pose for pose in found if differs(pose, best))]
 
 

@@ -85,7 +85,7 @@ def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
     begun = replace(coarse, T_target_source=T_begun)
     if _is_found(begun, found):
         return _Start(begun, 0.0)
-    most = trial.table.most_lead(trial.least_odds)
+    most = trial.table.most_lead(found.agreement.counts, trial.least_odds)
     if _lead(found, T_begun, trial) > most + APPROACH_LEAD:
         return None
     with trial.watch("refine"):

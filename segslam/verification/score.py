@@ -1,10 +1,10 @@
 """The probability that a pose between two scans is right, and what it is made of.
 
-A pose can be wrong in three ways: as a chance fit of two places; because one scan stands where the other saw through;
-or because another pose explains the scans as well. The first is judged by the patches of the scans (`patches`): how
-much more often do right poses show them than the wrong poses that resemble them most? The second by the share of
-patches in free space, the third by the lead over each other pose that was tried. The likeliest way counts.
-`tools.benchmarks.score` measures all numbers in `score.json` on pairs of scans whose poses are known.
+A pose is a chance fit unless the patches of the scans (`patches`) show enough of what right poses show more often than
+the wrong poses that resemble them most, and few of them are where the other scan saw through. The log odds of a pose
+that fits are a sum: what its patches show, and its least lead over the other poses that were tried. Patches beside each
+other err together, so the same lead counts less if there are many of them. `tools.benchmarks.score` measures all numbers
+in `score.json` on pairs of scans whose poses are known.
 """
 
 import json
@@ -21,11 +21,10 @@ from segslam.core.config import VerifyConfig
 from segslam.core.types import Vector
 from segslam.verification.patches import BINS, Agreement, Counts, Shown
 
-NO_OTHER = 7.0
+NO_OTHER = 10.0
 """Lead of a pose (standard deviations) if no other pose was found, and at most."""
 LEAST_SCATTER = 1.0
 """Least standard deviation of the sum over all patches (nats), of poses that show the same."""
-PARTS = {"surfaces": slice(2, None), "no_surface": slice(1, 2), "free_space": slice(0, 1)}
 
 
 class Judged(NamedTuple):
@@ -34,12 +33,25 @@ class Judged(NamedTuple):
     log_odds: float
     """That it is right, in nats; right and wrong poses being equally frequent."""
     evidence: dict[str, float]
-    """Its summands by name: what the patches show, the `usual` value of all patches, and the best `other_pose`."""
+    """Its summands by name: what the patches show, what is `usual` for so many of them, the best `other_pose`, and what
+    makes it a `chance_fit`."""
 
     @property
     def probability(self) -> float:
         """That the pose is right, 0 to 1."""
         return 1.0 / (1.0 + math.exp(-min(max(self.log_odds, -500.0), 500.0)))
+
+
+class Weights(NamedTuple):
+    """What the log odds of a pose that fits are made of."""
+
+    free_space: float
+    """Of the root of the share of patches in free space, against the pose."""
+    number: float
+    """Of the root of the number of patches, against the pose."""
+    lead: float
+    """Of the least lead over another pose."""
+    offset: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,12 +60,13 @@ class Table:
 
     ratios: Vector
     """log of how much more often right poses show a patch of each of `BINS` than wrong ones (nats)."""
-    match: tuple[float, float]
-    """Slope and offset of the log odds that a pose is no chance fit, by its mean ratio."""
-    free: tuple[float, float]
-    """The same that it does not contradict free space, by the root of the share of its patches that do."""
-    lead: tuple[float, float]
-    """The same that no other pose is as good, by the square of the least lead over another pose, with its sign."""
+    least_ratio: float
+    """Mean log ratio of a patch that a pose has at least unless it is a chance fit (nats)."""
+    most_free: float
+    """Root of the share of patches in free space that it has at most."""
+    chance: float
+    """Log odds of a chance fit."""
+    weights: Weights
     margin: float = 0.0
     """How much more the odds of all accepted poses together are than those of the least probable of them (nats)."""
 
@@ -65,20 +78,22 @@ class Table:
         """Mean log ratio of a patch (nats); 0 without patches."""
         return float(counts @ self.ratios / max(counts.sum(), 1.0))
 
-    def match_odds(self, counts: Counts) -> float:
-        """Log odds of a pose whatever other poses show, which can only lower them."""
-        return -float(np.logaddexp(-self._fit_odds(counts), -self._free_odds(counts)))
+    def fits(self, counts: Counts) -> bool:
+        """False for a chance fit, which no other evidence can make probable."""
+        return self.mean_ratio(counts) >= self.least_ratio and violating_root(counts) <= self.most_free
 
-    def _fit_odds(self, counts: Counts) -> float:
-        return self.match[0] * self.mean_ratio(counts) + self.match[1]
+    def log_odds(self, counts: Counts, lead: float) -> float:
+        """Log odds of a pose by its patches, and by its least lead over another pose."""
+        return self._fit_odds(counts, lead) if self.fits(counts) else self.chance
 
-    def _free_odds(self, counts: Counts) -> float:
-        return self.free[1] - self.free[0] * violating_root(counts)
-
-    def lead_odds(self, lead: float) -> float:
-        """Log odds that no other pose is as good, by the least lead."""
-        capped = min(lead, NO_OTHER)
-        return self.lead[0] * capped * abs(capped) + self.lead[1]
+    def _fit_odds(self, counts: Counts, lead: float) -> float:
+        weights = self.weights
+        return (
+            -weights.free_space * violating_root(counts)
+            - weights.number * math.sqrt(counts.sum())
+            + weights.lead * min(lead, NO_OTHER)
+            + weights.offset
+        )
 
     def lead_of(self, found: Agreement, other: Agreement) -> float:
         """How much more likely the patches are at one pose than at another, in standard deviations of the difference.
@@ -92,28 +107,32 @@ class Table:
         return paired_lead(self.ratios, pairs)
 
     def judge_patches(self, counts: Counts) -> Judged:
-        """A pose by its patches alone, whatever other poses show."""
-        log_odds = self.match_odds(counts)
-        share = self.match[0] * counts * self.ratios / max(counts.sum(), 1.0)
-        evidence = {name: float(share[bins].sum()) for name, bins in PARTS.items()} | {"usual": self.match[1]}
-        evidence["free_space"] += log_odds - self._fit_odds(counts)
-        return Judged(log_odds, evidence)
+        """A pose by its patches alone, whatever other poses show, which can only lower its odds."""
+        return self._judged(counts, NO_OTHER)
 
     def judge(self, found: Agreement, others: Sequence[Agreement] | None = None) -> Judged:
         """A pose that shows `found`, where other poses that were tried show `others`.
 
         None for a pose that is known beforehand, so that no others were tried: it is judged by its patches alone.
         """
-        alone = self.judge_patches(found.counts)
         if others is None:
-            return alone
+            return self.judge_patches(found.counts)
         lead = min((self.lead_of(found, other) for other in others), default=NO_OTHER)
-        log_odds = -float(np.logaddexp(-alone.log_odds, -self.lead_odds(lead)))
-        return Judged(log_odds, alone.evidence | {"other_pose": log_odds - alone.log_odds})
+        judged = self._judged(found.counts, lead)
+        of_lead = self.weights.lead * (min(lead, NO_OTHER) - NO_OTHER)
+        judged.evidence["usual"] -= of_lead
+        return judged._replace(evidence=judged.evidence | {"other_pose": of_lead})
 
-    def most_lead(self, least_odds: float) -> float:
-        """Lead over another pose beyond which it cannot lower the odds of a pose below `least_odds`."""
-        return math.sqrt(max(least_odds + RIVAL_NATS - self.lead[1], 0.0) / self.lead[0])
+    def _judged(self, counts: Counts, lead: float) -> Judged:
+        evidence = {"free_space": -self.weights.free_space * violating_root(counts)}
+        evidence["usual"] = self._fit_odds(counts, lead) - evidence["free_space"]
+        if not self.fits(counts):
+            evidence["chance_fit"] = self.chance - sum(evidence.values())
+        return Judged(self.log_odds(counts, lead), evidence)
+
+    def most_lead(self, counts: Counts, least_odds: float) -> float:
+        """Lead over another pose beyond which it cannot lower the odds of a pose that fits below `least_odds`."""
+        return (least_odds + RIVAL_NATS - self._fit_odds(counts, 0.0)) / self.weights.lead
 
 
 def paired_lead(ratios: Vector, pairs: Sequence[tuple[Shown, Shown]]) -> float:
@@ -142,9 +161,8 @@ def shipped() -> Table:
 
 
 def table_of(content: dict[str, object]) -> Table:
-    """A table from JSON: `ratios` by the name of the bin, and three lines. Raises KeyError for a missing bin."""
+    """A table from JSON: `ratios` by the name of the bin, and numbers by theirs. Raises KeyError for a missing one."""
     ratios: Any = content["ratios"]
-    lines: list[Any] = [content[name] for name in ("match", "free", "lead")]
-    match, free, lead = ((float(slope), float(offset)) for slope, offset in lines)
-    margin: Any = content["margin"]
-    return Table(np.array([ratios[name] for name in BINS]), match, free, lead, float(margin))
+    numbers: list[Any] = [content[name] for name in ("least_ratio", "most_free", "chance", *Weights._fields, "margin")]
+    least_ratio, most_free, chance, *weights, margin = map(float, numbers)
+    return Table(np.array([ratios[name] for name in BINS]), least_ratio, most_free, chance, Weights(*weights), margin)

@@ -25,7 +25,7 @@ FEW_OFF_M = 0.5
 submaps, simulated 06, scenes of even seeds) none was farther off than 0.33 m."""
 FEW_RATIO = 0.15
 """Chosen: a pose is not refined further if its mean log ratio, of the patches of one scan after a refinement with few
-points, is more than this below what it needs (nats)."""
+points, is more than this below that of a pose that fits (nats)."""
 EQUAL_M, EQUAL_RAD = 0.1, math.radians(0.5)
 """Chosen: a hypothesis is not refined with all points if few points lead it this close to where another was refined."""
 
@@ -69,11 +69,6 @@ class Trial(NamedTuple):
         """Log odds that an accepted pose has at least."""
         return self.table.least_odds(self.config.verify)
 
-    @property
-    def least_ratio(self) -> float:
-        """Mean log ratio of the patches that an accepted pose has at least (nats)."""
-        return (self.least_odds - self.table.match[1]) / self.table.match[0]
-
     def begin(self, coarse: Registration) -> Transform | Rejected:
         """The pose to which few points of the source lead from a hypothesis; `Rejected` if it is hopeless with all.
 
@@ -102,7 +97,7 @@ class Trial(NamedTuple):
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m with few points")
         counts = patches.counted(self.first_look(led.T_target_source))
         ratio = self.table.mean_ratio(counts)
-        least = self.least_ratio - FEW_RATIO
+        least = self.table.least_ratio - FEW_RATIO
         if ratio < least:
             judgement = self.table.judge_patches(counts)
             detail = f"{ratio:.2f} < {least:.2f} nats a patch with few points"
@@ -127,9 +122,13 @@ class Trial(NamedTuple):
         with self.watch("verify"):
             return Found(coarse, fine, patches.agreement(*scans, fine.T_target_source))
 
-    def match_odds(self, pose: Found) -> float:
-        """Log odds that a pose is no chance fit, whatever other poses show."""
-        return self.table.match_odds(pose.agreement.counts)
+    def fits(self, pose: Found) -> bool:
+        """False for a chance fit."""
+        return self.table.fits(pose.agreement.counts)
+
+    def mean_ratio(self, pose: Found) -> float:
+        """Mean log ratio of the patches at a pose (nats)."""
+        return self.table.mean_ratio(pose.agreement.counts)
 
     def judge(self, pose: Found, others: Sequence[Found] | None) -> Alignment | Rejected:
         """The pose with its probability, `Rejected` if too improbable; `others`: as for `score.Table.judge`."""

@@ -28,15 +28,17 @@ def _pose(good: int, bad: int, x: float = 0.0, *, is_right: bool, is_allowed: bo
 
 
 def _pair(part: str, right: int | None, wrong: int) -> Pair:
-    """Poses with so many of 100 patches in free space; no right one for scans of different places."""
+    """Poses with so many of 100 patches in free space; two wrong ones for scans of different places."""
     poses = [_pose(100 - wrong, wrong, 5.0, is_right=False)]
-    if right is not None:
+    if right is None:
+        poses.append(_pose(99 - wrong, wrong + 1, 9.0, is_right=False))
+    else:
         poses.append(_pose(100 - right, right, is_right=True))
     return Pair(part, "64", right is not None, 0.5, poses, "right" if right is not None else "improbable", 0.1)
 
 
 TAUGHT = [_pair(part, 3 + k % 5, 35 + k) for part in ("street", "wood", "hall") for k in range(10)]
-TAUGHT += [_pair(part, None, 30 + 2 * k) for part in ("street", "wood", "hall") for k in range(10)]
+TAUGHT += [_pair(part, None, 2 + k % 6) for part in ("street", "wood", "hall") for k in range(10)]
 
 
 def test_the_ratios_say_what_right_poses_show_more_often() -> None:
@@ -62,10 +64,16 @@ def test_the_best_pose_is_one_that_the_prior_allows_and_leads_over_all_others() 
 def test_parts_that_taught_nothing_are_separated() -> None:
     scored = left_out(TAUGHT)
     (row,) = (row for row in curve(scored) if row["wrong_accepted"] == 0)
-    assert row["right_accepted"] == row["of_right"] == 30
+    assert row["right_accepted"] == row["of_right"] >= 24
+    assert row["of"] >= 20
     table = calibrated(learnt(TAUGHT), calibration(TAUGHT, scored))
     odds = {best.pose.is_right: odds_of(best, table) for best, _ in scored}
     assert odds[True] > 3.0 > -3.0 > odds[False]
+
+
+def test_a_chance_fit_is_no_best_pose() -> None:
+    table = learnt(TAUGHT)
+    assert best_of(Pair("street", "64", True, 0.5, [_pose(60, 40, is_right=False)], "improbable", 0.1), table) is None
 
 
 def test_tenths_compare_probabilities_with_what_is_right() -> None:

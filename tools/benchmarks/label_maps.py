@@ -43,7 +43,7 @@ def mapped(data: Path, out: Path, *options: object) -> dict[str, Any]:
     if not (out / "metrics.json").exists():
         segslam("map", data, "--sequence", "00", "--out", out, *options)
     metrics = json.loads((out / "metrics.json").read_text())
-    return {key: metrics[key] for key in KEYS}
+    return {key: metrics[key] for key in KEYS if key in metrics}
 
 
 def compared(work: Path, sensor: str, *, num_frames: int | None, seed: int) -> dict[str, Any]:

@@ -1,13 +1,15 @@
 """Single scans of another drive located in a finished run: success and false poses, where the truth of both is known.
 
-    python -m tools.benchmarks.locate RUN DATA [--sequence 06] [--every 25] [--labels auto]
+    python -m tools.benchmarks.locate RUN DATA [--sequence 06] [--every 25] [--labels auto] [--yaws 24]
 
 The true poses of both are in one frame, as those of two days that `segslam simulate` makes with one seed. A scan counts
-if a keyframe of the run is within 10 m; found is within 2 m and 5 degrees of the true pose in its keyframe.
+if a keyframe of the run is within 10 m; found is within 2 m and 5 degrees of the true pose in its keyframe. With
+`--yaws`, each scan is located at so many headings.
 """
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
+from itertools import product
 from pathlib import Path
 from time import perf_counter, process_time
 
@@ -15,10 +17,11 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.evaluation import PoseError
-from segslam.core.types import Rejected
+from segslam.core.trajectory import Poses
+from segslam.core.types import Rejected, Transform
 from segslam.labels.late import computed
 from segslam.output.finished import read_run
-from segslam.run.locator import Locator
+from segslam.run.locator import Located, Locator
 from segslam.scans import open_dataset
 from tools.benchmarks import common
 
@@ -32,6 +35,7 @@ def main() -> None:
     parser.add_argument("--sequence", default="00")
     parser.add_argument("--every", type=int, default=25)
     parser.add_argument("--labels", default="auto")
+    parser.add_argument("--yaws", type=int, default=1)
     options = parser.parse_args()
     run = read_run(options.run)
     data = open_dataset(options.data, sequence=options.sequence, labels=options.labels)
@@ -43,23 +47,21 @@ def main() -> None:
     T_keyframes = np.stack([T_of_scan[int(scan)] for scan in scans])
     locator = Locator.from_run(options.run)
     outcomes: Counter[str] = Counter()
+    by_scan: defaultdict[int, Counter[str]] = defaultdict(Counter)
     seconds, cpu_seconds = [], []
-    for row in range(0, len(data), options.every):
+    for row, turn in product(range(0, len(data), options.every), range(options.yaws)):
         scan = data[row]
-        T_true = T_of_query[int(scan.index or 0)]
+        T_turned_lidar = geometry.transform(geometry.yaw(2.0 * np.pi * turn / options.yaws), np.zeros(3))
+        T_true = T_of_query[int(scan.index or 0)] @ geometry.inverse(T_turned_lidar)
         near = np.linalg.norm(T_keyframes[:, :3, 3] - T_true[:3, 3], axis=1).min() <= WITHIN_M
         labels = computed(scan.labels)
         started, started_cpu = perf_counter(), process_time()
-        found = locator.locate(scan.points, labels if labels.any() else None)
+        found = locator.locate(geometry.apply(T_turned_lidar, scan.points), labels if labels.any() else None)
         seconds.append(perf_counter() - started)
         cpu_seconds.append(process_time() - started_cpu)
-        if isinstance(found, Rejected):
-            outcome = f"rejected: {found.reason.value}"
-        else:
-            T_lidar_found = geometry.inverse(T_true) @ T_keyframes[found.keyframe_id]
-            error = PoseError.of(T_lidar_found @ found.alignment.fine.T_target_source)
-            outcome = "found" if error.success else "false"
+        outcome = _outcome(found, T_true, T_keyframes)
         outcomes[("" if near else "off the map, ") + outcome] += 1
+        by_scan[int(scan.index or 0)][outcome] += 1
     counted = sum(count for name, count in outcomes.items() if not name.startswith("off"))
     figures = {
         "num_keyframes": len(T_keyframes),
@@ -67,10 +69,19 @@ def main() -> None:
         "success": outcomes["found"] / max(counted, 1),
         "num_false": outcomes["false"] + outcomes["off the map, false"],
         "outcomes": dict(outcomes),
+        "by_scan": {scan: dict(counts) for scan, counts in by_scan.items()},
         "seconds_median": float(np.median(seconds)),
         "cpu_seconds_median": float(np.median(cpu_seconds)),
     }
     print(json.dumps(figures, indent=2))
+
+
+def _outcome(found: Located | Rejected, T_true: Transform, T_keyframes: Poses) -> str:
+    if isinstance(found, Rejected):
+        return f"rejected: {found.reason.value}"
+    T_lidar_found = geometry.inverse(T_true) @ T_keyframes[found.keyframe_id]
+    error = PoseError.of(T_lidar_found @ found.alignment.fine.T_target_source)
+    return "found" if error.success else "false"
 
 
 if __name__ == "__main__":

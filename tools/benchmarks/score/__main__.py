@@ -83,9 +83,10 @@ def _learn(options: Namespace) -> None:
         "made_by": "python -m tools.benchmarks.score learn",
         "pairs": len(pairs),
         "ratios": {name: round(float(value), 3) for name, value in zip(BINS, table.ratios, strict=True)},
-        "match": [round(value, 2) for value in table.match],
-        "free": [round(value, 2) for value in table.free],
-        "lead": [round(value, 3) for value in table.lead],
+        "least_ratio": round(table.least_ratio, 3),
+        "most_free": round(table.most_free, 3),
+        "chance": round(table.chance, 2),
+        **{name: round(value, 3) for name, value in table.weights._asdict().items()},
         "margin": round(table.margin, 2),
     }
     options.table.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

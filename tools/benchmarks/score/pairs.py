@@ -86,7 +86,7 @@ def described(task: Task, config: Config) -> Pair:
     if task.is_true and task.T_target_source is not None:
         scans = task.source.observed, task.target.observed
         overlap = agreement(*scans, task.T_target_source).overlap
-    is_searched = bool(tried) and trial.match_odds(tried[0]) >= trial.least_odds
+    is_searched = bool(tried) and trial.fits(tried[0])
     return Pair(task.part, task.sensor, task.is_true, overlap, poses, verdict, seconds, is_searched)
 
 

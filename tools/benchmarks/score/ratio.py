@@ -4,27 +4,32 @@ A pair counts as much as all others of its part together allow: each part weighs
 poses, so the prior odds are even.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import expit
 
 from segslam.core.types import Transform, Vector
 from segslam.verification.patches import BINS, Counts, Shown, counted
 from segslam.verification.rivals import SAME_POSE_M, SAME_POSE_RAD
-from segslam.verification.score import NO_OTHER, Table, paired_lead, violating_root
+from segslam.verification.score import NO_OTHER, Table, Weights, paired_lead, violating_root
 from segslam.verification.trial import is_near
 
 PRIOR_COUNT = 0.5
-"""Jeffreys': pseudo-counts of a bin that was never seen."""
-PART_WEIGHT, CLASS_WEIGHT = 100.0, 60.0
-"""Number of poses as which a part counts in the ratios, and either class of a part in the slopes."""
-START = np.array([0.7, 0.7, 0.7, 2.0, 2.0, 2.0])
-SIGMA = np.array([2.0, 2.0, 2.0, 6.0, 6.0, 6.0])
-"""Normal prior of the logarithms of the slopes, in standard deviations of what they multiply, and of the offsets."""
+"""Jeffreys': pseudo-counts of a bin or case that was never seen."""
+PART_WEIGHT = 100.0
+"""Number of poses as which a part counts in the ratios."""
+LOST = 0.03, 0.02
+"""Chosen: shares of right poses that are given up as chance fits for their mean ratio, and for free space."""
+HUNDREDTHS = np.linspace(0.0, 1.0, 101)
+MISLED = 0.002
+"""Chosen: share of poses that are right or wrong for a reason that no patch shows, so that none of them decides."""
+SIGMA = 3.0
+"""Normal prior of the weights, in standard deviations of what they multiply."""
 TAIL = 20
 """Number of wrong poses that show how fast their odds fall."""
 HOPELESS = -2.0
@@ -64,7 +69,7 @@ class Pair:
     seconds: float
     """CPU of the registration."""
     is_searched: bool = True
-    """False if no other poses were searched, because the best one was hopeless by the table of the package."""
+    """False if no other poses were searched, because the best one was a chance fit by the table of the package."""
 
 
 class Best(NamedTuple):
@@ -102,13 +107,15 @@ def _shares(counts: Counts) -> Counts:
 
 
 def best_of(pair: Pair, table: Table) -> Best | None:
-    """The best pose, and its lead over those that differ from it; None if it is hopeless or the prior allows none."""
+    """The best pose, and its lead over those that differ; None for a chance fit, or if the prior allows no pose."""
     ratios = [table.mean_ratio(pose.counts) for pose in pair.poses]
     allowed = [number for number, pose in enumerate(pair.poses) if pose.is_allowed]
     if not allowed or not pair.is_searched:
         return None
     first = max(allowed, key=ratios.__getitem__)
     best = pair.poses[first]
+    if not table.fits(best.counts):
+        return None
     leads = [
         paired_lead(table.ratios, [(best.of_source, pose.of_source), (best.of_target, pose.of_target)])
         for pose in pair.poses
@@ -123,29 +130,67 @@ def bests(pairs: Sequence[Pair], table: Table) -> list[Best]:
 
 
 def learnt(pairs: Sequence[Pair]) -> Table:
-    """The table that these pairs teach. Its odds are too certain for other parts: `calibrated`."""
+    """The table that these pairs teach. Its odds are too certain for other parts: `calibrated`.
+
+    The weights are those of a logistic regression in which right and wrong poses weigh the same.
+    """
     ratios = log_ratios(pairs)
-    blank = Table(ratios, (1.0, 0.0), (1.0, 0.0), (1.0, 0.0))
+    limits = _limits(pairs, ratios)
+    blank = Table(ratios, *limits, _chance(pairs, ratios, *limits), Weights(0.0, 0.0, 0.0, 0.0))
     found = bests(pairs, blank)
+    is_right = np.array([best.pose.is_right for best in found])
     values = np.array([ingredients(best) for best in found])
     mean, scale = values.mean(axis=0), values.std(axis=0) + 1e-9
-    is_right, weight = _weighed(found)
+    weight = _weights(found)
 
     def loss(numbers: Vector) -> float:
-        odds = _odds((values - mean) / scale * np.exp(numbers[:3]) + numbers[3:])
-        prior = 0.5 * (((numbers - START) / SIGMA) ** 2).sum()
-        return float((weight * np.logaddexp(0.0, np.where(is_right, -odds, odds))).sum() + prior)
+        odds = (values - mean) / scale @ numbers[:-1] + numbers[-1]
+        prior = 0.5 * ((numbers[:-1] / SIGMA) ** 2).sum()
+        likelihood = MISLED + (1.0 - 2.0 * MISLED) * expit(np.where(is_right, odds, -odds))
+        return float(prior - weight @ np.log(likelihood))
 
-    numbers = minimize(loss, START).x
-    slopes = np.exp(numbers[:3]) / scale
-    offsets = numbers[3:] - slopes * mean
-    match, free, lead = ((float(slope), float(offset)) for slope, offset in zip(slopes, offsets, strict=True))
-    return Table(ratios, match, free, lead)
+    numbers = minimize(loss, np.array([1.0, 1.0, 1.0, 0.0])).x
+    weights = numbers[:-1] / scale
+    return replace(blank, weights=Weights._make([*weights.tolist(), float(numbers[-1] - weights @ mean)]))
+
+
+def _weights(found: Sequence[Best]) -> Vector:
+    """(n,) of best poses: right and wrong ones weigh the same, and so do the right ones of each part."""
+    number = Counter(best.pair.part for best in found if best.pose.is_right)
+    num_right, num_wrong = number.total(), len(found) - number.total()
+    each = num_right / max(len(number), 1)
+    return np.array(
+        [each / number[one.pair.part] if one.pose.is_right else num_right / max(num_wrong, 1) for one in found]
+    )
 
 
 def ingredients(best: Best) -> Vector:
-    """(3,) of a best pose: mean ratio, freedom from violations, and squared lead."""
-    return np.array([best.ratio, -violating_root(best.pose.counts), best.lead * abs(best.lead)])
+    """(3,) of a best pose, in the order of `Weights`."""
+    counts = best.pose.counts
+    return np.array([-violating_root(counts), -np.sqrt(counts.sum()), best.lead])
+
+
+def _limits(pairs: Sequence[Pair], ratios: Vector) -> tuple[float, float]:
+    """Least mean ratio and largest root of the share in free space: all but `LOST` of the right poses keep them.
+
+    Each part weighs the same.
+    """
+    right: defaultdict[str, list[Counts]] = defaultdict(list)
+    for pair in pairs:
+        right[pair.part] += [pose.counts for pose in pair.poses if pose.is_right]
+    ratio = [np.quantile([_shares(counts) @ ratios for counts in part], HUNDREDTHS) for part in right.values()]
+    free = [np.quantile([violating_root(counts) for counts in part], HUNDREDTHS) for part in right.values()]
+    return float(np.quantile(ratio, LOST[0])), float(np.quantile(free, 1.0 - LOST[1]))
+
+
+def _chance(pairs: Sequence[Pair], ratios: Vector, least_ratio: float, most_free: float) -> float:
+    """Log odds of a pose beyond the limits, right and wrong poses being equally frequent."""
+    beyond: dict[bool, list[bool]] = {True: [], False: []}
+    for pose in (pose for pair in pairs for pose in pair.poses):
+        fits = _shares(pose.counts) @ ratios >= least_ratio and violating_root(pose.counts) <= most_free
+        beyond[pose.is_right].append(not fits)
+    shares = {is_right: (sum(rows) + PRIOR_COUNT) / (len(rows) + 1.0) for is_right, rows in beyond.items()}
+    return float(np.log(shares[True] / shares[False]))
 
 
 def left_out(pairs: Sequence[Pair]) -> list[tuple[Best, float]]:
@@ -159,8 +204,7 @@ def left_out(pairs: Sequence[Pair]) -> list[tuple[Best, float]]:
 
 def odds_of(best: Best, table: Table) -> float:
     """Log odds of a best pose."""
-    slopes, offsets = np.array(_lines(table)).T
-    return float(_odds((slopes * ingredients(best) + offsets)[None])[0])
+    return table.log_odds(best.pose.counts, best.lead)
 
 
 def calibration(pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]]) -> tuple[float, float]:
@@ -191,7 +235,7 @@ def margin(pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]], share: f
     number = Counter(pair.is_true for pair in pairs)
     wrong = np.sort([odds for best, odds in scored if not best.pose.is_right])[::-1]
     right = np.array([odds for best, odds in scored if best.pose.is_right])
-    start, scale = wrong[TAIL], float(np.mean(wrong[:TAIL] - wrong[TAIL]))
+    start, scale = wrong[TAIL], float(np.median(wrong[:TAIL] - wrong[TAIL])) / np.log(2.0)
     accepted = float(np.mean(right > start)) * len(right) / number[True]
     least = start + scale * np.log(TAIL / number[False] / (share / 3.0 * accepted))
     return float(np.log((1.0 - share) / share) - least)
@@ -199,22 +243,5 @@ def margin(pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]], share: f
 
 def calibrated(table: Table, line: tuple[float, float]) -> Table:
     """A table whose log odds are those of `table` moved to this line."""
-    match, free, lead = ((line[0] * slope, line[0] * offset + line[1]) for slope, offset in _lines(table))
-    return Table(table.ratios, match, free, lead)
-
-
-def _lines(table: Table) -> tuple[tuple[float, float], ...]:
-    return table.match, table.free, table.lead
-
-
-def _weighed(found: Sequence[Best]) -> tuple[np.ndarray, Vector]:
-    """Right or not, and the weight, of each best pose."""
-    groups = [(best.pair.part, best.pose.is_right) for best in found]
-    number = Counter(groups)
-    return np.array([right for _, right in groups]), np.array([CLASS_WEIGHT / number[group] for group in groups])
-
-
-def _odds(ways: np.ndarray) -> Vector:
-    """(n,) of the ways to be wrong, the likeliest one counts; `ways` (n, 3)."""
-    found: Vector = -np.logaddexp.reduce(-ways, axis=1)
-    return found
+    *weights, offset = (line[0] * weight for weight in table.weights)
+    return replace(table, weights=Weights._make([*weights, offset + line[1]]))

@@ -145,9 +145,7 @@ def learnt(pairs: Sequence[Pair]) -> Table:
 
     def loss(numbers: Vector) -> float:
         odds = (values - mean) / scale @ numbers[:-1] + numbers[-1]
-        prior = 0.5 * ((numbers[:-1] / SIGMA) ** 2).sum()
-        likelihood = MISLED + (1.0 - 2.0 * MISLED) * expit(np.where(is_right, odds, -odds))
-        return float(prior - weight @ np.log(likelihood))
+        return _surprise(odds, is_right, weight) + 0.5 * float(((numbers[:-1] / SIGMA) ** 2).sum())
 
     numbers = minimize(loss, np.array([1.0, 1.0, 1.0, 0.0])).x
     weights = numbers[:-1] / scale
@@ -162,6 +160,12 @@ def _weights(found: Sequence[Best]) -> Vector:
     return np.array(
         [each / number[one.pair.part] if one.pose.is_right else num_right / max(num_wrong, 1) for one in found]
     )
+
+
+def _surprise(odds: Vector, is_right: np.ndarray, weight: Vector) -> float:
+    """Negative log-likelihood of what is right, given log odds; `MISLED` of the poses follow no odds."""
+    likelihood = MISLED + (1.0 - 2.0 * MISLED) * expit(np.where(is_right, odds, -odds))
+    return -float(weight @ np.log(likelihood))
 
 
 def ingredients(best: Best) -> Vector:
@@ -218,9 +222,8 @@ def calibration(pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]]) -> 
     weight = np.where(is_right, 1.0, number[True] / max(number[False], 1))
 
     def loss(line: Vector) -> float:
-        line_odds = line[0] * odds + line[1]
-        prior = 0.5 * (((line - [1.0, 0.0]) / 4.0) ** 2).sum()
-        return float((weight * np.logaddexp(0.0, np.where(is_right, -line_odds, line_odds))).sum() + prior)
+        prior = 0.5 * float((((line - [1.0, 0.0]) / 4.0) ** 2).sum())
+        return _surprise(line[0] * odds + line[1], is_right, weight) + prior
 
     slope, offset = minimize(loss, np.array([1.0, 0.0])).x
     return float(slope), float(offset)

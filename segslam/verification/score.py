@@ -2,9 +2,9 @@
 
 A pose is a chance fit unless the patches of the scans (`patches`) show enough of what right poses show more often than
 the wrong poses that resemble them most, and few of them are where the other scan saw through. The log odds of a pose
-that fits are a sum: what its patches show, and its least lead over the other poses that were tried. Patches beside each
-other err together, so the same lead counts less if there are many of them. `tools.benchmarks.score` measures all numbers
-in `score.json` on pairs of scans whose poses are known.
+that fits are a sum: its least lead over the other poses that were tried, the share of its patches in free space, and
+the number of its patches. Patches beside each other err together, so the same lead counts less if there are many.
+`tools.benchmarks.score` measures all numbers in `score.json` on pairs of scans whose poses are known.
 """
 
 import json

@@ -91,10 +91,9 @@ def write_kitti_sequence(root: Path, *, num_scans: int = NUM_SCANS) -> Path:
         rows.astype("<f4").tofile(folder / "velodyne" / f"{scan.index:06d}.bin")
         RAW_OF_LABEL[scan.labels].astype("<u4").tofile(folder / "true_labels" / f"{scan.index:06d}.label")
     (folder / "calib.txt").write_text(example_drive(1).calib)
-    (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans[:num_scans]))
+    (folder / "times.txt").write_text("".join(f"{scan.stamp_ns / 1e9:.6f}\n" for scan in scans))
     write_kitti(
-        root / "poses" / "00.txt",
-        camera_from_lidar(truth.T_world_lidar[:num_scans], read_calibration(folder / "calib.txt")),
+        root / "poses" / "00.txt", camera_from_lidar(truth.T_world_lidar, read_calibration(folder / "calib.txt"))
     )
     return folder / "velodyne"
 

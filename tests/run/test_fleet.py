@@ -44,7 +44,9 @@ def _drives(recordings: list[Path]) -> list[Drive]:
     file = recordings[0].parent / "drives.yaml"
     reference = open_dataset(recordings[0]).reference
     assert reference is not None
-    write_fixes(file.with_name("few.csv"), reference.stamp_ns[:2], reference.T_world_lidar[:2])
+    few = file.with_name("few.csv")
+    if not few.exists():  # a drive is mapped again if a file of it is new
+        write_fixes(few, reference.stamp_ns[:2], reference.T_world_lidar[:2])
     in_file = {"topic": TOPIC, "gnss": "few.csv"}
     entries = [{"data": path.name} | in_file if path.suffix else _on_globe(path) for path in recordings]
     file.write_text(json.dumps(entries))

@@ -64,6 +64,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twenty scans in KITTI's layout with true poses and labels."""
     folder = tmp_path_factory.mktemp("kitti")
     write_kitti_sequence(folder, num_scans=NUM_SCANS)
+    for file in (folder / "sequences" / "00" / "times.txt", folder / "poses" / "00.txt"):
+        file.write_text("".join(file.read_text().splitlines(keepends=True)[:NUM_SCANS]))
     return folder
 
 

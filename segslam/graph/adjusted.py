@@ -7,6 +7,7 @@ its median in a simulation with the noise as claimed, whose solution has the sam
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 
 import gtsam
 import numpy as np
@@ -77,6 +78,29 @@ def solve_adjusted(
         if np.abs(factors / before - 1.0).max() < SETTLED:
             break
     return found, (float(before[0]), float(before[1]))
+
+
+def without_shared_rotation(odometry: Sequence[Edge], measured: Sequence[Edge], within: int) -> list[Edge]:
+    """Odometry without the rotation per metre that its motions have in common, compared with measurements.
+
+    Beams that point lower than assumed pitch every motion of an odometry from scans. Measurements of corrected scans,
+    at most `within` keyframes apart, show this rotation; its median over them is removed from each motion.
+    """
+    motions = {edge.a: edge for edge in odometry if not is_break(edge)}
+    rates = []
+    for edge in measured:
+        between = [motions[a] for a in range(edge.a, edge.b) if a in motions] if edge.b - edge.a <= within else []
+        length_m = sum(geometry.distance(one.T_a_b) for one in between)
+        if length_m > 0.0 and len(between) == edge.b - edge.a:
+            turn = geometry.log(geometry.inverse(reduce(np.matmul, [one.T_a_b for one in between])) @ edge.T_a_b)[:3]
+            rates.append(turn / length_m)
+    rate = np.median(rates, axis=0) if rates else np.zeros(3)
+
+    def turned(edge: Edge) -> Edge:
+        turn = np.concatenate([rate * geometry.distance(edge.T_a_b), np.zeros(3)])
+        return replace(edge, T_a_b=edge.T_a_b @ geometry.exp(turn))
+
+    return [edge if is_break(edge) else turned(edge) for edge in odometry]
 
 
 def weighted_edges(

@@ -17,7 +17,7 @@ from segslam.core import geometry
 from segslam.core.config import GraphConfig
 from segslam.core.types import GraphEstimate, Information, LoopClosure, Mask, SegslamError, Transform, Vector
 from segslam.graph import noise
-from segslam.graph.adjusted import solve_adjusted, weighted_edges
+from segslam.graph.adjusted import solve_adjusted, weighted_edges, without_shared_rotation
 from segslam.graph.breaks import is_break, relinked
 from segslam.graph.closure_pairs import consistent_pairs, largest_consistent
 from segslam.graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors, values_of
@@ -71,8 +71,9 @@ class PoseGraph:
         self._num_closures_in_estimate = 0
         self._weights: list[float] = []
         """Weights of the closures in the last estimate."""
+        self._adjusted_odometry: list[Edge] = []
         self._measured: list[Edge] = []
-        """The relative poses of the last adjustment."""
+        """The motions and the relative poses of the last adjustment."""
         self._noise_factors = (1.0, 1.0)
         self._T_odom_last = np.eye(4)
         self._travel_m = Rows(np.empty(0))
@@ -221,17 +222,17 @@ class PoseGraph:
             final = self._solve_final()
         return self._estimate(final.solution.search.error, final.solution.weights)
 
-    def adjust(self, measured: Sequence[Edge]) -> tuple[GraphEstimate, tuple[float, float]]:
+    def adjust(self, measured: Sequence[Edge], *, shared_within: int = 0) -> tuple[GraphEstimate, tuple[float, float]]:
         """The estimate with further relative poses, after `finish`, and factors of noise (`solve_adjusted`).
 
-        Rejected closures and motions stay rejected. `measured` replaces that of an earlier call.
+        Rejected closures and motions stay rejected. `measured` replaces that of an earlier call. Measurements of at
+        most `shared_within` keyframes' distance show the rotation that all motions share, which is removed for it.
         """
         kept = [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
-        found, factors = solve_adjusted(
-            self._prior(), self._kept_odometry(), kept, measured, self._values, self._kernel
-        )
+        odometry = without_shared_rotation(self._kept_odometry(), measured, shared_within)
+        found, factors = solve_adjusted(self._prior(), odometry, kept, measured, self._values, self._kernel)
         self._take(found.values)
-        self._measured, self._noise_factors = list(measured), factors
+        self._adjusted_odometry, self._measured, self._noise_factors = odometry, list(measured), factors
         return self._estimate(found.error, self._weights), factors
 
     def _solve_final(self) -> MotionSolution:
@@ -281,7 +282,12 @@ class PoseGraph:
         """
         kept = [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
         edges = weighted_edges(
-            self._kept_odometry(), kept, self._measured, self._noise_factors, self._values, self._kernel
+            self._adjusted_odometry or self._kept_odometry(),
+            kept,
+            self._measured,
+            self._noise_factors,
+            self._values,
+            self._kernel,
         )
         write_g2o(path, G2oGraph(dict(enumerate(self.T_world_keyframes)), edges))
 

@@ -14,7 +14,7 @@ from segslam.core.config import Config
 from segslam.core.types import GraphEstimate, IndexPairs, Mask, Points, Vector
 from segslam.graph import PoseGraph
 from segslam.odometry.calibration import measure_vertical_angle
-from segslam.slam.adjustment.pairs import EVERY, all_pairs
+from segslam.slam.adjustment.pairs import EVERY, STEPS, all_pairs
 from segslam.slam.adjustment.progress import Progress, no_progress
 from segslam.slam.adjustment.record import Adjustment
 from segslam.slam.adjustment.registrations import RegisteredPair, register_pairs
@@ -59,7 +59,7 @@ def adjust(
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
         title = f"refine {number}/{config.adjustment.rounds}"
-        made = _round(graph, corrected, config, end_s, partial(_titled, progress, title))
+        made = _round(graph, corrected, config, end_s, bool(correction_deg), partial(_titled, progress, title))
         last = made or last
         if made is None or not made.is_complete:
             break
@@ -98,6 +98,7 @@ def _round(
     points_of: PointsOf,
     config: Config,
     end_s: float,
+    is_corrected: bool,
     show: Callable[[Iterable[Any], int], Iterator[Any]],
 ) -> _Round | None:
     """Register submaps by the current poses, and solve the graph; None if no pair could be registered."""
@@ -110,7 +111,9 @@ def _round(
     if not registered:
         return None
     share = min(1.0, EVERY / (2 * REACH + 1))  # so that every scan counts once
-    estimate, noise_factors = graph.adjust([one.edge(share=share) for one in registered])
+    estimate, noise_factors = graph.adjust(
+        [one.edge(share=share) for one in registered], shared_within=STEPS[-1] if is_corrected else 0
+    )
     return _Round(len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
 
 

@@ -5,7 +5,8 @@ milliseconds. If this contradicts the motion, the scan is registered with the la
 odometry's motion, the last motion, no motion; and, if none of them explains the scan as scans of this drive usually are
 explained, from poses all around and from place recognition. The most likely pose is kept. Each following scan is
 registered as well, until the odometry agrees with a window of registrations, after the n-th repair with n windows. So
-are the first scans of a drive, where KISS-ICP has few points in its map.
+are the first scans of a drive, where KISS-ICP has few points in its map. After a repair the odometry continues from the
+local map; smaller corrections leave it undisturbed, and are added to its poses.
 """
 
 import math
@@ -57,6 +58,8 @@ class CheckedOdometry:
         self._motion = MotionModel()
         self._usual_check, self._usual_fit = Usual(), Usual()
         self._T_odom_last = np.eye(4)
+        self._T_odom_inner: Transform = np.eye(4)
+        """Pose of the frame in which the inner odometry continues, undisturbed by small corrections."""
         self._num_unchecked = self._num_repaired = 0
         self._num_to_watch = WINDOW if inner.is_from_scans else 0
 
@@ -73,8 +76,11 @@ class CheckedOdometry:
         if not self._config.health.check:
             return proposed
         seen = SeenScan(proposed.points, self._refine)
-        T_odom_lidar, motion = self._checked(proposed.T_odom_lidar, seen, gap)
+        T_odom_proposed = self._T_odom_inner @ proposed.T_odom_lidar
+        T_odom_lidar, motion = self._checked(T_odom_proposed, seen, gap)
         self._T_odom_last = T_odom_lidar
+        if motion.state is MotionState.REFINED:
+            self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(proposed.T_odom_lidar))
         return OdometryResult(T_odom_lidar, proposed.points, proposed.labels, proposed.intensities, motion)
 
     def follow(
@@ -94,6 +100,7 @@ class CheckedOdometry:
         self._T_odom_last = T_odom_lidar
         downsampled = [(T_odom_scan, scan.thinned) for T_odom_scan, scan in seen]
         self._inner.follow(downsampled, T_odom_lidar, T_before_lidar, last=last)
+        self._T_odom_inner = np.eye(4)
 
     def _checked(self, T_odom_proposed: Transform, scan: SeenScan, gap: float) -> tuple[Transform, Motion]:
         """The pose of a scan and the result of its check, if one is due."""
@@ -185,8 +192,9 @@ class CheckedOdometry:
             self._lost = self._lost or (self._map, 0)
             self._map = LocalMap(self._refine)
         self._map.add(T_odom_lidar, scan)
-        if state is not MotionState.CONFIRMED:
+        if state in (MotionState.REPAIRED, MotionState.BROKEN):
             self._inner.follow(self._map.scans, T_odom_lidar, self._motion.T_step)
+            self._T_odom_inner = np.eye(4)
         return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
 
     def _contradicts(self, fits: Sequence[Fit], T_map_proposed: Transform, scan: SeenScan) -> bool:

@@ -10,7 +10,7 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.types import Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
-from segslam.odometry.nudge import CHECK_VOXELS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
+from segslam.odometry.nudge import CHECK_VOXELS, NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
 from segslam.registration import refinement
 
 MAP_SCANS = 40
@@ -123,33 +123,25 @@ class LocalMap:
         return None if found is None else fit(scan.thinned, self.newest.light, found, voxel_m=self._voxel_m)
 
     def register(self, scan: SeenScan, T_map_guess: Transform) -> list[Fit]:
-        """Poses of a scan in the map near an initial guess: by GICP, and by robust steps from the guess.
-
-        GICP reaches farther. The robust steps end at the static scene where a vehicle ahead attracts GICP.
-        """
+        """The pose of a scan in the map near an initial guess, by GICP and then robust steps; none without overlap."""
         found = refinement.refine(scan.surface, self.surface(), T_map_guess, config=self._config, must_converge=False)
-        starts: list[tuple[Transform, Sequence[float]]] = [(T_map_guess, SEARCH_VOXELS)]
-        if isinstance(found, Registration):
-            starts.append((found.T_target_source, POLISH_VOXELS))
-        poses = [
-            nudge(scan.surface.points, self.surface(), T_start, voxel_m=self._voxel_m, reaches=reaches)
-            for T_start, reaches in starts
-        ]
-        return [self.fit(scan, pose) for pose in poses if pose is not None]
+        if not isinstance(found, Registration):
+            return []
+        pose = self._nudged(scan, found.T_target_source, POLISH_VOXELS, NUM_POINTS)
+        return [] if pose is None else [self.fit(scan, pose)]
 
     def approach(self, scan: SeenScan, T_map_guess: Transform) -> Fit | None:
         """The pose to which robust steps with few points lead from a guess; None if too few points are near the map."""
-        found = nudge(
-            scan.surface.points,
-            self.surface(),
-            T_map_guess,
-            voxel_m=self._voxel_m,
-            reaches=SEARCH_VOXELS,
-            num_points=NUM_SEARCH,
-        )
+        found = self._nudged(scan, T_map_guess, SEARCH_VOXELS, NUM_SEARCH)
         return None if found is None else self.fit(scan, found)
 
     def fit(self, scan: SeenScan, T_map_lidar: Transform) -> Fit:
         """The likelihood of the scan at this pose."""
         surface = self.surface()
         return fit(scan.surface.points, surface, T_map_lidar, voxel_m=self._voxel_m, sigma_m=surface.roughness_m)
+
+    def _nudged(
+        self, scan: SeenScan, T_map_guess: Transform, reaches: Sequence[float], num_points: int
+    ) -> Transform | None:
+        source, target = scan.surface.points, self.surface()
+        return nudge(source, target, T_map_guess, voxel_m=self._voxel_m, reaches=reaches, num_points=num_points)

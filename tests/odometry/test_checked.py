@@ -105,6 +105,27 @@ def test_a_wrong_first_motion_is_repaired_and_a_right_one_is_kept(metres: float)
     assert _worst_step_m(results[:2]) < 0.06
 
 
+def test_small_corrections_do_not_disturb_an_odometry_and_add_up() -> None:
+    """An odometry that drifts sideways by 5 cm a scan continues in its own frame, each motion corrected."""
+
+    class Drifting(_LikeKiss):
+        def follow(self, *_: object, **__: object) -> None:
+            raise AssertionError("a correction below the tolerance disturbs the odometry")
+
+    scans, truth = round_drive()
+    poses = truth.T_world_lidar.copy()
+    aside = geometry.transform(np.eye(3), [0.0, 0.05, 0.0])
+    for k in range(1, len(poses)):
+        poses[k] = poses[k - 1] @ geometry.inverse(truth.T_world_lidar[k - 1]) @ truth.T_world_lidar[k] @ aside
+    inner = Drifting(replace(truth, T_world_lidar=poses), CONFIG.odometry)
+    odometry = CheckedOdometry(inner, CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, scans[:25])
+    assert [result.motion.state for result in results if result.motion].count(MotionState.REFINED) > 15
+    assert _worst_step_m(results) < 0.05
+    T_true = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[24]
+    assert geometry.distance(geometry.inverse(T_true) @ results[24].T_odom_lidar) < 0.2
+
+
 def test_without_the_check_a_jump_remains() -> None:
     config = load_config(None, ["health.check=false"])
     results = _registered(_checked(_slipped(metres=3.0), config), round_drive()[0][: SLIP_AT + 2])

@@ -32,8 +32,9 @@ class Command:
 
     def _read(self) -> None:
         assert self.process.stderr
-        for line in self.process.stderr:
-            self.lines.append(line.rstrip())
+        with self.process.stderr as lines:
+            for line in lines:
+                self.lines.append(line.rstrip())
 
     def wait_for(self, text: str) -> bool:
         """Wait until a line has this text; False if the command ends before."""
@@ -53,9 +54,11 @@ class Command:
             status = self.process.wait(LIMIT_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
+            self.process.stdout.close()
             return -999, {}
         self._reader.join(5)
-        printed = self.process.stdout.read()
+        with self.process.stdout as output:
+            printed = output.read()
         return status, json.loads(printed) if printed else {}
 
     @property

@@ -2,11 +2,11 @@
 
 As long as the odometry is sound, a scan every `keyframes.distance_m` is compared with the previous one in a few
 milliseconds. If this contradicts the motion, the scan is registered with the last scans from several proposals: the
-odometry's motion, the last motion, no motion; and, if none of them explains the scan as scans of this drive usually are
-explained, from poses all around and from place recognition. The most likely pose is kept. Each following scan is
-registered as well, until the odometry agrees with a window of registrations, after the n-th repair with n windows. So
-are the first scans of a drive, where KISS-ICP has few points in its map. After a repair the odometry continues from the
-local map; smaller corrections leave it undisturbed, and are added to its poses.
+odometry's motion and the last motion; and, if neither explains the scan as scans of this drive usually are explained,
+no motion, poses all around, and place recognition. The most likely pose is kept. Each following scan is registered as
+well, until the odometry agrees with a window of registrations, after the n-th repair with n windows. So are the first
+scans of a drive, where KISS-ICP has few points in its map. After a repair the odometry continues from the local map;
+smaller corrections leave it undisturbed, and are added to its poses.
 """
 
 import math
@@ -162,8 +162,10 @@ class CheckedOdometry:
         T_odom_map = self._map.T_odom_map
         T_map_odom = geometry.inverse(T_odom_map)
         T_map_proposed, T_map_last = T_map_odom @ T_odom_proposed, T_map_odom @ self._T_odom_last
-        starts = [T_map_proposed, T_map_odom @ T_odom_predicted, T_map_last]
+        starts = [T_map_proposed, T_map_odom @ T_odom_predicted]
         fits = fits or self._search.near(self._map, scan, starts)
+        if not (fits and self._is_usual(fits[0])):
+            fits = self._search.near(self._map, scan, [T_map_last], fits)
         unsure, elsewhere = np.zeros((6, 6)), float(is_rejoined)  # the scan before is not in the map before a break
 
         if not is_rejoined and not (fits and self._is_usual(fits[0])):

@@ -35,13 +35,16 @@ class PoseSearch:
         """True if a registration from one of two poses reaches the other."""
         return displacement_m(scan.few, T_map_a, T_map_b) < self._same_m
 
-    def near(self, local: LocalMap, scan: SeenScan, T_map_proposed: Sequence[Transform]) -> list[Fit]:
-        """The different poses to which registrations from the proposals lead, the most likely first."""
+    def near(
+        self, local: LocalMap, scan: SeenScan, T_map_proposed: Sequence[Transform], known: Sequence[Fit] = ()
+    ) -> list[Fit]:
+        """`known` poses and those to which registrations from the proposals lead, the most likely first."""
         starts: list[Transform] = []
         for T_map_start in T_map_proposed:
             if not any(self.is_same(scan, T_map_start, T_map_other) for T_map_other in starts):
                 starts.append(T_map_start)
-        return self._different(scan, [fit for T_map_start in starts for fit in local.register(scan, T_map_start)])
+        found = [fit for T_map_start in starts for fit in local.register(scan, T_map_start)]
+        return self._different(scan, [*known, *found])
 
     def around(
         self, local: LocalMap, scan: SeenScan, T_map_last: Transform, T_step: Transform, known: Sequence[Fit]

@@ -11,7 +11,7 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.kernels import kernel
 from segslam.core.types import Information, Transform, Vector
-from segslam.slam.adjustment.submaps import Submap
+from segslam.slam.adjustment.submaps import NUM_THREADS, Submap
 
 SEARCH_M = (1.0, 0.8, 0.7)
 """Chosen: search distance of each iteration, the last one for all others; odometry errs by less over 30 m."""
@@ -69,7 +69,9 @@ class _Fit:
     def step(self, T_target_source: Transform, iteration: int) -> Vector | None:
         """The next step of the pose (right perturbation); None with few pairs."""
         target = self._target
-        nearest, distance_m = target.surface.nearest(geometry.apply(T_target_source, self.points))
+        nearest, distance_m = target.surface.nearest(
+            geometry.apply(T_target_source, self.points), num_threads=NUM_THREADS
+        )
         self.hessian, gradient, squares, weights, self.num = _normal_equations(
             self.points,
             self._normals,

@@ -18,6 +18,9 @@ from segslam.slam.adjustment.pairs import EVERY
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
 
+NUM_THREADS = 2
+"""Threads of searches in submaps: nothing else runs at the end of a drive. Results do not depend on it."""
+
 PointsOf = Callable[[int], Points]
 """Returns the points of a keyframe, by id, in its own frame."""
 
@@ -60,7 +63,7 @@ class Submaps:
         keys, _ = cell_keys(points, self._refine.voxel_m)
         voxels, group = np.unique(hash_keys(keys)[1], return_inverse=True)
         merged = group_means(points, group, len(voxels)) if len(points) else points
-        surface = make_surface(merged, config=self._refine)
+        surface = make_surface(merged, config=self._refine, num_threads=NUM_THREADS)
         return Submap(surface, surface.points.copy(), surface.normals.copy())
 
 

@@ -7,21 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from segslam.cli.console import (
-    ConfigOption,
-    DatasetOption,
-    EncodingOption,
-    FramesOption,
-    JsonOption,
-    LabelsOption,
-    QuietOption,
-    SequenceOption,
-    SetOption,
-    announce,
-    print_json,
-    progress,
-)
-from segslam.cli.overwriting import OverwriteOption
+from segslam.cli.console import Terminal
+from segslam.cli.options import EncodingOption, LabelsOption, OverwriteOption, ScanOptions, Settings
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.core.types import Labels, Scan
@@ -42,13 +30,11 @@ class Labelled:
 
 def label(
     data: Annotated[Path, typer.Argument(help="KITTI folder (with sequences/), folder of scans, or recording.")],
+    *,
     out: Annotated[Path, typer.Option(help="New folder for the labels and pictures.")],
     labels: LabelsOption,
     truth: Annotated[Path | None, typer.Option(help="Folder of true .label files to compare with.")] = None,
-    dataset: DatasetOption = None,
-    sequence: SequenceOption = "00",
-    frames: FramesOption = None,
-    topic: Annotated[str, typer.Option(help="Point cloud topic, if the recording has more than one.")] = "",
+    options: ScanOptions,
     encoding: EncodingOption = None,
     truth_encoding: Annotated[
         Literal["raw", "learning", "learning-0"] | None,
@@ -58,57 +44,38 @@ def label(
         Literal["raw", "learning", "learning-0"], typer.Option(help="Numbering of the written label files.")
     ] = "raw",
     pictures: Annotated[int, typer.Option(min=0, help="Number of scans to draw, spread evenly over the drive.")] = 1,
-    config: ConfigOption = None,
-    settings: SetOption = None,
+    changes: Settings,
     overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Label scans: write a .label file per scan and pictures, and measure the accuracy if true labels are given.
 
     Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
     """
-    announce(f"label: opening {data}", quiet=quiet)
-    from segslam.core.config import load_config
-    from segslam.core.types import SegslamError
+    terminal.announce(f"label: opening {data}")
     from segslam.output.folder import new_folder
-    from segslam.scans import open_dataset
 
-    settings_now = load_config(config, settings or ())
+    angle_deg = changes.load().sensor.vertical_angle_deg
 
     def opened(source: str, numbering: "Encoding | None") -> "Dataset":
-        return open_dataset(
-            data,
-            sequence=sequence,
-            dataset=dataset,
-            labels=source,
-            encoding=numbering,
-            frames=frames,
-            topic=topic,
-            vertical_angle_deg=settings_now.sensor.vertical_angle_deg,
-        )
+        return options.source(data, source, numbering, vertical_angle_deg=angle_deg).open()
 
     scans = opened(labels, encoding)
     true_scans = _open_truth(truth, truth_encoding, opened) if truth else None
     folder = out if overwrite and out.is_dir() else new_folder(out)
     tally = Tally(scans, folder, write_as=write_as, num_pictures=pictures)
     found = _labelled(scans, true_scans)
-    for one in progress(found, total=len(scans), title="label", quiet=quiet):
+    for one in terminal.progress(found, len(scans), "label"):
         if one is not None:
             tally.add(one)
     if not tally.seconds:
         raise SegslamError(f"{data}: none of the {len(scans)} scans could be labelled; see the warnings above")
     figures = tally.figures()
-    if json:
-        print_json(figures)
-    elif not quiet:
-        print(_table(figures, folder))
+    terminal.table(figures, _table(figures, folder))
 
 
 def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Dataset":
     """The same scans with their true labels. A relative folder is searched here, then beside the scans."""
-    from segslam.core.types import SegslamError
-
     try:
         scans: Dataset = opened(str(truth.expanduser().absolute() if truth.is_dir() else truth), numbering)
     except SegslamError as error:
@@ -184,6 +151,7 @@ class Tally:
 
         from segslam.core.types import Label
         from segslam.labels.scores import class_scores, group_scores, largest_confusions
+        from segslam.output.folder import write_csv
 
         shares = self._num_points / self._num_points.sum()
         most_first = np.argsort(-shares, kind="stable")
@@ -196,7 +164,9 @@ class Tally:
         counts = self._confusion
         if not counts.any():
             return figures
-        _write_confusion(self._folder / "confusion.csv", counts)
+        names = [label.name.lower() for label in list(Label)[: len(counts)]]
+        rows = ([name, *row] for name, row in zip(names[1:], counts[1:].tolist(), strict=True))
+        write_csv(self._folder / "confusion.csv", ["truth \\ label", *names], rows)
         by_class = class_scores(counts)
         known = [by_class[Label(int(i)).name.lower()] for i in np.flatnonzero(counts.sum(axis=1))]
         return figures | {
@@ -217,18 +187,6 @@ class Tally:
         image = network.settings if network else fitting_image(one.scan.points)
         title = f"{self._scans.name}, scan {self._scans.names[one.row]}, {len(one.labels)} points"
         return draw_labels(one.scan.points, one.labels, truth=one.truth, image=image, title=title)
-
-
-def _write_confusion(file: Path, counts: Any) -> None:
-    import csv
-
-    from segslam.core.types import Label
-
-    names = [label.name.lower() for label in list(Label)[: len(counts)]]
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["truth \\ label", *names])
-        writer.writerows([name, *row] for name, row in zip(names[1:], counts[1:].tolist(), strict=True))
 
 
 def _table(figures: dict[str, Any], folder: Path) -> str:

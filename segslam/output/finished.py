@@ -98,7 +98,7 @@ class FinishedRun:
 
     def _repr_html_(self) -> str:
         """The trajectory and the figures, for notebooks."""
-        from segslam.output.report.summary import as_html
+        from segslam.output.report import as_html
 
         return as_html(self)
 

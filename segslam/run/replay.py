@@ -1,14 +1,14 @@
 """Loop closing and optimisation again, from the log of a run."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from segslam.core.config import Config, changed_settings, load_config
 from segslam.core.types import SegslamError
-from segslam.output.accuracy import accuracy
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import copy_alone, log_of, new_folder, write_metrics
-from segslam.output.log import RunLog, read_log
+from segslam.output.folder import copy_alone, log_of, new_folder
+from segslam.output.log import Mirror, RunLog, read_log
 from segslam.run.run import Run
 from segslam.slam.loop_edits import LoopEdits
 from segslam.slam.slam import Slam
@@ -26,39 +26,76 @@ def replay(
     `run`: its folder or log.mcap. `settings`: changes such as `"verify.max_false_share=0.01"`; `edits` forbids and adds
     loops. Raises SegslamError for a setting that cannot be changed, and for a run localised in the map of another.
     """
-    from segslam.output.report import write_report
-
-    recorded = read_log(log_of(Path(run)))
-    if recorded.options.get("in_map"):
+    replayed = Replay.of(Path(run), settings=settings, edits=edits)
+    if replayed.in_map:
         raise SegslamError(f"{run}: localised in the map of another run; use the command `segslam replay`")
-    config = load_config(None, settings, base=recorded.config)
-    check_settings(config, recorded)
-    edits = LoopEdits.from_json(recorded.options.get("edits", "")).and_then(edits)
-    reference, folder = recorded.reference(), new_folder(Path(out))
-    with Run(
-        folder,
-        Slam(config, edits=edits),
-        dataset=recorded.run.get("dataset", ""),
-        T_camera_lidar=recorded.T_camera_lidar,
-        reference=reference,
-        options={} if edits == NO_EDITS else {"edits": edits.to_json()},
-    ) as made:
-        copy_alone(recorded.path.parent, folder)
-        for _ in made.repeat(recorded.steps()):
+    folder = new_folder(Path(out))
+    with replayed.begun(folder) as made:
+        copy_alone(replayed.recorded.path.parent, folder)
+        for _ in made.repeat(replayed.recorded.steps()):
             pass
-        result, metrics = made.finish()
-    if reference is not None:
-        metrics |= accuracy(result, reference)
-    write_metrics(folder, metrics)
-    write_report(folder)
+        made.complete()
     return read_run(folder)
 
 
-def check_settings(settings_now: Config, recorded: RunLog) -> None:
-    """Raises SegslamError for a change that would have no effect."""
-    for key, before, _ in changed_settings(recorded.config, settings_now):
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What a run is made of that starts from the log of another."""
+
+    recorded: RunLog
+    config: Config
+    edits: LoopEdits = NO_EDITS
+    """Those of the logged run, then those of this one."""
+
+    @classmethod
+    def of(
+        cls, run: Path, *, config: Path | None = None, settings: Sequence[str] = (), edits: LoopEdits = NO_EDITS
+    ) -> "Replay":
+        """Reads the log of a run, given its folder or the log. Raises SegslamError for a change without effect."""
+        recorded = read_log(log_of(run))
+        changed = changed_config(recorded, file=config, settings=settings)
+        return cls(recorded, changed, LoopEdits.from_json(recorded.options.get("edits", "")).and_then(edits))
+
+    @property
+    def in_map(self) -> Path | None:
+        """The run in whose map the logged one was localised, if it was."""
+        name = self.recorded.options.get("in_map")
+        return Path(name) if name else None
+
+    def begun(
+        self,
+        folder: Path,
+        slam: Slam | None = None,
+        *,
+        options: Mapping[str, str] | None = None,
+        mirror: Mirror | None = None,
+    ) -> Run:
+        """The new run in its folder, before its first step.
+
+        By default, `slam` closes loops with the edits, and the log has the `options` that further replays need.
+        """
+        if options is None and self.in_map:
+            options = {"in_map": str(self.in_map)}
+        elif options is None:
+            options = {} if self.edits == NO_EDITS else {"edits": self.edits.to_json()}
+        return Run(
+            folder,
+            slam or Slam(self.config, edits=self.edits),
+            dataset=self.recorded.run.get("dataset", ""),
+            T_camera_lidar=self.recorded.T_camera_lidar,
+            reference=self.recorded.reference(),
+            options=options,
+            mirror=mirror,
+        )
+
+
+def changed_config(recorded: RunLog, *, file: Path | None = None, settings: Sequence[str] = ()) -> Config:
+    """The settings of a logged run with changes. Raises SegslamError for a change that would have no effect."""
+    config = load_config(file, settings, base=recorded.config)
+    for key, before, _ in changed_settings(recorded.config, config):
         if key.partition(".")[0] in BEFORE_THE_KEYFRAMES:
             raise SegslamError(
                 f"{key}: a replay uses the keyframes of {recorded.path}, which were made with {before}; "
                 "keep this value, or map the data again"
             )
+    return config

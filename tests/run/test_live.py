@@ -13,7 +13,7 @@ from helpers.hanging_source import HangingSource
 from helpers.live_command import LiveCommand, record, write_scan
 from helpers.terminal import in_terminal
 
-from segslam.cli.live_status import too_slow
+from segslam.cli.live import too_slow
 from segslam.core import geometry
 from segslam.core.config import Config, OdometryConfig
 from segslam.core.evaluation import trajectory_metrics
@@ -23,8 +23,7 @@ from segslam.output.finished import read_run
 from segslam.output.log import LogWriter, read_log
 from segslam.run.live import FolderSource, Front
 from segslam.run.live.folder import stamp_of_name
-from segslam.run.live.rhythm import Rhythm
-from segslam.run.live.waiting import Waiting
+from segslam.run.live.waiting import Rhythm, Waiting
 
 INTERVAL_NS = 100_000_000
 SETTINGS = ("--set", "odometry.min_range_m=1")

@@ -23,8 +23,7 @@ from segslam.core.types import BadScan, Scan, SegslamError
 from segslam.odometry import Tracked, Tracker
 from segslam.output.log import read_log
 from segslam.run.live import FolderSource, Front, Placed
-from segslam.run.live.placed import Past
-from segslam.run.live.serve import OdometryEnded, _place_all
+from segslam.run.live.serve import OdometryEnded, Past, _place_all
 from segslam.run.live.waiting import Arrival, Waiting
 
 SETTINGS = ("--set", "odometry.min_range_m=1")

@@ -1,9 +1,10 @@
-"""Visualisation of a run, step by step, as Foxglove messages."""
+"""Visualisation of a run, step by step, as Foxglove messages: drawings, and what happens in words."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 from segslam.core import geometry
@@ -15,6 +16,8 @@ from segslam.core.types import (
     Label,
     Labels,
     LoopAttempt,
+    LoopClosure,
+    MotionState,
     Points,
     Rejected,
     RejectReason,
@@ -22,9 +25,10 @@ from segslam.core.types import (
     Trajectory,
     Transform,
     Vector,
+    probability_text,
 )
 from segslam.output.log import foxglove, schema
-from segslam.output.log.messages import messages_of
+from segslam.output.log.foxglove import timestamp
 from segslam.output.log.records import codec
 
 ACCEPTED_COLOR = "#2ca02cff"
@@ -239,3 +243,32 @@ def numbers_and_words(values: Mapping[str, Any], prefix: str = "") -> dict[str, 
         elif not isinstance(value, list):
             flat[prefix + key] = str(value)
     return flat
+
+
+INFO, WARNING = Log.Level.Value("INFO"), Log.Level.Value("WARNING")
+NAME = "segslam"
+REPAIRS = (MotionState.REPAIRED, MotionState.REJOINED)
+
+
+def warning(text: str, *, stamp_ns: int) -> Log:
+    """A warning, for example about a scan that was skipped."""
+    return Log(timestamp=timestamp(stamp_ns), level=WARNING, message=text, name=NAME)
+
+
+def messages_of(step: Step) -> Iterator[Log]:
+    """Repairs and breaks of the odometry as warnings, accepted loops as information."""
+    motion = step.motion
+    if motion is not None and motion.state in REPAIRS:
+        by = "" if motion.moved_m is None else f", by {motion.moved_m:.2f} m"
+        yield warning(f"scan {step.scan_index}: motion of the odometry repaired{by}", stamp_ns=step.stamp_ns)
+    elif motion is not None and motion.state is MotionState.BROKEN:
+        yield warning(f"scan {step.scan_index}: break, the scans do not support the motion", stamp_ns=step.stamp_ns)
+    for attempt in step.attempts:
+        if isinstance(attempt.outcome, LoopClosure):
+            closure, found = attempt.outcome, attempt.outcome.alignment
+            probable = "" if found.probability is None else probability_text(found.probability, found.evidence) + ", "
+            text = (
+                f"loop from keyframe {closure.source_id} to {closure.target_id}: {probable}"
+                f"overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m"
+            )
+            yield Log(timestamp=timestamp(step.stamp_ns), level=INFO, message=text, name=NAME)

@@ -26,18 +26,8 @@ def metadata(
     config: Config, dataset: str, T_camera_lidar: Transform | None, options: Mapping[str, str]
 ) -> dict[str, dict[str, str]]:
     """Metadata records by name, as documented in `schema`."""
-    records = {
-        name: {key: _printable(value) for key, value in values.items()}
-        for name, values in _records(config, dataset, T_camera_lidar, options).items()
-    }
-    return {**records, schema.CHECK_METADATA: {"crc32": str(schema.checksum(records))}}
-
-
-def _records(
-    config: Config, dataset: str, T_camera_lidar: Transform | None, options: Mapping[str, str]
-) -> dict[str, dict[str, str]]:
     calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
-    return {
+    written = {
         schema.RUN_METADATA: {
             "schema_version": str(schema.VERSION),
             "dataset": dataset,
@@ -52,6 +42,8 @@ def _records(
         schema.OPTIONS_METADATA: dict(options),
         schema.PACKAGES_METADATA: {name: _version(name) for name in PACKAGES},
     }
+    records = {name: {key: _printable(text) for key, text in values.items()} for name, values in written.items()}
+    return {**records, schema.CHECK_METADATA: {"crc32": str(schema.checksum(records))}}
 
 
 def _printable(text: str) -> str:

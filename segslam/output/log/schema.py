@@ -1,11 +1,19 @@
-"""Topics, frames and metadata of a log, and the version of this format."""
+"""Topics, channels, frames and metadata of a log, and the version of this format."""
 
 import json
 import zlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from segslam.core.types import GraphEstimate, LateLoops, Step, Trajectory
+from segslam.output.log.cloud import KeyframePoints
 from segslam.output.log.records import codec
 from segslam.slam.adjustment import Adjustment
 
@@ -95,11 +103,6 @@ def json_schemas() -> dict[str, dict[str, Any]]:
     }
 
 
-def schema_text(schema: dict[str, Any]) -> bytes:
-    """A JSON Schema as stored in the file."""
-    return json.dumps(schema).encode()
-
-
 def is_readable(written: dict[str, Any], own: dict[str, Any]) -> bool:
     """True if records written with one JSON Schema contain all fields that a reader of `own` needs, with equal types.
 
@@ -116,3 +119,46 @@ def is_readable(written: dict[str, Any], own: dict[str, Any]) -> bool:
         elif name in own.get("required", ()):
             return False
     return all(key in theirs and is_readable(theirs[key], ours[key]) for theirs, ours, key in parts)
+
+
+PROTOBUF_TOPICS: dict[str, Any] = {
+    TRANSFORMS: FrameTransform,
+    KEYFRAME: KeyframePoints,
+    POINTS: PointCloud,
+    MAP: PointCloud,
+    ODOMETRY: PosesInFrame,
+    TRAJECTORY: PosesInFrame,
+    TRAJECTORY_BEFORE: PosesInFrame,
+    GROUND_TRUTH: PosesInFrame,
+    LOG: Log,
+    ACCEPTED: SceneUpdate,
+    REJECTED: SceneUpdate,
+    GRAPH: SceneUpdate,
+}
+
+
+class Channel(NamedTuple):
+    """A topic and the encoding of its messages."""
+
+    topic: str
+    encoding: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+
+
+def channels() -> list[Channel]:
+    """Every topic of a log."""
+    descriptions = {
+        message: build_file_descriptor_set(message).SerializeToString()
+        for message in dict.fromkeys(PROTOBUF_TOPICS.values())
+    }
+    protobuf = [
+        Channel(topic, "protobuf", message.DESCRIPTOR.full_name, "protobuf", descriptions[message])
+        for topic, message in PROTOBUF_TOPICS.items()
+    ]
+    own = [
+        Channel(topic, "json", values["title"], "jsonschema", json.dumps(values).encode())
+        for topic, values in json_schemas().items()
+    ]
+    return protobuf + own

@@ -27,9 +27,8 @@ from segslam.output.georeferenced import georeference
 from segslam.output.report import write_report
 from segslam.run.fleets.drives import Drive
 from segslam.run.fleets.relations import Relation, read_relation, write_relation
-from segslam.run.given_odometry import given_odometry
 from segslam.run.locator import Locator
-from segslam.run.map_folder import map_folder, open_scans
+from segslam.run.map_folder import given_odometry, map_source, open_scans
 from segslam.run.sessions.merge import arranged, write_merged
 from segslam.run.sessions.recorded import Session, read_session
 from segslam.run.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
@@ -91,18 +90,7 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
     odometry = None
     if drive.odometry:
         odometry = given_odometry(Path(drive.odometry), open_scans(source, config), config.odometry)
-    map_folder(
-        source.data,
-        part,
-        config=config,
-        sequence=source.sequence,
-        dataset=source.dataset,
-        labels=source.labels,
-        encoding=source.encoding,
-        frames=source.frames,
-        topic=source.topic,
-        odometry=odometry,
-    )
+    map_source(source, part, config=config, odometry=odometry)
     if fixes is not None:
         _georeference(part, drive.name, fixes)
     _made(part, mapped.folder(fleet), key)

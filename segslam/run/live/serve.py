@@ -1,23 +1,77 @@
 """The front process: receives scans, estimates their poses by odometry and publishes the poses."""
 
 import signal
+from collections import deque
 from contextlib import suppress
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.memory import keep_freed_memory
-from segslam.core.types import BadScan, Scan, SegslamError
+from segslam.core.types import BadScan, Points, Scan, SegslamError, Step
 from segslam.odometry import KissOdometry, OdometryApart, Tracked, Tracker
-from segslam.run.live.placed import Ended, Gaps, Past, Placed
-from segslam.run.live.source import Source
-from segslam.run.live.waiting import Arrival, Tally, Waiting
+from segslam.run.live.waiting import Arrival, Source, Tally, Waiting
+
+
+class Gaps(NamedTuple):
+    """Gaps in the stamps so far."""
+
+    num_gaps: int = 0
+    num_missing: int = 0
+    longest_gap_s: float = 0.0
+    num_clock_set: int = 0
+
+    @classmethod
+    def of(cls, waiting: Waiting) -> "Gaps":
+        """Those of the scans that have arrived."""
+        rhythm = waiting.rhythm
+        return cls(rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_clock_set)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A scan with its odometry pose, or an unusable scan, and the counts so far."""
+
+    tracked: Tracked | BadScan
+    latency_s: float
+    """Time from the arrival of the scan to the publication of its pose."""
+    placed_s: float
+    """Time of the publication, by time.monotonic."""
+    num_dropped: int
+    gaps: Gaps
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """End of the stream: reason and final counts."""
+
+    why: str = ""
+    """Empty if the stop was requested."""
+    failed: bool = False
+    died: bool = False
+    """True if the process can be started again."""
+    num_arrived: int = 0
+    num_dropped: int = 0
+    gaps: Gaps = field(default_factory=Gaps)
+
+
+@dataclass(slots=True, eq=False)
+class Past:
+    """The scans of front processes that have ended."""
+
+    steps: list[Step]
+    """Poses and motions only."""
+    clouds: deque[tuple[int, Points]]
+    """Row and points of the last keyframes."""
+    gaps: Gaps = field(default_factory=Gaps)
+
 
 READY = b"ready"
 END_S = 5.0

@@ -114,16 +114,10 @@ class Shift:
 
 
 def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopAttempt, ...]]) -> Iterator[Step]:
-    """The steps of a session with their points; `more`: further loops of its keyframes, by original id.
-
-    Loops tried after the session's last scan are added to the step of its last keyframe.
-    """
-    late = session.log.late_loops()
-    last_id = len(session.travel_m) - 1
-    for number, step in enumerate(session.log.steps()):
+    """The steps of a session (`RunLog.whole_steps`); `more`: further loops of its keyframes, by original id."""
+    for number, step in enumerate(session.log.whole_steps(len(session.travel_m))):
         attempts, keyframe, motion = [shift.attempt(attempt) for attempt in step.attempts], step.keyframe, step.motion
         if keyframe is not None:
-            attempts += [shift.attempt(attempt) for attempt in (late if keyframe.id == last_id else ())]
             attempts += more.get(keyframe.id, ())
             keyframe = replace(
                 keyframe,

@@ -134,9 +134,11 @@ class RunOutput(RunSettings):
 
     def maps(self, folder: Path) -> tuple[list[Path], list[Path]]:
         """Map files as given, and as paths in the run folder. Raises SegslamError if one cannot be written."""
-        from segslam.output.map import check_names
-
         names = [*map(Path, WITH_MAP if self.with_map else ()), *(self.map_file or ())]
+        if not names:
+            return [], []
+        from segslam.output.map.write import check_names
+
         files = [folder / name for name in names]
         check_names(files)
         for file in files:

@@ -207,7 +207,7 @@ def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool
     """The edits of the options. Raises SegslamError if there are none."""
     forbidden, added = pairs_of(forbid, "--forbid"), pairs_of(add, "--add")
     if add_near_fixes:
-        from segslam.run.near_fixes import pairs_near_fixes
+        from segslam.run.replay import pairs_near_fixes
 
         added |= pairs_near_fixes(run) - forbidden
     if not forbidden | added:

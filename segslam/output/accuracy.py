@@ -25,8 +25,11 @@ def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
         for prefix, trajectory in others.items()
         for name, value in trajectory_accuracy(trajectory, reference).items()
     }
-    loops = {} if result.from_map_m is not None else _loop_accuracy(result, reference)
-    return corrected | compared | loops
+    if result.from_map_m is not None:
+        return corrected | compared
+    closures, pairs, truth = judged_closures(result, reference)
+    measured = np.array([closure.T_target_source for closure in closures]).reshape(-1, 4, 4)
+    return corrected | compared | loop_metrics(measured, pairs, truth)
 
 
 def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[str, float]:
@@ -43,11 +46,6 @@ def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[Loo
     known = [c for c in closures if c.source_id in place_of_id and c.target_id in place_of_id]
     pairs = np.array([(place_of_id[c.source_id], place_of_id[c.target_id]) for c in known], dtype=int).reshape(-1, 2)
     return known, pairs, reference.T_world_lidar[rows[:, 1]]
-
-
-def _loop_accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
-    closures, pairs, truth = judged_closures(result, reference)
-    return loop_metrics(np.array([c.T_target_source for c in closures]).reshape(-1, 4, 4), pairs, truth)
 
 
 Align = Literal["se3", "sim3", "first", "none"]

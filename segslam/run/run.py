@@ -32,7 +32,6 @@ from segslam.core.whole_files import write_whole
 from segslam.graph import PoseGraph
 from segslam.odometry.calibration import measure_vertical_angle
 from segslam.output.accuracy import accuracy
-from segslam.output.export import write_maps
 from segslam.output.finished import read_metrics
 from segslam.output.folder import (
     ADJUSTED_GRAPH,
@@ -268,7 +267,10 @@ class Run:
             "peak_rss_mb": peak_mb(),
             **figures,
             **({} if result.from_map_m is None else {"localised_percent": 100.0 * float(result.localised().mean())}),
-            "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
+            "stage_ms": {
+                stage: {"median": median(times), "p95": float(np.percentile(times, 95))}
+                for stage, times in self._stage_ms.items()
+            },
         }
 
     def complete(
@@ -285,6 +287,7 @@ class Run:
         `more` adds figures computed from the result. `place` georeferences the folder before the maps are written, and
         returns what it found. `search_s` and `progress` as in `finish`. A failure of place or maps leaves a report.
         """
+        from segslam.output.export import write_maps
         from segslam.output.report import write_report
 
         result, metrics = self.finish(search_s=search_s, progress=progress)
@@ -364,7 +367,3 @@ class Run:
 
 def _other_data(log: Path, difference: str) -> SegslamError:
     return SegslamError(f"{log}: {difference}; resume with the data of the interrupted run")
-
-
-def _median_and_p95(times: list[float]) -> dict[str, float]:
-    return {"median": median(times), "p95": float(np.percentile(times, 95))}

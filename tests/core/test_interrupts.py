@@ -29,7 +29,7 @@ WRITING = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from segslam.output.map import TemporaryDirectory
+from segslam.output.map.write import TemporaryDirectory
 from segslam.core.interrupts import ctrl_c_in_order, removed_when_stopped
 from segslam.core.whole_files import whole_file
 with ctrl_c_in_order(), whole_file(Path(sys.argv[1], "half.txt")) as part:

@@ -30,8 +30,8 @@ from segslam.output.log import container, schema
 from segslam.output.log.cloud import KeyframePoints, intensities, place_of, points_and_labels
 from segslam.output.log.container import CutError, Span, messages_within
 from segslam.output.log.foxglove import transforms
-from segslam.output.log.origin import restored
 from segslam.output.log.records import codec
+from segslam.output.log.schema import restored
 from segslam.slam.adjustment import Adjustment
 
 

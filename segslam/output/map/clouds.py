@@ -3,15 +3,17 @@
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from segslam.core.config import MapConfig
 from segslam.core.extras import how_to_install
 from segslam.core.types import Label, Points, SegslamError
-from segslam.gnss.geodesy import Origin
 from segslam.output.map.part import Extent, Part
+
+if TYPE_CHECKING:
+    from segslam.gnss.geodesy import Origin
 
 PLY_ROW = [("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")]
 PCD_ROW = [("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")]
@@ -148,7 +150,7 @@ class LasCloud:
         self._writer.close()
 
 
-def _utm(origin: Origin, header: Any) -> Callable[[Points], Points]:
+def _utm(origin: "Origin", header: Any) -> Callable[[Points], Points]:
     """UTM coordinates of points, whose zone and offsets are written into the header of a LAS file."""
     from pyproj import CRS
 

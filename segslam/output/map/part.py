@@ -2,19 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from segslam.core.config import MapConfig
 from segslam.core.types import Labels, Points, Vector
-from segslam.gnss.geodesy import Origin
 from segslam.labels.class_colors import Colors
 from segslam.output.map.free_ranges import FreeRanges
 from segslam.output.map.tiles import Tile
 
-Window = tuple[float, float, float, float]
-"""West, east, south and north end of an image (m)."""
+if TYPE_CHECKING:
+    from segslam.gnss.geodesy import Origin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +34,7 @@ class Extent:
     """Free space observed by the keyframes."""
     cut_m: Vector | None = None
     """Heights (n,) of `overhead.cut_heights` for each position of the path; None if no picture is drawn."""
-    origin: Origin | None = None
+    origin: "Origin | None" = None
     """Place of the world frame (east, north, up) on the globe, if it is known."""
 
 

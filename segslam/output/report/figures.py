@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import cycle
@@ -15,10 +16,9 @@ from matplotlib.figure import Figure
 
 from segslam.core.evaluation import align_positions, false_loops, pose_errors
 from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
-from segslam.core.types import LoopClosure, MotionState, Rejected, RejectReason, Vector
+from segslam.core.types import MotionState, Rejected, RejectReason
 from segslam.output.accuracy import judged_closures
 from segslam.output.finished import FinishedRun
-from segslam.output.georeferenced import FIXES, read_globe
 
 # Okabe and Ito's colours, distinguishable with any colour vision
 TRUTH, CORRECTED, ODOMETRY, ALONE = "#B8B8B8", "#0072B2", "#E69F00", "#CC79A7"
@@ -105,7 +105,18 @@ def draw_paths(run: FinishedRun) -> str:
 def draw_loops(run: FinishedRun) -> str:
     """All loop candidates on the corrected trajectory: closures as lines between their ends, rejected ones as dots."""
     figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
-    _plot_attempts(figure.subplots(), run)
+    axes = figure.subplots()
+    positions = run.result.trajectory.T_world_lidar[:, :2, 3]
+    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
+    ends = positions[run.result.keyframe_rows]
+    for label, color, is_closed, pairs in _by_outcome(run):
+        if not is_closed:
+            axes.plot(*ends[[source for source, _ in pairs]].T, ".", color=color, markersize=7, label=label, zorder=2)
+            continue
+        for pair in pairs:
+            axes.plot(*ends[list(pair)].T, "o-", color=color, markersize=3, linewidth=1.5)
+        axes.plot([], [], "o-", color=color, label=label)
+    _finish_map(axes, num_columns=2)
     return svg(figure, "loops")
 
 
@@ -115,21 +126,14 @@ def draw_loops_over_time(run: FinishedRun) -> str:
     axes = figure.subplots()
     time_s = (run.result.odometry.stamp_ns - run.result.odometry.stamp_ns[0]) / 1e9
     keyframe_s = time_s[run.result.keyframe_rows]
-    for (reason, pairs), color in zip(_rejected_pairs(run).items(), cycle(REJECTED), strict=False):
-        _plot_times(axes, keyframe_s, pairs, f"{reason.replace('_', ' ')} ({len(pairs)})", color, "x")
-    for name, color, closures in _closure_kinds(run):
-        if closures:
-            pairs = [(closure.source_id, closure.target_id) for closure in closures]
-            _plot_times(axes, keyframe_s, pairs, f"{name} ({len(pairs)})", color, "o")
+    for label, color, is_closed, pairs in _by_outcome(run):
+        sources, targets = np.array(pairs).T
+        marker = "o" if is_closed else "x"
+        axes.plot(keyframe_s[sources], keyframe_s[targets], marker, color=color, label=label, markersize=5)
     axes.plot([0, keyframe_s[-1]], [0, keyframe_s[-1]], color=TRUTH, linewidth=1.0)
     axes.set(xlabel="time of the new keyframe (s)", ylabel="time of the old keyframe (s)")
     _legend_on_top(axes, num_columns=2)
     return svg(figure, "times")
-
-
-def _plot_times(axes: Axes, time_s: Vector, pairs: list[tuple[int, int]], label: str, color: str, marker: str) -> None:
-    sources, targets = np.array(pairs).T
-    axes.plot(time_s[sources], time_s[targets], marker, color=color, label=label, markersize=5)
 
 
 def draw_errors(poses: Compared) -> str:
@@ -191,50 +195,44 @@ def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:
             axes.plot(*T_corrected[rows, :2, 3].T, marker, color=color, markersize=7, zorder=4, label=label)
 
 
-def _plot_attempts(axes: Axes, run: FinishedRun) -> None:
-    positions = run.result.trajectory.T_world_lidar[:, :2, 3]
-    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
-    ends = positions[run.result.keyframe_rows]
-    for (reason, pairs), color in zip(_rejected_pairs(run).items(), cycle(REJECTED), strict=False):
-        label = f"{reason.replace('_', ' ')} ({len(pairs)})"
-        axes.plot(*ends[[source for source, _ in pairs]].T, ".", color=color, markersize=7, label=label, zorder=2)
-    for name, color, closures in _closure_kinds(run):
-        for closure in closures:
-            axes.plot(*ends[[closure.source_id, closure.target_id]].T, "o-", color=color, markersize=3, linewidth=1.5)
-        if closures:
-            axes.plot([], [], "o-", color=color, label=f"{name} ({len(closures)})")
-    _finish_map(axes, num_columns=2)
-
-
 def _finish_map(axes: Axes, *, num_columns: int) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
     _legend_on_top(axes, num_columns=num_columns)
 
 
-def _rejected_pairs(run: FinishedRun) -> dict[RejectReason, list[tuple[int, int]]]:
-    """New and old keyframe of each rejected candidate, by reason, in the order of the pipeline."""
-    pairs: dict[RejectReason, list[tuple[int, int]]] = {}
+class _Outcome(NamedTuple):
+    """The loop candidates with one outcome, of which there is one at least."""
+
+    label: str
+    color: str
+    is_closed: bool
+    pairs: list[tuple[int, int]]
+    """New and old keyframe of each."""
+
+
+def _by_outcome(run: FinishedRun) -> list[_Outcome]:
+    """Rejected candidates by reason, in the order of the pipeline; then closures: accepted, rejected later, false."""
+    rejected, closed = defaultdict[RejectReason, list[tuple[int, int]]](list), []
     for attempt in run.result.attempts:
+        pair = (attempt.candidate.source_id, attempt.candidate.target_id)
         if isinstance(attempt.outcome, Rejected):
-            ids = (attempt.candidate.source_id, attempt.candidate.target_id)
-            pairs.setdefault(attempt.outcome.reason, []).append(ids)
-    return {reason: pairs[reason] for reason in RejectReason if reason in pairs}
-
-
-def _closure_kinds(run: FinishedRun) -> list[tuple[str, str, list[LoopClosure]]]:
-    """Name, colour and closures: accepted, rejected by the optimiser, or false by the ground truth."""
-    closures = [attempt.outcome for attempt in run.result.attempts if isinstance(attempt.outcome, LoopClosure)]
+            rejected[attempt.outcome.reason].append(pair)
+        else:
+            closed.append(pair)
     false = _false_closures(run)
     off = run.result.estimate.rejected - false
-    pairs = [(closure.source_id, closure.target_id) for closure in closures]
-    kinds = (
-        ("accepted", ACCEPTED, set(pairs) - off - false),
-        ("rejected by the optimiser", OPTIMISED_AWAY, off),
-        ("false", FALSE, false),
-    )
+    reasons = [reason for reason in RejectReason if reason in rejected]
+    groups = [
+        *(
+            (reason.replace("_", " "), color, False, rejected[reason])
+            for reason, color in zip(reasons, cycle(REJECTED), strict=False)
+        ),
+        ("accepted", ACCEPTED, True, [pair for pair in closed if pair not in off | false]),
+        ("rejected by the optimiser", OPTIMISED_AWAY, True, [pair for pair in closed if pair in off]),
+        ("false", FALSE, True, [pair for pair in closed if pair in false]),
+    ]
     return [
-        (name, color, [closure for pair, closure in zip(pairs, closures, strict=True) if pair in members])
-        for name, color, members in kinds
+        _Outcome(f"{name} ({len(pairs)})", color, is_closed, pairs) for name, color, is_closed, pairs in groups if pairs
     ]
 
 
@@ -265,9 +263,13 @@ RESIDUALS = ("residual_east_m", "residual_north_m")
 
 def draw_fixes(folder: Path) -> str | None:
     """SVG text: fixes over the path in top view, and residuals over time; None for a run without fixes."""
+    file = folder / "gnss.csv"
+    if not file.is_file():
+        return None
+    from segslam.output.georeferenced import read_globe
+
     globe = read_globe(folder)
-    file = folder / FIXES
-    if globe is None or not file.is_file():
+    if globe is None:
         return None
     with file.open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if row["residual_east_m"]]

@@ -12,7 +12,7 @@ import numpy as np
 from segslam.core.config import MapConfig
 from segslam.core.types import Keyframe, Labels, Points, SegslamError, Transform
 from segslam.output.log.drawing import CloudOf, map_points
-from segslam.output.map import MapSummary, write_map
+from segslam.output.map.write import MapSummary, write_map
 
 logger = logging.getLogger(__name__)
 

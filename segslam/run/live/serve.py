@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,22 +17,7 @@ from segslam.core.config import Config
 from segslam.core.memory import keep_freed_memory
 from segslam.core.types import BadScan, Points, Scan, SegslamError, Step
 from segslam.odometry import KissOdometry, OdometryApart, Tracked, Tracker
-from segslam.run.live.waiting import Arrival, Source, Tally, Waiting
-
-
-class Gaps(NamedTuple):
-    """Gaps in the stamps so far."""
-
-    num_gaps: int = 0
-    num_missing: int = 0
-    longest_gap_s: float = 0.0
-    num_clock_set: int = 0
-
-    @classmethod
-    def of(cls, waiting: Waiting) -> "Gaps":
-        """Those of the scans that have arrived."""
-        rhythm = waiting.rhythm
-        return cls(rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_clock_set)
+from segslam.run.live.waiting import Arrival, Gaps, Source, Tally, Waiting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +108,7 @@ def serve(pipe: Connection, source: Source, config: Config, idle_s: float | None
     finally:
         if feeder is None or not feeder.is_alive():
             source.close()
-    to_send.put(Ended(why, failed, died, waiting.num_arrived, waiting.num_dropped, Gaps.of(waiting)))
+    to_send.put(Ended(why, failed, died, waiting.num_arrived, waiting.num_dropped, waiting.rhythm.gaps))
     to_send.put(None)
     sender.join()
 
@@ -146,8 +131,7 @@ def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
         tracker.note(step)
     for step in past.steps[-ROWS_CONTINUED:]:
         waiting.rhythm.note(step.stamp_ns)
-    rhythm = waiting.rhythm
-    rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_clock_set = past.gaps
+    waiting.rhythm.gaps = past.gaps
     keyframes = [row for row, _ in past.clouds]
     last = range(max(len(past.steps) - ROWS_CONTINUED, keyframes[0]), len(past.steps))
     rows = sorted({*keyframes, *last})
@@ -177,7 +161,7 @@ def _place_all(
             last_ns = arrival.stamp_ns
             _publish(source, arrival, tracked, to_send)
         now = monotonic()
-        to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.num_dropped, Gaps.of(waiting)))
+        to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.num_dropped, waiting.rhythm.gaps))
     return not waiting.is_closed
 
 

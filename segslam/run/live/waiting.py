@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 from threading import Condition, Event, Thread
 from time import monotonic
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from segslam.core.types import BadScan, Scan, SegslamError, Transform
 from segslam.scans import open_dataset
@@ -117,6 +117,16 @@ SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
 """Chosen: the sender's clock was set forward if a stamp is this much later than the last: no drive has such a gap."""
 
 
+class Gaps(NamedTuple):
+    """Gaps in the stamps so far."""
+
+    num_gaps: int = 0
+    num_missing: int = 0
+    """Number of missing scans, estimated from the length of the gaps."""
+    longest_gap_s: float = 0.0
+    num_clock_set: int = 0
+
+
 class Rhythm:
     """Tracks the stamps of arriving scans."""
 
@@ -124,11 +134,7 @@ class Rhythm:
         self._intervals_ns: deque[int] = deque(maxlen=21)
         self._last_ns: int | None = None
         self._shift_ns = 0
-        self.num_gaps = 0
-        self.num_missing = 0
-        """Number of missing scans, estimated from the length of the gaps."""
-        self.longest_gap_s = 0.0
-        self.num_clock_set = 0
+        self.gaps = Gaps()
 
     def note(self, sent_ns: int) -> int:
         """The stamp of the next scan: as sent, or shifted to follow the last one if the clock was set."""
@@ -137,7 +143,7 @@ class Rhythm:
         if last_ns is not None and not last_ns - SET_BACK_NS <= stamp_ns <= last_ns + SET_FORWARD_NS:
             self._shift_ns += last_ns + self._usual_ns() - stamp_ns
             stamp_ns = sent_ns + self._shift_ns
-            self.num_clock_set += 1
+            self.gaps = self.gaps._replace(num_clock_set=self.gaps.num_clock_set + 1)
         if last_ns is not None and stamp_ns > last_ns:
             self._note_interval(stamp_ns - last_ns)
         self._last_ns = max(stamp_ns, last_ns or 0)
@@ -154,9 +160,9 @@ class Rhythm:
     def _note_interval(self, interval_ns: int) -> None:
         usual_ns = self._usual_ns()
         if usual_ns and interval_ns > LONG_GAP * usual_ns:
-            self.num_gaps += 1
-            self.num_missing += round(interval_ns / usual_ns) - 1
-            self.longest_gap_s = max(self.longest_gap_s, interval_ns * 1e-9)
+            num_gaps, num_missing, longest_s, num_clock_set = self.gaps
+            num_missing += round(interval_ns / usual_ns) - 1
+            self.gaps = Gaps(num_gaps + 1, num_missing, max(longest_s, interval_ns * 1e-9), num_clock_set)
         self._intervals_ns.append(interval_ns)
 
     def _usual_ns(self) -> int:

@@ -19,7 +19,8 @@ from segslam.output.georeferenced import georeference_if_possible, recorded_fixe
 from segslam.run.locator import Locator
 from segslam.run.run import Run
 from segslam.run.sessions.recorded import Session, Shift, next_shift, read_sessions, shifted_steps
-from segslam.run.sessions.session_pose import Progress, SessionPose, attempt, find_session, no_progress
+from segslam.run.sessions.session_pose import SessionPose, attempt, find_session
+from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.slam import Slam, SlamResult
 
 OPTIMIZE_EVERY = 25

@@ -81,12 +81,9 @@ class Locator:
         """`keyframes`: by id, with or without points; `clouds` provides the points. Missing signatures are computed."""
         self.config = config
         self.T_world_keyframe = T_world_keyframe
-        travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
-        self.submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: travel_m)
+        self.submaps = submaps_of(keyframes, clouds, config)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         """A keyframe by its id, prepared for alignment."""
-        for keyframe in keyframes:
-            self.submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
         self.signatures = [self._signature(keyframe) for keyframe in keyframes]
         self.places = Places()
         for keyframe, signature in zip(keyframes, self.signatures, strict=True):
@@ -151,6 +148,15 @@ class Locator:
             return PlaceSignature.from_bytes(keyframe.place)
         made = self.submaps.gathered(keyframe.id, newest_id=keyframe.id)
         return signature_of(made.points, made.labels)
+
+
+def submaps_of(keyframes: list[Keyframe], clouds: Clouds, config: Config) -> Submaps:
+    """The submaps of a drive; sparse keyframes are merged with their neighbours. Arguments as for `Locator`."""
+    travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
+    submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: travel_m)
+    for keyframe in keyframes:
+        submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
+    return submaps
 
 
 def locate(run: str | Path, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,18 +25,10 @@ from segslam.slam.slam import Slam
 if TYPE_CHECKING:
     from segslam.labels.encodings import Encoding
     from segslam.odometry import Odometry
-    from segslam.registration.prepared import Labeller
 
 
-@runtime_checkable
-class SlamOf(Protocol):
-    """Factory of the pipeline of a run: `Slam`, or another class with the same methods."""
-
-    def __call__(
-        self, config: Config, *, odometry: "Odometry | None" = None, labeller: "Labeller | None" = None
-    ) -> Slam:
-        """Arguments as for `Slam`."""
-        ...
+SlamOf = Callable[..., Slam]
+"""What makes the pipeline of a run: `Slam`, or another with the same arguments and methods."""
 
 
 def map_folder(

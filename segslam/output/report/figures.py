@@ -132,7 +132,7 @@ def draw_loops_over_time(run: FinishedRun) -> str:
         axes.plot(keyframe_s[sources], keyframe_s[targets], marker, color=color, label=label, markersize=5)
     axes.plot([0, keyframe_s[-1]], [0, keyframe_s[-1]], color=TRUTH, linewidth=1.0)
     axes.set(xlabel="time of the new keyframe (s)", ylabel="time of the old keyframe (s)")
-    _legend_on_top(axes, num_columns=2)
+    legend_on_top(axes, num_columns=2)
     return svg(figure, "times")
 
 
@@ -146,15 +146,20 @@ def draw_errors(poses: Compared) -> str:
         drives = [("KISS-ICP alone", poses.alone, ALONE), ("odometry after repairs", *drives[0][1:]), drives[1]]
     for name, estimate, color in drives:
         aligned = align_positions(estimate[:, :3, 3], poses.truth[:, :3, 3]) @ estimate
-        error_m = pose_errors(aligned, poses.truth).translation_m
-        label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
-        whole.plot(along_m, error_m, color=color, label=label, linewidth=1.4)
+        plot_error(whole, name, aligned, poses.truth, color)
         height.plot(along_m, (aligned - poses.truth)[:, 2, 3], color=color, linewidth=1.4)
     whole.set(ylabel="error (m)")
     whole.set_ylim(bottom=0)
     height.set(xlabel="distance travelled (m)", ylabel="height error (m)")
-    _legend_on_top(whole, num_columns=1)
+    legend_on_top(whole, num_columns=1)
     return svg(figure, "errors")
+
+
+def plot_error(axes: Axes, name: str, aligned: Poses, reference: Poses, color: str) -> None:
+    """Draw the position error of aligned poses against the distance travelled."""
+    error_m = pose_errors(aligned, reference).translation_m
+    label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
+    axes.plot(travelled_m(reference), error_m, color=color, label=label, linewidth=1.4)
 
 
 def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
@@ -166,7 +171,7 @@ def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
     axes.barh(stages, [stage_ms[stage]["median"] for stage in stages], color=CORRECTED, height=0.45, label="median")
     axes.grid(visible=False, axis="y")
     axes.set(xlabel="time (ms)", xscale="log")  # from a keyframe's fraction of a millisecond to minutes of adjustment
-    _legend_on_top(axes)
+    legend_on_top(axes)
     return svg(figure, "stages")
 
 
@@ -197,7 +202,7 @@ def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:
 
 def _finish_map(axes: Axes, *, num_columns: int) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
-    _legend_on_top(axes, num_columns=num_columns)
+    legend_on_top(axes, num_columns=num_columns)
 
 
 class _Outcome(NamedTuple):
@@ -246,7 +251,8 @@ def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:
     return {(c.source_id, c.target_id) for c, is_false in zip(closures, false, strict=True) if is_false}
 
 
-def _legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
+def legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
+    """Draw the legend above the axes, on the left."""
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=num_columns, borderaxespad=0.2, fontsize=10)
 
 

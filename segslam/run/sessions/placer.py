@@ -7,7 +7,7 @@ again without initial guess.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
@@ -45,14 +45,6 @@ REMEMBERED_M = 60.0
 NUM_PREPARED = 64
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pose:
-    """A keyframe with a pose in the map's world."""
-
-    keyframe_id: int
-    T_world_keyframe: Transform
-
-
 class Placer:
     """Replaces the loop closer in a drive that is localised; the calls come in the same order."""
 
@@ -62,7 +54,7 @@ class Placer:
         ids = sorted(locator.T_world_keyframe)
         self._T_world_map = np.array([locator.T_world_keyframe[number] for number in ids])
         self._map_seen: Callable[[int], Observed] = lru_cache(NUM_PREPARED)(partial(self._seen, locator.submaps))
-        self._last: _Pose | None = None
+        self._last: Placement | None = None
         """The newest placed keyframe."""
         self._found: list[Placement] = []
         """Locations that are not yet confirmed."""
@@ -146,19 +138,19 @@ class Placer:
 
     def _confirmed(self, found: Placement) -> tuple[tuple[Placement, ...], Rejected | None]:
         """The location with an earlier one that is consistent with it; it waits if there is none."""
-        if self._last is not None and self._agree(self._last, found):
+        if self._last is not None and self._agree(self._last, found, BREAK_TRAVEL_M):
             return self._taken((found,)), None
         for earlier in reversed(self._found):
-            if self._agree(earlier, found):
+            if self._agree(earlier, found, REMEMBERED_M):
                 return self._taken((earlier, found)), None
         self._found.append(found)
         return (), Rejected(RejectReason.UNCONFIRMED, "found, but not yet confirmed by another keyframe")
 
-    def _agree(self, earlier: "Placement | _Pose", later: Placement) -> bool:
-        """True if odometry leads from one location to the other."""
+    def _agree(self, earlier: Placement, later: Placement, within_m: float) -> bool:
+        """True if odometry leads from one location to the other, over less than this travel."""
         travel_m = self._graph.travel_m
         way_m = float(travel_m[later.keyframe_id] - travel_m[earlier.keyframe_id])
-        if way_m >= (REMEMBERED_M if isinstance(earlier, Placement) else BREAK_TRAVEL_M):
+        if way_m >= within_m:
             return False
         T_earlier_later = self._motion(earlier.keyframe_id, later.keyframe_id)
         off = geometry.inverse(earlier.T_world_keyframe @ T_earlier_later) @ later.T_world_keyframe
@@ -167,9 +159,7 @@ class Placer:
     def _taken(self, placements: tuple[Placement, ...]) -> tuple[Placement, ...]:
         for placement in placements:
             self._graph.place(placement)
-        newest = placements[-1]
-        self._last = _Pose(newest.keyframe_id, newest.T_world_keyframe)
-        self._found = []
+        self._last, self._found = placements[-1], []
         return placements
 
     def _motion(self, earlier_id: int, later_id: int) -> Transform:

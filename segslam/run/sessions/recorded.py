@@ -1,29 +1,24 @@
 """A finished run as one session of a merged run: its keyframes, and its steps with new numbers."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from segslam.candidates.proximity import BREAK_TRAVEL_M
-from segslam.core.config import Config
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
     Information,
-    Labels,
     LoopAttempt,
     LoopClosure,
     Motion,
     MotionState,
-    Points,
     SegslamError,
     Step,
     Transform,
     Vector,
 )
-from segslam.keyframes.submaps import Submaps
-from segslam.labels import geometric_labels
 from segslam.odometry import information_of
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import folder_of, log_of
@@ -152,17 +147,3 @@ def next_shift(before: Shift, session: Session, T_new_old: Transform, following:
         travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_TRAVEL_M,
         T_new_old=T_new_old,
     )
-
-
-def submaps(session: Session, config: Config) -> Callable[[int], tuple[Points, Labels]]:
-    """Function from a keyframe's id to its points and labels; sparse keyframes are merged with their neighbours."""
-    recorded = session.log.keyframes()
-    made = Submaps(config, lambda: recorded, geometric_labels, lambda: session.travel_m)
-    for number in range(len(recorded)):
-        made.add(session.T_odom_keyframe[number], labelled_by_shape=bool(recorded[number].labelled_by_shape))
-
-    def of(keyframe_id: int) -> tuple[Points, Labels]:
-        submap = made.submap(keyframe_id)
-        return submap.points, submap.labels
-
-    return of

@@ -15,8 +15,8 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import PoseGraph
-from segslam.run.locator import Locator
-from segslam.run.sessions.recorded import FIRST_MOTION, Session, submaps
+from segslam.run.locator import Locator, submaps_of
+from segslam.run.sessions.recorded import FIRST_MOTION, Session
 from segslam.slam.adjustment import Progress, no_progress
 
 NUM_QUERIES = 60
@@ -62,7 +62,8 @@ def find_session(
     `likely`: these keyframes are searched instead, in this order, and those before and after each that is found, until
     the first `MOST_FAILED` were not.
     """
-    submap = submaps(session, config)
+    recorded = session.log.keyframes()
+    submaps = submaps_of([recorded[number] for number in range(len(recorded))], recorded, config)
     found: list[tuple[int, int, Alignment]] = []
     count = len(session.travel_m)
     queries = (
@@ -71,7 +72,8 @@ def find_session(
     num_tried = 0
     for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
         num_tried += 1
-        place = locator.locate(*submap(keyframe_id))
+        submap = submaps.submap(keyframe_id)
+        place = locator.locate(submap.points, submap.labels)
         if not isinstance(place, Rejected):
             found.append((keyframe_id, place.keyframe_id, place.alignment))
         if len(found) == NUM_ENOUGH or (likely is not None and not found and num_tried == MOST_FAILED):

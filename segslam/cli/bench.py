@@ -1,6 +1,7 @@
 """`segslam bench`: the experiments of the paper, with all methods on the same scans."""
 
 import os
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -93,7 +94,7 @@ def pairs(data: DataArgument, options: Options, changes: Settings, terminal: Ter
 
     Example: segslam bench pairs kitti --sequence 06 --pairs kitti06_3to5.txt --sample 100 --workers 4 --out bench06
     """
-    _run_pairs("pairs", data, options, changes, terminal)
+    _experiment("pairs", data, options, changes, terminal, lambda variations: variations.pair_trials, by="list")
 
 
 @app.command()
@@ -103,7 +104,7 @@ def timing(data: DataArgument, options: Options, changes: Settings, terminal: Te
 
     Example: segslam bench timing kitti --sequence 06 --pairs kitti06_3to5.txt --pairs kitti06_8to10.txt --sample 50
     """
-    _run_pairs("timing", data, options, changes, terminal)
+    _experiment("timing", data, options, changes, terminal, lambda variations: variations.pair_trials, by="list")
 
 
 @app.command()
@@ -122,13 +123,11 @@ def yaw(
 
     Example: segslam bench yaw kitti --sequence 05 --step-deg 5 --out yaw05
     """
-    job = _make_job(data, options, changes, terminal)
-    from segslam.bench.experiments.variations import PAPER_PAIR, turned_trials
 
-    reference = _reference_of(job)
-    lists = _read_lists(options, reference, default=PAPER_PAIR)
-    trials = [trial for one in lists for trial in turned_trials(one, reference, step_deg=step_deg)]
-    _run("yaw", job, lists, trials, options, terminal, by="yaw_deg", step_deg=step_deg)
+    def vary(variations: Any) -> Callable[..., Iterable["Trial"]]:
+        return partial(variations.turned_trials, step_deg=step_deg)
+
+    _experiment("yaw", data, options, changes, terminal, vary, by="yaw_deg", of_paper=True, step_deg=step_deg)
 
 
 @app.command()
@@ -151,16 +150,13 @@ def deterioration(
 
     Example: segslam bench deterioration kitti --sequence 05 --labels predictions --clouds one --out lost05
     """
-    job = _make_job(data, options, changes, terminal)
-    from segslam.bench.experiments.variations import PAPER_PAIR, unlabelled_trials
 
-    reference = _reference_of(job)
-    lists = _read_lists(options, reference, default=PAPER_PAIR)
-    reduced = partial(
-        unlabelled_trials, lost_percent=lost_percent, num_draws=draws, seed=options.seed, both=clouds == "both"
-    )
-    trials = [trial for one in lists for trial in reduced(one, reference)]
-    _run("deterioration", job, lists, trials, options, terminal, by="lost_percent", clouds=clouds, draws=draws)
+    def vary(variations: Any) -> Callable[..., Iterable["Trial"]]:
+        drawn = {"num_draws": draws, "seed": options.seed}
+        return partial(variations.unlabelled_trials, lost_percent=lost_percent, both=clouds == "both", **drawn)
+
+    asked = {"clouds": clouds, "draws": draws}
+    _experiment("deterioration", data, options, changes, terminal, vary, by="lost_percent", of_paper=True, **asked)
 
 
 @app.command()
@@ -236,14 +232,6 @@ def _make_job(data: Path, options: Options, changes: Settings, terminal: Termina
     return Job(source, tuple(chosen), config)
 
 
-def _reference_of(job: "Job") -> "Trajectory | None":
-    """The true poses of the data set."""
-    from segslam.bench.experiments.job import open_once
-
-    dataset, _ = open_once(job.source)
-    return dataset.reference
-
-
 def _read_lists(
     options: Options, reference: "Trajectory | None", *, default: "PairList | None" = None
 ) -> list["PairList"]:
@@ -302,40 +290,40 @@ def _posed(reference: "Trajectory | None") -> "Trajectory":
     return reference
 
 
-def _run_pairs(experiment: str, data: Path, options: Options, changes: Settings, terminal: Terminal) -> None:
-    # as in `yaw`, what loads scipy is imported after the first message, which is that of make_job
-    job = _make_job(data, options, changes, terminal)
-    from segslam.bench.experiments.variations import pair_trials
-
-    reference = _reference_of(job)
-    lists = _read_lists(options, reference)
-    trials = [trial for one in lists for trial in pair_trials(one, reference)]
-    _run(experiment, job, lists, trials, options, terminal, by="list")
-
-
-def _run(
-    experiment: str,
-    job: "Job",
-    lists: list["PairList"],
-    trials: list["Trial"],
+def _experiment(
+    name: str,
+    data: Path,
     options: Options,
+    changes: Settings,
     terminal: Terminal,
+    vary: Callable[[Any], Callable[..., Iterable["Trial"]]],
     *,
     by: str,
-    **settings: Any,
+    of_paper: bool = False,
+    **asked: Any,
 ) -> None:
-    """Register the pairs, print the results, and write the report if a folder is given."""
+    """Register the pairs, print the results, and write the report if a folder is given.
+
+    `vary` returns the function of the module `variations` that makes the trials of a list; the module loads scipy and
+    is imported after the first message. `of_paper`: the default is the pair of the paper. `asked` is for the report.
+    """
+    job = _make_job(data, options, changes, terminal)
+    from segslam.bench.experiments import variations
+    from segslam.bench.experiments.job import open_once
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
     from segslam.bench.experiments.report_tables import overall, plain
     from segslam.bench.experiments.summary import results
 
+    reference = open_once(job.source)[0].reference
+    lists = _read_lists(options, reference, default=variations.PAPER_PAIR if of_paper else None)
+    trials = [trial for one in lists for trial in vary(variations)(one, reference)]
     rows = _run_trials(job, trials, options, terminal)
-    found = with_paper_values(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
+    found = with_paper_values(results(rows, by=by), experiment=name, sequence=options.sequence, lists=lists)
     if options.out is not None:
         workers = "of a Dask cluster" if options.scheduler else options.workers
-        asked = {"sample": options.sample, "seed": options.seed, "workers": workers, **settings}
-        report = account(experiment, job, lists, found, options=asked)
+        asked = {"sample": options.sample, "seed": options.seed, "workers": workers, **asked}
+        report = account(name, job, lists, found, options=asked)
         _write_report(options.out, report, _pictures(job, trials, rows, options.draw), terminal)
     terminal.answer(found, plain(overall(found)))
 

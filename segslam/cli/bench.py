@@ -236,7 +236,7 @@ def _read_lists(
     options: Options, reference: "Trajectory | None", *, default: "PairList | None" = None
 ) -> list["PairList"]:
     """The lists from files, or the list selected by distance, or the default; sampled if requested."""
-    from segslam.bench.experiments.pairs import cut_pairs, read_pairs, sample_pairs
+    from segslam.bench.experiments.pairs import read_pairs, sample_pairs
 
     cuts = options.min_m is not None or options.max_m is not None
     if options.pairs and cuts:
@@ -244,7 +244,7 @@ def _read_lists(
     if options.pairs:
         lists = [read_pairs(file) for file in options.pairs]
     elif cuts:
-        lists = [cut_pairs(_posed(reference), **_bounds(options))]
+        lists = [_cut(options, reference)]
     elif default is not None:
         lists = [default]
     else:
@@ -277,17 +277,17 @@ def _run_trials(job: "Job", trials: list["Trial"], options: Options, terminal: T
     return rows
 
 
-def _bounds(options: Options) -> dict[str, Any]:
-    if options.min_m is None or options.max_m is None or not options.min_m < options.max_m:
-        raise SegslamError(f"--min-m {options.min_m} --max-m {options.max_m}: give both, the smaller one first")
-    name = f"cut_{options.min_m:g}to{options.max_m:g}"
-    return {"name": name, "min_m": options.min_m, "max_m": options.max_m, "min_gap": options.min_gap}
+def _cut(options: Options, reference: "Trajectory | None") -> "PairList":
+    """The list selected by distance from the true poses."""
+    from segslam.bench.experiments.pairs import cut_pairs
 
-
-def _posed(reference: "Trajectory | None") -> "Trajectory":
+    low_m, high_m = options.min_m, options.max_m
     if reference is None:
         raise SegslamError("--min-m: the data has no true poses; give lists with --pairs FILE")
-    return reference
+    if low_m is None or high_m is None or not low_m < high_m:
+        raise SegslamError(f"--min-m {low_m} --max-m {high_m}: give both, the smaller one first")
+    name = f"cut_{low_m:g}to{high_m:g}"
+    return cut_pairs(reference, name=name, min_m=low_m, max_m=high_m, min_gap=options.min_gap)
 
 
 def _experiment(

@@ -144,11 +144,14 @@ def _replay_log(
     changes.load()  # reports a wrong setting before the log is read
     from segslam.output.folder import copy_alone, new_folder
     from segslam.run.replay import Replay
-    from segslam.run.sessions.localiser import localiser_in
 
     replayed = Replay.of(log, config=changes.config, settings=changes.changes(), edits=edits)
     recorded = replayed.recorded
-    slam = localiser_in(replayed.in_map)(replayed.config) if replayed.in_map else None
+    slam = None
+    if replayed.in_map:
+        from segslam.run.sessions.localiser import localiser_in
+
+        slam = localiser_in(replayed.in_map)(replayed.config)
     terminal.compile_kernels()
     with ExitStack() as stack:
         server = serve_foxglove(foxglove, stack, terminal)

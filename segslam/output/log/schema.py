@@ -211,11 +211,10 @@ def _printable(text: str) -> str:
 
 def restored(values: Mapping[str, str]) -> dict[str, str]:
     """The values of a metadata record with the bytes of which `metadata` has made escapes."""
-
-    def as_it_was(text: str) -> str:
-        return ESCAPED.sub(lambda found: chr(int(found[1], 16)), text).replace(r"\x5cudc", r"\udc")
-
-    return {key: as_it_was(value) for key, value in values.items()}
+    return {
+        key: ESCAPED.sub(lambda found: chr(int(found[1], 16)), text).replace(r"\x5cudc", r"\udc")
+        for key, text in values.items()
+    }
 
 
 def _command() -> str:

@@ -61,7 +61,7 @@ VALUE_NAMES: Mapping[type, str] = MappingProxyType({Path: "PATH", str: "TEXT", i
 
 
 def add(app: typer.Typer, words: Sequence[str] = ()) -> None:
-    """Add the command that the words of a command line call; without such a word all commands, as for the help."""
+    """Add the command that begins these words of a command line; all commands if there is none, as for the help."""
     called = ALIASES.get(words[0], words[0]) if words else ""
     known = {name: (title, *entry) for title, group in GROUPS.items() for name, entry in group.items()}
     present = {command.name for command in app.registered_commands}

@@ -11,9 +11,10 @@ from segslam.core.config import MapConfig, load_config
 from segslam.core.geometry import raise_beams
 from segslam.core.types import GraphEstimate, Keyframe, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import cannot_write, whole_file
-from segslam.output.folder import log_of
+from segslam.output.folder import PLACE_ON_GLOBE, log_of
 from segslam.output.log import RunLog, read_log
 from segslam.output.map.write import check_files, write_map
+from segslam.output.tracks import is_track, track
 from segslam.slam.adjustment import Progress, no_progress
 
 if TYPE_CHECKING:
@@ -41,13 +42,15 @@ def write_maps(
 
     Raises SegslamError if the run did not finish or a name has an unknown extension, WorkFailed if the disk is full.
     """
-    from segslam.output.georeferenced import read_globe
     from segslam.output.report import BEFORE_AFTER, draw_before_after
-    from segslam.output.tracks import is_track, track
 
     started = perf_counter()
     folder = log.path.parent
-    globe = read_globe(folder)
+    globe = None
+    if (folder / PLACE_ON_GLOBE).exists():
+        from segslam.output.georeferenced import read_globe
+
+        globe = read_globe(folder)
     origin = None if globe is None else globe.origin
     of_map = [file for file in files if file.name != BEFORE_AFTER and not is_track(file)]
     check_files(of_map, origin=origin)

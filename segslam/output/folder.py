@@ -33,6 +33,7 @@ LOOP_COLUMNS = (
     *("prepare_s", "match_s", "refine_s", "verify_s"),
 )
 LOG = "log.mcap"
+PLACE_ON_GLOBE = "georeference.json"
 ADJUSTED_GRAPH = "adjusted.g2o"
 """All edges of the last estimate, with the information with which they act."""
 ALONE, ALONE_FILES = "kiss_icp", ("kiss_icp_tum.txt", "kiss_icp_kitti.txt")

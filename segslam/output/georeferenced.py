@@ -22,13 +22,13 @@ from segslam.gnss.geodesy import Geodetic
 from segslam.gnss.reading import read_fixes
 from segslam.graph import read_g2o
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import ADJUSTED_GRAPH, folder_of, log_of, room_for, write_csv, write_metrics
+from segslam.output.folder import ADJUSTED_GRAPH, PLACE_ON_GLOBE, folder_of, log_of, room_for, write_csv, write_metrics
 from segslam.output.log import schema
 from segslam.output.log.locations import Locations, write_locations
 
 logger = logging.getLogger(__name__)
 
-FILE, FIXES, GEODETIC, ENU = "georeference.json", "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
+FILE, FIXES, GEODETIC, ENU = PLACE_ON_GLOBE, "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
 DATUM = "WGS84 (EPSG:4979)"
 PLACE = ("datum", "latitude_deg", "longitude_deg", "height_m", "epsg", "T_enu_map", "sigma")
 """What a run localised in the map takes over from `FILE`."""

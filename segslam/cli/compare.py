@@ -111,7 +111,7 @@ def sweep(
     from segslam.run.fleets.workers import workers as started
     from segslam.run.replay import changed_config
 
-    recorded = read_log(log_of(run))
+    recorded = read_log(run)
     for changes in grid.values():  # reports a wrong setting before anything is replayed
         changed_config(recorded, settings=changes)
     out.mkdir(parents=True, exist_ok=True)

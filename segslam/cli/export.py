@@ -36,10 +36,9 @@ def export(
     check_free(files, overwrite=overwrite)
     terminal.announce(f"export: reading {run}")
     from segslam.output.export import write_maps
-    from segslam.output.folder import log_of
     from segslam.output.log import read_log
 
-    log = read_log(log_of(run))
+    log = read_log(run)
     figures = write_maps(log, files, config=changes.load(base=log.config).map, show=terminal.progress)
     terminal.answer(figures, map_summary(figures, files))
 

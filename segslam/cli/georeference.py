@@ -95,13 +95,13 @@ def georeference(
     """
     check_exists(run, "give the folder of a finished run")
     terminal.announce(f"georeference: reading {gnss.gnss}")
-    from segslam.output.folder import folder_of, log_of
+    from segslam.output.folder import folder_of
     from segslam.output.georeferenced import FILE
     from segslam.output.log import read_log
     from segslam.output.report import write_report
 
     folder = folder_of(run)
-    data = read_log(log_of(folder)).options.get("data")  # may have a topic with fixes
+    data = read_log(folder).options.get("data")  # may have a topic with fixes
     place = gnss.placing(Path(data) if data else None)
     if place is None:
         raise SegslamError("--gnss: give the position fixes, as in --gnss fixes.csv")

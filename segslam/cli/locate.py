@@ -98,11 +98,10 @@ def locate(
     for scan in scans:
         check_exists(scan, "give scan files")
     terminal.announce(f"locate: reading {run}")
-    from segslam.output.folder import folder_of
     from segslam.run.locator import Locator
 
     files.check()
-    locator = Locator.from_run(folder_of(run))
+    locator = Locator.from_run(run)
     terminal.compile_kernels()
     num_bad = 0
     found = []

@@ -30,10 +30,9 @@ def info(run: LogArgument, *, terminal: Terminal) -> None:
     """
     check_run(run)
     terminal.announce(f"info: reading {run}")
-    from segslam.output.folder import log_of
     from segslam.output.log import read_log
 
-    found = _found_in(read_log(log_of(run)))
+    found = _found_in(read_log(run))
     terminal.table(found, _lines(found))
 
 
@@ -55,10 +54,9 @@ def view(
     check_free([save], overwrite=overwrite)
     terminal.announce(f"view: reading {run}")
     from segslam.core.whole_files import whole_file
-    from segslam.output.folder import log_of
     from segslam.output.log import read_log
 
-    log = read_log(log_of(run))
+    log = read_log(run)
     with nullcontext() if save is None else whole_file(save) as part:
         scene = open_scene(part, view_every=log.config.log.view_every, named=save)
         num_steps = 0

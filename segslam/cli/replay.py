@@ -224,10 +224,9 @@ def _check_keyframes(run: Path, edits: LoopEdits, terminal: Terminal) -> None:
 
     A pair that is forbidden but was never tried is reported: it may be a mistyped id.
     """
-    from segslam.output.folder import log_of
     from segslam.output.log import read_log
 
-    recorded = read_log(log_of(run))
+    recorded = read_log(run)
     if recorded.options.get("in_map"):
         raise SegslamError(f"{run}: localised in the map of another run, without loops of its own; edit that run")
     num = len(recorded.keyframes())

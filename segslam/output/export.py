@@ -11,7 +11,7 @@ from segslam.core.config import MapConfig, load_config
 from segslam.core.geometry import raise_beams
 from segslam.core.types import GraphEstimate, Keyframe, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import cannot_write, whole_file
-from segslam.output.folder import PLACE_ON_GLOBE, log_of
+from segslam.output.folder import PLACE_ON_GLOBE
 from segslam.output.log import RunLog, read_log
 from segslam.output.map.write import check_files, write_map
 from segslam.output.tracks import is_track, track
@@ -28,7 +28,7 @@ def export(run: str | Path, files: Sequence[str | Path], *, settings: Sequence[s
     .tif, .geojson, .kml, .gpx and map_projector_info.yaml; all are written, or none.
     `settings`: changes such as `"map.color=height"`. Raises SegslamError, naming the file and the remedy.
     """
-    log = read_log(log_of(Path(run)))
+    log = read_log(Path(run))
     config = load_config(None, settings, base=log.config).map
     return write_maps(log, [Path(file) for file in files], config=config)
 

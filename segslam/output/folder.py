@@ -44,7 +44,7 @@ UNFINISHED = ".part"
 
 def log_of(run: Path) -> Path:
     """Path of the log of a run, given its folder or the log."""
-    return run if run.is_file() else run / LOG
+    return run / LOG if run.is_dir() else run
 
 
 def folder_of(run: Path) -> Path:

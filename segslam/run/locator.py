@@ -28,7 +28,6 @@ from segslam.keyframes.keyframes import Clouds, downsample_keyframe
 from segslam.keyframes.submaps import Submaps
 from segslam.labels import geometric_labels
 from segslam.output.finished import read_run
-from segslam.output.folder import log_of
 from segslam.output.log import read_log
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.slam.recognition import MAX_PLACES, Recognised, recognise
@@ -93,7 +92,7 @@ class Locator:
     def from_run(cls, folder: str | Path) -> "Locator":
         """The locator of a run folder. Raises SegslamError, naming the file, if it is damaged or did not finish."""
         run = read_run(folder)
-        recorded = read_log(log_of(run.folder)).keyframes()
+        recorded = read_log(run.folder).keyframes()
         keyframes = [recorded[number] for number in range(len(recorded))]
         return cls(keyframes, recorded, run.result.estimate.T_world_keyframe, config=run.config)
 

@@ -13,7 +13,7 @@ from segslam.core.config import Config, ProximityConfig, changed_settings, load_
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import LoopClosure, SegslamError, Vector
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import copy_alone, folder_of, log_of, new_folder
+from segslam.output.folder import copy_alone, new_folder
 from segslam.output.georeferenced import FILE, read_globe
 from segslam.output.log import Mirror, RunLog, read_log
 from segslam.run.run import Run
@@ -59,7 +59,7 @@ class Replay:
         cls, run: Path, *, config: Path | None = None, settings: Sequence[str] = (), edits: LoopEdits = NO_EDITS
     ) -> "Replay":
         """Reads the log of a run, given its folder or the log. Raises SegslamError for a change without effect."""
-        recorded = read_log(log_of(run))
+        recorded = read_log(run)
         changed = changed_config(recorded, file=config, settings=settings)
         return cls(recorded, changed, LoopEdits.from_json(recorded.options.get("edits", "")).and_then(edits))
 
@@ -110,7 +110,7 @@ def changed_config(recorded: RunLog, *, file: Path | None = None, settings: Sequ
 
 def pairs_near_fixes(run_or_log: Path) -> frozenset[Pair]:
     """Loops of a georeferenced run that were not tried. Raises SegslamError if it has no place on the globe."""
-    run = read_run(folder_of(run_or_log))
+    run = read_run(run_or_log)
     globe = read_globe(run.folder)
     if globe is None:
         raise SegslamError(f"{run.folder / FILE}: missing; `segslam georeference` the run first")

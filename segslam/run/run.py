@@ -301,7 +301,7 @@ class Run:
                 placed = place(self.folder)
                 metrics = read_metrics(self.folder)
             if map_files:
-                log = read_log(self.folder / LOG)
+                log = read_log(self.folder)
                 metrics |= write_maps(log, map_files, config=log.config.map, show=progress)
                 metrics["peak_rss_mb"] = peak_mb()
                 write_metrics(self.folder, metrics)

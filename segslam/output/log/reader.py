@@ -26,6 +26,7 @@ from segslam.core.types import (
     Trajectory,
     Transform,
 )
+from segslam.output.folder import log_of
 from segslam.output.log import container, schema
 from segslam.output.log.cloud import KeyframePoints, intensities, place_of, points_and_labels
 from segslam.output.log.container import CutError, Span, messages_within
@@ -222,8 +223,12 @@ class RunLog:
         return self._decoded(lambda: codec(record).decode(json.loads(data), {}))
 
 
-def read_log(path: Path) -> RunLog:
-    """Open the log of a run, complete or not. Raises SegslamError if it is missing or has another schema version."""
+def read_log(run: Path) -> RunLog:
+    """Open the log of a run, complete or not, given its folder or the log.
+
+    Raises SegslamError if it is missing or has another schema version.
+    """
+    path = log_of(run)
     remedy = "give the log.mcap of a run"
     try:
         metadata, cut = container.metadata(path)
@@ -234,18 +239,18 @@ def read_log(path: Path) -> RunLog:
         raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}") from cut
     if check is not None and check.get("crc32") != str(schema.checksum(metadata)):
         raise SegslamError(f"{path}: the settings at its start are damaged (wrong checksum); map the data again")
-    run = restored(metadata.get(schema.RUN_METADATA, {}))
-    if "yaml" not in metadata.get(schema.CONFIG_METADATA, {}) or "schema_version" not in run:
+    about = restored(metadata.get(schema.RUN_METADATA, {}))
+    if "yaml" not in metadata.get(schema.CONFIG_METADATA, {}) or "schema_version" not in about:
         raise SegslamError(f"{path}: an MCAP file, but not a log of segslam; {remedy}")
     packages = metadata.get(schema.PACKAGES_METADATA, {})
-    if run["schema_version"] != str(schema.VERSION):
+    if about["schema_version"] != str(schema.VERSION):
         raise SegslamError(
-            f"{path}: a log of schema version {brief(run['schema_version'])}, but this version reads {schema.VERSION}; "
+            f"{path}: a log of schema version {brief(about['schema_version'])}, but this version reads {schema.VERSION}; "
             f"use segslam {brief(packages.get('segslam', 'of that time'))}, which wrote it"
         )
     config = config_from_yaml(metadata[schema.CONFIG_METADATA]["yaml"], f"{path} (settings)")
     options = restored(metadata.get(schema.OPTIONS_METADATA, {}))
-    return RunLog(path=path, config=config, run=run, packages=packages, options=options)
+    return RunLog(path=path, config=config, run=about, packages=packages, options=options)
 
 
 def _is_readable(written: bytes, own: dict[str, Any]) -> bool:

@@ -33,7 +33,7 @@ def write_report(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     run = read_run(folder)
-    log = read_log(folder / LOG)
+    log = read_log(folder)
     with matplotlib.rc_context(figures.STYLE):
         plots = _plots(run)
     about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
@@ -100,7 +100,7 @@ def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[
     kept: dict[int, Keyframe] = {}
 
     def keyframes() -> Iterator[Keyframe]:
-        steps = read_log(run.folder / LOG).steps()
+        steps = read_log(run.folder).steps()
         return islice((step.keyframe for step in steps if step.keyframe is not None), len(poses))
 
     drawn = (keyframe for keyframe in keyframes() if keyframe.id % every == 0)

@@ -21,7 +21,7 @@ from segslam.core.types import (
 )
 from segslam.odometry import information_of
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import folder_of, log_of
+from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
 
 GAP_NS = 1_000_000_000
@@ -51,8 +51,8 @@ class Session:
 
 def read_session(folder: Path) -> Session:
     """The session of a run folder, or of its log. Raises SegslamError as `read_run`, or if keyframes are missing."""
-    run = read_run(folder_of(folder))
-    log = read_log(log_of(folder))
+    run = read_run(folder)
+    log = read_log(folder)
     estimate = run.result.estimate.T_world_keyframe
     T_odom, travel_m, informations = [], [], []
     since: list[Motion] = []

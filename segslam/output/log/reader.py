@@ -245,8 +245,8 @@ def read_log(run: Path) -> RunLog:
     packages = metadata.get(schema.PACKAGES_METADATA, {})
     if about["schema_version"] != str(schema.VERSION):
         raise SegslamError(
-            f"{path}: a log of schema version {brief(about['schema_version'])}, but this version reads {schema.VERSION}; "
-            f"use segslam {brief(packages.get('segslam', 'of that time'))}, which wrote it"
+            f"{path}: a log of schema version {brief(about['schema_version'])}, but this version reads "
+            f"{schema.VERSION}; use segslam {brief(packages.get('segslam', 'of that time'))}, which wrote it"
         )
     config = config_from_yaml(metadata[schema.CONFIG_METADATA]["yaml"], f"{path} (settings)")
     options = restored(metadata.get(schema.OPTIONS_METADATA, {}))

@@ -10,7 +10,6 @@ import matplotlib
 from segslam.core.types import Keyframe, LoopAttempt
 from segslam.core.whole_files import write_whole
 from segslam.output.finished import FIGURES, FinishedRun, read_run
-from segslam.output.folder import LOG
 from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png

@@ -1,8 +1,8 @@
 """`segslam label`."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import logging
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -16,16 +16,7 @@ if TYPE_CHECKING:
     from segslam.labels.encodings import Encoding
     from segslam.scans import Dataset
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Labelled:
-    """A usable scan, its labels and, if requested, its true labels; one row per usable point."""
-
-    row: int
-    scan: "Scan"
-    labels: "Labels"
-    truth: "Labels | None"
-    seconds: float
+logger = logging.getLogger(__name__)
 
 
 def label(
@@ -63,11 +54,9 @@ def label(
     scans = opened(labels, encoding)
     true_scans = _open_truth(truth, truth_encoding, opened) if truth else None
     folder = out if overwrite and out.is_dir() else new_folder(out)
-    tally = Tally(scans, folder, write_as=write_as, num_pictures=pictures)
-    found = _labelled(scans, true_scans)
-    for one in terminal.progress(found, len(scans), "label"):
-        if one is not None:
-            tally.add(one)
+    tally = Tally(scans, true_scans, folder, write_as=write_as, num_pictures=pictures)
+    for row in terminal.progress(range(len(scans)), len(scans), "label"):
+        tally.add(row)
     if not tally.seconds:
         raise SegslamError(f"{data}: none of the {len(scans)} scans could be labelled; see the warnings above")
     figures = tally.figures()
@@ -85,40 +74,24 @@ def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Data
     return scans
 
 
-def _labelled(scans: "Dataset", true_scans: "Dataset | None") -> Iterator[Labelled | None]:
-    """Each scan with its labels; None, with a warning, for an unusable scan."""
-    import logging
-    from time import perf_counter
-
-    from segslam.core.types import BadScan
-    from segslam.labels import geometric_labels
-    from segslam.labels.late import computed
-
-    for row in range(len(scans)):
-        try:
-            scan = scans[row]
-            truth = None if true_scans is None else computed(true_scans[row].labels)
-        except BadScan as error:
-            logging.getLogger(__name__).warning("%s; skipped", error)
-            yield None
-            continue
-        started = perf_counter()
-        labels = computed(scan.labels)
-        if scans.labels.geometric and not labels.any():
-            labels = geometric_labels(scan.points)
-        yield Labelled(row, scan, labels, truth, perf_counter() - started)
-
-
 class Tally:
-    """Writes the labels of each scan, and counts classes and confusions."""
+    """Labels scans, writes their labels, and counts classes and confusions."""
 
-    def __init__(self, scans: "Dataset", folder: Path, *, write_as: "Encoding", num_pictures: int) -> None:
+    def __init__(
+        self,
+        scans: "Dataset",
+        true_scans: "Dataset | None",
+        folder: Path,
+        *,
+        write_as: "Encoding",
+        num_pictures: int,
+    ) -> None:
         import numpy as np
 
         from segslam.core.types import Label
         from segslam.labels.scores import NUM_CLASSES
 
-        self._scans = scans
+        self._scans, self._true_scans = scans, true_scans
         self._folder = folder
         self._encoding = write_as
         self._drawn = set(np.linspace(0, len(scans) - 1, num_pictures).astype(int).tolist())
@@ -126,22 +99,35 @@ class Tally:
         self._confusion = np.zeros((NUM_CLASSES, NUM_CLASSES), np.int64)
         self.seconds: list[float] = []
 
-    def add(self, one: Labelled) -> None:
-        """Write the labels, and the picture if the scan was selected for drawing."""
+    def add(self, row: int) -> None:
+        """Label a scan; a warning for an unusable one. It is drawn if it was selected for drawing."""
         import numpy as np
 
+        from segslam.core.types import BadScan
         from segslam.core.whole_files import write_whole
+        from segslam.labels import geometric_labels
         from segslam.labels.label_files import write_labels
+        from segslam.labels.late import computed
         from segslam.labels.scores import confusion
 
-        self.seconds.append(one.seconds)
-        self._num_points += np.bincount(one.labels, minlength=len(self._num_points))
-        if one.truth is not None:
-            self._confusion += confusion(one.labels, one.truth)
-        name = self._scans.names[one.row]
-        write_labels(self._folder / f"{name}.label", one.labels, one.scan.kept, self._encoding)
-        if one.row in self._drawn:
-            write_whole(self._folder / f"{name}.png", self._picture(one))
+        try:
+            scan = self._scans[row]
+            truth = None if self._true_scans is None else computed(self._true_scans[row].labels)
+        except BadScan as error:
+            logger.warning("%s; skipped", error)
+            return
+        started = perf_counter()
+        labels = computed(scan.labels)
+        if self._scans.labels.geometric and not labels.any():
+            labels = geometric_labels(scan.points)
+        self.seconds.append(perf_counter() - started)
+        self._num_points += np.bincount(labels, minlength=len(self._num_points))
+        if truth is not None:
+            self._confusion += confusion(labels, truth)
+        name = self._scans.names[row]
+        write_labels(self._folder / f"{name}.label", labels, scan.kept, self._encoding)
+        if row in self._drawn:
+            write_whole(self._folder / f"{name}.png", self._picture(name, scan, labels, truth))
 
     def figures(self) -> dict[str, Any]:
         """Shares of the classes and time; with true labels also scores, and `confusion.csv` is written."""
@@ -180,13 +166,13 @@ class Tally:
             ],
         }
 
-    def _picture(self, one: Labelled) -> bytes:
+    def _picture(self, name: str, scan: "Scan", labels: "Labels", truth: "Labels | None") -> bytes:
         from segslam.output.report.labels import draw_labels, fitting_image
 
         network = self._scans.labels.network
-        image = network.settings if network else fitting_image(one.scan.points)
-        title = f"{self._scans.name}, scan {self._scans.names[one.row]}, {len(one.labels)} points"
-        return draw_labels(one.scan.points, one.labels, truth=one.truth, image=image, title=title)
+        image = network.settings if network else fitting_image(scan.points)
+        title = f"{self._scans.name}, scan {name}, {len(labels)} points"
+        return draw_labels(scan.points, labels, truth=truth, image=image, title=title)
 
 
 def _table(figures: dict[str, Any], folder: Path) -> str:

@@ -267,10 +267,9 @@ def map_scans(
 ) -> None:
     """Map a data set into a new folder, or resume the run `recorded`, and show the figures.
 
-    The run keeps the vertical angle with which the data set was opened.
-    `watch` is called with each step, `mirror` with each message of the log; `slam_of` creates the pipeline, `place`
-    georeferences the run. Raises
-    typer.Exit(130) if Ctrl-C ended the run early; `go_on`, the command that continues it, is then printed.
+    The run keeps the vertical angle with which the data set was opened. `watch` is called with each step, `mirror` with
+    each message of the log; `slam_of` creates the pipeline, `place` georeferences the run. Raises typer.Exit(130) if
+    Ctrl-C ended the run early; `go_on`, the command that continues it, is then printed.
     """
     from segslam.odometry import OdometryApart
     from segslam.output.folder import new_folder

@@ -26,14 +26,11 @@ from segslam.labels.class_colors import of_classes
 
 _POINT = np.dtype([("xyz", "<f4", 3), ("label", "u1"), ("rgba", "u1", 4)])
 _POINT_FIELDS = [
-    PackedElementField(name="x", offset=0, type=PackedElementField.FLOAT32),
-    PackedElementField(name="y", offset=4, type=PackedElementField.FLOAT32),
-    PackedElementField(name="z", offset=8, type=PackedElementField.FLOAT32),
-    PackedElementField(name="label", offset=12, type=PackedElementField.UINT8),
-    PackedElementField(name="red", offset=13, type=PackedElementField.UINT8),
-    PackedElementField(name="green", offset=14, type=PackedElementField.UINT8),
-    PackedElementField(name="blue", offset=15, type=PackedElementField.UINT8),
-    PackedElementField(name="alpha", offset=16, type=PackedElementField.UINT8),
+    *(PackedElementField(name=axis, offset=4 * k, type=PackedElementField.FLOAT32) for k, axis in enumerate("xyz")),
+    *(
+        PackedElementField(name=name, offset=12 + k, type=PackedElementField.UINT8)
+        for k, name in enumerate(("label", "red", "green", "blue", "alpha"))
+    ),
 ]
 _IDENTITY = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 

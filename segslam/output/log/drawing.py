@@ -106,14 +106,12 @@ class Drawing:
         self._T_world_odom = estimate.T_world_keyframe[last] @ geometry.inverse(self._T_odom_keyframe[last])
         yield self._odom_in_world(stamp_ns)
         if path:
-            poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
-            yield schema.TRAJECTORY, poses
+            yield schema.TRAJECTORY, foxglove.path(estimate.T_world_keyframe.values(), stamp_ns=stamp_ns)
             yield schema.GRAPH, self._graph(estimate, stamp_ns)
 
     def draw_path(self, estimate: GraphEstimate, *, stamp_ns: int) -> Topical:
         """The path before the adjustment of the whole map."""
-        poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
-        return schema.TRAJECTORY_BEFORE, poses
+        return schema.TRAJECTORY_BEFORE, foxglove.path(estimate.T_world_keyframe.values(), stamp_ns=stamp_ns)
 
     def draw_map(self, estimate: GraphEstimate, cloud: CloudOf, *, stamp_ns: int) -> Iterator[Topical]:
         """One cloud of the whole drive in world.
@@ -141,11 +139,10 @@ class Drawing:
         )
         if len(self._T_odom_keyframe) >= PATH_GROWTH * self._num_on_path:
             self._num_on_path = len(self._T_odom_keyframe)
-            path = foxglove.poses_in_frame(self._T_odom_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
-            yield schema.ODOMETRY, path
+            yield schema.ODOMETRY, foxglove.path(self._T_odom_keyframe.values(), stamp_ns=stamp_ns)
             if corrected:
                 poses = [self._in_world(number) for number in self._T_odom_keyframe]
-                yield schema.TRAJECTORY, foxglove.poses_in_frame(poses, frame=schema.WORLD, stamp_ns=stamp_ns)
+                yield schema.TRAJECTORY, foxglove.path(poses, stamp_ns=stamp_ns)
 
     def _attempts(self, attempts: tuple[LoopAttempt, ...], stamp_ns: int) -> Iterator[Topical]:
         for topic, wanted in ((schema.ACCEPTED, False), (schema.REJECTED, True)):
@@ -170,7 +167,6 @@ class Drawing:
             f"{pair[0]} to {pair[1]}",
             foxglove.line([self._position(keyframe_id) for keyframe_id in pair], [color]),
             numbers_and_words(codec(LoopAttempt).encode(attempt)),
-            frame=schema.WORLD,
             stamp_ns=stamp_ns,
         )
 
@@ -179,7 +175,7 @@ class Drawing:
         colors = [weight_color(weight) for weight in estimate.closure_weights.values()]
         about = {"error": f"{estimate.error:g}", "closures": str(len(colors))}
         lines = foxglove.line(ends, colors)
-        return foxglove.scene([foxglove.entity("closures", lines, about, frame=schema.WORLD, stamp_ns=stamp_ns)])
+        return foxglove.scene([foxglove.entity("closures", lines, about, stamp_ns=stamp_ns)])
 
     def _position(self, keyframe_id: int) -> Vector:
         """Position in world, by the last estimate and the odometry since."""
@@ -223,7 +219,7 @@ def ground_truth(reference: Trajectory, *, stamp_ns: int) -> Topical:
     """The true path, moved to start at the origin of world."""
     T_first_true = geometry.inverse(reference.T_world_lidar[0])
     path = (T_first_true @ T_true_lidar for T_true_lidar in reference.T_world_lidar)
-    return schema.GROUND_TRUTH, foxglove.poses_in_frame(path, frame=schema.WORLD, stamp_ns=stamp_ns)
+    return schema.GROUND_TRUTH, foxglove.path(path, stamp_ns=stamp_ns)
 
 
 def weight_color(weight: float) -> str:

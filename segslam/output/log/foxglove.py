@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 from segslam.core import geometry
 from segslam.core.types import Labels, Points, Transform, Vector
 from segslam.labels.class_colors import of_classes
+from segslam.output.log.schema import WORLD
 
 _POINT = np.dtype([("xyz", "<f4", 3), ("label", "u1"), ("rgba", "u1", 4)])
 _POINT_FIELDS = [
@@ -62,10 +63,10 @@ def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) ->
     )
 
 
-def poses_in_frame(T_frame_each: Iterable[Transform], *, frame: str, stamp_ns: int) -> PosesInFrame:
-    """Message with a path; `transforms` recovers its poses to float64 precision."""
-    stack = np.array(list(T_frame_each)).reshape(-1, 4, 4)
-    return PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=frame, poses=_poses(stack))
+def path(T_world_each: Iterable[Transform], *, stamp_ns: int) -> PosesInFrame:
+    """Message with a path in world; `transforms` recovers its poses to float64 precision."""
+    stack = np.array(list(T_world_each)).reshape(-1, 4, 4)
+    return PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=WORLD, poses=_poses(stack))
 
 
 def transforms(poses: PosesInFrame) -> list[Transform]:
@@ -90,13 +91,11 @@ def line(points: Sequence[Vector], colors: Sequence[str], *, width_px: float = 2
     )
 
 
-def entity(
-    identity: str, lines: LinePrimitive, metadata: Mapping[str, str], *, frame: str, stamp_ns: int
-) -> SceneEntity:
-    """Lines that remain until an entity of the same identity replaces them; a click shows the metadata."""
+def entity(identity: str, lines: LinePrimitive, metadata: Mapping[str, str], *, stamp_ns: int) -> SceneEntity:
+    """Lines in world that remain until an entity of the same identity replaces them; a click shows the metadata."""
     return SceneEntity(
         timestamp=timestamp(stamp_ns),
-        frame_id=frame,
+        frame_id=WORLD,
         id=identity,
         metadata=[KeyValuePair(key=key, value=value) for key, value in metadata.items()],
         lines=[lines],

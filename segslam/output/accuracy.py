@@ -11,6 +11,21 @@ from segslam.core.types import IndexPairs, LoopClosure, Points, Trajectory, Vect
 from segslam.output.folder import ALONE
 from segslam.slam.slam import SlamResult
 
+Align = Literal["se3", "sim3", "first", "none"]
+"""Alignment of the estimate: rigid (the default everywhere), with scale, by the first pose, or none."""
+MOST_OFF = 0.1
+"""Largest difference between the length of a pair and the distance asked for, as a share; evo's default."""
+MEANINGS = {
+    "ate_mean_m": "the same error, mean (m)",
+    "ate_median_m": "the same error, median (m)",
+    "ate_max_m": "the same error, largest (m)",
+    "rpe_distance_m": "distance of the two figures below (m)",
+    "rpe_over_distance_m": "error of the motion over this distance, rms (m)",
+    "rpe_over_distance_percent": "the same error, mean, in percent of the distance (%)",
+    "scale": "scale of the estimate (alignment sim3)",
+}
+"""Meaning of the figures that only the evaluation has."""
+
 
 def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
     """The figures of `metrics.json` that need ground truth.
@@ -46,22 +61,6 @@ def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[Loo
     known = [c for c in closures if c.source_id in place_of_id and c.target_id in place_of_id]
     pairs = np.array([(place_of_id[c.source_id], place_of_id[c.target_id]) for c in known], dtype=int).reshape(-1, 2)
     return known, pairs, reference.T_world_lidar[rows[:, 1]]
-
-
-Align = Literal["se3", "sim3", "first", "none"]
-"""Alignment of the estimate: rigid (the default everywhere), with scale, by the first pose, or none."""
-MOST_OFF = 0.1
-"""Largest difference between the length of a pair and the distance asked for, as a share; evo's default."""
-MEANINGS = {
-    "ate_mean_m": "the same error, mean (m)",
-    "ate_median_m": "the same error, median (m)",
-    "ate_max_m": "the same error, largest (m)",
-    "rpe_distance_m": "distance of the two figures below (m)",
-    "rpe_over_distance_m": "error of the motion over this distance, rms (m)",
-    "rpe_over_distance_percent": "the same error, mean, in percent of the distance (%)",
-    "scale": "scale of the estimate (alignment sim3)",
-}
-"""Meaning of the figures that only the evaluation has."""
 
 
 def scores(

@@ -66,6 +66,9 @@ MAP_RANGE_M, MAP_VOXEL_M = 40.0, 0.2
 Topical = tuple[str, Message]
 CloudOf = Callable[[int], tuple[Points, Labels]]
 """Function from the id of a keyframe to its points, in its frame, and their labels."""
+INFO, WARNING = Log.Level.Value("INFO"), Log.Level.Value("WARNING")
+NAME = "segslam"
+REPAIRS = (MotionState.REPAIRED, MotionState.REJOINED)
 
 
 class Drawing:
@@ -239,11 +242,6 @@ def numbers_and_words(values: Mapping[str, Any], prefix: str = "") -> dict[str, 
         elif not isinstance(value, list):
             flat[prefix + key] = str(value)
     return flat
-
-
-INFO, WARNING = Log.Level.Value("INFO"), Log.Level.Value("WARNING")
-NAME = "segslam"
-REPAIRS = (MotionState.REPAIRED, MotionState.REJOINED)
 
 
 def warning(text: str, *, stamp_ns: int) -> Log:

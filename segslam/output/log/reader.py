@@ -35,6 +35,14 @@ from segslam.output.log.records import codec
 from segslam.output.log.schema import restored
 from segslam.slam.adjustment import Adjustment
 
+logger = logging.getLogger(__name__)
+NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
+NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, RecursionError, DecodeError)
+"""Exceptions on content of another program, or damaged in spite of a correct checksum."""
+Parts = Mapping[str, bytes]
+"""The latest message of each topic."""
+Decoded = TypeVar("Decoded")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedKeyframe:
@@ -76,16 +84,6 @@ class RecordedKeyframes:
         except (OSError, CutError, ValueError, DecodeError) as error:
             raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
         raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
-
-
-logger = logging.getLogger(__name__)
-
-NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
-NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, RecursionError, DecodeError)
-"""Exceptions on content of another program, or damaged in spite of a correct checksum."""
-Parts = Mapping[str, bytes]
-"""The latest message of each topic."""
-Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True, slots=True)

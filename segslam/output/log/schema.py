@@ -88,6 +88,25 @@ PACKAGES_METADATA = "segslam.packages"
 
 CHECK_METADATA = "segslam.check"
 """Metadata record: `crc32`, the checksum of the other records, because MCAP has none; missing in older logs."""
+PROTOBUF_TOPICS: dict[str, Any] = {
+    TRANSFORMS: FrameTransform,
+    KEYFRAME: KeyframePoints,
+    POINTS: PointCloud,
+    MAP: PointCloud,
+    ODOMETRY: PosesInFrame,
+    TRAJECTORY: PosesInFrame,
+    TRAJECTORY_BEFORE: PosesInFrame,
+    GROUND_TRUTH: PosesInFrame,
+    LOG: Log,
+    ACCEPTED: SceneUpdate,
+    REJECTED: SceneUpdate,
+    GRAPH: SceneUpdate,
+}
+CPU_INFO = Path("/proc/cpuinfo")
+ESCAPED = re.compile(r"\\u(dc[89a-f][0-9a-f])")
+"""A byte of a file name that is not UTF-8, as Python writes it (PEP 383)."""
+PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
+"""Packages whose versions a log records, because results depend on them."""
 
 
 def checksum(metadata: Mapping[str, Mapping[str, str]]) -> int:
@@ -130,22 +149,6 @@ def is_readable(written: dict[str, Any], own: dict[str, Any]) -> bool:
     return all(key in theirs and is_readable(theirs[key], ours[key]) for theirs, ours, key in parts)
 
 
-PROTOBUF_TOPICS: dict[str, Any] = {
-    TRANSFORMS: FrameTransform,
-    KEYFRAME: KeyframePoints,
-    POINTS: PointCloud,
-    MAP: PointCloud,
-    ODOMETRY: PosesInFrame,
-    TRAJECTORY: PosesInFrame,
-    TRAJECTORY_BEFORE: PosesInFrame,
-    GROUND_TRUTH: PosesInFrame,
-    LOG: Log,
-    ACCEPTED: SceneUpdate,
-    REJECTED: SceneUpdate,
-    GRAPH: SceneUpdate,
-}
-
-
 class Channel(NamedTuple):
     """A topic and the encoding of its messages."""
 
@@ -171,13 +174,6 @@ def channels() -> list[Channel]:
         for topic, values in json_schemas().items()
     ]
     return protobuf + own
-
-
-CPU_INFO = Path("/proc/cpuinfo")
-ESCAPED = re.compile(r"\\u(dc[89a-f][0-9a-f])")
-"""A byte of a file name that is not UTF-8, as Python writes it (PEP 383)."""
-PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
-"""Packages whose versions a log records, because results depend on them."""
 
 
 def metadata(

@@ -36,6 +36,17 @@ from segslam.output.log.records import codec
 from segslam.output.log.schema import channels, metadata
 from segslam.slam.adjustment import Adjusted, Adjustment
 
+POSES_PER_KEYFRAME = 50
+"""Chosen: number of logged poses of estimates per keyframe, about 4 kB each, so that the log grows with the drive
+only. All estimates are logged until the limit is reached; then every second estimate, and so on."""
+CHUNK_BYTES = 4 * 2**20
+"""Larger than any step: a chunk ends with its step, so that a step is complete or missing."""
+_STATM = Path("/proc/self/statm")
+Encoded = tuple[str, bytes]
+"""Topic and data of a message."""
+Mirror = Callable[[str, bytes, int], None]
+"""Called with topic, data and stamp (ns) of each message after it is written."""
+
 
 class Output:
     """Unbuffered stream with the methods that MCAP's writer uses: write, tell, flush.
@@ -105,20 +116,6 @@ def is_being_written(path: Path) -> bool:
         except BlockingIOError:
             return True
         return False
-
-
-POSES_PER_KEYFRAME = 50
-"""Chosen: number of logged poses of estimates per keyframe, about 4 kB each, so that the log grows with the drive
-only. All estimates are logged until the limit is reached; then every second estimate, and so on."""
-CHUNK_BYTES = 4 * 2**20
-"""Larger than any step: a chunk ends with its step, so that a step is complete or missing."""
-
-_STATM = Path("/proc/self/statm")
-
-Encoded = tuple[str, bytes]
-"""Topic and data of a message."""
-Mirror = Callable[[str, bytes, int], None]
-"""Called with topic, data and stamp (ns) of each message after it is written."""
 
 
 class LogWriter:

@@ -34,6 +34,7 @@ STYLE: Any = {
 }
 WIDTH_IN = 5.4
 """Text of 11 points is then 10 pixels high on a phone."""
+RESIDUALS = ("residual_east_m", "residual_north_m")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,9 +263,6 @@ def svg(figure: Figure, name: str) -> str:
     with matplotlib.rc_context({"svg.hashsalt": name}):
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()
-
-
-RESIDUALS = ("residual_east_m", "residual_north_m")
 
 
 def draw_fixes(folder: Path) -> str | None:

@@ -23,6 +23,8 @@ from segslam.slam import slam_result
 NUM_EACH = 3
 APART = 10
 """Chosen: keyframes between two pictures of one kind, so that they show different places."""
+SOURCE, TARGET = "#D55E00", "#4D4D4D"
+VIEW_M = 50.0
 
 
 def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
@@ -76,10 +78,6 @@ def _miss(attempt: LoopAttempt) -> tuple[int, float]:
 def _standing(keyframe: Keyframe) -> Points:
     """The points above ground; all points if none is labelled as ground."""
     return keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))].astype(np.float64)
-
-
-SOURCE, TARGET = "#D55E00", "#4D4D4D"
-VIEW_M = 50.0
 
 
 def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform], title: str) -> bytes:

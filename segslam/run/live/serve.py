@@ -19,6 +19,15 @@ from segslam.core.types import BadScan, Points, Scan, SegslamError, Step
 from segslam.odometry import KissOdometry, OdometryApart, Tracked, Tracker
 from segslam.run.live.waiting import Arrival, Gaps, Source, Tally, Waiting
 
+READY = b"ready"
+END_S = 5.0
+"""Chosen: time for a source to end; the process does not wait longer for a middleware that hangs."""
+ROWS_CONTINUED = 30
+"""Chosen: number of last scans, beside the last keyframes, from which the odometry continues: its usual interval is the
+median of 21."""
+MOST_SHOWN = 200
+"""Chosen: number of characters shown of an exception, which may contain the content of a file."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
@@ -56,16 +65,6 @@ class Past:
     clouds: deque[tuple[int, Points]]
     """Row and points of the last keyframes."""
     gaps: Gaps = field(default_factory=Gaps)
-
-
-READY = b"ready"
-END_S = 5.0
-"""Chosen: time for a source to end; the process does not wait longer for a middleware that hangs."""
-ROWS_CONTINUED = 30
-"""Chosen: number of last scans, beside the last keyframes, from which the odometry continues: its usual interval is the
-median of 21."""
-MOST_SHOWN = 200
-"""Chosen: number of characters shown of an exception, which may contain the content of a file."""
 
 
 class OdometryEnded(Exception):

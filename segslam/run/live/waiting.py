@@ -19,6 +19,16 @@ MOST_WAITING = 4
 """Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
 END_NS = 2**62
 """Stamps are below this one, in the year 2116: 64 bits hold them also if they are shifted."""
+LONG_GAP = 1.5
+"""Chosen: there is a gap if stamps are farther apart than this many usual intervals."""
+LONGEST_PREDICTED = 10.0
+"""Chosen: after more intervals (1 s at 10 Hz), prediction with constant velocity is useless."""
+SET_BACK_NS = 1_000_000_000
+"""Chosen: the sender's clock was set back if a stamp is this much earlier than the last, as in a replay."""
+SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
+"""Chosen: the sender's clock was set forward if a stamp is this much later than the last: no drive has such a gap."""
+PATIENCE_S = 2.0
+"""Chosen: time to wait for the first cloud of a topic; a sensor that runs sends ten a second."""
 
 
 class Tally(ctypes.Structure):
@@ -107,16 +117,6 @@ class Waiting:
             self._changed.notify()
 
 
-LONG_GAP = 1.5
-"""Chosen: there is a gap if stamps are farther apart than this many usual intervals."""
-LONGEST_PREDICTED = 10.0
-"""Chosen: after more intervals (1 s at 10 Hz), prediction with constant velocity is useless."""
-SET_BACK_NS = 1_000_000_000
-"""Chosen: the sender's clock was set back if a stamp is this much earlier than the last, as in a replay."""
-SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
-"""Chosen: the sender's clock was set forward if a stamp is this much later than the last: no drive has such a gap."""
-
-
 class Gaps(NamedTuple):
     """Gaps in the stamps so far."""
 
@@ -199,10 +199,6 @@ class Source(Protocol):
     def close(self) -> None:
         """Release the resources of `open`."""
         ...
-
-
-PATIENCE_S = 2.0
-"""Chosen: time to wait for the first cloud of a topic; a sensor that runs sends ten a second."""
 
 
 def extent_in_folder(folder: Path) -> float | None:

@@ -44,7 +44,7 @@ def map_folder(
     topic: str = "",
     odometry: "Odometry | None" = None,
     on_step: Callable[[Step], object] = lambda step: None,
-    slam_of: "SlamOf" = Slam,
+    slam_of: SlamOf = Slam,
     options: Mapping[str, str] = MappingProxyType({}),
 ) -> FinishedRun:
     """Map a folder of scans or a recording into the new folder `out`, like `segslam map`; returns the finished run.
@@ -67,10 +67,11 @@ def map_source(
     config: Config | None = None,
     odometry: "Odometry | None" = None,
     on_step: Callable[[Step], object] = lambda step: None,
-    slam_of: "SlamOf" = Slam,
+    slam_of: SlamOf = Slam,
     options: Mapping[str, str] = MappingProxyType({}),
+    place: Callable[[Path], str] | None = None,
 ) -> FinishedRun:
-    """As `map_folder`."""
+    """As `map_folder`; `place` georeferences the run."""
     scans = open_scans(source, config or Config())
     config = in_effect(config or preset(preset_for(extent_m(scans))), scans)
     folder = new_folder(out)
@@ -84,7 +85,7 @@ def map_source(
                 on_step(step)
         if run.num_steps == 0:
             raise SegslamError(f"{source.data}: none of its {len(scans)} scans could be used; see the warnings")
-        run.complete()
+        run.complete(place=place)
     return read_run(folder)
 
 
@@ -94,7 +95,7 @@ def begun(
     config: Config,
     *,
     odometry: "Odometry",
-    slam_of: "SlamOf" = Slam,
+    slam_of: SlamOf = Slam,
     options: Mapping[str, str] = MappingProxyType({}),
     resumes: bool = False,
     mirror: Mirror | None = None,

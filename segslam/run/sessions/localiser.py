@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,17 +18,14 @@ from segslam.output.finished import FinishedRun
 from segslam.output.georeferenced import take_over
 from segslam.registration.prepared import Labeller
 from segslam.run.locator import Locator
-from segslam.run.map_folder import map_folder
+from segslam.run.map_folder import SlamOf, map_folder
 from segslam.run.sessions.anchored import AnchoredGraph
 from segslam.run.sessions.placer import Placer
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.slam import Slam, SlamResult
 
-if TYPE_CHECKING:
-    from segslam.run.map_folder import SlamOf
 
-
-def localiser_in(run: str | Path) -> "SlamOf":
+def localiser_in(run: str | Path) -> SlamOf:
     """What makes pipelines that localise in the map of a finished run, which is read now."""
     return partial(Localiser, Locator.from_run(run))
 

@@ -113,7 +113,7 @@ def fleet(
         scheduler=scheduler,
         num_workers=workers,
         same_reference=same_reference,
-        settings=changes.changes(),
+        settings=changes.overrides(),
         shown=terminal.progress,
         say=terminal.say,
     )

@@ -87,7 +87,7 @@ class Settings:
         ),
     ] = None
 
-    def changes(self) -> list[str]:
+    def overrides(self) -> list[str]:
         """Changes of single settings, as for `load_config`."""
         return self.settings or []
 
@@ -95,7 +95,7 @@ class Settings:
         """The settings. Raises SegslamError as `load_config`; called early, it reports a wrong setting at once."""
         from segslam.core.config import load_config
 
-        return load_config(self.config, self.changes(), base=base)
+        return load_config(self.config, self.overrides(), base=base)
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,10 @@ class RunSettings(Settings):
         ),
     ] = None
 
-    def changes(self) -> list[str]:
+    def overrides(self) -> list[str]:
         """Those of `--set`, followed by that of `--refine-minutes`."""
         minutes = [] if self.refine_minutes is None else [f"adjustment.max_minutes={self.refine_minutes}"]
-        return [*super().changes(), *minutes]
+        return [*super().overrides(), *minutes]
 
 
 @dataclass(frozen=True)

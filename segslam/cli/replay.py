@@ -108,7 +108,7 @@ def refine(
     from segslam.run.replay import Replay
     from segslam.slam.slam import Slam
 
-    refined = Replay.of(run, config=changes.config, settings=changes.changes())
+    refined = Replay.of(run, config=changes.config, settings=changes.overrides())
     recorded = refined.recorded
     if refined.in_map:
         raise SegslamError(f"{run}: localised in the map of another run; refine that run instead")
@@ -145,7 +145,7 @@ def _replay_log(
     from segslam.output.folder import copy_alone, new_folder
     from segslam.run.replay import Replay
 
-    replayed = Replay.of(log, config=changes.config, settings=changes.changes(), edits=edits)
+    replayed = Replay.of(log, config=changes.config, settings=changes.overrides(), edits=edits)
     recorded = replayed.recorded
     slam = None
     if replayed.in_map:

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path as FilePath
 from threading import Event, Thread
 from time import monotonic
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
@@ -44,6 +44,7 @@ try:
 except ImportError:  # a minimal installation
     Trigger = None
 
+SpunNode = TypeVar("SpunNode", bound="_Spun")
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 NAMESPACE = "segslam"
 ODOM, MAP = "odom", "map"
@@ -199,7 +200,7 @@ class _Spun:
         self._context, self._node = start_node(name)
         self._thread = Thread(target=self._spin, name=name, daemon=True)
 
-    def __enter__(self) -> Self:
+    def __enter__(self: SpunNode) -> SpunNode:
         self._thread.start()
         return self
 

@@ -287,7 +287,6 @@ class Run:
         `more` adds figures computed from the result. `place` georeferences the folder before the maps are written, and
         returns what it found. `search_s` and `progress` as in `finish`. A failure of place or maps leaves a report.
         """
-        from segslam.output.export import write_maps
         from segslam.output.report import write_report
 
         result, metrics = self.finish(search_s=search_s, progress=progress)
@@ -301,6 +300,8 @@ class Run:
                 placed = place(self.folder)
                 metrics = read_metrics(self.folder)
             if map_files:
+                from segslam.output.export import write_maps
+
                 log = read_log(self.folder)
                 metrics |= write_maps(log, map_files, config=log.config.map, show=progress)
                 metrics["peak_rss_mb"] = peak_mb()

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from segslam.run.locator import Located, Locator, locate
     from segslam.run.map_folder import map_folder
     from segslam.run.replay import replay
-    from segslam.run.sessions.localise import localise
+    from segslam.run.sessions.localiser import localise
     from segslam.run.sessions.merge import merge
     from segslam.scans import open_dataset
     from segslam.slam.slam import Slam
@@ -77,7 +77,7 @@ _HOMES = {
     "keep_freed_memory": "core.memory",
     "load_config": "core.config",
     "locate": "run.locator",
-    "localise": "run.sessions.localise",
+    "localise": "run.sessions.localiser",
     "map_folder": "run.map_folder",
     "merge": "run.sessions.merge",
     "open_dataset": "scans",

@@ -220,13 +220,13 @@ def test_the_page_of_options_is_that_of_the_configuration() -> None:
 
 def test_commands_are_added_once_however_many_are_run() -> None:
     for _ in range(2):
-        commands.add_all(cli.app)
+        commands.add(cli.app)
     names = [command.name for command in cli.app.registered_commands]
     assert len(names) == len(set(names)) > 20
 
 
 def test_every_command_has_an_example_and_every_option_is_explained() -> None:
-    commands.add_all(cli.app)
+    commands.add(cli.app)
     for name, command in all_commands(get_command(cli.app)):
         assert "Example" in (command.help or ""), f"segslam {name}"
         for parameter in command.params:
@@ -246,7 +246,7 @@ def test_help_starts_without_the_heavy_packages() -> None:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_the_commands_and_options_that_a_page_names_exist(page: str) -> None:
-    commands.add_all(cli.app)
+    commands.add(cli.app)
     known = dict(all_commands(get_command(cli.app)))
     for line in re.findall(r"(?m)^(?:    |\$ )segslam .*$|`segslam [^`]*`", (ROOT / page).read_text()):
         words = line.strip(" `$").split("#")[0].split()

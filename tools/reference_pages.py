@@ -48,7 +48,7 @@ def glossary_page() -> str:
 
 def commands_page() -> str:
     """Every command with its arguments and options."""
-    commands.add_all(cli.app)
+    commands.add(cli.app)
     parts = ["# Commands\n\nGenerated from the program; `segslam COMMAND --help` shows the same.\n"]
     group = ""
     for name, command in _leaves(get_command(cli.app)):

@@ -1,4 +1,7 @@
-"""The command line: one file per command. Only this package prints. Commands import large libraries when they run."""
+"""The command line: a file for each command, or for some that share their steps; `commands` lists them.
+
+Only this package prints. Commands import large libraries when they run.
+"""
 
 import errno
 import io
@@ -9,8 +12,8 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.groups import GroupedCommands
-from segslam.cli.warn import FirstOfEachKind
+from segslam.cli.commands import GroupedCommands, add
+from segslam.cli.console import FirstOfEachKind, say
 from segslam.core.errors import SegslamError, reason
 from segslam.core.interrupts import EXIT_STATUS, ctrl_c_in_order, stop_line
 from segslam.core.memory import keep_freed_memory
@@ -56,26 +59,24 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _status(arguments: list[str] | None) -> int:
     """The exit status of a command. A failure prints one line."""
-    from segslam.cli import commands
-
     keep_freed_memory()
     warnings = FirstOfEachKind()
     logging.basicConfig(level=logging.WARNING, handlers=[warnings])
-    commands.add_all(app)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be unprintable
     try:
-        given = sys.argv[1:] if arguments is None else arguments
-        app([_with_home(argument) for argument in given], prog_name="segslam")
+        words = [_with_home(argument) for argument in (sys.argv[1:] if arguments is None else arguments)]
+        add(app, words)
+        app(words, prog_name="segslam")
     except SystemExit as ended:
         status = ended.code if isinstance(ended.code, int) else 0
         if status == EXIT_STATUS:
-            print(stop_line(), file=sys.stderr)
+            say(stop_line())
         return _flushed(status)
     except SegslamError as error:
-        print(f"segslam: {error}", file=sys.stderr)
+        say(f"segslam: {error}")
     except OSError as error:
-        print(f"segslam: {_of_file(error)}", file=sys.stderr)
+        say(f"segslam: {_of_file(error)}")
     finally:
         warnings.print_counts()
     return _flushed(BAD_INPUT)
@@ -109,6 +110,6 @@ def _flushed(status: int) -> int:
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # prevents a second error when Python exits
         if status == 0 and not isinstance(error, BrokenPipeError):
-            print(f"segslam: {_of_file(error)}", file=sys.stderr)
+            say(f"segslam: {_of_file(error)}")
         return BAD_INPUT
     return status

@@ -1,82 +1,142 @@
 """`segslam bench`: the experiments of the paper, with all methods on the same scans."""
 
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from segslam.cli.bench_options import (
-    DataArgument,
-    Options,
-    make_job,
-    read_lists,
-    reference_of,
-    run_trials,
-)
-from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
-from segslam.cli.shared_options import with_options
+from segslam.bench.experiments.method_settings import METHOD_NAMES
+from segslam.cli.completion import methods
+from segslam.cli.console import Terminal
+from segslam.cli.options import DatasetOption, EncodingOption, LabelsOption, SequenceOption, Settings, with_options
+from segslam.core.errors import SegslamError
+from segslam.core.interrupts import EXIT_STATUS, when_stopped
+from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.bench.experiments.job import Job
     from segslam.bench.experiments.pairs import PairList
     from segslam.bench.experiments.rows import Row
     from segslam.bench.experiments.trials import Trial
+    from segslam.core.types import Trajectory
 
 app = typer.Typer(
     help="Repeat the experiments of the Segregator paper; every method gets the same scans.", no_args_is_help=True
 )
 
 LOST_PERCENT = [10.0, 30.0, 50.0, 70.0, 90.0]
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+DataArgument = Annotated[Path, typer.Argument(help="KITTI folder, with real or simulated scans.")]
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options common to all experiments."""
+
+    pairs: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--pairs", help="List of pairs: one `source target` per line, or JSON with their poses; may be repeated."
+        ),
+    ] = None
+    min_m: Annotated[
+        float | None,
+        typer.Option("--min-m", min=0, help="Make a list from the true poses: smallest distance of a pair (m)."),
+    ] = None
+    max_m: Annotated[float | None, typer.Option("--max-m", min=0, help="Largest distance of such a pair (m).")] = None
+    min_gap: Annotated[
+        int, typer.Option("--min-gap", min=1, help="Smallest number of scans between the two of such a pair.")
+    ] = 50
+    sample: Annotated[
+        int | None, typer.Option("--sample", min=1, help="Use only N pairs of each list, drawn at random.")
+    ] = None
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --sample.")] = 0
+    sequence: SequenceOption = "00"
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            autocompletion=methods,
+            help=f"Method, may be repeated; default: all of {', '.join(METHOD_NAMES)}.",
+        ),
+    ] = None
+    dataset: DatasetOption = None
+    labels: LabelsOption = "auto"
+    encoding: EncodingOption = None
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, help="Number of processes on this machine (extra `cluster`).")
+    ] = 1
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help="Address of a Dask cluster with access to DATA (extra `cluster`).")
+    ] = None
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Folder for the report and the rows; the same command continues an interrupted benchmark there.",
+        ),
+    ] = None
+    details: Annotated[Path | None, typer.Option("--details", help="CSV file to write, one row per registration.")] = (
+        None
+    )
+    draw: Annotated[int, typer.Option("--draw", min=0, help="Draw the N worst failures; needs --out.")] = 0
 
 
 @app.command()
 @with_options
-def pairs(data: DataArgument, options: Options) -> None:
+def pairs(data: DataArgument, options: Options, changes: Settings, terminal: Terminal) -> None:
     """Measure the success rate over lists of pairs.
 
     Example: segslam bench pairs kitti --sequence 06 --pairs kitti06_3to5.txt --sample 100 --workers 4 --out bench06
     """
-    _run_pairs("pairs", data, options)
+    _experiment("pairs", data, options, changes, terminal, lambda variations: variations.pair_trials, by="list")
 
 
 @app.command()
 @with_options
-def timing(data: DataArgument, options: Options) -> None:
+def timing(data: DataArgument, options: Options, changes: Settings, terminal: Terminal) -> None:
     """Measure the time of each stage, the errors and the graph size, all lists together (paper: sequence 06).
 
     Example: segslam bench timing kitti --sequence 06 --pairs kitti06_3to5.txt --pairs kitti06_8to10.txt --sample 50
     """
-    _run_pairs("timing", data, options)
+    _experiment("timing", data, options, changes, terminal, lambda variations: variations.pair_trials, by="list")
 
 
 @app.command()
 @with_options
 def yaw(
     data: DataArgument,
+    *,
     options: Options,
+    changes: Settings,
     step_deg: Annotated[
         float, typer.Option("--step-deg", min=1, max=180, help="Step between two yaw angles (degrees).")
     ] = 15.0,
+    terminal: Terminal,
 ) -> None:
     """Measure the error against the yaw of the source, over the full circle. Default pair: scans 0 and 10.
 
     Example: segslam bench yaw kitti --sequence 05 --step-deg 5 --out yaw05
     """
-    job = make_job(data, options)
-    from segslam.bench.experiments.variations import PAPER_PAIR, turned_trials
 
-    reference = reference_of(job)
-    lists = read_lists(options, reference, default=PAPER_PAIR)
-    trials = [trial for one in lists for trial in turned_trials(one, reference, step_deg=step_deg)]
-    _run("yaw", job, lists, trials, options, by="yaw_deg", step_deg=step_deg)
+    def vary(variations: Any) -> Callable[..., Iterable["Trial"]]:
+        return partial(variations.turned_trials, step_deg=step_deg)
+
+    _experiment("yaw", data, options, changes, terminal, vary, by="yaw_deg", of_paper=True, step_deg=step_deg)
 
 
 @app.command()
 @with_options
 def deterioration(
     data: DataArgument,
+    *,
     options: Options,
+    changes: Settings,
     lost_percent: Annotated[
         list[float], typer.Option("--lost", min=0, max=100, help="Percentage of labels to remove; may be repeated.")
     ] = LOST_PERCENT,
@@ -84,34 +144,33 @@ def deterioration(
         Literal["one", "both"], typer.Option(help="Remove labels from the source only, or from both scans.")
     ] = "both",
     draws: Annotated[int, typer.Option("--draws", min=1, help="Number of random draws at each percentage.")] = 10,
+    terminal: Terminal,
 ) -> None:
     """Measure the success while labels are removed at random. Default pair: scans 0 and 10.
 
     Example: segslam bench deterioration kitti --sequence 05 --labels predictions --clouds one --out lost05
     """
-    job = make_job(data, options)
-    from segslam.bench.experiments.variations import PAPER_PAIR, unlabelled_trials
 
-    reference = reference_of(job)
-    lists = read_lists(options, reference, default=PAPER_PAIR)
-    reduced = partial(
-        unlabelled_trials, lost_percent=lost_percent, num_draws=draws, seed=options.seed, both=clouds == "both"
-    )
-    trials = [trial for one in lists for trial in reduced(one, reference)]
-    _run("deterioration", job, lists, trials, options, by="lost_percent", clouds=clouds, draws=draws)
+    def vary(variations: Any) -> Callable[..., Iterable["Trial"]]:
+        drawn = {"num_draws": draws, "seed": options.seed}
+        return partial(variations.unlabelled_trials, lost_percent=lost_percent, both=clouds == "both", **drawn)
+
+    asked = {"clouds": clouds, "draws": draws}
+    _experiment("deterioration", data, options, changes, terminal, vary, by="lost_percent", of_paper=True, **asked)
 
 
 @app.command()
+@with_options
 def places(
     file: Annotated[
         Path, typer.Argument(help="Places: a .npz with `columns` (n, size, size) uint8 and `poses` (n, 3, 4).")
     ],
+    *,
     database: Annotated[str, typer.Option("--database", help="Rows of the database: A:B, B excluded.")],
     queries: Annotated[str, typer.Option("--queries", help="Rows of the queries: C:D.")],
     turned: Annotated[bool, typer.Option("--turned", help="Rotate each query by a random yaw.")] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --turned.")] = 0,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Measure how often a place is recognised, without labels. A hit is within 5 m; queries without one are omitted.
 
@@ -119,7 +178,7 @@ def places(
     """
     from segslam.bench.experiments.places import PlacesBench, parse_range, read_places
 
-    announce(f"bench places: reading {file}", quiet=quiet)
+    terminal.announce(f"bench places: reading {file}")
     seen = read_places(file)
     bench = PlacesBench(
         seen,
@@ -127,61 +186,149 @@ def places(
         parse_range(queries, "--queries", len(seen)),
         turned_seed=seed if turned else None,
     )
-    for _ in progress(bench.run(), total=bench.num_steps, title="bench places", quiet=quiet):
+    for _ in terminal.progress(bench.run(), bench.num_steps, "bench places"):
         pass
     figures = bench.figures()
-    if json:
-        print_json(figures)
-        return
-    say(
+    terminal.answer(
+        figures,
         f"{figures['num_queries']} queries of {figures['num_places']} places: recall@1 {figures['recall_at_1']:.3f}, "
         f"recall@20 {figures['recall_at_20']:.3f}; {figures['query_ms']:.1f} ms per query, "
         f"{figures['index_bytes']} bytes per place",
-        quiet=quiet,
     )
 
 
-def _run_pairs(experiment: str, data: Path, options: Options) -> None:
-    # as in `yaw`, what loads scipy is imported after the first message, which is that of make_job
-    job = make_job(data, options)
-    from segslam.bench.experiments.variations import pair_trials
+def _make_job(data: Path, options: Options, changes: Settings, terminal: Terminal) -> "Job":
+    """The job that the options describe. By default, methods that are not installed are skipped with a message."""
+    terminal.announce(f"bench: opening {data}")
+    for variable in THREAD_VARIABLES:  # before Open3D and others are loaded, because times are per core
+        os.environ.setdefault(variable, "1")
+    from segslam.bench.experiments.job import Job
+    from segslam.bench.experiments.methods import find_method
+    from segslam.scans import DataSource
 
-    reference = reference_of(job)
-    lists = read_lists(options, reference)
-    trials = [trial for one in lists for trial in pair_trials(one, reference)]
-    _run(experiment, job, lists, trials, options, by="list")
+    if options.details is not None:
+        check_target(options.details)
+    if options.draw and options.out is None:
+        raise SegslamError("--draw: pictures need a folder; give --out DIR")
+    chosen = []
+    for name in dict.fromkeys(options.method or METHOD_NAMES):
+        try:
+            find_method(name)
+        except SegslamError as error:
+            if options.method:
+                raise
+            terminal.say(f"method skipped: {error}")
+        else:
+            chosen.append(name)
+    config = changes.load()
+    source = DataSource(
+        data.expanduser().absolute(),
+        options.sequence,
+        options.dataset,
+        options.labels,
+        options.encoding,
+        vertical_angle_deg=config.sensor.vertical_angle_deg,
+    )
+    return Job(source, tuple(chosen), config)
 
 
-def _run(
-    experiment: str,
-    job: "Job",
-    lists: list["PairList"],
-    trials: list["Trial"],
+def _read_lists(
+    options: Options, reference: "Trajectory | None", *, default: "PairList | None" = None
+) -> list["PairList"]:
+    """The lists from files, or the list selected by distance, or the default; sampled if requested."""
+    from segslam.bench.experiments.pairs import read_pairs, sample_pairs
+
+    cuts = options.min_m is not None or options.max_m is not None
+    if options.pairs and cuts:
+        raise SegslamError("--pairs, --min-m: give lists of pairs, or make one with --min-m and --max-m, not both")
+    if options.pairs:
+        lists = [read_pairs(file) for file in options.pairs]
+    elif cuts:
+        lists = [_cut(options, reference)]
+    elif default is not None:
+        lists = [default]
+    else:
+        raise SegslamError("--pairs: give a list of pairs, or make one from the true poses with --min-m and --max-m")
+    if options.sample is None:
+        return lists
+    return [sample_pairs(one, num_pairs=options.sample, seed=options.seed) for one in lists]
+
+
+def _run_trials(job: "Job", trials: list["Trial"], options: Options, terminal: Terminal) -> list["Row"]:
+    """All rows in the order of the trials. After Ctrl-C, finished rows remain in the folder of `--out`."""
+    from segslam.bench.experiments.benchmark import Pool, in_order, run
+    from segslam.bench.experiments.rows import write_rows
+
+    terminal.compile_kernels()
+    rows: list[Row] = []
+    pool = Pool(options.workers, options.scheduler)
+    kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
+    when_stopped(f"the finished registrations {kept}")
+    work = run(job, trials, pool=pool, folder=options.out)
+    try:
+        for some in terminal.progress(work, len(trials), "bench"):
+            rows += some
+    except KeyboardInterrupt:
+        when_stopped(f"{len(rows)} registrations {kept}")
+        raise typer.Exit(EXIT_STATUS) from None
+    rows = in_order(rows, job, trials)
+    if options.details is not None:
+        write_rows(options.details, rows)
+    return rows
+
+
+def _cut(options: Options, reference: "Trajectory | None") -> "PairList":
+    """The list selected by distance from the true poses."""
+    from segslam.bench.experiments.pairs import cut_pairs
+
+    low_m, high_m = options.min_m, options.max_m
+    if reference is None:
+        raise SegslamError("--min-m: the data has no true poses; give lists with --pairs FILE")
+    if low_m is None or high_m is None or not low_m < high_m:
+        raise SegslamError(f"--min-m {low_m} --max-m {high_m}: give both, the smaller one first")
+    name = f"cut_{low_m:g}to{high_m:g}"
+    return cut_pairs(reference, name=name, min_m=low_m, max_m=high_m, min_gap=options.min_gap)
+
+
+def _experiment(
+    name: str,
+    data: Path,
     options: Options,
+    changes: Settings,
+    terminal: Terminal,
+    vary: Callable[[Any], Callable[..., Iterable["Trial"]]],
     *,
     by: str,
-    **settings: Any,
+    of_paper: bool = False,
+    **asked: Any,
 ) -> None:
-    """Register the pairs, print the results, and write the report if a folder is given."""
+    """Register the pairs, print the results, and write the report if a folder is given.
+
+    `vary` returns the function of the module `variations` that makes the trials of a list; the module loads scipy and
+    is imported after the first message. `of_paper`: the default is the pair of the paper. `asked` is for the report.
+    """
+    job = _make_job(data, options, changes, terminal)
+    from segslam.bench.experiments import variations
+    from segslam.bench.experiments.job import open_once
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
     from segslam.bench.experiments.report_tables import overall, plain
     from segslam.bench.experiments.summary import results
 
-    rows = run_trials(job, trials, options)
-    found = with_paper_values(results(rows, by=by), experiment=experiment, sequence=options.sequence, lists=lists)
+    reference = open_once(job.source)[0].reference
+    lists = _read_lists(options, reference, default=variations.PAPER_PAIR if of_paper else None)
+    trials = [trial for one in lists for trial in vary(variations)(one, reference)]
+    rows = _run_trials(job, trials, options, terminal)
+    found = with_paper_values(results(rows, by=by), experiment=name, sequence=options.sequence, lists=lists)
     if options.out is not None:
         workers = "of a Dask cluster" if options.scheduler else options.workers
-        asked = {"sample": options.sample, "seed": options.seed, "workers": workers, **settings}
-        report = account(experiment, job, lists, found, options=asked)
-        _write_report(options.out, report, _pictures(job, trials, rows, options.draw), quiet=options.quiet)
-    if options.json:
-        print_json(found)
-    else:
-        say(plain(overall(found)), quiet=options.quiet)
+        asked = {"sample": options.sample, "seed": options.seed, "workers": workers, **asked}
+        report = account(name, job, lists, found, options=asked)
+        _write_report(options.out, report, _pictures(job, trials, rows, options.draw), terminal)
+    terminal.answer(found, plain(overall(found)))
 
 
-def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes], *, quiet: bool) -> None:
+def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes], terminal: Terminal) -> None:
     """Write the report, and the pictures as separate files."""
     from segslam.bench.experiments.report import write_bench_report
     from segslam.core.whole_files import write_whole
@@ -189,14 +336,14 @@ def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes],
     write_bench_report(out, report, pictures=pictures)
     for number, png in enumerate(pictures.values()):
         write_whole(out / f"failure_{number:02d}.png", png)
-    say(f"{out / 'report.html'}, report.md, report.json, details.csv", quiet=quiet)
+    terminal.say(f"{out / 'report.html'}, report.md, report.json, details.csv")
 
 
 def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) -> dict[str, bytes]:
     """Pictures of the worst failures, by caption."""
     from segslam.bench.experiments.job import BAD_SCAN, points_of
     from segslam.bench.experiments.summary import worst_failures
-    from segslam.output.report.pairs import draw_pair
+    from segslam.output.report.gallery import draw_pair
 
     trial_of = {trial.key: trial for trial in trials}
     pictures = {}

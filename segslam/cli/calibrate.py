@@ -3,24 +3,13 @@
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from segslam.cli.checks import check_exists
-from segslam.cli.console import (
-    ConfigOption,
-    DatasetOption,
-    FramesOption,
-    JsonOption,
-    QuietOption,
-    SequenceOption,
-    SetOption,
-    announce,
-    print_json,
-    progress,
-    say,
-)
+from segslam.cli.console import Terminal
+from segslam.cli.options import ScanOptions, Settings
 
 if TYPE_CHECKING:
     from segslam.odometry.calibration import Calibrator, VerticalAngle
@@ -31,17 +20,13 @@ logger = logging.getLogger(__name__)
 
 def calibrate(
     data: Annotated[Path, typer.Argument(help="KITTI folder (with sequences/), folder of scans, or recording.")],
-    dataset: DatasetOption = None,
-    sequence: SequenceOption = "00",
-    frames: FramesOption = None,
-    topic: Annotated[str, typer.Option(help="Point cloud topic, if the recording (rosbag, mcap) has several.")] = "",
+    *,
+    scans: ScanOptions,
     distance_m: Annotated[
         float, typer.Option("--distance", min=50, help="Use the first scans, up to this distance of travel (m).")
     ] = 400.0,
-    config: ConfigOption = None,
-    settings: SetOption = None,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    changes: Settings,
+    terminal: Terminal,
 ) -> None:
     """Measure the error of a LiDAR's vertical angles from the first few hundred metres of a drive.
 
@@ -49,32 +34,17 @@ def calibrate(
     the value of the setting that corrects it is printed as well.
     Example: segslam calibrate kitti --sequence 00 --set sensor.vertical_angle_deg=0
     """
-    from segslam.core.config import load_config
-
     check_exists(data, "give the folder with sequences/ or with the scans")
-    settings_now = load_config(config, settings or ())
-    announce(f"calibrate: opening {data}", quiet=quiet)
+    settings = changes.load()
+    terminal.announce(f"calibrate: opening {data}")
     from segslam.odometry.calibration import Calibrator
-    from segslam.scans import open_dataset
 
-    scans = open_dataset(
-        data,
-        sequence=sequence,
-        dataset=dataset,
-        labels="none",
-        frames=frames,
-        topic=topic,
-        vertical_angle_deg=settings_now.sensor.vertical_angle_deg,
-    )
-    calibrator = Calibrator(settings_now)
-    for _ in progress(_driven(calibrator, scans, distance_m), total=len(scans), title="calibrate", quiet=quiet):
+    opened = scans.source(data, vertical_angle_deg=settings.sensor.vertical_angle_deg).open()
+    calibrator = Calibrator(settings)
+    for _ in terminal.progress(_driven(calibrator, opened, distance_m), len(opened), "calibrate"):
         pass
-    found = calibrator.vertical_angle()
-    applied_deg = scans.vertical_angle_deg
-    if json:
-        print_json(_figures(found, applied_deg))
-    else:
-        say(_summary(found, applied_deg, calibrator.travel_m), quiet=quiet)
+    found, applied_deg = calibrator.vertical_angle(), opened.vertical_angle_deg
+    terminal.answer(_figures(found, applied_deg), _summary(found, applied_deg, calibrator.travel_m))
 
 
 def _driven(calibrator: "Calibrator", scans: "Dataset", distance_m: float) -> "Iterator[None]":
@@ -91,7 +61,7 @@ def _driven(calibrator: "Calibrator", scans: "Dataset", distance_m: float) -> "I
             return
 
 
-def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, object]:
+def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, Any]:
     """The figures; null if the angle is unknown."""
     return {
         "vertical_deg": found.angle_deg if found else None,

@@ -1,15 +1,20 @@
-"""`segslam compare`."""
+"""`segslam compare` and `sweep`: the figures of several runs in one table."""
 
+import shutil
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists
-from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
-from segslam.cli.overwriting import OverwriteOption, check_free
-from segslam.cli.tables import CsvOption, LatexOption, figure, write_tables
-from segslam.core.errors import SegslamError
+from segslam.cli import completion
+from segslam.cli.checks import check_exists, check_free, check_run
+from segslam.cli.console import Terminal, print_json, print_out
+from segslam.cli.options import OverwriteOption
+from segslam.cli.tables import TableFiles, as_text, figure
+from segslam.core.errors import SegslamError, WorkFailed
+from segslam.core.interrupts import when_stopped
 
 COLUMN = 14
 """Smallest width of a column of the table, in characters."""
@@ -17,14 +22,13 @@ COLUMN = 14
 
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, two or more.", metavar="RUN RUN...")],
+    *,
     plot: Annotated[
         Path | None, typer.Option(help="Draw the trajectories and their errors to this file: .png, .svg or .pdf.")
     ] = None,
-    csv: CsvOption = None,
-    latex: LatexOption = None,
+    tables: TableFiles,
     overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Compare runs: errors, loops and speed in one table, trajectories in one figure.
 
@@ -33,8 +37,8 @@ def compare(
     for folder in runs:
         check_exists(folder, "give run folders")
     names = _names(runs)
-    check_free([file for file in (plot, csv, latex) if file], overwrite=overwrite)
-    announce(f"compare: reading {len(runs)} runs", quiet=quiet)
+    check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
+    terminal.announce(f"compare: reading {len(runs)} runs")
     from segslam.output.finished import read_metrics, read_run
     from segslam.output.report.comparison import check_picture, draw_runs
 
@@ -42,13 +46,13 @@ def compare(
         check_picture(plot)
         draw_runs(plot, {name: read_run(folder) for name, folder in zip(names, runs, strict=True)})
     figures = {name: read_metrics(folder) for name, folder in zip(names, runs, strict=True)}
-    write_tables(figures, csv_file=csv, latex_file=latex)
-    if json:
+    tables.write(figures)
+    if terminal.json:
         print_json({"runs": figures, "plot": None if plot is None else str(plot)})
         return
-    print_out(table(figures))
+    print_out(_table(figures))
     if plot is not None:
-        say(f"figure written to {plot}", quiet=quiet)
+        terminal.say(f"figure written to {plot}")
 
 
 def _names(runs: list[Path]) -> list[str]:
@@ -59,7 +63,7 @@ def _names(runs: list[Path]) -> list[str]:
     return short if len(set(short)) == len(runs) else [str(folder) for folder in runs]
 
 
-def table(figures: dict[str, dict[str, Any]]) -> str:
+def _table(figures: dict[str, dict[str, Any]]) -> str:
     """A line for each figure of any run, and a column for each run; `-` for missing figures."""
     from segslam.output.finished import FIGURES
 
@@ -71,3 +75,80 @@ def table(figures: dict[str, dict[str, Any]]) -> str:
             cells = ("-" if value is None else figure(value) for value in values)
             lines.append("".join(f"{cell:>{width}}" for cell in cells) + f"  {meaning}")
     return "\n".join(lines)
+
+
+def sweep(
+    run: Annotated[Path, typer.Argument(help="Run folder, or its log.mcap.")],
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the replays; what is there already is not done again.")],
+    settings: Annotated[
+        list[str],
+        typer.Option(
+            "--set",
+            metavar="SECTION.KEY=A,B,C",
+            autocompletion=completion.settings,
+            help="Values of a setting; of several settings, all combinations are replayed.",
+        ),
+    ],
+    workers: Annotated[int, typer.Option(min=1, help="Number of processes on this machine.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers replay, as tcp://HOST:8786.")
+    ] = None,
+    tables: TableFiles,
+    overwrite: OverwriteOption = False,
+    terminal: Terminal,
+) -> None:
+    """Replay a run with every combination of some settings, and show the results in one table.
+
+    Example: segslam sweep runs/00 --set verify.max_false_share=0.01,0.001 --out sweeps/overlap
+    """
+    check_run(run)
+    grid = grid_of(settings)
+    check_free([tables.csv, tables.latex], overwrite=overwrite)
+    terminal.announce(f"sweep: reading {run}")
+    from segslam.output.folder import log_of
+    from segslam.output.log import read_log
+    from segslam.run.fleets.workers import workers as started
+    from segslam.run.replay import changed_config
+
+    recorded = read_log(run)
+    for changes in grid.values():  # reports a wrong setting before anything is replayed
+        changed_config(recorded, settings=changes)
+    out.mkdir(parents=True, exist_ok=True)
+    when_stopped(f"what is done is kept in {out}; call the same command again to go on")
+    tasks = [(str(log_of(run).resolve()), str((out / name).resolve()), changes) for name, changes in grid.items()]
+    rows: dict[str, dict[str, Any]] = {name: {} for name in grid}
+    failures = []
+    with started(out.resolve(), number=workers, scheduler=scheduler) as (work, _):
+        for number, outcome in terminal.progress(work(replay_one, tasks), len(tasks), "sweep"):
+            name = list(grid)[number]
+            rows[name] = outcome.value or {}
+            failures += [f"{name}: {outcome.failure}"] if outcome.failure else []
+    tables.write(rows)
+    terminal.table({"runs": rows}, as_text(rows))
+    terminal.say(f"runs in {out}")
+    if failures:
+        raise WorkFailed("; ".join(failures))
+
+
+def grid_of(settings: Sequence[str]) -> dict[str, list[str]]:
+    """Name -> settings of each combination. Raises SegslamError for a text without values."""
+    choices = []
+    for text in settings:
+        key, _, values = text.partition("=")
+        if not key or not values:
+            raise SegslamError(f"--set {text}: give values, as in --set verify.max_false_share=0.01,0.001")
+        choices.append([f"{key}={value}" for value in values.split(",") if value])
+    return {" ".join(combination): list(combination) for combination in product(*choices)}
+
+
+def replay_one(log: str, folder: str, settings: list[str]) -> dict[str, Any]:
+    """The figures of one replay, which is not done again if its folder has them; runs in a worker process."""
+    from segslam.output.finished import read_metrics
+    from segslam.run.replay import replay
+
+    out = Path(folder)
+    if not (out / "report.html").is_file():  # the last file that a replay writes
+        shutil.rmtree(out, ignore_errors=True)
+        replay(log, out, settings=settings)
+    return read_metrics(out)

@@ -4,8 +4,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from segslam.bench.experiments.method_settings import METHOD_NAMES
-
 LABELS = ("auto", "none", "geometric", "network:")
 SENSORS = ("hdl64", "os1-64", "vlp16")
 
@@ -41,6 +39,13 @@ def presets(incomplete: str) -> list[str]:
     return _starting(["auto", *SETTINGS], incomplete)
 
 
+def methods(incomplete: str) -> list[str]:
+    """Methods of registration."""
+    from segslam.bench.experiments.method_settings import METHOD_NAMES
+
+    return _starting(METHOD_NAMES, incomplete)
+
+
 def datasets(incomplete: str) -> list[str]:
     """Kinds of data."""
     from segslam.scans.recordings import known_kinds
@@ -74,6 +79,3 @@ def _settings(config: Any, incomplete: str) -> list[str]:
     hint = fields.get(f"{key}=")
     values = ("true", "false") if hint is bool else get_args(hint) if get_origin(hint) is Literal else ()
     return _starting([f"{key}={value}" for value in values], incomplete)
-
-
-METHODS = one_of(*METHOD_NAMES)

@@ -1,21 +1,45 @@
-"""Parts common to all commands: options, progress on standard error, JSON on standard output."""
+"""What all commands share: messages, warnings and progress on standard error, results on standard output."""
 
-import json
+import json as json_text
 import logging
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import dataclass
 from time import monotonic
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
 
-from segslam.cli import completion
-from segslam.cli.warn import FirstOfEachKind
 from segslam.core.errors import WorkFailed, reason
 
+logger = logging.getLogger(__name__)
 Item = TypeVar("Item")
+
+
+class FirstOfEachKind(logging.Handler):
+    """Prints the first warning of each kind and counts the others; a kind is a logger and a message template."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._first: dict[tuple[str, str], str] = {}
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print or count a warning."""
+        kind = (record.name, str(record.msg))
+        self._counts[kind] += 1
+        if kind not in self._first:
+            self._first[kind] = f"{record.levelname}: {record.getMessage()}"
+            say(f"segslam: {self._first[kind]}")
+
+    def print_counts(self) -> None:
+        """Print the number of further warnings of each kind."""
+        for kind, num_warnings in self._counts.items():
+            if num_warnings > 1:
+                say(f"segslam: {num_warnings - 1} more warnings like this: {self._first[kind]}")
+        self._counts.clear()
 
 
 def _without_warnings(quiet: bool) -> bool:
@@ -26,78 +50,79 @@ def _without_warnings(quiet: bool) -> bool:
     return quiet
 
 
-JsonOption = Annotated[
-    bool,
-    typer.Option("--json", help="Print the figures as one JSON object on standard output, and nothing else there."),
-]
-QuietOption = Annotated[
-    bool,
-    typer.Option(
-        "--quiet",
-        "-q",
-        callback=_without_warnings,
-        help="Print no progress and no warnings, only the error that ends the command.",
-    ),
-]
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="YAML file with the settings that differ from the defaults.")
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="SECTION.KEY=VALUE",
-        autocompletion=completion.settings,
-        help="Change one setting: section.key=value; may be repeated.",
-    ),
-]
-RefineMinutesOption = Annotated[
-    float | None,
-    typer.Option(
-        "--refine-minutes",
-        metavar="MINUTES",
-        help="Time limit of the adjustment of the whole map after the loops; 60 by default, 0: no adjustment.",
-    ),
-]
-DatasetOption = Annotated[
-    str | None,
-    typer.Option(
-        "--dataset",
-        autocompletion=completion.datasets,
-        help="Kind of data: kitti, or a reader of kiss-icp; detected by default.",
-    ),
-]
-SequenceOption = Annotated[str, typer.Option("--sequence", help="Sequence of the data set.")]
-FramesOption = Annotated[
-    str | None,
-    typer.Option("--frames", metavar="A:B[:STEP]", help="Use scans A to B by number, B excluded; every STEP-th."),
-]
-LabelsOption = Annotated[
-    str,
-    typer.Option(
-        "--labels",
-        autocompletion=completion.labels_or_files,
-        help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder.",
-    ),
-]
-EncodingOption = Annotated[
-    Literal["raw", "learning", "learning-0"] | None,
-    typer.Option(
-        "--encoding",
-        help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18).",
-    ),
-]
+@dataclass(frozen=True)
+class Terminal:
+    """Options of nearly every command, and how it answers: results on standard output, all else on standard error."""
 
+    json: Annotated[
+        bool,
+        typer.Option("--json", help="Print the figures as one JSON object on standard output, and nothing else there."),
+    ] = False
+    quiet: Annotated[
+        bool,
+        typer.Option(
+            "--quiet",
+            "-q",
+            callback=_without_warnings,
+            help="Print no progress and no warnings, only the error that ends the command.",
+        ),
+    ] = False
 
-def with_minutes(settings: list[str] | None, refine_minutes: float | None) -> list[str]:
-    """The settings of `--set`, followed by that of `--refine-minutes`."""
-    minutes = [] if refine_minutes is None else [f"adjustment.max_minutes={refine_minutes}"]
-    return [*(settings or ()), *minutes]
+    def say(self, text: str) -> None:
+        """Print a message, unless `--quiet` is given."""
+        if not self.quiet:
+            say(text)
+
+    def announce(self, text: str) -> None:
+        """Print a first message on a terminal, before libraries are imported and data is opened."""
+        if sys.stderr.isatty():
+            self.say(text)
+
+    def answer(self, figures: dict[str, Any], text: str) -> None:
+        """Print the figures with `--json`, otherwise the text as a message."""
+        if self.json:
+            print_json(figures)
+        else:
+            self.say(text)
+
+    def table(self, figures: dict[str, Any], text: str) -> None:
+        """Print the figures with `--json`, otherwise, unless `--quiet` is given, the text on standard output."""
+        if self.json:
+            print_json(figures)
+        elif not self.quiet:
+            print_out(text)
+
+    def progress(self, items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
+        """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if quiet."""
+        if self.quiet:
+            yield from items
+        elif sys.stderr.isatty():
+            yield from _bar(items, total, title)
+        else:
+            yield from _lines(items, total, title)
+
+    def compile_kernels(self) -> int:
+        """Compile all kernels, with a progress bar, unless they are compiled; returns the number of compiled kernels.
+
+        On failure, each kernel is compiled on its first call.
+        """
+        from segslam.core import kernels
+
+        if kernels.are_built():
+            return 0
+        total = kernels.num_kernels()
+        self.say("first use on this machine: compiling, once, 20 to 60 s")
+        try:
+            for _ in self.progress(kernels.build(), total, "compile"):
+                pass
+        except (RuntimeError, OSError) as error:
+            logger.warning("%s; the run starts slowly", error)
+        return total
 
 
 def print_json(values: dict[str, Any]) -> None:
     """Print one JSON object on standard output. Raises ValueError for NaN: callers must omit unknown figures."""
-    print_out(json.dumps(values, allow_nan=False))
+    print_out(json_text.dumps(values, allow_nan=False))
 
 
 def print_out(text: str) -> None:
@@ -110,10 +135,9 @@ def print_out(text: str) -> None:
         raise WorkFailed(f"standard output: cannot be written ({reason(error)}); redirect it elsewhere") from error
 
 
-def say(text: str, *, quiet: bool = False) -> None:
+def say(text: str) -> None:
     """Print a message on standard error; standard output is reserved for results."""
-    if not quiet:
-        print(text, file=sys.stderr)
+    print(text, file=sys.stderr)
 
 
 @contextmanager
@@ -125,43 +149,22 @@ def how_to_go_on(line: str) -> Iterator[None]:
         raise WorkFailed(f"{error}; {line}") from error
 
 
-def announce(text: str, *, quiet: bool) -> None:
-    """Print a first message on a terminal, before libraries are imported and data is opened."""
-    if sys.stderr.isatty():
-        say(text, quiet=quiet)
-
-
-def progress(items: Iterable[Item], *, total: int, title: str, quiet: bool = False) -> Iterator[Item]:
-    """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if `quiet`."""
-    if quiet:
-        yield from items
-    elif sys.stderr.isatty():
-        yield from _bar(items, total, title)
-    else:
-        yield from _lines(items, total, title)
-
-
 def _bar(items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
+    from rich import progress
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeRemainingColumn,
-    )
     from rich.text import Text
 
-    class Rate(ProgressColumn):
+    class Rate(progress.ProgressColumn):
         """Items per second; rich gives no estimate before the second item."""
 
-        def render(self, task: Task) -> Text:
+        def render(self, task: progress.Task) -> Text:
             return Text("" if task.speed is None else f"{task.speed:.1f}/s")
 
-    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), Rate(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bars:
+    columns = (
+        *(progress.TextColumn(title), progress.BarColumn(), progress.MofNCompleteColumn()),
+        *(Rate(), progress.TimeRemainingColumn()),
+    )
+    with progress.Progress(*columns, console=Console(stderr=True)) as bars:
         task = bars.add_task(title, total=total)
         for item in items:
             yield item
@@ -175,5 +178,5 @@ def _lines(items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
         now = monotonic()
         if now - last >= 10 or done == total:
             rate = done / max(now - started, 1e-9)
-            print(f"{title}: {done}/{total}, {rate:.1f}/s, {(total - done) / rate:.0f} s left", file=sys.stderr)
+            say(f"{title}: {done}/{total}, {rate:.1f}/s, {(total - done) / rate:.0f} s left")
             last = now

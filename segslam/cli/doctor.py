@@ -1,4 +1,4 @@
-"""`segslam doctor`."""
+"""`segslam doctor` and `warm-up`: what this machine has, and the compiled code."""
 
 import ctypes
 import os
@@ -7,11 +7,13 @@ import re
 import sys
 from collections import defaultdict
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import typer
 
-from segslam.cli.console import JsonOption, QuietOption, print_json, print_out
+from segslam.cli.console import Terminal
+from segslam.core.interrupts import when_stopped
 
 LIBRARIES = {
     "libusb-1.0.so.0": "libusb-1.0-0",
@@ -22,18 +24,32 @@ LIBRARIES = {
 """Shared libraries needed by Open3D, and their packages in Debian and Ubuntu."""
 
 
-def doctor(json: JsonOption = False, quiet: QuietOption = False) -> None:
+def doctor(*, terminal: Terminal) -> None:
     """Show the environment: versions, shared libraries, processor, memory, display, compiled code.
 
     Exit status 1 if a required package or library is missing. Example: segslam doctor
     """
     report = examine()
-    if json:
-        print_json(report)
-    elif not quiet:
-        print_out("\n".join(_lines(report)))
+    terminal.table(report, "\n".join(_lines(report)))
     if report["problems"]:
         raise typer.Exit(1)
+
+
+def warm_up(*, terminal: Terminal) -> None:
+    """Compile all numba kernels now instead of in the first run, for example in a container image.
+
+    Compiled code is stored in NUMBA_CACHE_DIR if set, otherwise beside the package, or in the user's cache folder if
+    the package is read-only.
+
+    Example: segslam warm-up
+    """
+    when_stopped("the kernels compiled so far are kept; the same command compiles the others")
+    started = perf_counter()
+    num_compiled = terminal.compile_kernels()
+    seconds = perf_counter() - started
+    ready = f"ready in {seconds:.1f} s; {num_compiled} kernels were compiled"
+    figures = {"seconds": seconds, "num_compiled": num_compiled}
+    terminal.answer(figures, ready if num_compiled else "ready: all kernels are compiled")
 
 
 def examine() -> dict[str, Any]:

@@ -1,28 +1,30 @@
 """`segslam eval`."""
 
-from functools import partial
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from segslam.cli.checks import check_links
-from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out, say
-from segslam.cli.evaluate_folder import score_folders
-from segslam.cli.overwriting import OverwriteOption, check_free
-from segslam.cli.tables import CsvOption, LatexOption, as_text, figure, write_tables
+from segslam.cli.checks import check_free, check_links
+from segslam.cli.console import Terminal
+from segslam.cli.options import OverwriteOption
+from segslam.cli.tables import TableFiles, as_text, figure
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.core.evaluation import Up
     from segslam.core.trajectory import PoseFile, Poses
     from segslam.core.types import IndexPairs
-    from segslam.output.scores import Align
+    from segslam.output.accuracy import Align
 
 
 def evaluate(
     run: Annotated[
         Path | None, typer.Argument(help="Run folder; its metrics.json is updated with the new figures.")
     ] = None,
+    *,
     reference: Annotated[
         Path | None, typer.Option(help="Ground-truth poses, KITTI or TUM format; a folder if --estimate is one.")
     ] = None,
@@ -48,14 +50,12 @@ def evaluate(
         float | None,
         typer.Option(min=0.01, metavar="METRES", help="Also measure the error of the motion over this distance."),
     ] = None,
-    csv: CsvOption = None,
-    latex: LatexOption = None,
+    tables: TableFiles,
     plot: Annotated[
         Path | None, typer.Option(help="Draw both trajectories and the error to this file: .png, .svg or .pdf.")
     ] = None,
     overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Measure the error of a run, or of a trajectory, against ground truth.
 
@@ -65,66 +65,60 @@ def evaluate(
     Example: segslam eval runs/00; or segslam eval --estimate poses_kitti.txt --reference kitti/poses/00.txt; or
     segslam eval --estimate runs --reference kitti/poses --csv kitti.csv
     """
-    check_free([file for file in (plot, csv, latex) if file], overwrite=overwrite)
+    check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
     if run is not None or estimate is not None:
-        announce(f"eval: reading {run or estimate}", quiet=quiet)
-    from segslam.core.types import SegslamError
-
-    how = _How(align, rpe_distance)
+        terminal.announce(f"eval: reading {run or estimate}")
+    how = _How(align, rpe_distance, plot, terminal)
     if run is not None and estimate is None:
-        figures = _score_run(run, reference, plot, how, quiet=quiet)
+        figures = _score_run(run, reference, how)
         rows = {run.resolve().name: figures}
     elif run is None and estimate is not None and reference is not None:
 
-        def score(made: Path, true: Path, *, quiet: bool = quiet) -> dict[str, Any]:
-            return _score_files(made, true, format, up, max_difference, plot, how, quiet=quiet)
+        def score(made: Path, true: Path, how: _How) -> dict[str, Any]:
+            return _score_files(made, true, format, up, max_difference, how)
 
         if estimate.is_dir():
             if plot is not None:
                 raise SegslamError("--plot: draws one drive; give two files")
-            rows = score_folders(estimate, reference, partial(score, quiet=True))
+            silent = how._replace(terminal=replace(terminal, quiet=True))
+            rows = _score_folders(estimate, reference, lambda made, true: score(made, true, silent))
             axes = ", ".join(sorted({str(row["up"]) for row in rows.values() if "up" in row}))
-            say(f"{reference}: upward axis {axes}" + ("" if up else "; for another: --up"), quiet=quiet)
+            terminal.say(f"{reference}: upward axis {axes}" + ("" if up else "; for another: --up"))
             figures = {"drives": rows}
         else:
-            figures = score(estimate, reference)
+            figures = score(estimate, reference, how)
             rows = {estimate.stem: figures}
     else:
         raise SegslamError("give either a run folder, or two files with --estimate and --reference")
-    write_tables(rows, csv_file=csv, latex_file=latex)
-    if json:
-        print_json(figures)
-    elif not quiet:
-        print_out(as_text(rows) if "drives" in figures else table(figures))
-    if plot is not None and not json:
-        say(f"figure written to {plot}", quiet=quiet)
+    tables.write(rows)
+    terminal.table(figures, as_text(rows) if "drives" in figures else _table(figures))
+    if plot is not None and not terminal.json:
+        terminal.say(f"figure written to {plot}")
 
 
-def table(figures: dict[str, Any]) -> str:
+def _table(figures: dict[str, Any]) -> str:
     """The figures with their meaning, one per line."""
+    from segslam.output.accuracy import MEANINGS
     from segslam.output.finished import FIGURES
-    from segslam.output.scores import MEANINGS
 
     meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
     return "\n".join(f"{figure(figures[key]):>10}  {meaning}" for key, meaning in meanings.items() if key in figures)
 
 
 class _How(NamedTuple):
-    """Alignment, and the distance of the relative error."""
+    """Alignment, distance of the relative error, file of the figure, and where messages go."""
 
     align: "Align"
     rpe_distance_m: float | None
+    plot: Path | None
+    terminal: Terminal
 
 
-def _score_run(
-    folder: Path, reference_file: Path | None, plot: Path | None, how: _How, *, quiet: bool
-) -> dict[str, Any]:
+def _score_run(folder: Path, reference_file: Path | None, how: _How) -> dict[str, Any]:
     from segslam.core.trajectory import rows_of_same_scan
-    from segslam.core.types import SegslamError
-    from segslam.output.accuracy import accuracy
+    from segslam.output.accuracy import accuracy, scores
     from segslam.output.finished import ACCURACY, plain_name, read_run, true_poses
     from segslam.output.folder import folder_of, write_metrics
-    from segslam.output.scores import scores
 
     folder = folder_of(folder)
     check_links(folder)
@@ -139,7 +133,7 @@ def _score_run(
             f"{reference_file or folder}: only {len(reference)} of {num_scans} scans have a pose; three are needed"
         )
     if len(reference) < num_scans:
-        say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose", quiet=quiet)
+        how.terminal.say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose")
     metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY}
     metrics |= figures
     trajectory = run.result.trajectory
@@ -147,10 +141,33 @@ def _score_run(
     matched, truth = trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]]
     if how.align == "se3":
         write_metrics(folder, metrics)
-    if plot is not None:
-        _draw(plot, matched, truth, "z")
+    if how.plot is not None:
+        _draw(how.plot, matched, truth, "z")
     more = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance_m)
     return more | metrics if how.align == "se3" else metrics | more
+
+
+def _score_folders(
+    estimates: Path, references: Path, score: Callable[[Path, Path], dict[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """The figures of each drive by name, in order, then their means over the drives, called `mean`.
+
+    A drive has a file `NAME.txt` in both folders, or `NAME/poses_kitti.txt` in the first, as run folders have. Raises
+    SegslamError if no drive has both.
+    """
+    rows: dict[str, dict[str, Any]] = {}
+    for true in sorted(references.glob("*.txt")):
+        made = [file for file in (estimates / true.name, estimates / true.stem / "poses_kitti.txt") if file.is_file()]
+        rows |= {true.stem: score(made[0], true)} if made else {}
+    if not rows:
+        raise SegslamError(
+            f"{estimates}: no drive has poses here and in {references}; give both files one name, 00.txt, or the "
+            "runs 00, 01, ..."
+        )
+    first, *others = rows.values()
+    numeric = [key for key, value in first.items() if isinstance(value, float) and all(key in row for row in others)]
+    mean = {key: sum(row[key] for row in rows.values()) / len(rows) for key in numeric}
+    return rows | ({"mean": mean} if len(rows) > 1 else {})
 
 
 def _draw(file: Path, estimate: "Poses", reference: "Poses", up: "Up") -> None:
@@ -166,15 +183,11 @@ def _score_files(
     format: Literal["kitti", "tum"] | None,
     up: "Up | None",
     max_difference_s: float,
-    plot: Path | None,
     how: _How,
-    *,
-    quiet: bool,
 ) -> dict[str, Any]:
     from segslam.core.evaluation import UP
     from segslam.core.trajectory import read_poses
-    from segslam.core.types import SegslamError
-    from segslam.output.scores import scores
+    from segslam.output.accuracy import scores
 
     estimate, reference = (read_poses(file, format=format) for file in (estimate_file, reference_file))
     if (estimate.stamp_ns is None) != (reference.stamp_ns is None):
@@ -196,11 +209,11 @@ def _score_files(
             f"poses of {reference_file}; at least three are needed. Check the files, or raise --max-difference"
         )
     if why:
-        say(f"{reference_file}: upward axis {direction} ({why}); for another: --up", quiet=quiet)
-    if plot is not None:
-        _draw(plot, matched, truth, direction or "z")
+        how.terminal.say(f"{reference_file}: upward axis {direction} ({why}); for another: --up")
+    if how.plot is not None:
+        _draw(how.plot, matched, truth, direction or "z")
     if not len(rows) == len(estimate) == len(reference):
-        say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}", quiet=quiet)
+        how.terminal.say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}")
     return figures | {"num_poses": len(rows), "up": direction}
 
 

@@ -1,21 +1,16 @@
-"""`segslam export`, and the map files of other commands."""
+"""`segslam export` and `convert`: maps and trajectories as files for other programs."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Literal
 
 import typer
 
-from segslam.cli.console import ConfigOption, JsonOption, QuietOption, SetOption, announce, print_json, progress, say
-from segslam.cli.overwriting import OverwriteOption, check_free
+from segslam.cli.checks import check_exists, check_free
+from segslam.cli.console import Terminal
+from segslam.cli.ending import map_summary
+from segslam.cli.options import OverwriteOption, Settings
 
-if TYPE_CHECKING:
-    from segslam.core.config import MapConfig
-    from segslam.output.log import RunLog
-
-WITH_MAP = ("map.ply", "map.png")
-"""Files that `--map` writes into the run folder."""
+FormatOf = Literal["kitti", "tum", "csv"] | None
 
 
 def export(
@@ -27,11 +22,10 @@ def export(
             "a georeferenced run also .tif (GeoTIFF), .geojson .kml .gpx (trajectory), map_projector_info.yaml."
         ),
     ],
-    config: ConfigOption = None,
-    settings: SetOption = None,
+    *,
+    changes: Settings,
     overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Write the map of a finished run: a point cloud, a top view, an occupancy grid for map_server.
 
@@ -40,38 +34,54 @@ def export(
     Example: segslam export runs/00 map.laz map.png grid.yaml --set map.color=height
     """
     check_free(files, overwrite=overwrite)
-    announce(f"export: reading {run}", quiet=quiet)
-    from segslam.core.config import load_config
-    from segslam.output.folder import log_of
+    terminal.announce(f"export: reading {run}")
+    from segslam.output.export import write_maps
     from segslam.output.log import read_log
 
-    log = read_log(log_of(run))
-    figures = write_maps(log, files, config=load_config(config, settings or (), base=log.config).map, quiet=quiet)
-    if json:
-        print_json(figures)
-    else:
-        say(map_summary(figures, files), quiet=quiet)
+    log = read_log(run)
+    figures = write_maps(log, files, config=changes.load(base=log.config).map, show=terminal.progress)
+    terminal.answer(figures, map_summary(figures, files))
 
 
-def write_maps(log: "RunLog", files: Sequence[Path], *, config: "MapConfig", quiet: bool) -> dict[str, Any]:
-    """As `segslam.output.export.write_maps`, with progress bars."""
-    from segslam.output.export import write_maps as write
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="Trajectory: KITTI, TUM or CSV format.")],
+    target: Annotated[
+        Path, typer.Argument(metavar="OUT", help="File to write; .csv, .tum and .kitti name their format.")
+    ],
+    *,
+    source_format: Annotated[
+        FormatOf, typer.Option("--from", help="Format of IN; detected by default from its columns.")
+    ] = None,
+    target_format: Annotated[
+        FormatOf, typer.Option("--to", help="Format of OUT; by default by its name, else TUM if there are stamps.")
+    ] = None,
+    times: Annotated[
+        Path | None, typer.Option(help="KITTI's times.txt: one time (s) a line, for poses without stamps.")
+    ] = None,
+    calib: Annotated[Path | None, typer.Option(help="KITTI's calib.txt, for --to-frame.")] = None,
+    to_frame: Annotated[
+        Literal["camera", "lidar"] | None,
+        typer.Option(help="Write poses of the LiDAR for those of the camera, or the reverse; needs --calib."),
+    ] = None,
+    overwrite: OverwriteOption = False,
+    terminal: Terminal,
+) -> None:
+    """Convert a trajectory between KITTI, TUM and CSV, and between the frames of camera and LiDAR.
 
-    return write(log, files, config=config, show=partial(_shown, quiet=quiet))
+    Example: segslam convert poses/00.txt 00.tum --times sequences/00/times.txt
+    """
+    check_exists(source, "give a trajectory")
+    check_free([target], overwrite=overwrite)
+    terminal.announce(f"convert: reading {source}")
+    from segslam.output.conversion import convert as convert_file
 
-
-def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
-    """Summary of the map."""
-    written = f"map in {', '.join(str(file) for file in files)}"
-    if "num_map_points" not in figures:
-        return written
-    removed = figures["num_map_moving_points"], figures["num_map_voxels_seen_through"]
-    return (
-        f"map of {figures['num_map_points']} points in {figures['map_seconds']:.1f} s; removed as moving: "
-        f"{removed[0]} points by class, {removed[1]} voxels that other scans see through\n"
-        f"{written}"
+    num_poses = convert_file(
+        source,
+        target,
+        source_format=source_format,
+        target_format=target_format,
+        times=times,
+        calib=calib,
+        to=to_frame,
     )
-
-
-def _shown(items: "Iterable[Any]", total: int, title: str, *, quiet: bool) -> "Iterator[Any]":
-    return progress(items, total=total, title=title, quiet=quiet)
+    terminal.answer({"num_poses": num_poses, "file": str(target)}, f"{num_poses} poses in {target}")

@@ -1,54 +1,31 @@
 """`segslam label`."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import logging
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from segslam.cli.console import (
-    ConfigOption,
-    DatasetOption,
-    EncodingOption,
-    FramesOption,
-    JsonOption,
-    LabelsOption,
-    QuietOption,
-    SequenceOption,
-    SetOption,
-    announce,
-    print_json,
-    progress,
-)
-from segslam.cli.overwriting import OverwriteOption
+from segslam.cli.console import Terminal
+from segslam.cli.options import EncodingOption, LabelsOption, OverwriteOption, ScanOptions, Settings
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.core.types import Labels, Scan
     from segslam.labels.encodings import Encoding
     from segslam.scans import Dataset
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Labelled:
-    """A usable scan, its labels and, if requested, its true labels; one row per usable point."""
-
-    row: int
-    scan: "Scan"
-    labels: "Labels"
-    truth: "Labels | None"
-    seconds: float
+logger = logging.getLogger(__name__)
 
 
 def label(
     data: Annotated[Path, typer.Argument(help="KITTI folder (with sequences/), folder of scans, or recording.")],
+    *,
     out: Annotated[Path, typer.Option(help="New folder for the labels and pictures.")],
     labels: LabelsOption,
     truth: Annotated[Path | None, typer.Option(help="Folder of true .label files to compare with.")] = None,
-    dataset: DatasetOption = None,
-    sequence: SequenceOption = "00",
-    frames: FramesOption = None,
-    topic: Annotated[str, typer.Option(help="Point cloud topic, if the recording has more than one.")] = "",
+    options: ScanOptions,
     encoding: EncodingOption = None,
     truth_encoding: Annotated[
         Literal["raw", "learning", "learning-0"] | None,
@@ -58,57 +35,36 @@ def label(
         Literal["raw", "learning", "learning-0"], typer.Option(help="Numbering of the written label files.")
     ] = "raw",
     pictures: Annotated[int, typer.Option(min=0, help="Number of scans to draw, spread evenly over the drive.")] = 1,
-    config: ConfigOption = None,
-    settings: SetOption = None,
+    changes: Settings,
     overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Label scans: write a .label file per scan and pictures, and measure the accuracy if true labels are given.
 
     Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
     """
-    announce(f"label: opening {data}", quiet=quiet)
-    from segslam.core.config import load_config
-    from segslam.core.types import SegslamError
+    terminal.announce(f"label: opening {data}")
     from segslam.output.folder import new_folder
-    from segslam.scans import open_dataset
 
-    settings_now = load_config(config, settings or ())
+    angle_deg = changes.load().sensor.vertical_angle_deg
 
     def opened(source: str, numbering: "Encoding | None") -> "Dataset":
-        return open_dataset(
-            data,
-            sequence=sequence,
-            dataset=dataset,
-            labels=source,
-            encoding=numbering,
-            frames=frames,
-            topic=topic,
-            vertical_angle_deg=settings_now.sensor.vertical_angle_deg,
-        )
+        return options.source(data, source, numbering, vertical_angle_deg=angle_deg).open()
 
     scans = opened(labels, encoding)
     true_scans = _open_truth(truth, truth_encoding, opened) if truth else None
     folder = out if overwrite and out.is_dir() else new_folder(out)
-    tally = Tally(scans, folder, write_as=write_as, num_pictures=pictures)
-    found = _labelled(scans, true_scans)
-    for one in progress(found, total=len(scans), title="label", quiet=quiet):
-        if one is not None:
-            tally.add(one)
+    tally = Tally(scans, true_scans, folder, write_as=write_as, num_pictures=pictures)
+    for row in terminal.progress(range(len(scans)), len(scans), "label"):
+        tally.add(row)
     if not tally.seconds:
         raise SegslamError(f"{data}: none of the {len(scans)} scans could be labelled; see the warnings above")
     figures = tally.figures()
-    if json:
-        print_json(figures)
-    elif not quiet:
-        print(_table(figures, folder))
+    terminal.table(figures, _table(figures, folder))
 
 
 def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Dataset":
     """The same scans with their true labels. A relative folder is searched here, then beside the scans."""
-    from segslam.core.types import SegslamError
-
     try:
         scans: Dataset = opened(str(truth.expanduser().absolute() if truth.is_dir() else truth), numbering)
     except SegslamError as error:
@@ -118,40 +74,24 @@ def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Data
     return scans
 
 
-def _labelled(scans: "Dataset", true_scans: "Dataset | None") -> Iterator[Labelled | None]:
-    """Each scan with its labels; None, with a warning, for an unusable scan."""
-    import logging
-    from time import perf_counter
-
-    from segslam.core.types import BadScan
-    from segslam.labels import geometric_labels
-    from segslam.labels.late import computed
-
-    for row in range(len(scans)):
-        try:
-            scan = scans[row]
-            truth = None if true_scans is None else computed(true_scans[row].labels)
-        except BadScan as error:
-            logging.getLogger(__name__).warning("%s; skipped", error)
-            yield None
-            continue
-        started = perf_counter()
-        labels = computed(scan.labels)
-        if scans.labels.geometric and not labels.any():
-            labels = geometric_labels(scan.points)
-        yield Labelled(row, scan, labels, truth, perf_counter() - started)
-
-
 class Tally:
-    """Writes the labels of each scan, and counts classes and confusions."""
+    """Labels scans, writes their labels, and counts classes and confusions."""
 
-    def __init__(self, scans: "Dataset", folder: Path, *, write_as: "Encoding", num_pictures: int) -> None:
+    def __init__(
+        self,
+        scans: "Dataset",
+        true_scans: "Dataset | None",
+        folder: Path,
+        *,
+        write_as: "Encoding",
+        num_pictures: int,
+    ) -> None:
         import numpy as np
 
         from segslam.core.types import Label
         from segslam.labels.scores import NUM_CLASSES
 
-        self._scans = scans
+        self._scans, self._true_scans = scans, true_scans
         self._folder = folder
         self._encoding = write_as
         self._drawn = set(np.linspace(0, len(scans) - 1, num_pictures).astype(int).tolist())
@@ -159,22 +99,35 @@ class Tally:
         self._confusion = np.zeros((NUM_CLASSES, NUM_CLASSES), np.int64)
         self.seconds: list[float] = []
 
-    def add(self, one: Labelled) -> None:
-        """Write the labels, and the picture if the scan was selected for drawing."""
+    def add(self, row: int) -> None:
+        """Label a scan; a warning for an unusable one. It is drawn if it was selected for drawing."""
         import numpy as np
 
+        from segslam.core.types import BadScan
         from segslam.core.whole_files import write_whole
+        from segslam.labels import geometric_labels
         from segslam.labels.label_files import write_labels
+        from segslam.labels.late import computed
         from segslam.labels.scores import confusion
 
-        self.seconds.append(one.seconds)
-        self._num_points += np.bincount(one.labels, minlength=len(self._num_points))
-        if one.truth is not None:
-            self._confusion += confusion(one.labels, one.truth)
-        name = self._scans.names[one.row]
-        write_labels(self._folder / f"{name}.label", one.labels, one.scan.kept, self._encoding)
-        if one.row in self._drawn:
-            write_whole(self._folder / f"{name}.png", self._picture(one))
+        try:
+            scan = self._scans[row]
+            truth = None if self._true_scans is None else computed(self._true_scans[row].labels)
+        except BadScan as error:
+            logger.warning("%s; skipped", error)
+            return
+        started = perf_counter()
+        labels = computed(scan.labels)
+        if self._scans.labels.geometric and not labels.any():
+            labels = geometric_labels(scan.points)
+        self.seconds.append(perf_counter() - started)
+        self._num_points += np.bincount(labels, minlength=len(self._num_points))
+        if truth is not None:
+            self._confusion += confusion(labels, truth)
+        name = self._scans.names[row]
+        write_labels(self._folder / f"{name}.label", labels, scan.kept, self._encoding)
+        if row in self._drawn:
+            write_whole(self._folder / f"{name}.png", self._picture(name, scan, labels, truth))
 
     def figures(self) -> dict[str, Any]:
         """Shares of the classes and time; with true labels also scores, and `confusion.csv` is written."""
@@ -184,6 +137,7 @@ class Tally:
 
         from segslam.core.types import Label
         from segslam.labels.scores import class_scores, group_scores, largest_confusions
+        from segslam.output.folder import write_csv
 
         shares = self._num_points / self._num_points.sum()
         most_first = np.argsort(-shares, kind="stable")
@@ -196,7 +150,9 @@ class Tally:
         counts = self._confusion
         if not counts.any():
             return figures
-        _write_confusion(self._folder / "confusion.csv", counts)
+        names = [label.name.lower() for label in list(Label)[: len(counts)]]
+        rows = ([name, *row] for name, row in zip(names[1:], counts[1:].tolist(), strict=True))
+        write_csv(self._folder / "confusion.csv", ["truth \\ label", *names], rows)
         by_class = class_scores(counts)
         known = [by_class[Label(int(i)).name.lower()] for i in np.flatnonzero(counts.sum(axis=1))]
         return figures | {
@@ -210,25 +166,13 @@ class Tally:
             ],
         }
 
-    def _picture(self, one: Labelled) -> bytes:
+    def _picture(self, name: str, scan: "Scan", labels: "Labels", truth: "Labels | None") -> bytes:
         from segslam.output.report.labels import draw_labels, fitting_image
 
         network = self._scans.labels.network
-        image = network.settings if network else fitting_image(one.scan.points)
-        title = f"{self._scans.name}, scan {self._scans.names[one.row]}, {len(one.labels)} points"
-        return draw_labels(one.scan.points, one.labels, truth=one.truth, image=image, title=title)
-
-
-def _write_confusion(file: Path, counts: Any) -> None:
-    import csv
-
-    from segslam.core.types import Label
-
-    names = [label.name.lower() for label in list(Label)[: len(counts)]]
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["truth \\ label", *names])
-        writer.writerows([name, *row] for name, row in zip(names[1:], counts[1:].tolist(), strict=True))
+        image = network.settings if network else fitting_image(scan.points)
+        title = f"{self._scans.name}, scan {name}, {len(labels)} points"
+        return draw_labels(scan.points, labels, truth=truth, image=image, title=title)
 
 
 def _table(figures: dict[str, Any], folder: Path) -> str:

@@ -2,38 +2,33 @@
 
 import json as json_text
 import shlex
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import median
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists
-from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import announce, how_to_go_on, say
-from segslam.cli.ending import finish
-from segslam.cli.foxglove import serve_foxglove
-from segslam.cli.gnss_options import GnssOptions
-from segslam.cli.live_status import LiveFigures, Status, too_slow
-from segslam.cli.overwriting import check_free, make_room
+from segslam.cli.checks import check_exists, check_free, make_room
+from segslam.cli.console import Terminal, how_to_go_on
+from segslam.cli.ending import counted, finish
+from segslam.cli.georeference import GnssOptions
+from segslam.cli.options import PresetOption, RunOutput
 from segslam.cli.preset import live_config
-from segslam.cli.run_options import OutputOptions, PresetOption
-from segslam.cli.shared_options import with_options
-from segslam.cli.view import check_display, close_scene, open_scene
+from segslam.cli.viewers import check_display, close_scene, open_scene, serve_foxglove
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.extras import how_to_install
 from segslam.core.interrupts import stopped_by_signals, when_stopped
 
 if TYPE_CHECKING:
-    from segslam.core.config import Config
     from segslam.core.types import BadScan, Step
     from segslam.output.foxglove_server import FoxgloveServer
     from segslam.output.viewer import Scene
-    from segslam.registration.prepared import Labeller
-    from segslam.run.live import Front, LiveMap, Source
+    from segslam.run.live import Ended, Front, LiveMap, Placed, Source
     from segslam.run.live.live_map import Show
     from segslam.run.live.ros import MappingPublisher
     from segslam.run.run import Run
@@ -46,9 +41,15 @@ MAP_SO_FAR = "map_so_far.ply"
 """Written by the service `/segslam/save_map`."""
 FINAL_SEARCH_S = 60.0
 """Chosen: the last search for loops ends after this time, so that the results of a live run are soon complete."""
+LINE_EVERY_S, BAR_EVERY_S = 10.0, 0.2
+LATE_S = 5.0
+"""Larger delays of loop closing are shown."""
+MANY_DROPPED = 0.02
+"""Chosen: share of dropped scans above which a faster odometry is recommended."""
+COARSER = 1.5
+"""Measured: KISS-ICP with voxels of 1.5 m takes 0.36 to 0.50 of the time that it takes with 1 m (docs/live.md)."""
 
 
-@with_options
 def live(
     out: Annotated[Path, typer.Option(help="New folder for the run.")],
     *,
@@ -63,99 +64,52 @@ def live(
     ] = None,
     labels: Annotated[str, typer.Option("--labels", help="Labels: geometric (auto is the same) or none.")] = "auto",
     preset: PresetOption = "auto",
-    options: OutputOptions,
+    output: RunOutput,
     gnss: GnssOptions,
+    terminal: Terminal,
 ) -> None:
     """Map scans while they arrive. Ctrl-C or SIGTERM finishes the run.
 
     Example: segslam live /data/scans --out runs/now --idle 10
     """
-    quiet = options.quiet
-    if options.view:
+    if output.view:
         check_display()
     _check_source(folder, topic, out)
     if gnss.gnss is not None:
         _check_ros("--gnss")
-    options.load_config()  # reports a wrong setting before the scans are looked at
+    output.load()  # reports a wrong setting before the scans are looked at
     if labels not in ("auto", "geometric", "none"):
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
-    announce("live: starting", quiet=quiet)
-    settings = options.load_config(base=live_config(preset, folder, topic, quiet=quiet))
+    terminal.announce("live: starting")
+    settings = output.load(base=live_config(preset, folder, topic, terminal))
+    from segslam.labels.label_files import unlabelled
     from segslam.output.folder import new_folder
-
-    map_names, map_files = options.maps(out)
-    check_free([file for file in map_files if out not in file.parents], overwrite=options.overwrite)
-    angle_deg = settings.sensor.vertical_angle_deg or 0.0
-    sensor = settings.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
-    settings = settings.model_copy(update={"sensor": sensor})
-    source = _source(folder, topic, intensities=settings.map.color == "intensity", vertical_angle_deg=angle_deg)
-    scene = open_scene(None, view_every=settings.log.view_every) if options.view else None
-    with ExitStack() as stack:
-        server = serve_foxglove(options.foxglove, stack, quiet=quiet)
-        make_room(out, overwrite=options.overwrite, inputs=[folder] if folder else [])
-        out = new_folder(out)
-        compile_kernels(quiet=quiet)
-        recorded = {
-            "labels": labels,
-            "live": source.name,
-            "map_files": json_text.dumps([str(name) for name in map_names]),
-        }
-        why = map_live(
-            source,
-            out,
-            settings=settings,
-            labeller=_unlabelled() if labels == "none" else None,
-            options=recorded,
-            idle_s=idle,
-            map_files=map_files,
-            scene=scene,
-            server=server,
-            gnss=gnss,
-            json=options.json,
-            quiet=quiet,
-        )
-    if scene:
-        close_scene(scene, None)
-    if why:
-        raise WorkFailed(f"{why}; the scans until then are mapped, results in {out}")
-
-
-def map_live(
-    source: "Source",
-    folder: Path,
-    *,
-    settings: "Config",
-    labeller: "Labeller | None",
-    options: dict[str, str],
-    idle_s: float | None,
-    map_files: list[Path],
-    scene: "Scene | None",
-    server: "FoxgloveServer | None",
-    gnss: GnssOptions,
-    json: bool,
-    quiet: bool,
-) -> str:
-    """Map the scans of a source into a new folder until it ends. Returns the reason if it failed, otherwise "".
-
-    Raises SegslamError if the source cannot be opened or no scan arrived; the folder is then removed.
-    """
     from segslam.run.live import Front, LiveMap
     from segslam.run.run import Run
     from segslam.slam.slam import Slam
 
-    go_on = f"make the results from the log: segslam replay {shlex.quote(str(folder))} --out NEW"
-    when_stopped(f"the log in {folder} is kept; {go_on}")
-    slam = Slam(settings, labeller=labeller)
-
-    def tell(text: str) -> None:
-        say(text, quiet=quiet)
-
-    with how_to_go_on(go_on), ExitStack() as stack:
+    map_names, map_files = output.maps(out)
+    check_free([file for file in map_files if out not in file.parents], overwrite=output.overwrite)
+    angle_deg = settings.sensor.vertical_angle_deg or 0.0
+    sensor = settings.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
+    settings = settings.model_copy(update={"sensor": sensor})
+    source = _source(folder, topic, intensities=settings.map.color == "intensity", vertical_angle_deg=angle_deg)
+    recorded = {"labels": labels, "live": source.name, "map_files": json_text.dumps([str(name) for name in map_names])}
+    scene = open_scene(None, view_every=settings.log.view_every) if output.view else None
+    with ExitStack() as stack:
+        server = serve_foxglove(output.foxglove, stack, terminal)
+        make_room(out, overwrite=output.overwrite, inputs=[folder])
+        out = new_folder(out)
+        terminal.compile_kernels()
+        slam = Slam(settings, labeller=(lambda points: unlabelled(len(points))) if labels == "none" else None)
+        go_on = f"make the results from the log: segslam replay {shlex.quote(str(out))} --out NEW"
+        when_stopped(f"the log in {out} is kept; {go_on}")
+        stack.enter_context(how_to_go_on(go_on))
         mirror = server.send if server else None
-        run = stack.enter_context(Run(folder, slam, dataset=source.name, options=options, mirror=mirror))
+        run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
         publisher = _publisher(source, run, stack)
         place = gnss.placing_live(stack)
-        front = stack.enter_context(Front(source, settings, tell=tell, idle_s=idle_s))
+        front = stack.enter_context(Front(source, settings, tell=terminal.say, idle_s=idle))
         stops: list[bool] = []
 
         def stop() -> None:
@@ -164,40 +118,38 @@ def map_live(
 
         stack.enter_context(stopped_by_signals(stop))
         front.wait_until_ready()
-        tell(f"{source.name}: waiting for scans; Ctrl-C ends the run")
-        shows = _shows(server, publisher)
-        with LiveMap(shows, view_every=settings.log.view_every) as live_map:
-            watch = _watch(run, scene, live_map, publisher)
-            figures = _follow(front, run, watch, quiet=quiet)
+        terminal.say(f"{source.name}: waiting for scans; Ctrl-C ends the run")
+        with LiveMap(_shows(server, publisher), view_every=settings.log.view_every) as live_map:
+            figures = _follow(front, run, _watch(run, scene, live_map, publisher), terminal)
         ended = front.ended
         if run.num_steps == 0:
             raise SegslamError(f"{source.name}: no scan was mapped{f' ({ended.why})' if ended.why else ''}")
         if ended.why and not ended.failed:
-            say(f"{source.name}: {ended.why}", quiet=quiet)
+            terminal.say(f"{source.name}: {ended.why}")
         for file in map_files:
             file.parent.mkdir(parents=True, exist_ok=True)
-
         more = figures.metrics(ended, num_restarts=front.num_restarts)
         finish(
             run,
-            None,
+            terminal,
             map_files=map_files,
-            json=json,
-            quiet=quiet,
             more=lambda _: more,
             search_s=FINAL_SEARCH_S,
             stopped=bool(stops),
             place=place,
         )
         if advice := too_slow(more, settings.odometry.voxel_size_m):
-            say(advice, quiet=quiet)
-    return ended.why if ended.failed else ""
+            terminal.say(advice)
+    if scene:
+        close_scene(scene, None)
+    if ended.failed:
+        raise WorkFailed(f"{ended.why}; the scans until then are mapped, results in {out}")
 
 
-def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]", *, quiet: bool) -> LiveFigures:
+def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]", terminal: Terminal) -> "LiveFigures":
     """Close the loops of each scan with a pose, log it and show it."""
     figures = LiveFigures()
-    with Status(quiet=quiet) as status:
+    with Status(terminal) as status:
         for placed in front:
             tries_loops = front.num_keyframes_waiting < MOST_BEHIND
             watch(run.follow(placed.tracked, tries_loops=tries_loops))
@@ -275,7 +227,7 @@ def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertic
 def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublisher | None":
     """The publisher of path and map if the source is a topic; it also saves the map on request."""
     from segslam.run.live import FolderSource
-    from segslam.run.live.saved_map import save_map
+    from segslam.run.live.live_map import save_map
 
     if isinstance(source, FolderSource):
         return None
@@ -284,15 +236,109 @@ def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublis
     def save() -> str:
         file = run.folder / MAP_SO_FAR
         made = save_map(*run.map_so_far(), file, config=run.config.map)
-        return f"{file}: {made.num_points} points of {made.num_keyframes} keyframe{'s' * (made.num_keyframes != 1)}"
+        return f"{file}: {made.num_points} points of {counted(made.num_keyframes, 'keyframe')}"
 
     return stack.enter_context(MappingPublisher(save))
 
 
-def _unlabelled() -> "Labeller":
-    from segslam.labels.label_files import unlabelled
+class LiveFigures:
+    """Latencies, delays and counts of a live run."""
 
-    def labeller(points: Any) -> Any:
-        return unlabelled(len(points))
+    def __init__(self) -> None:
+        self._latency_ms: list[float] = []
+        self._lag_s: list[float] = []
+        self._num_unsearched = 0
+        self._started = monotonic()
+        self.num_dropped = self.num_missing = 0
 
-    return labeller
+    def note(self, placed: "Placed", *, lag_s: float, tries_loops: bool) -> None:
+        """Record a scan that was mapped and logged."""
+        from segslam.odometry import Tracked
+
+        self._latency_ms.append(1000 * placed.latency_s)
+        self._lag_s.append(lag_s)
+        is_keyframe = isinstance(placed.tracked, Tracked) and placed.tracked.registered is not None
+        self._num_unsearched += is_keyframe and not tries_loops
+        self.num_dropped, self.num_missing = placed.num_dropped, placed.gaps.num_missing
+
+    def metrics(self, ended: "Ended", *, num_restarts: int) -> dict[str, Any]:
+        """The figures of `metrics.json` that only live runs have."""
+        num_dropped = max(self.num_dropped, ended.num_dropped)
+        return {
+            "num_scans_arrived": ended.num_arrived or len(self._lag_s) + num_dropped,
+            "num_scans_dropped": num_dropped,
+            "num_scans_missing": max(self.num_missing, ended.gaps.num_missing),
+            "num_gaps": ended.gaps.num_gaps,
+            "longest_gap_s": ended.gaps.longest_gap_s,
+            "num_clock_set": ended.gaps.num_clock_set,
+            "num_restarts": num_restarts,
+            "num_keyframes_unsearched": self._num_unsearched,
+            "latency_ms": _spread(self._latency_ms),
+            "loop_lag_s": _spread(self._lag_s),
+        }
+
+    def line(self) -> str:
+        """The status in one line."""
+        num = len(self._lag_s)
+        rate = num / max(monotonic() - self._started, 1e-9)
+        text = f"live: {num} scans, {rate:.1f}/s"
+        if num:
+            text += f", pose {median(self._latency_ms[-20:]):.0f} ms after the scan"
+            if self._lag_s[-1] > LATE_S:
+                text += f", loops {self._lag_s[-1]:.1f} s behind"
+        if self.num_dropped:
+            text += f", {self.num_dropped} dropped"
+        if self.num_missing:
+            text += f", {self.num_missing} missing"
+        return text
+
+
+def too_slow(metrics: Mapping[str, Any], voxel_size_m: float) -> str:
+    """Advice after a run whose odometry dropped many scans; empty if it dropped few, or because a process died."""
+    num_dropped, num_arrived = metrics["num_scans_dropped"], metrics["num_scans_arrived"]
+    if num_dropped <= MANY_DROPPED * num_arrived or metrics.get("num_restarts"):
+        return ""
+    return (
+        f"{num_dropped} of {num_arrived} scans were dropped because odometry took too long; "
+        f"--set odometry.voxel_size_m={COARSER * voxel_size_m:g} takes about half the time"
+    )
+
+
+class Status:
+    """Status line that is updated on a terminal, printed every ten seconds elsewhere; a context manager."""
+
+    def __init__(self, terminal: Terminal) -> None:
+        self._terminal = terminal
+        self._shown = monotonic()
+        self._bar: Any = None
+
+    def __enter__(self) -> "Status":
+        if not self._terminal.quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import Progress, SpinnerColumn, TextColumn
+
+            columns = (SpinnerColumn(), TextColumn("{task.description}"))
+            self._bar = Progress(*columns, console=Console(stderr=True)).__enter__()
+            self._task = self._bar.add_task("live: no scan yet", total=None)
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(*failure)
+
+    def show(self, figures: LiveFigures) -> None:
+        """Show the status if it is due."""
+        now = monotonic()
+        if now - self._shown < (LINE_EVERY_S if self._bar is None else BAR_EVERY_S):
+            return
+        self._shown = now
+        if self._bar is None:
+            self._terminal.say(figures.line())
+        else:
+            self._bar.update(self._task, description=figures.line())
+
+
+def _spread(values: list[float]) -> dict[str, float]:
+    """Median, 95th percentile and maximum."""
+    ordered = sorted(values)
+    return {"median": median(ordered), "p95": ordered[int(0.95 * (len(ordered) - 1))], "max": ordered[-1]}

@@ -1,34 +1,95 @@
-"""`segslam locate`."""
+"""`segslam locate` and `register`: poses of single scans, in a map or in another scan."""
 
+from dataclasses import dataclass
 from json import dumps
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
+from segslam.bench.experiments.method_settings import METHOD_NAMES, check_method
 from segslam.cli.checks import check_exists
-from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import EncodingOption, QuietOption, announce, print_out, progress, say
+from segslam.cli.completion import labels_or_files, methods, one_of
+from segslam.cli.console import Terminal, print_json, print_out, say
+from segslam.cli.options import EncodingOption, Settings
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
-    from segslam.core.types import Labels, Points, Rejected
+    from segslam.bench.experiments.estimate import Estimate
+    from segslam.core.config import Config
+    from segslam.core.stopwatch import Stopwatch
+    from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels
     from segslam.run.locator import Located, Locator
+
+LABEL_WORDS = ("geometric", "none")
+
+
+@dataclass(frozen=True)
+class _ListTerminal(Terminal):
+    """As `Terminal`; the figures are those of several scans."""
+
+    json: Annotated[
+        bool,
+        typer.Option("--json", help="Print a JSON list with one object per scan on standard output, and nothing else."),
+    ] = False
+
+
+@dataclass(frozen=True)
+class ScanFileOptions:
+    """What the scans of both commands have in common."""
+
+    dataset: Annotated[
+        str | None,
+        typer.Option(autocompletion=one_of("kitti"), help="kitti: apply KITTI's correction of the vertical angles."),
+    ] = None
+    encoding: EncodingOption = None
+
+    def check(self) -> None:
+        """Raises SegslamError for an unknown kind of data."""
+        if self.dataset not in (None, "kitti"):
+            raise SegslamError(
+                f"--dataset {self.dataset}: only kitti needs a correction; omit the option for other data"
+            )
+
+    def ready(self, file: Path, points: "Points", labels: "ScanLabels", config: "Config") -> "Scan":
+        """The usable points of a file, corrected, and their labels."""
+        from segslam.scans.dataset import make_scan
+        from segslam.scans.kitti import VERTICAL_ANGLE_DEG
+
+        angle_deg = config.sensor.vertical_angle_deg
+        if angle_deg is None:
+            angle_deg = VERTICAL_ANGLE_DEG if self.dataset == "kitti" else 0.0
+        return make_scan(file, 0, 0, points, labels, vertical_angle_deg=angle_deg)
+
+
+class LabelsCommand(TyperCommand):
+    """Accepts `--labels S T` as well as `--labels geometric`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Repeat the option before its second value, because click accepts one value per option."""
+        if "--labels" in args:
+            second = args.index("--labels") + 2
+            if second < len(args) and not _is_word(args[second - 1]) and not args[second].startswith("-"):
+                args = [*args[:second], "--labels", *args[second:]]
+        return super().parse_args(ctx, args)
+
+
+def _is_word(label_source: str) -> bool:
+    """True if the value is a labelling method for both scans, not a file."""
+    return label_source in LABEL_WORDS or label_source.startswith("network:")
 
 
 def locate(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run, or its log.mcap.")],
     scans: Annotated[list[Path], typer.Argument(help="Scans to locate: .bin, .npy, .ply or .pcd.")],
-    dataset: Annotated[str | None, typer.Option(help="kitti: apply KITTI's correction of the vertical angles.")] = None,
+    *,
     labels: Annotated[
         str, typer.Option(help="Labels: geometric, none, or a folder of .label files named like the scans.")
     ] = "geometric",
-    encoding: EncodingOption = None,
-    json: Annotated[
-        bool,
-        typer.Option("--json", help="Print a JSON list with one object per scan on standard output, and nothing else."),
-    ] = False,
-    quiet: QuietOption = False,
+    files: ScanFileOptions,
+    terminal: _ListTerminal,
 ) -> None:
     """Find the poses of single scans in a finished run, without an initial guess. Exit status 1 if none is found.
 
@@ -36,21 +97,18 @@ def locate(
     """
     for scan in scans:
         check_exists(scan, "give scan files")
-    announce(f"locate: reading {run}", quiet=quiet)
-    from segslam.core.types import SegslamError
-    from segslam.output.folder import folder_of
+    terminal.announce(f"locate: reading {run}")
     from segslam.run.locator import Locator
 
-    if dataset not in (None, "kitti"):
-        raise SegslamError(f"--dataset {dataset}: only kitti needs a correction; omit the option for other data")
-    locator = Locator.from_run(folder_of(run))
-    compile_kernels(quiet=quiet)
+    files.check()
+    locator = Locator.from_run(run)
+    terminal.compile_kernels()
     num_bad = 0
     found = []
-    for scan in progress(scans, total=len(scans), title="locate", quiet=quiet):
+    for scan in terminal.progress(scans, len(scans), "locate"):
         started = perf_counter()
         try:
-            points, classes = _read(scan, scans, dataset, labels, encoding, locator)
+            points, classes = _read_one(scan, scans, labels, files, locator)
         except SegslamError as error:
             num_bad += 1
             found.append(
@@ -58,19 +116,71 @@ def locate(
             )
         else:
             started = perf_counter()
-            found.append(_figures(locator.locate(points, classes)) | {"seconds": perf_counter() - started})
-    if json:
+            found.append(_place(locator.locate(points, classes)) | {"seconds": perf_counter() - started})
+    if terminal.json:
         print_out(dumps(found, allow_nan=False))
     else:
-        _show(scans, found, quiet=quiet)
+        _show_places(scans, found, terminal)
     if num_bad:
         raise SegslamError(f"{num_bad} of {len(scans)} scans cannot be read; copy the files again, or omit them")
     if not any(one["found"] for one in found):
         raise typer.Exit(1)
 
 
-def _read(
-    scan: Path, scans: list[Path], dataset: str | None, labels: str, encoding: Any, locator: "Locator"
+def register(
+    source: Annotated[Path, typer.Argument(help="Scan to align: .bin, .npy, .ply or .pcd.")],
+    target: Annotated[Path, typer.Argument(help="Fixed scan.")],
+    *,
+    labels: Annotated[
+        list[str] | None,
+        typer.Option(
+            autocompletion=labels_or_files,
+            help="Labels: two .label files (source, target), geometric (default), network:MODEL.onnx, or none.",
+        ),
+    ] = None,
+    files: ScanFileOptions,
+    method: Annotated[
+        str, typer.Option(autocompletion=methods, help=f"Method: {', '.join(METHOD_NAMES)}.")
+    ] = "segregator-c2f",
+    refine: Annotated[
+        bool, typer.Option("--refine/--no-refine", help="Refine the coarse pose with GICP (method segregator-c2f).")
+    ] = True,
+    changes: Settings,
+    terminal: Terminal,
+) -> None:
+    """Find the pose of one scan in another, without an initial guess. Exit status 1 if no pose is found.
+
+    Example: segslam register 000000.bin 004413.bin --dataset kitti --labels 000000.label 004413.label
+    """
+    for scan in (source, target):
+        check_exists(scan, "give two scan files")
+    check_method(method)
+    settings = changes.load()
+    terminal.announce(f"register: reading {source} and {target}")
+    from segslam.bench.experiments.methods import find_method, prepare_parts
+    from segslam.core.stopwatch import Stopwatch
+
+    if method == "segregator-c2f" and not refine:
+        method = "segregator"
+    chosen = find_method(method)
+    terminal.compile_kernels()
+    watch = Stopwatch()
+    clouds = _read_two(source, target, labels, files, settings, watch)
+    scans: list[dict[str, Any]] = []
+    for name, (points, classes) in zip(("source", "target"), clouds, strict=True):
+        with watch(f"describe_{name}"):
+            parts = prepare_parts(points, classes, methods=[method], config=settings)
+        scans.append({part: made.value for part, made in parts.items()})
+    found = chosen.align(scans[0], scans[1], settings, watch)
+    figures = _pose(found, watch)
+    _show_pose(figures, terminal)
+    if not figures["accepted"]:
+        say(f"rejected: {figures['reason']} ({figures['detail']})")
+        raise typer.Exit(1)
+
+
+def _read_one(
+    scan: Path, scans: list[Path], labels: str, files: ScanFileOptions, locator: "Locator"
 ) -> tuple["Points", "Labels | None"]:
     """Points of a scan and their labels; None for labels if they are to be computed from geometry."""
     import numpy as np
@@ -78,24 +188,60 @@ def _read(
     from segslam.labels.label_files import encoding_of, read_labels
     from segslam.labels.late import computed
     from segslam.scans.clouds import read_cloud
-    from segslam.scans.dataset import make_scan
-    from segslam.scans.kitti import VERTICAL_ANGLE_DEG
 
-    angle_deg = locator.config.sensor.vertical_angle_deg
-    if angle_deg is None:
-        angle_deg = VERTICAL_ANGLE_DEG if dataset == "kitti" else 0.0
     points = read_cloud(scan)
     ids = np.zeros(len(points), np.uint8)
-    if labels not in ("geometric", "none"):
-        files = [Path(labels) / f"{one.stem}.label" for one in scans]
-        for file in files:
+    if labels not in LABEL_WORDS:
+        named = [Path(labels) / f"{one.stem}.label" for one in scans]
+        for file in named:
             check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
-        ids = read_labels(Path(labels) / f"{scan.stem}.label", len(points), encoding or encoding_of(files))
-    ready = make_scan(scan, 0, 0, points, ids, vertical_angle_deg=angle_deg)
+        numbering = files.encoding or encoding_of(named)
+        ids = read_labels(Path(labels) / f"{scan.stem}.label", len(points), numbering)
+    ready = files.ready(scan, points, ids, locator.config)
     return ready.points, None if labels == "geometric" else computed(ready.labels)
 
 
-def _figures(found: "Located | Rejected") -> dict[str, Any]:
+def _read_two(
+    source: Path,
+    target: Path,
+    labels: list[str] | None,
+    files: ScanFileOptions,
+    config: "Config",
+    watch: "Stopwatch",
+) -> list[tuple["Points", "Labels"]]:
+    """Points and labels of the two scans."""
+    from segslam.labels import geometric_labels
+    from segslam.labels.label_files import encoding_of, open_labels, read_labels
+    from segslam.labels.late import computed
+    from segslam.scans.clouds import read_cloud, read_intensities
+
+    files.check()
+    both = (source, target)
+    stored = [read_cloud(file) for file in both]
+    words = labels or ["geometric"]
+    classes: list[ScanLabels]
+    if len(words) == 2:
+        named = [Path(word) for word in words]
+        numbering = files.encoding or encoding_of(named)
+        classes = [read_labels(file, len(points), numbering) for file, points in zip(named, stored, strict=True)]
+    elif _is_word(words[0]):
+        labeller = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None)
+        classes = [
+            labeller.read(file.stem, points, read_intensities(file)) for file, points in zip(both, stored, strict=True)
+        ]
+    else:
+        raise SegslamError(
+            f"--labels {words[0]}: give two .label files, source and target, or geometric, or network:MODEL"
+        )
+    scans = [files.ready(file, points, ids, config) for file, points, ids in zip(both, stored, classes, strict=True)]
+    with watch("label"):
+        return [
+            (scan.points, geometric_labels(scan.points) if words[0] == "geometric" else computed(scan.labels))
+            for scan in scans
+        ]
+
+
+def _place(found: "Located | Rejected") -> dict[str, Any]:
     from segslam.core.types import Rejected
 
     if isinstance(found, Rejected):
@@ -121,15 +267,48 @@ def _not_found(
     return {"found": False, **nothing, **judged, "reason": reason, "detail": detail}
 
 
-def _show(scans: list[Path], found: list[dict[str, Any]], *, quiet: bool) -> None:
+def _show_places(scans: list[Path], found: list[dict[str, Any]], terminal: Terminal) -> None:
     """Print file and pose of each scan on standard output, and details on standard error."""
     for scan, one in zip(scans, found, strict=True):
         if one["found"]:
             print_out(f"{scan} " + " ".join(f"{value:.6f}" for value in one["T_world_lidar"]))
-            say(
+            terminal.say(
                 f"{scan}: at keyframe {one['keyframe']}, {one['inliers']} inliers, overlap {one['overlap']:.2f}, "
-                f"probability {one['probability']:.4f}, {1000 * one['seconds']:.0f} ms",
-                quiet=quiet,
+                f"probability {one['probability']:.4f}, {1000 * one['seconds']:.0f} ms"
             )
         else:
             say(f"{scan}: not found: {one['reason']} ({one['detail']})")
+
+
+def _pose(found: "Estimate | Rejected", watch: "Stopwatch") -> dict[str, Any]:
+    from segslam.core.types import Rejected
+
+    reason, detail, pose = None, None, None
+    if isinstance(found, Rejected):
+        reason, detail = found.reason.value, found.detail
+    else:
+        pose = found.T_target_source.ravel().tolist()
+    names = ("probability", "evidence", "num_correspondences", "num_edges", "num_inliers", "overlap")
+    shown = {key: getattr(found, key, None) for key in names}
+    answer = {"accepted": reason is None, "reason": reason, "detail": detail, "T_target_source": pose}
+    return answer | shown | {"seconds": watch.seconds}
+
+
+def _show_pose(figures: dict[str, Any], terminal: Terminal) -> None:
+    import numpy as np
+
+    from segslam.core.types import probability_text
+
+    if terminal.json:
+        print_json(figures)
+        return
+    if not figures["accepted"]:
+        return
+    rows = np.array(figures["T_target_source"]).reshape(4, 4)
+    print_out("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
+    overlap = "" if figures["overlap"] is None else f", overlap {figures['overlap']:.2f}"
+    times = ", ".join(f"{stage} {1000 * seconds:.0f} ms" for stage, seconds in figures["seconds"].items())
+    if figures["probability"] is not None:
+        terminal.say(probability_text(figures["probability"], figures["evidence"]))
+    inliers = "" if figures["num_inliers"] is None else f"{figures['num_inliers']} inliers{overlap}; "
+    terminal.say(f"{inliers}{times}")

@@ -1,35 +1,21 @@
-"""`segslam merge`."""
+"""`segslam merge` and `fleet`: several drives in one frame."""
 
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from segslam.cli.checks import check_exists
-from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import (
-    ConfigOption,
-    JsonOption,
-    QuietOption,
-    RefineMinutesOption,
-    SetOption,
-    announce,
-    progress,
-    say,
-    with_minutes,
-)
-from segslam.cli.ending import finish
-from segslam.cli.export import WITH_MAP
-from segslam.cli.overwriting import OverwriteOption, make_room
-from segslam.cli.run_options import WithMapOption
+from segslam.cli.checks import check_exists, make_room
+from segslam.cli.console import Terminal, print_out
+from segslam.cli.ending import finish, is_interrupted
+from segslam.cli.options import WITH_MAP, OverwriteOption, RunSettings, Settings, WithMapOption
+from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
 
 def merge(
     runs: Annotated[list[Path], typer.Argument(help="Folders of finished runs, two or more.", metavar="RUN RUN...")],
+    *,
     out: Annotated[Path, typer.Option(help="New folder for the merged run.")],
     same_reference: Annotated[
         bool,
@@ -37,13 +23,10 @@ def merge(
             "--same-reference", help="The true poses of all runs are in one frame: score the merged trajectory."
         ),
     ] = False,
-    refine_minutes: RefineMinutesOption = None,
     with_map: WithMapOption = False,
-    config: ConfigOption = None,
-    settings: SetOption = None,
+    changes: RunSettings,
     overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Merge runs that share places into one run: one frame, one map, one log.
 
@@ -55,44 +38,90 @@ def merge(
     """
     for folder in runs:
         check_exists(folder, "give the folders of finished runs")
-    from segslam.core.config import load_config
     from segslam.output.folder import check_new, new_folder
 
     if not overwrite:
         check_new(out)
-    settings = with_minutes(settings, refine_minutes)
-    load_config(config, settings)  # reports a wrong setting before the logs are read
-    announce(f"merge: reading {len(runs)} runs", quiet=quiet)
-    from segslam.run.sessions.merge import plan, run_of
+    changes.load()  # reports a wrong setting before the logs are read
+    terminal.announce(f"merge: reading {len(runs)} runs")
+    from segslam.run.sessions.merge import plan
     from segslam.run.sessions.recorded import read_sessions
 
     sessions = read_sessions(runs)
-    compile_kernels(quiet=quiet)
-    settings_now = load_config(config, settings, base=sessions[0].run.config)
-    merged = plan(sessions, config=settings_now, same_reference=same_reference, progress=partial(_shown, quiet=quiet))
-    say(merged.summary(), quiet=quiet)
+    terminal.compile_kernels()
+    settings = changes.load(base=sessions[0].run.config)
+    merged = plan(sessions, config=settings, same_reference=same_reference, progress=terminal.progress)
+    terminal.say(merged.summary())
     make_room(out, overwrite=overwrite, inputs=runs)
     folder = new_folder(out)
     when_stopped(f"the log in {folder} is kept, without results")
-    with run_of(merged, folder, settings_now) as run:
-        interrupted = True
-        with suppress(KeyboardInterrupt):
-            for _ in progress(run.take(merged.steps()), total=merged.num_steps, title="merge", quiet=quiet):
-                pass
-            interrupted = False
-        if interrupted:
+    with merged.begun(folder, settings) as run:
+        if is_interrupted(terminal.progress(run.take(merged.steps()), merged.num_steps, "merge")):
             raise typer.Exit(EXIT_STATUS)
         files = [folder / name for name in WITH_MAP] if with_map else []
-        finish(
-            run,
-            merged.reference,
-            map_files=files,
-            json=json,
-            quiet=quiet,
-            more=merged.figures,
-            place=merged.georeference,
-        )
+        finish(run, terminal, map_files=files, more=merged.figures, place=merged.georeference)
 
 
-def _shown(items: Iterable[Any], total: int, title: str, *, quiet: bool) -> Iterator[Any]:
-    return progress(items, total=total, title=title, quiet=quiet)
+def fleet(
+    drives: Annotated[
+        list[Path],
+        typer.Argument(help="A list of recordings in YAML, or the recordings themselves.", metavar="LIST.yaml|DATA..."),
+    ],
+    *,
+    out: Annotated[Path, typer.Option(help="Folder of the fleet; what is there already is not done again.")],
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Dask scheduler whose workers do the work, as tcp://HOST:8786.", metavar="ADDRESS"),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(help="Number of processes on this machine, by default one for two cores.", min=1),
+    ] = None,
+    same_reference: Annotated[
+        bool,
+        typer.Option("--same-reference", help="The true poses of all drives are in one frame: score each component."),
+    ] = False,
+    changes: Settings,
+    terminal: Terminal,
+) -> None:
+    """Map any number of drives, and join those that share places: one frame, one map, one log for each component.
+
+    A drive that fails is named and tried again by the next call; the others go on. Call it again to add drives.
+
+    Example: segslam fleet drives.yaml --out city
+    """
+    if scheduler is not None and workers is not None:
+        raise SegslamError("--workers: the scheduler has workers of its own; omit one of the options")
+    for path in drives:
+        check_exists(path, "give a list of drives in YAML, or recordings")
+    terminal.announce("fleet: reading the list")
+    from segslam.run.fleets import drives_of, read_drives
+    from segslam.run.fleets import fleet as run_fleet
+    from segslam.run.fleets.orchestrate import FILE
+
+    changes.load()  # reports a wrong setting before anything is mapped
+    if len(drives) == 1 and drives[0].suffix.lower() in (".yaml", ".yml"):
+        if changes.config is not None:
+            raise SegslamError("--config: give it for each drive in the list, as config: FILE.yaml")
+        listed = read_drives(drives[0])
+    else:
+        listed = drives_of(drives, config=changes.config)
+    when_stopped(f"what is done is kept in {out}; call the same command again to go on")
+    result = run_fleet(
+        listed,
+        out,
+        scheduler=scheduler,
+        num_workers=workers,
+        same_reference=same_reference,
+        settings=changes.overrides(),
+        shown=terminal.progress,
+        say=terminal.say,
+    )
+    if terminal.json:
+        print_out((result.folder / FILE).read_text(encoding="utf-8").rstrip())
+        return
+    for number, component in enumerate(result.components):
+        error = f", error {component['ate_m']:.3f} m" if "ate_m" in component else ""
+        loops = f"{component.get('num_loops_between', 0)} loops between them"
+        terminal.say(f"component {number}: {', '.join(component['drives'])}; {loops}{error}")
+    terminal.say(f"report: {result.folder / 'report.html'}")

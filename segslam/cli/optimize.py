@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from segslam.cli.console import JsonOption, QuietOption, announce, print_json, say
-from segslam.cli.overwriting import OverwriteOption, check_free
+from segslam.cli.checks import check_free
+from segslam.cli.console import Terminal
+from segslam.cli.options import OverwriteOption
 from segslam.core.errors import SegslamError
 from segslam.core.whole_files import check_target, whole_file
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 def optimize(
     graph: Annotated[Path, typer.Argument(help="g2o file with VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines.")],
+    *,
     out: Annotated[Path, typer.Option(help="g2o file to write: the same edges, with the optimised vertices.")],
     robust: Annotated[
         Literal["none", "huber", "cauchy", "geman-mcclure", "gnc", "consistent"],
@@ -28,8 +30,7 @@ def optimize(
     ] = "consistent",
     overwrite: OverwriteOption = False,
     force: Annotated[bool, typer.Option("--force", hidden=True, help="The same as --overwrite.")] = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Optimise a pose graph. Errors are half the chi-square, as in GTSAM, of the edges that were not rejected.
 
@@ -39,7 +40,7 @@ def optimize(
     """
     check_target(out)
     check_free([out], overwrite=overwrite or force)
-    announce(f"optimize: reading {graph}", quiet=quiet)
+    terminal.announce(f"optimize: reading {graph}")
     from segslam.graph import Unsolvable, optimize_graph, read_g2o, write_g2o
 
     try:
@@ -48,28 +49,14 @@ def optimize(
         raise SegslamError(f"{graph}: {error}") from error
     with whole_file(out) as part:
         write_g2o(part, result.graph)
-    if json:
-        print_json(
-            {
-                "initial_error": result.initial_error,
-                "final_error": result.final_error,
-                "iterations": result.iterations,
-                "seconds": result.seconds,
-                "num_outliers": result.num_outliers,
-                "robust": result.robust,
-                "robust_cost": result.robust_cost,
-                "outliers": result.outliers,
-                "chi2_per_dof": result.chi2_per_dof,
-                **dict(zip(("chi2_median", "chi2_p95", "chi2_max"), result.chi2_quantiles, strict=True)),
-                "converged": result.converged,
-                "doubts": result.doubts,
-            }
-        )
-    else:
-        for line in _lines(result, out):
-            say(line, quiet=quiet)
-        for doubt in result.doubts:
-            say(f"the result may be wrong: {doubt}", quiet=quiet)
+    names = (
+        *("initial_error", "final_error", "iterations", "seconds", "num_outliers", "robust", "robust_cost", "outliers"),
+        *("chi2_per_dof", "converged", "doubts"),
+    )
+    quantiles = dict(zip(("chi2_median", "chi2_p95", "chi2_max"), result.chi2_quantiles, strict=True))
+    figures = {name: getattr(result, name) for name in names} | quantiles
+    doubts = (f"the result may be wrong: {doubt}" for doubt in result.doubts)
+    terminal.answer(figures, "\n".join([*_lines(result, out), *doubts]))
 
 
 def _lines(result: "Optimized", out: Path) -> Iterator[str]:

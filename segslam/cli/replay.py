@@ -1,163 +1,252 @@
-"""`segslam replay`."""
+"""`segslam replay`, `edit` and `refine`: a new run from the log of another."""
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
-from itertools import tee
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from itertools import chain, tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists
-from segslam.cli.compiling import compile_kernels
-from segslam.cli.console import (
-    ConfigOption,
-    JsonOption,
-    QuietOption,
-    RefineMinutesOption,
-    SetOption,
-    announce,
-    progress,
-    with_minutes,
-)
-from segslam.cli.ending import finish
-from segslam.cli.foxglove import FoxgloveOption, serve_foxglove
-from segslam.cli.in_map import pipeline
-from segslam.cli.overwriting import OverwriteOption, make_room
+from segslam.cli.checks import check_run, make_room
+from segslam.cli.console import Terminal
+from segslam.cli.ending import finish, is_interrupted
+from segslam.cli.options import WITH_MAP, FoxgloveOption, LogArgument, OverwriteOption, RunSettings, WithMapOption
+from segslam.cli.viewers import serve_foxglove
+from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
-from segslam.slam.loop_edits import LoopEdits
+from segslam.slam.loop_edits import LoopEdits, Pair, pairs_of
 
 if TYPE_CHECKING:
-    from segslam.core.types import Step, Trajectory
+    from segslam.core.types import Step
     from segslam.output.log import RunLog
     from segslam.run.run import Run
     from segslam.slam.slam_result import SlamResult
 
 NO_EDITS = LoopEdits()
+OutOption = Annotated[Path, typer.Option(help="New folder for the run.")]
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, finished or not.")],
-    out: Annotated[Path, typer.Option(help="New folder for the run.")],
-    config: ConfigOption = None,
-    settings: SetOption = None,
-    refine_minutes: RefineMinutesOption = None,
+    log: LogArgument,
+    *,
+    out: OutOption,
+    changes: RunSettings,
     foxglove: FoxgloveOption = None,
     overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
+    terminal: Terminal,
 ) -> None:
     """Repeat loop closing and optimisation from the log of a run, with some settings changed.
 
     Example: segslam replay runs/00/log.mcap --out runs/00-strict --set verify.max_false_share=0.0001
     """
-    check_exists(log, "give a run folder, or its log.mcap")
-    announce(f"replay: reading {log}", quiet=quiet)
-    replay_log(
-        log,
-        out,
-        config=config,
-        settings=with_minutes(settings, refine_minutes),
-        foxglove=foxglove,
-        overwrite=overwrite,
-        json=json,
-        quiet=quiet,
-    )
+    check_run(log)
+    terminal.announce(f"replay: reading {log}")
+    _replay_log(log, out, changes, terminal, foxglove=foxglove, overwrite=overwrite)
 
 
-def replay_log(
+def edit(
+    run: LogArgument,
+    *,
+    out: OutOption,
+    forbid: Annotated[
+        list[str] | None,
+        typer.Option(metavar="I:J", help="Never close a loop between these two keyframes; may be repeated."),
+    ] = None,
+    add: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="I:J", help="Register these two keyframes, wherever the drift has put them; may be repeated."
+        ),
+    ] = None,
+    add_near_fixes: Annotated[
+        bool,
+        typer.Option("--add-near-fixes", help="Add keyframes that the fixes of the run place near each other."),
+    ] = False,
+    changes: RunSettings,
+    overwrite: OverwriteOption = False,
+    terminal: Terminal,
+) -> None:
+    """Forbid or add loops by hand, and repeat the run with them. Keyframes have the ids of loops.csv and the report.
+
+    An added loop is registered without initial guess; its pose must pass all checks but the comparison with the drift.
+    Later replays and edits keep these edits.
+
+    Example: segslam edit runs/00 --forbid 120:15 --add 300:40 --out runs/00-edited
+    """
+    check_run(run)
+    edits = _edits(run, forbid or [], add or [], add_near_fixes=add_near_fixes)
+    terminal.announce(f"edit: reading {run}")
+    _check_keyframes(run, edits, terminal)
+
+    def after(result: "SlamResult") -> Mapping[str, Any]:
+        outcomes = _outcomes(result)
+        for pair in sorted(edits.added):
+            terminal.say(f"added {pair[0]}:{pair[1]}: {outcomes.get(pair, 'not tried, because the run ended before')}")
+        return {}
+
+    _replay_log(run, out, changes, terminal, edits=edits, after=after, overwrite=overwrite)
+
+
+def refine(
+    run: LogArgument,
+    *,
+    out: Annotated[Path, typer.Option(help="New folder for the adjusted run.")],
+    with_map: WithMapOption = False,
+    changes: RunSettings,
+    overwrite: OverwriteOption = False,
+    terminal: Terminal,
+) -> None:
+    """Adjust the whole map of a run: register submaps of its keyframes, and optimise all poses. Its loops are kept.
+
+    Example: segslam refine runs/00 --out runs/00-refined --set adjustment.rounds=2
+    """
+    check_run(run)
+    changes.load()  # reports a wrong setting before the log is read
+    terminal.announce(f"refine: reading {run}")
+    from segslam.output.folder import copy_alone, new_folder
+    from segslam.run.replay import Replay
+    from segslam.slam.slam import Slam
+
+    refined = Replay.of(run, config=changes.config, settings=changes.overrides())
+    recorded = refined.recorded
+    if refined.in_map:
+        raise SegslamError(f"{run}: localised in the map of another run; refine that run instead")
+    if refined.config.adjustment.max_minutes == 0.0:
+        raise SegslamError("adjustment.max_minutes=0: nothing to do; give a limit with --refine-minutes")
+    terminal.compile_kernels()
+    make_room(out, overwrite=overwrite, inputs=[run])
+    folder = new_folder(out)
+    when_stopped(f"the log in {folder} is kept, without results")
+    with refined.begun(folder, Slam(refined.config), options={}) as made:
+        steps = made.take((step, 0, False) for step in recorded.whole_steps(len(recorded.keyframes())))
+        if is_interrupted(terminal.progress(steps, recorded.num_steps(), "read")):
+            raise typer.Exit(EXIT_STATUS)
+        copy_alone(recorded.path.parent, folder)
+        finish(made, terminal, map_files=[folder / name for name in WITH_MAP] if with_map else [], search_s=0.0)
+
+
+def _replay_log(
     log: Path,
     out: Path,
+    changes: RunSettings,
+    terminal: Terminal,
     *,
-    config: Path | None,
-    settings: list[str],
     foxglove: str | None = None,
     edits: LoopEdits = NO_EDITS,
     after: "Callable[[SlamResult], Mapping[str, Any]]" = lambda result: {},
     overwrite: bool,
-    json: bool,
-    quiet: bool,
 ) -> None:
     """Repeat a run from its log into a new folder; `edits` follow those of the run.
 
     `after` returns further figures, from the result. Raises typer.Exit(130) if Ctrl-C ended it early.
     """
-    from segslam.core.config import load_config
+    changes.load()  # reports a wrong setting before the log is read
+    from segslam.output.folder import copy_alone, new_folder
+    from segslam.run.replay import Replay
 
-    load_config(config, settings)  # reports a wrong setting before the log is read
-    from segslam.output.folder import copy_alone, log_of, new_folder
-    from segslam.output.log import read_log
-    from segslam.run.replay import check_settings
-    from segslam.run.run import Run
-    from segslam.slam.slam import Slam
+    replayed = Replay.of(log, config=changes.config, settings=changes.overrides(), edits=edits)
+    recorded = replayed.recorded
+    slam = None
+    if replayed.in_map:
+        from segslam.run.sessions.localiser import localiser_in
 
-    recorded = read_log(log_of(log))
-    settings_now = load_config(config, settings, base=recorded.config)
-    check_settings(settings_now, recorded)
-    reference = recorded.reference()
-    in_map = recorded.options.get("in_map")
-    slam_of = pipeline(Path(in_map) if in_map else None)
-    in_all = LoopEdits.from_json(recorded.options.get("edits", "")).and_then(edits)
-    options = {"in_map": in_map} if in_map else {"edits": in_all.to_json()} if in_all != LoopEdits() else {}
-    compile_kernels(quiet=quiet)
+        slam = localiser_in(replayed.in_map)(replayed.config)
+    terminal.compile_kernels()
     with ExitStack() as stack:
-        server = serve_foxglove(foxglove, stack, quiet=quiet)
+        server = serve_foxglove(foxglove, stack, terminal)
         make_room(out, overwrite=overwrite, inputs=[log])
         folder = new_folder(out)
         when_stopped(f"the log in {folder} is kept, without results")
-        run = stack.enter_context(
-            Run(
-                folder,
-                slam_of(settings_now) if slam_of else Slam(settings_now, edits=in_all),
-                dataset=recorded.run.get("dataset", ""),
-                T_camera_lidar=recorded.T_camera_lidar,
-                reference=reference,
-                options=options,
-                mirror=server.send if server else None,
-            )
-        )
+        run = stack.enter_context(replayed.begun(folder, slam, mirror=server.send if server else None))
         copy_alone(recorded.path.parent, folder)
-        changes, interrupted = _repeat(run, recorded, quiet=quiet)
-        if interrupted and run.num_steps == 0:
+        compared = _Compared(recorded, run)
+        stopped = is_interrupted(terminal.progress(compared.repeated(), recorded.num_steps(), "replay"))
+        if stopped and run.num_steps == 0:
             when_stopped("nothing was written")
             raise typer.Exit(EXIT_STATUS)
-        more = changes | _recorded_accuracy(recorded, reference)
-        finish(
-            run, reference, json=json, quiet=quiet, more=lambda result: {**more, **after(result)}, stopped=interrupted
-        )
-    if interrupted:
+        finish(run, terminal, more=lambda result: {**compared.figures(), **after(result)}, stopped=stopped)
+    if stopped:
         when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps were replayed; results in {folder}")
         raise typer.Exit(EXIT_STATUS)
 
 
-def _repeat(run: "Run", recorded: "RunLog", *, quiet: bool) -> tuple[dict[str, Any], bool]:
-    """Repeat every step. Returns the numbers of new and lost loops, and whether Ctrl-C ended it early."""
-    before: set[tuple[int, int]] = set()
-    after: set[tuple[int, int]] = set()
-    originals, sources = tee(recorded.steps())  # read alternately: only one step is in memory
-    pairs = zip(originals, run.repeat(sources), strict=True)
-    interrupted = True
-    with suppress(KeyboardInterrupt):
-        for original, repeated in progress(pairs, total=recorded.num_steps(), title="replay", quiet=quiet):
-            before |= _closures(original)
-            after |= _closures(repeated)
-        interrupted = False
-    return {"num_loops_won": len(after - before), "num_loops_lost": len(before - after)}, interrupted
+class _Compared:
+    """Repeats the steps of a log, and compares the loops and the error with those of the logged run."""
+
+    def __init__(self, recorded: "RunLog", run: "Run") -> None:
+        self._recorded, self._run = recorded, run
+        self._before: set[Pair] = set()
+        self._after: set[Pair] = set()
+
+    def repeated(self) -> "Iterator[Step]":
+        originals, sources = tee(self._recorded.steps())  # read alternately: only one step is in memory
+        for original, repeated in zip(originals, self._run.repeat(sources), strict=True):
+            self._before |= _closures(original)
+            self._after |= _closures(repeated)
+            yield repeated
+
+    def figures(self) -> dict[str, Any]:
+        """Numbers of new and lost loops; the error of the logged run, if it finished and has ground truth."""
+        from segslam.output.accuracy import trajectory_accuracy
+
+        before, after = self._before, self._after
+        figures: dict[str, Any] = {"num_loops_won": len(after - before), "num_loops_lost": len(before - after)}
+        reference, result = self._recorded.reference(), self._recorded.result()
+        if reference is not None and result is not None:
+            error = trajectory_accuracy(result[1], reference)
+            figures |= {"recorded_ate_m": error["ate_m"]} if "ate_m" in error else {}
+        return figures
 
 
-def _closures(step: "Step") -> set[tuple[int, int]]:
+def _closures(step: "Step") -> set[Pair]:
     from segslam.core.types import LoopClosure
 
     outcomes = (attempt.outcome for attempt in step.attempts)
     return {(outcome.source_id, outcome.target_id) for outcome in outcomes if isinstance(outcome, LoopClosure)}
 
 
-def _recorded_accuracy(recorded: "RunLog", reference: "Trajectory | None") -> dict[str, Any]:
-    """The error of the replayed run, if it finished and has ground truth."""
-    from segslam.output.accuracy import trajectory_accuracy
+def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool) -> LoopEdits:
+    """The edits of the options. Raises SegslamError if there are none."""
+    forbidden, added = pairs_of(forbid, "--forbid"), pairs_of(add, "--add")
+    if add_near_fixes:
+        from segslam.run.replay import pairs_near_fixes
 
-    result = recorded.result()
-    if reference is None or result is None:
-        return {}
-    accuracy = trajectory_accuracy(result[1], reference)
-    return {"recorded_ate_m": accuracy["ate_m"]} if "ate_m" in accuracy else {}
+        added |= pairs_near_fixes(run) - forbidden
+    if not forbidden | added:
+        remedy = "the fixes propose no further loop" if add_near_fixes else "give --forbid I:J or --add I:J"
+        raise SegslamError(f"nothing to edit: {remedy}")
+    return LoopEdits(forbidden, added)
+
+
+def _check_keyframes(run: Path, edits: LoopEdits, terminal: Terminal) -> None:
+    """Raises SegslamError for a keyframe that the run does not have, and for a run localised in a map.
+
+    A pair that is forbidden but was never tried is reported: it may be a mistyped id.
+    """
+    from segslam.output.log import read_log
+
+    recorded = read_log(run)
+    if recorded.options.get("in_map"):
+        raise SegslamError(f"{run}: localised in the map of another run, without loops of its own; edit that run")
+    num = len(recorded.keyframes())
+    for newer, older in sorted(edits.forbidden | edits.added):
+        if newer >= num:
+            raise SegslamError(f"{newer}:{older}: {run} has keyframes 0 to {num - 1}; the report shows their ids")
+    attempts = chain(
+        (attempt for step in recorded.steps(clouds=False) for attempt in step.attempts), recorded.late_loops()
+    )
+    tried = {(attempt.candidate.source_id, attempt.candidate.target_id) for attempt in attempts}
+    for newer, older in sorted(edits.forbidden - tried):
+        terminal.say(f"{newer}:{older}: {run} has not tried this loop; forbidden all the same (loops.csv has the ids)")
+
+
+def _outcomes(result: "SlamResult") -> dict[Pair, str]:
+    """The outcome of each pair that was tried."""
+    from segslam.slam.slam_result import outcome_text
+
+    weights = result.estimate.closure_weights
+    return {
+        (attempt.candidate.source_id, attempt.candidate.target_id): outcome_text(attempt, weights)
+        for attempt in result.attempts
+    }

@@ -4,6 +4,7 @@ import csv
 import io
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,10 +12,6 @@ import typer
 
 from segslam.core.whole_files import write_whole
 
-CsvOption = Annotated[Path | None, typer.Option("--csv", help="Write the table to this file, a row for each.")]
-LatexOption = Annotated[
-    Path | None, typer.Option("--latex", help="Write the table to this file as a LaTeX tabular, a row for each.")
-]
 SHORT = {
     "ate_m": "ATE (m)",
     "ate_mean_m": "mean (m)",
@@ -38,12 +35,21 @@ def figure(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:.4g}"
 
 
-def write_tables(rows: Rows, *, csv_file: Path | None, latex_file: Path | None) -> None:
-    """Write the files that are given: CSV has all numbers in full, LaTeX the columns for people."""
-    if csv_file is not None:
-        write_whole(csv_file, as_csv(rows))
-    if latex_file is not None:
-        write_whole(latex_file, as_latex(rows))
+@dataclass(frozen=True)
+class TableFiles:
+    """Options of commands with a table."""
+
+    csv: Annotated[Path | None, typer.Option("--csv", help="Write the table to this file, a row for each.")] = None
+    latex: Annotated[
+        Path | None, typer.Option("--latex", help="Write the table to this file as a LaTeX tabular, a row for each.")
+    ] = None
+
+    def write(self, rows: Rows) -> None:
+        """Write the files that are given: CSV has all numbers in full, LaTeX the columns for people."""
+        if self.csv is not None:
+            write_whole(self.csv, as_csv(rows))
+        if self.latex is not None:
+            write_whole(self.latex, as_latex(rows))
 
 
 def as_csv(rows: Rows) -> str:

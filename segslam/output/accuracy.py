@@ -1,12 +1,30 @@
-"""Errors of a run against ground truth: trajectory, odometry, loops."""
+"""Errors against ground truth: of a run, its odometry and its loops; of a trajectory, as other tools state them."""
+
+from typing import Literal
 
 import numpy as np
 
-from segslam.core.evaluation import loop_metrics, trajectory_metrics
-from segslam.core.trajectory import Poses, rows_of_same_scan
-from segslam.core.types import IndexPairs, LoopClosure, Trajectory
+from segslam.core import geometry
+from segslam.core.evaluation import MIN_POSES, Z_UP, align_positions, loop_metrics, pose_errors, trajectory_metrics
+from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
+from segslam.core.types import IndexPairs, LoopClosure, Points, Trajectory, Vector
 from segslam.output.folder import ALONE
 from segslam.slam.slam import SlamResult
+
+Align = Literal["se3", "sim3", "first", "none"]
+"""Alignment of the estimate: rigid (the default everywhere), with scale, by the first pose, or none."""
+MOST_OFF = 0.1
+"""Largest difference between the length of a pair and the distance asked for, as a share; evo's default."""
+MEANINGS = {
+    "ate_mean_m": "the same error, mean (m)",
+    "ate_median_m": "the same error, median (m)",
+    "ate_max_m": "the same error, largest (m)",
+    "rpe_distance_m": "distance of the two figures below (m)",
+    "rpe_over_distance_m": "error of the motion over this distance, rms (m)",
+    "rpe_over_distance_percent": "the same error, mean, in percent of the distance (%)",
+    "scale": "scale of the estimate (alignment sim3)",
+}
+"""Meaning of the figures that only the evaluation has."""
 
 
 def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
@@ -22,8 +40,11 @@ def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
         for prefix, trajectory in others.items()
         for name, value in trajectory_accuracy(trajectory, reference).items()
     }
-    loops = {} if result.from_map_m is not None else _loop_accuracy(result, reference)
-    return corrected | compared | loops
+    if result.from_map_m is not None:
+        return corrected | compared
+    closures, pairs, truth = judged_closures(result, reference)
+    measured = np.array([closure.T_target_source for closure in closures]).reshape(-1, 4, 4)
+    return corrected | compared | loop_metrics(measured, pairs, truth)
 
 
 def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[str, float]:
@@ -42,6 +63,81 @@ def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[Loo
     return known, pairs, reference.T_world_lidar[rows[:, 1]]
 
 
-def _loop_accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
-    closures, pairs, truth = judged_closures(result, reference)
-    return loop_metrics(np.array([c.T_target_source for c in closures]).reshape(-1, 4, 4), pairs, truth)
+def scores(
+    estimate: Poses,
+    reference: Poses,
+    *,
+    align: Align = "se3",
+    rpe_distance_m: float | None = None,
+    up: tuple[float, float, float] = Z_UP,
+) -> dict[str, float]:
+    """The figures of `trajectory_metrics` after this alignment, and those of `MEANINGS`; (n, 4, 4) each, row by row.
+
+    Empty for fewer than 3 rows. `rpe_distance_m` adds the error of the motion between poses this far apart along the
+    true path; none is given if the drive is shorter. With `sim3` all figures are of the scaled estimate.
+    """
+    if len(reference) < MIN_POSES:
+        return {}
+    scale = scale_of(estimate[:, :3, 3], reference[:, :3, 3]) if align == "sim3" else 1.0
+    scaled = estimate.copy()
+    scaled[:, :3, 3] *= scale
+    aligned = aligned_by(scaled, reference, align)
+    figures = trajectory_metrics(scaled, reference, up=up)
+    errors = pose_errors(aligned, reference)
+    if align in ("first", "none"):  # trajectory_metrics aligns; these are the errors without it
+        figures["ate_m"] = _rms(errors.translation_m)
+        figures["are_deg"] = _rms(errors.rotation_deg)
+        figures["height_m"] = _rms((aligned - reference)[:, :3, 3] @ np.array(up))
+    figures |= {
+        "ate_mean_m": float(errors.translation_m.mean()),
+        "ate_median_m": float(np.median(errors.translation_m)),
+    }
+    figures |= {"ate_max_m": float(errors.translation_m.max())}
+    if align == "sim3":
+        figures["scale"] = scale
+    return figures | ({} if rpe_distance_m is None else _over_distance(aligned, reference, rpe_distance_m))
+
+
+def aligned_by(estimate: Poses, reference: Poses, align: Align) -> Poses:
+    """The estimate in the frame of the reference; for `sim3` the estimate must be scaled before."""
+    if align == "none":
+        return estimate
+    if align == "first":
+        return reference[0] @ geometry.inverse(estimate[0]) @ estimate
+    return align_positions(estimate[:, :3, 3], reference[:, :3, 3]) @ estimate
+
+
+def scale_of(source: Points, target: Points) -> float:
+    """The factor of the source that aligns matched points best (Umeyama, PAMI 1991, Eq. 42); 1 if all are one point."""
+    source_centred, target_centred = source - source.mean(axis=0), target - target.mean(axis=0)
+    spread = float(np.square(source_centred).sum())
+    rotation = align_positions(source, target)[:3, :3]
+    return float((target_centred * (source_centred @ rotation.T)).sum() / spread) if spread > 0 else 1.0
+
+
+def pairs_at_distance(reference: Poses, distance_m: float) -> IndexPairs:
+    """Rows (i, j) of all poses and the later pose nearest to this distance along the path, if within 10 % of it."""
+    travel_m = travelled_m(reference)
+    wanted = travel_m + distance_m
+    after = np.clip(np.searchsorted(travel_m, wanted), 1, len(travel_m) - 1)
+    nearer = np.where(np.abs(travel_m[after - 1] - wanted) <= np.abs(travel_m[after] - wanted), after - 1, after)
+    rows = np.arange(len(travel_m))
+    close = np.abs(travel_m[nearer] - wanted) <= MOST_OFF * distance_m
+    return np.column_stack([rows, nearer])[close & (nearer > rows)]
+
+
+def _over_distance(estimate: Poses, reference: Poses, distance_m: float) -> dict[str, float]:
+    pairs = pairs_at_distance(reference, distance_m)
+    if len(pairs) == 0:
+        return {}
+    motions = (np.linalg.inv(poses[pairs[:, 0]]) @ poses[pairs[:, 1]] for poses in (estimate, reference))
+    errors_m = pose_errors(*motions).translation_m
+    return {
+        "rpe_distance_m": distance_m,
+        "rpe_over_distance_m": _rms(errors_m),
+        "rpe_over_distance_percent": float(100 * errors_m.mean() / distance_m),
+    }
+
+
+def _rms(values: Vector) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -5,18 +5,20 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from segslam.core.config import MapConfig, load_config
 from segslam.core.geometry import raise_beams
 from segslam.core.types import GraphEstimate, Keyframe, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import cannot_write, whole_file
-from segslam.output.folder import log_of
-from segslam.output.georeferenced import Globe, read_globe
+from segslam.output.folder import PLACE_ON_GLOBE
 from segslam.output.log import RunLog, read_log
-from segslam.output.map import check_files, write_map
+from segslam.output.map.write import check_files, write_map
 from segslam.output.tracks import is_track, track
 from segslam.slam.adjustment import Progress, no_progress
+
+if TYPE_CHECKING:
+    from segslam.output.georeferenced import Globe
 
 
 def export(run: str | Path, files: Sequence[str | Path], *, settings: Sequence[str] = ()) -> dict[str, Any]:
@@ -26,7 +28,7 @@ def export(run: str | Path, files: Sequence[str | Path], *, settings: Sequence[s
     .tif, .geojson, .kml, .gpx and map_projector_info.yaml; all are written, or none.
     `settings`: changes such as `"map.color=height"`. Raises SegslamError, naming the file and the remedy.
     """
-    log = read_log(log_of(Path(run)))
+    log = read_log(Path(run))
     config = load_config(None, settings, base=log.config).map
     return write_maps(log, [Path(file) for file in files], config=config)
 
@@ -44,7 +46,11 @@ def write_maps(
 
     started = perf_counter()
     folder = log.path.parent
-    globe = read_globe(folder)
+    globe = None
+    if (folder / PLACE_ON_GLOBE).exists():
+        from segslam.output.georeferenced import read_globe
+
+        globe = read_globe(folder)
     origin = None if globe is None else globe.origin
     of_map = [file for file in files if file.name != BEFORE_AFTER and not is_track(file)]
     check_files(of_map, origin=origin)
@@ -58,13 +64,7 @@ def write_maps(
         if not of_map:
             return {"map_seconds": perf_counter() - started}
         try:
-            made = write_map(
-                _placed(log, globe, show),
-                of_map,
-                config=config,
-                origin=origin,
-                show=lambda parts, total: show(parts, total, "clean"),
-            )
+            made = write_map(_placed(log, globe, show), of_map, config=config, origin=origin, show=show)
         except OSError as error:
             raise cannot_write(of_map[0], error) from error
     return {
@@ -84,7 +84,7 @@ def _finished(log: RunLog) -> tuple[GraphEstimate, Trajectory]:
     return result
 
 
-def _placed(log: RunLog, globe: Globe | None, show: Progress) -> Iterator[tuple[Keyframe, Transform]]:
+def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tuple[Keyframe, Transform]]:
     """Each keyframe, its points corrected as in the adjustment of the run, with its final T_world_keyframe.
 
     The world of a georeferenced run is its local frame.

@@ -11,7 +11,7 @@ import numpy as np
 from segslam.core.config import Config
 from segslam.core.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
-from segslam.output.folder import ALONE, LOG, read_alone, read_localised
+from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log
 from segslam.slam.slam import SlamResult
 
@@ -98,17 +98,17 @@ class FinishedRun:
 
     def _repr_html_(self) -> str:
         """The trajectory and the figures, for notebooks."""
-        from segslam.output.report.summary import as_html
+        from segslam.output.report import as_html
 
         return as_html(self)
 
 
 def read_run(folder: str | Path) -> FinishedRun:
-    """The run of a folder. Raises SegslamError if there is none, or it did not finish."""
-    folder = Path(folder)
+    """The run of a folder, or of its log. Raises SegslamError if there is none, or it did not finish."""
+    folder = folder_of(Path(folder))
     if not folder.is_dir():
         raise SegslamError(f"{folder}: no such folder; give a folder made by `segslam map --out`")
-    log = read_log(folder / LOG)
+    log = read_log(folder)
     result = _result(log)
     return FinishedRun(
         folder=folder,

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,6 @@ from segslam.core.trajectory import camera_from_lidar, read_poses, write_kitti, 
 from segslam.core.types import (
     Alignment,
     LoopAttempt,
-    LoopClosure,
     Mask,
     Rejected,
     SegslamError,
@@ -27,19 +26,25 @@ from segslam.core.types import (
 from segslam.core.whole_files import whole_file, write_whole
 
 POSE_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
-STAGES = ("prepare", "match", "refine", "verify")
+LOOP_COLUMNS = (
+    *("source", "target", "outcome", "detail", "distance_m", "correspondences", "inliers", "overlap", "rms_m"),
+    *("free_space_violation", "probability", "evidence", "weight"),
+    *POSE_COLUMNS,
+    *("prepare_s", "match_s", "refine_s", "verify_s"),
+)
 LOG = "log.mcap"
+PLACE_ON_GLOBE = "georeference.json"
 ADJUSTED_GRAPH = "adjusted.g2o"
 """All edges of the last estimate, with the information with which they act."""
-ALONE = "kiss_icp"
-"""Start of the names of the files with the poses by KISS-ICP alone."""
+ALONE, ALONE_FILES = "kiss_icp", ("kiss_icp_tum.txt", "kiss_icp_kitti.txt")
+"""The files with the poses by KISS-ICP alone, and the start of their names and of their figures."""
 UNFINISHED = ".part"
 """Suffix of a file that replaces another when it is complete."""
 
 
 def log_of(run: Path) -> Path:
     """Path of the log of a run, given its folder or the log."""
-    return run if run.is_file() else run / LOG
+    return run / LOG if run.is_dir() else run
 
 
 def folder_of(run: Path) -> Path:
@@ -84,20 +89,15 @@ def write_poses(
         write_kitti(part, poses)
 
 
-def write_alone(folder: Path, alone: Trajectory, T_camera_lidar: Transform | None) -> None:
-    """The files of KISS-ICP alone, as `write_poses`."""
-    write_poses(folder, ALONE, alone, T_camera_lidar)
-
-
 def remove_alone(folder: Path) -> None:
     """Remove the files of KISS-ICP alone, whose state is lost when a run is resumed."""
-    for name in (f"{ALONE}_tum.txt", f"{ALONE}_kitti.txt"):
+    for name in ALONE_FILES:
         (folder / name).unlink(missing_ok=True)
 
 
 def copy_alone(source: Path, target: Path) -> None:
     """Copy the files of KISS-ICP alone to another run of the same scans, if the first has them."""
-    for name in (f"{ALONE}_tum.txt", f"{ALONE}_kitti.txt"):
+    for name in ALONE_FILES:
         if (source / name).is_file():
             write_whole(target / name, (source / name).read_bytes())
 
@@ -116,15 +116,19 @@ def read_alone(folder: Path, scans: Trajectory) -> Trajectory | None:
     return replace(scans, T_world_lidar=poses.T_a_b)
 
 
+def write_csv(file: Path, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a line of column names and the rows, whole or not at all."""
+    with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(head)
+        writer.writerows(rows)
+
+
 def write_localised(folder: Path, trajectory: Trajectory, from_map_m: Vector, localised: Mask) -> None:
     """`localised.csv`, one row per scan: whether it is localised, and the travel to a keyframe with a placement."""
-    with whole_file(folder / "localised.csv") as part, part.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(("scan", "stamp_ns", "localised", "from_placed_keyframe_m"))
-        for scan, stamp_ns, is_localised, distance_m in zip(
-            trajectory.scan_index, trajectory.stamp_ns, localised, from_map_m, strict=True
-        ):
-            writer.writerow((scan, stamp_ns, int(is_localised), f"{distance_m:.2f}" if np.isfinite(distance_m) else ""))
+    away = (f"{distance_m:.2f}" if np.isfinite(distance_m) else "" for distance_m in from_map_m)
+    rows = zip(trajectory.scan_index, trajectory.stamp_ns, localised.astype(int), away, strict=True)
+    write_csv(folder / "localised.csv", ("scan", "stamp_ns", "localised", "from_placed_keyframe_m"), rows)
 
 
 def read_localised(folder: Path, num_scans: int) -> Vector | None:
@@ -147,12 +151,8 @@ def read_localised(folder: Path, num_scans: int) -> Vector | None:
 
 def write_loops(file: Path, attempts: tuple[LoopAttempt, ...], weights: dict[tuple[int, int], float]) -> None:
     """One row per attempt; cells that do not apply are empty. `weight`: final weight in the graph, 0 to 1."""
-    head = ("source", "target", "outcome", "detail", "distance_m", "correspondences", "inliers", "overlap", "rms_m")
-    last = ("free_space_violation", "probability", "evidence", "weight")
-    with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow((*head, *last, *POSE_COLUMNS, *(f"{stage}_s" for stage in STAGES)))
-        writer.writerows(_loop_row(attempt, weights) for attempt in attempts)
+    rows = (_loop_cells(attempt, weights) for attempt in attempts)
+    write_csv(file, LOOP_COLUMNS, ([row.get(name, "") for name in LOOP_COLUMNS] for row in rows))
 
 
 def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
@@ -174,32 +174,32 @@ def room_for(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _loop_row(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> list[object]:
+def _loop_cells(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> dict[str, object]:
+    """Column -> content, where it is known."""
     candidate, outcome = attempt.candidate, attempt.outcome
     ids = (candidate.source_id, candidate.target_id)
-    seconds = [f"{attempt.seconds[stage]:.6f}" if stage in attempt.seconds else "" for stage in STAGES]
-    if not isinstance(outcome, LoopClosure):
-        unknown = [""] * 5
-        weight_and_pose = [""] * (1 + len(POSE_COLUMNS))
-        judged = _judged_cells(outcome)
-        return [
-            *ids,
-            outcome.reason.value,
-            outcome.detail,
-            candidate.distance_m,
-            *unknown,
-            *judged,
-            *weight_and_pose,
-            *seconds,
-        ]
+    cells: dict[str, object] = {"source": ids[0], "target": ids[1], "distance_m": candidate.distance_m}
+    cells |= {f"{stage}_s": f"{seconds:.6f}" for stage, seconds in attempt.seconds.items()}
+    if isinstance(outcome, Rejected):
+        return cells | {"outcome": outcome.reason.value, "detail": outcome.detail} | _judged_cells(outcome)
     found = outcome.alignment
-    figures = (found.coarse.num_correspondences, found.coarse.num_inliers, found.overlap, found.rms_m)
-    last = (found.free_space_violation, *_judged_cells(found), weights[ids], *outcome.T_target_source.ravel())
-    return [*ids, "accepted", "", candidate.distance_m, *figures, *last, *seconds]
+    return {
+        **cells,
+        "outcome": "accepted",
+        "correspondences": found.coarse.num_correspondences,
+        "inliers": found.coarse.num_inliers,
+        "overlap": found.overlap,
+        "rms_m": found.rms_m,
+        "free_space_violation": found.free_space_violation,
+        **_judged_cells(found),
+        "weight": weights[ids],
+        **dict(zip(POSE_COLUMNS, outcome.T_target_source.ravel(), strict=True)),
+    }
 
 
-def _judged_cells(outcome: Alignment | Rejected) -> tuple[str, str]:
-    """Probability that the pose is right, and its evidence (nats by name, as JSON); empty if it was not judged."""
+def _judged_cells(outcome: Alignment | Rejected) -> dict[str, object]:
+    """Probability that the pose is right, and its evidence (nats by name, as JSON), if it was judged."""
     if outcome.probability is None:
-        return "", ""
-    return f"{outcome.probability:.6f}", json.dumps({name: round(value, 2) for name, value in outcome.evidence.items()})
+        return {}
+    evidence = json.dumps({name: round(value, 2) for name, value in outcome.evidence.items()})
+    return {"probability": f"{outcome.probability:.6f}", "evidence": evidence}

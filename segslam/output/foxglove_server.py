@@ -8,8 +8,8 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 from segslam.core.errors import SegslamError
 from segslam.core.types import Labels, Points
 from segslam.output.log import schema
-from segslam.output.log.channels import channels
 from segslam.output.log.drawing import map_message
+from segslam.output.log.schema import channels
 from segslam.output.origin_check import OriginCheck, hidden_address
 
 LASTING = (schema.MAP, schema.ODOMETRY, schema.TRAJECTORY, schema.GROUND_TRUTH, schema.GRAPH, schema.RESULT)

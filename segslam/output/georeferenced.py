@@ -22,13 +22,13 @@ from segslam.gnss.geodesy import Geodetic
 from segslam.gnss.reading import read_fixes
 from segslam.graph import read_g2o
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import ADJUSTED_GRAPH, folder_of, log_of, room_for, write_metrics
+from segslam.output.folder import ADJUSTED_GRAPH, PLACE_ON_GLOBE, folder_of, log_of, room_for, write_csv, write_metrics
 from segslam.output.log import schema
 from segslam.output.log.locations import Locations, write_locations
 
 logger = logging.getLogger(__name__)
 
-FILE, FIXES, GEODETIC, ENU = "georeference.json", "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
+FILE, FIXES, GEODETIC, ENU = PLACE_ON_GLOBE, "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
 DATUM = "WGS84 (EPSG:4979)"
 PLACE = ("datum", "latitude_deg", "longitude_deg", "height_m", "epsg", "T_enu_map", "sigma")
 """What a run localised in the map takes over from `FILE`."""
@@ -225,32 +225,42 @@ def _write_geodetic(run: FinishedRun, places: Geodetic, T_enu_lidar: Poses) -> N
     """A row a localised scan: time, latitude, longitude, height, and heading of the x axis clockwise from north."""
     trajectory = run.result.trajectory
     heading_deg = np.degrees(np.arctan2(T_enu_lidar[:, 0, 0], T_enu_lidar[:, 1, 0])) % 360.0
-    with whole_file(run.folder / GEODETIC) as part, part.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(("seconds", "latitude", "longitude", "height", "heading"))
-        for stamp_ns, (latitude, longitude, height_m), heading in zip(
-            *(values[run.result.localised()] for values in (trajectory.stamp_ns, places, heading_deg)), strict=True
-        ):
-            seconds = Decimal(int(stamp_ns)).scaleb(-9)
-            writer.writerow(
-                (f"{seconds:f}", f"{latitude:.10f}", f"{longitude:.10f}", f"{height_m:.4f}", f"{heading:.4f}")
-            )
+    localised = (values[run.result.localised()] for values in (trajectory.stamp_ns, places, heading_deg))
+    rows = (
+        (
+            f"{Decimal(int(stamp_ns)).scaleb(-9):f}",
+            f"{latitude:.10f}",
+            f"{longitude:.10f}",
+            f"{height:.4f}",
+            f"{head:.4f}",
+        )
+        for stamp_ns, (latitude, longitude, height), head in zip(*localised, strict=True)
+    )
+    write_csv(run.folder / GEODETIC, ("seconds", "latitude", "longitude", "height", "heading"), rows)
 
 
 def _write_fixes(folder: Path, placed: Georeference) -> None:
     """A row a fix: what was measured, by how much it differs from the drive, and whether it was kept or why not."""
-    head = ("stamp_ns", *DEGREES_AND_HEIGHT, *SIGMAS)
-    residuals = ("residual_east_m", "residual_north_m", "residual_up_m")
-    with whole_file(folder / FIXES) as part, part.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow((*head, *residuals, "weight", "weight_up", "kept", "reason"))
-        for row, reason in enumerate(placed.reasons):
-            measured = (*placed.measured_enu_m[row], *placed.residual_m[row], *placed.weights[row])
-            degrees = (f"{value:.10f}" if np.isfinite(value) else "" for value in placed.fixes.places[row, :2])
-            others = (
-                f"{value:.4f}" if np.isfinite(value) else "" for value in (placed.fixes.places[row, 2], *measured)
-            )
-            writer.writerow((int(placed.fixes.stamp_ns[row]), *degrees, *others, int(not reason), reason))
+    known = (
+        *DEGREES_AND_HEIGHT,
+        *SIGMAS,
+        "residual_east_m",
+        "residual_north_m",
+        "residual_up_m",
+        "weight",
+        "weight_up",
+    )
+    values = np.column_stack([placed.fixes.places, placed.measured_enu_m, placed.residual_m, placed.weights])
+    digits = [10, 10, *[4] * (len(known) - 2)]  # of degrees, and of all others
+    rows = (
+        (
+            int(stamp_ns),
+            *(f"{value:.{num}f}" if np.isfinite(value) else "" for value, num in zip(row, digits, strict=True)),
+            *(int(not reason), reason),
+        )
+        for stamp_ns, row, reason in zip(placed.fixes.stamp_ns, values, placed.reasons, strict=True)
+    )
+    write_csv(folder / FIXES, ("stamp_ns", *known, "kept", "reason"), rows)
 
 
 def summary(placed: Georeference) -> str:

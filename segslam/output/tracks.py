@@ -4,13 +4,16 @@ import json
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
 import numpy as np
 
 from segslam.core.types import Indices, SegslamError
-from segslam.gnss import Origin, geodetic_from_enu
-from segslam.output.georeferenced import Globe
+
+if TYPE_CHECKING:
+    from segslam.gnss import Origin
+    from segslam.output.georeferenced import Globe
 
 DEGREES, METRES = 9, 3
 """Decimals: 1e-9 degrees are 0.1 mm."""
@@ -26,7 +29,7 @@ def is_track(file: Path) -> bool:
     return file.suffix.lower() in KINDS or file.name == PROJECTOR_INFO
 
 
-def track(file: Path, globe: Globe | None, stamp_ns: Indices, *, name: str) -> bytes:
+def track(file: Path, globe: "Globe | None", stamp_ns: Indices, *, name: str) -> bytes:
     """The content of a file with the trajectory of a run, by the extension of its name.
 
     `stamp_ns` (n,): times of the scans, which GPX has if they are later than the year 2000; `name` of the track. Raises
@@ -36,6 +39,8 @@ def track(file: Path, globe: Globe | None, stamp_ns: Indices, *, name: str) -> b
         raise SegslamError(f"{file}: the run has no place on the globe; `segslam georeference RUN --gnss FIXES` first")
     if file.name == PROJECTOR_INFO:
         return _projector_info(globe.origin)
+    from segslam.gnss import geodetic_from_enu
+
     places = geodetic_from_enu(globe.T_enu_lidar[:, :3, 3], globe.origin)
     rows = [
         [round(longitude, DEGREES), round(latitude, DEGREES), round(height_m, METRES)]
@@ -88,7 +93,7 @@ def _xml(root: Xml.Element) -> bytes:
     return content + b"\n"
 
 
-def _projector_info(origin: Origin) -> bytes:
+def _projector_info(origin: "Origin") -> bytes:
     """A local frame tangent to the ellipsoid, in which exported clouds other than LAS and LAZ are."""
     lines = (
         *("projector_type: LocalCartesian", "vertical_datum: WGS84", "map_origin:"),

@@ -128,19 +128,15 @@ class Scene:
         self._viewer.log(f"{WORLD}/keyframes/{len(self._T_odom_keyframe) - 1}/motions/{step.scan_index}", mark)
 
     def _correct(self, estimate: GraphEstimate) -> None:
-        """Move the clouds to the current poses of their keyframes."""
+        """Move the clouds to the current poses of their keyframes, and mark motions that the optimiser rejected."""
         for keyframe_id, T_world_keyframe in estimate.T_world_keyframe.items():
             self._T_world_keyframe[keyframe_id] = T_world_keyframe
             self._viewer.log(f"{WORLD}/keyframes/{keyframe_id}", _pose(T_world_keyframe))
         self._T_world_odom = self._T_world_keyframe[-1] @ geometry.inverse(self._T_odom_keyframe[-1])
-        self._draw_rejected(estimate)
-        self._draw_paths()
-
-    def _draw_rejected(self, estimate: GraphEstimate) -> None:
-        """The motions of the odometry that the optimiser rejected."""
         ends = [[self._T_world_keyframe[number][:3, 3] for number in pair] for pair in estimate.motion_weights]
         color = _rgb(MOTION_COLORS[MotionState.BROKEN])
         self._viewer.log(f"{WORLD}/motions_rejected", rr.LineStrips3D(ends, colors=[color] * len(ends)))
+        self._draw_paths()
 
     def _add_attempt(self, attempt: LoopAttempt) -> None:
         candidate, outcome = attempt.candidate, attempt.outcome

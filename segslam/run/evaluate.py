@@ -7,8 +7,8 @@ import numpy as np
 from segslam.core.evaluation import Z_UP
 from segslam.core.trajectory import PoseFile, Poses, read_poses, rows_of_same_scan, rows_of_same_stamp
 from segslam.core.types import IndexPairs, SegslamError, Trajectory
+from segslam.output.accuracy import Align, scores
 from segslam.output.finished import FinishedRun
-from segslam.output.scores import Align, scores
 
 STAMP_TOLERANCE_NS = 10_000_000
 Given = FinishedRun | Trajectory | Poses | str | Path

@@ -28,7 +28,6 @@ from segslam.keyframes.keyframes import Clouds, downsample_keyframe
 from segslam.keyframes.submaps import Submaps
 from segslam.labels import geometric_labels
 from segslam.output.finished import read_run
-from segslam.output.folder import log_of
 from segslam.output.log import read_log
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.slam.recognition import MAX_PLACES, Recognised, recognise
@@ -81,12 +80,9 @@ class Locator:
         """`keyframes`: by id, with or without points; `clouds` provides the points. Missing signatures are computed."""
         self.config = config
         self.T_world_keyframe = T_world_keyframe
-        travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
-        self.submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: travel_m)
+        self.submaps = submaps_of(keyframes, clouds, config)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         """A keyframe by its id, prepared for alignment."""
-        for keyframe in keyframes:
-            self.submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
         self.signatures = [self._signature(keyframe) for keyframe in keyframes]
         self.places = Places()
         for keyframe, signature in zip(keyframes, self.signatures, strict=True):
@@ -96,7 +92,7 @@ class Locator:
     def from_run(cls, folder: str | Path) -> "Locator":
         """The locator of a run folder. Raises SegslamError, naming the file, if it is damaged or did not finish."""
         run = read_run(folder)
-        recorded = read_log(log_of(run.folder)).keyframes()
+        recorded = read_log(run.folder).keyframes()
         keyframes = [recorded[number] for number in range(len(recorded))]
         return cls(keyframes, recorded, run.result.estimate.T_world_keyframe, config=run.config)
 
@@ -151,6 +147,15 @@ class Locator:
             return PlaceSignature.from_bytes(keyframe.place)
         made = self.submaps.gathered(keyframe.id, newest_id=keyframe.id)
         return signature_of(made.points, made.labels)
+
+
+def submaps_of(keyframes: list[Keyframe], clouds: Clouds, config: Config) -> Submaps:
+    """The submaps of a drive; sparse keyframes are merged with their neighbours. Arguments as for `Locator`."""
+    travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
+    submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: travel_m)
+    for keyframe in keyframes:
+        submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
+    return submaps
 
 
 def locate(run: str | Path, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:

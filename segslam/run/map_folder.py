@@ -5,15 +5,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
-from segslam.core.config import Config
-from segslam.core.types import BadScan, SegslamError, Step
+import numpy as np
+
+from segslam.core.config import Config, OdometryConfig
+from segslam.core.trajectory import read_poses
+from segslam.core.types import BadScan, SegslamError, Step, Trajectory
 from segslam.labels.label_files import unlabelled
-from segslam.odometry import KissOdometry
-from segslam.output.accuracy import accuracy
+from segslam.odometry import GivenOdometry, KissOdometry
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import new_folder, write_metrics
+from segslam.output.folder import new_folder
+from segslam.output.log import Mirror
 from segslam.run.run import Run
 from segslam.scans import Dataset, DataSource
 from segslam.scans.presets import extent_m, preset, preset_for
@@ -22,18 +25,10 @@ from segslam.slam.slam import Slam
 if TYPE_CHECKING:
     from segslam.labels.encodings import Encoding
     from segslam.odometry import Odometry
-    from segslam.registration.prepared import Labeller
 
 
-@runtime_checkable
-class SlamOf(Protocol):
-    """Factory of the pipeline of a run: `Slam`, or another class with the same methods."""
-
-    def __call__(
-        self, config: Config, *, odometry: "Odometry | None" = None, labeller: "Labeller | None" = None
-    ) -> Slam:
-        """Arguments as for `Slam`."""
-        ...
+SlamOf = Callable[..., Slam]
+"""What makes the pipeline of a run: `Slam`, or another with the same arguments and methods."""
 
 
 def map_folder(
@@ -49,7 +44,7 @@ def map_folder(
     topic: str = "",
     odometry: "Odometry | None" = None,
     on_step: Callable[[Step], object] = lambda step: None,
-    slam_of: "SlamOf" = Slam,
+    slam_of: SlamOf = Slam,
     options: Mapping[str, str] = MappingProxyType({}),
 ) -> FinishedRun:
     """Map a folder of scans or a recording into the new folder `out`, like `segslam map`; returns the finished run.
@@ -59,38 +54,64 @@ def map_folder(
     cannot be used are skipped with a warning. Raises SegslamError, naming the file and the remedy, also if no scan
     remains.
     """
-    from segslam.output.report import write_report
-
-    given, config = config, config or Config()
     source = DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic)
-    scans = open_scans(source, config)
-    config = in_effect(given or preset(preset_for(extent_m(scans))), scans)
-    folder = new_folder(Path(out))
+    return map_source(
+        source, Path(out), config=config, odometry=odometry, on_step=on_step, slam_of=slam_of, options=options
+    )
+
+
+def map_source(
+    source: DataSource,
+    out: Path,
+    *,
+    config: Config | None = None,
+    odometry: "Odometry | None" = None,
+    on_step: Callable[[Step], object] = lambda step: None,
+    slam_of: SlamOf = Slam,
+    options: Mapping[str, str] = MappingProxyType({}),
+    place: Callable[[Path], str] | None = None,
+) -> FinishedRun:
+    """As `map_folder`; `place` georeferences the run."""
+    scans = open_scans(source, config or Config())
+    config = in_effect(config or preset(preset_for(extent_m(scans))), scans)
+    folder = new_folder(out)
     own = {"odometry": odometry, "slam_of": None if slam_of is Slam or "in_map" in options else slam_of}
     not_resumed = [name for name, value in own.items() if value is not None]
-    with Run(
-        folder,
-        slam_of(
-            config,
-            odometry=odometry or KissOdometry(config.odometry, keeps_alone=True),
-            labeller=labeller_of(scans),
-        ),
-        dataset=scans.name,
-        T_camera_lidar=scans.T_camera_lidar,
-        reference=scans.reference,
-        options={**resume_options(source), "python": ", ".join(not_resumed), **options},
-    ) as run:
+    recorded = {**resume_options(source), "python": ", ".join(not_resumed), **options}
+    alone = KissOdometry(config.odometry, keeps_alone=True)
+    with begun(scans, folder, config, odometry=odometry or alone, slam_of=slam_of, options=recorded) as run:
         for step in run.map(scans):
             if not isinstance(step, BadScan):
                 on_step(step)
         if run.num_steps == 0:
-            raise SegslamError(f"{data}: none of its {len(scans)} scans could be used; see the warnings")
-        result, metrics = run.finish()
-    if scans.reference is not None:
-        metrics |= accuracy(result, scans.reference)
-    write_metrics(folder, metrics)
-    write_report(folder)
+            raise SegslamError(f"{source.data}: none of its {len(scans)} scans could be used; see the warnings")
+        run.complete(place=place)
     return read_run(folder)
+
+
+def begun(
+    scans: Dataset,
+    folder: Path,
+    config: Config,
+    *,
+    odometry: "Odometry",
+    slam_of: SlamOf = Slam,
+    options: Mapping[str, str] = MappingProxyType({}),
+    resumes: bool = False,
+    mirror: Mirror | None = None,
+) -> Run:
+    """A run that maps a data set, before its first scan. `options`, `resumes` and `mirror` as for `Run`."""
+    labeller = None if scans.labels.geometric else lambda points: unlabelled(len(points))
+    return Run(
+        folder,
+        slam_of(config, odometry=odometry, labeller=labeller),
+        dataset=scans.name,
+        T_camera_lidar=scans.T_camera_lidar,
+        reference=scans.reference,
+        options=options,
+        resumes=resumes,
+        mirror=mirror,
+    )
 
 
 def resume_options(
@@ -122,6 +143,21 @@ def in_effect(settings: Config, scans: Dataset) -> Config:
     return settings.model_copy(update={"sensor": sensor})
 
 
-def labeller_of(scans: Dataset) -> "Labeller | None":
-    """None for geometric labels; a labeller that returns UNLABELLED if the data set was opened with `none`."""
-    return None if scans.labels.geometric else lambda points: unlabelled(len(points))
+def given_odometry(file: Path, scans: Dataset, config: OdometryConfig) -> "Odometry":
+    """Odometry from a file. TUM rows are matched by stamp; KITTI rows by scan number, or position among mapped scans.
+
+    Raises SegslamError unless the number of KITTI rows is that of all scans of the data or of the mapped scans.
+    """
+    poses = read_poses(file)
+    if poses.stamp_ns is not None:
+        trajectory = Trajectory(np.arange(len(poses)), poses.stamp_ns, poses.T_a_b)
+        return GivenOdometry(trajectory, config, match="stamp")
+    by_number = len(poses) == scans.num_recorded
+    if not by_number and len(poses) != len(scans):
+        numbers = dict.fromkeys((scans.num_recorded, len(scans)))
+        raise SegslamError(
+            f"{file}: {len(poses)} poses, but {scans.name} has {' or '.join(map(str, numbers))}; KITTI format needs "
+            "one line per scan, TUM format is matched by stamp"
+        )
+    rows = np.arange(len(poses)) if by_number else scans.scan_index
+    return GivenOdometry(Trajectory(rows, np.zeros(len(poses), dtype=np.int64), poses.T_a_b), config)

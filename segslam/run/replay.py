@@ -1,16 +1,23 @@
-"""Loop closing and optimisation again, from the log of a run."""
+"""Loop closing and optimisation again, from the log of a run; also with loops that its position fixes propose."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from segslam.core.config import Config, changed_settings, load_config
-from segslam.core.types import SegslamError
-from segslam.output.accuracy import accuracy
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from segslam.candidates.proximity import MIN_GAP_M
+from segslam.core.config import Config, ProximityConfig, changed_settings, load_config
+from segslam.core.trajectory import travelled_m
+from segslam.core.types import LoopClosure, SegslamError, Vector
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import copy_alone, log_of, new_folder, write_metrics
-from segslam.output.log import RunLog, read_log
+from segslam.output.folder import copy_alone, new_folder
+from segslam.output.georeferenced import FILE, read_globe
+from segslam.output.log import Mirror, RunLog, read_log
 from segslam.run.run import Run
-from segslam.slam.loop_edits import LoopEdits
+from segslam.slam.loop_edits import LoopEdits, Pair
 from segslam.slam.slam import Slam
 
 BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "keyframes", "geometric")
@@ -26,39 +33,116 @@ def replay(
     `run`: its folder or log.mcap. `settings`: changes such as `"verify.max_false_share=0.01"`; `edits` forbids and adds
     loops. Raises SegslamError for a setting that cannot be changed, and for a run localised in the map of another.
     """
-    from segslam.output.report import write_report
-
-    recorded = read_log(log_of(Path(run)))
-    if recorded.options.get("in_map"):
+    replayed = Replay.of(Path(run), settings=settings, edits=edits)
+    if replayed.in_map:
         raise SegslamError(f"{run}: localised in the map of another run; use the command `segslam replay`")
-    config = load_config(None, settings, base=recorded.config)
-    check_settings(config, recorded)
-    edits = LoopEdits.from_json(recorded.options.get("edits", "")).and_then(edits)
-    reference, folder = recorded.reference(), new_folder(Path(out))
-    with Run(
-        folder,
-        Slam(config, edits=edits),
-        dataset=recorded.run.get("dataset", ""),
-        T_camera_lidar=recorded.T_camera_lidar,
-        reference=reference,
-        options={} if edits == NO_EDITS else {"edits": edits.to_json()},
-    ) as made:
-        copy_alone(recorded.path.parent, folder)
-        for _ in made.repeat(recorded.steps()):
+    folder = new_folder(Path(out))
+    with replayed.begun(folder) as made:
+        copy_alone(replayed.recorded.path.parent, folder)
+        for _ in made.repeat(replayed.recorded.steps()):
             pass
-        result, metrics = made.finish()
-    if reference is not None:
-        metrics |= accuracy(result, reference)
-    write_metrics(folder, metrics)
-    write_report(folder)
+        made.complete()
     return read_run(folder)
 
 
-def check_settings(settings_now: Config, recorded: RunLog) -> None:
-    """Raises SegslamError for a change that would have no effect."""
-    for key, before, _ in changed_settings(recorded.config, settings_now):
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """What a run is made of that starts from the log of another."""
+
+    recorded: RunLog
+    config: Config
+    edits: LoopEdits = NO_EDITS
+    """Those of the logged run, then those of this one."""
+
+    @classmethod
+    def of(
+        cls, run: Path, *, config: Path | None = None, settings: Sequence[str] = (), edits: LoopEdits = NO_EDITS
+    ) -> "Replay":
+        """Reads the log of a run, given its folder or the log. Raises SegslamError for a change without effect."""
+        recorded = read_log(run)
+        changed = changed_config(recorded, file=config, settings=settings)
+        return cls(recorded, changed, LoopEdits.from_json(recorded.options.get("edits", "")).and_then(edits))
+
+    @property
+    def in_map(self) -> Path | None:
+        """The run in whose map the logged one was localised, if it was."""
+        name = self.recorded.options.get("in_map")
+        return Path(name) if name else None
+
+    def begun(
+        self,
+        folder: Path,
+        slam: Slam | None = None,
+        *,
+        options: Mapping[str, str] | None = None,
+        mirror: Mirror | None = None,
+    ) -> Run:
+        """The new run in its folder, before its first step.
+
+        By default, `slam` closes loops with the edits, and the log has the `options` that further replays need.
+        """
+        if options is None and self.in_map:
+            options = {"in_map": str(self.in_map)}
+        elif options is None:
+            options = {} if self.edits == NO_EDITS else {"edits": self.edits.to_json()}
+        return Run(
+            folder,
+            slam or Slam(self.config, edits=self.edits),
+            dataset=self.recorded.run.get("dataset", ""),
+            T_camera_lidar=self.recorded.T_camera_lidar,
+            reference=self.recorded.reference(),
+            options=options,
+            mirror=mirror,
+        )
+
+
+def changed_config(recorded: RunLog, *, file: Path | None = None, settings: Sequence[str] = ()) -> Config:
+    """The settings of a logged run with changes. Raises SegslamError for a change that would have no effect."""
+    config = load_config(file, settings, base=recorded.config)
+    for key, before, _ in changed_settings(recorded.config, config):
         if key.partition(".")[0] in BEFORE_THE_KEYFRAMES:
             raise SegslamError(
                 f"{key}: a replay uses the keyframes of {recorded.path}, which were made with {before}; "
                 "keep this value, or map the data again"
             )
+    return config
+
+
+def pairs_near_fixes(run_or_log: Path) -> frozenset[Pair]:
+    """Loops of a georeferenced run that were not tried. Raises SegslamError if it has no place on the globe."""
+    run = read_run(run_or_log)
+    globe = read_globe(run.folder)
+    if globe is None:
+        raise SegslamError(f"{run.folder / FILE}: missing; `segslam georeference` the run first")
+    rows, attempts = run.result.keyframe_rows, run.result.attempts
+    loops = [(one.outcome.source_id, one.outcome.target_id) for one in attempts if isinstance(one.outcome, LoopClosure)]
+    tried = {(one.candidate.source_id, one.candidate.target_id) for one in attempts}
+    travel_m = travelled_m(run.result.odometry.T_world_lidar)[rows]
+    return pairs_near(globe.T_enu_lidar[rows, :2, 3], travel_m, loops, tried, config=run.config.proximity)
+
+
+def pairs_near(
+    east_north_m: Float[np.ndarray, "n 2"],
+    travel_m: Vector,
+    loops: Collection[Pair],
+    tried: Collection[Pair],
+    *,
+    config: ProximityConfig,
+) -> frozenset[Pair]:
+    """For keyframes `min_gap_m` apart the nearest older one within `base_radius_m`, the radius without drift.
+
+    None where a loop joins the two places already, and no pair that was tried.
+    """
+    tree, pairs, last_m = cKDTree(east_north_m), set[Pair](), -np.inf
+    ends_m = travel_m[np.array(list(loops), np.int64).reshape(-1, 2)]
+    for newer, place in enumerate(east_north_m):
+        near = np.array(tree.query_ball_point(place, config.base_radius_m), np.int64)
+        near = near[travel_m[near] <= travel_m[newer] - config.min_travel_m]
+        if not len(near) or travel_m[newer] - last_m < MIN_GAP_M:
+            continue
+        older = int(near[np.linalg.norm(east_north_m[near] - place, axis=1).argmin()])
+        is_joined = (np.abs(ends_m - travel_m[[newer, older]]) < MIN_GAP_M + config.base_radius_m).all(axis=1)
+        if not is_joined.any() and (newer, older) not in tried:
+            pairs.add((newer, older))
+            last_m = travel_m[newer]
+    return frozenset(pairs)

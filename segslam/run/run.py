@@ -2,15 +2,15 @@
 
 import logging
 import math
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,19 +31,22 @@ from segslam.core.types import (
 from segslam.core.whole_files import write_whole
 from segslam.graph import PoseGraph
 from segslam.odometry.calibration import measure_vertical_angle
+from segslam.output.accuracy import accuracy
+from segslam.output.finished import read_metrics
 from segslam.output.folder import (
     ADJUSTED_GRAPH,
+    ALONE,
     LOG,
     UNFINISHED,
     read_alone,
     remove_alone,
     room_for,
-    write_alone,
     write_localised,
     write_loops,
+    write_metrics,
     write_poses,
 )
-from segslam.output.log import LogWriter, Mirror, RunLog
+from segslam.output.log import LogWriter, Mirror, RunLog, read_log
 from segslam.output.log.drawing import CloudOf
 from segslam.scans import Dataset
 from segslam.slam.adjustment import Progress, no_progress
@@ -53,6 +56,19 @@ logger = logging.getLogger(__name__)
 
 MOST_WAITING = 8
 """Chosen: scans by which odometry may lead loop closing, about 2 MB each: the time of a keyframe with two loops."""
+
+
+class Completed(NamedTuple):
+    """What a run ended with."""
+
+    metrics: dict[str, Any]
+    """The content of `metrics.json`."""
+    placed: str
+    """What was found when the run was placed on the globe; empty if it was not."""
+
+
+def _nothing_more(_: SlamResult) -> Mapping[str, Any]:
+    return {}
 
 
 class Run:
@@ -82,6 +98,7 @@ class Run:
         self.num_scans_skipped = 0
         self.num_scans_resumed = 0
         self._dataset = dataset
+        self._reference = reference
         self._resumes = resumes
         self._next_row = 0
         self._unreported: list[BadScan] = []
@@ -200,7 +217,10 @@ class Run:
         SegslamError if there was no step.
         """
         if self.num_steps == 0:
-            raise SegslamError(f"{self._dataset}: {self._why_nothing()}")
+            why = "no scan was mapped"
+            if self._unreported:
+                why = f"none of {len(self._unreported)} scans could be used; the first: {self._unreported[0]}"
+            raise SegslamError(f"{self._dataset}: {why}")
         started = perf_counter()
         result = self._slam.finish(search_s=search_s, progress=progress)
         self._note_ms("finish", perf_counter() - started)
@@ -223,20 +243,21 @@ class Run:
                 write_localised(self.folder, result.trajectory, result.from_map_m, result.localised())
             write_poses(self.folder, "odometry", result.odometry, self._T_camera_lidar)
             if result.alone is not None:
-                write_alone(self.folder, result.alone, self._T_camera_lidar)
+                write_poses(self.folder, ALONE, result.alone, self._T_camera_lidar)
             self._slam.graph.write_g2o(self.folder / "graph.g2o")
             if isinstance(self._slam.graph, PoseGraph):
                 self._slam.graph.write_adjusted_g2o(self.folder / ADJUSTED_GRAPH)
             write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
         closures = [attempt for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
+        states = Counter(motion.state for motion in result.motions)
         return result, {
             "num_scans": len(result.trajectory),
             "num_scans_skipped": self.num_scans_skipped,
             "length_m": float(travelled_m(result.trajectory.T_world_lidar)[-1]),
             "duration_s": float(np.ptp(result.trajectory.stamp_ns)) / 1e9,
             "num_keyframes": len(result.keyframe_rows),
-            "num_motions_repaired": _count(result, MotionState.REPAIRED, MotionState.REJOINED),
-            "num_motions_broken": _count(result, MotionState.BROKEN),
+            "num_motions_repaired": states[MotionState.REPAIRED] + states[MotionState.REJOINED],
+            "num_motions_broken": states[MotionState.BROKEN],
             "num_motions_rejected": len(result.estimate.motion_weights),
             "num_candidates": len(result.attempts),
             "num_loops_accepted": len(closures),
@@ -246,8 +267,49 @@ class Run:
             "peak_rss_mb": peak_mb(),
             **figures,
             **({} if result.from_map_m is None else {"localised_percent": 100.0 * float(result.localised().mean())}),
-            "stage_ms": {stage: _median_and_p95(times) for stage, times in self._stage_ms.items()},
+            "stage_ms": {
+                stage: {"median": median(times), "p95": float(np.percentile(times, 95))}
+                for stage, times in self._stage_ms.items()
+            },
         }
+
+    def complete(
+        self,
+        *,
+        more: Callable[[SlamResult], Mapping[str, Any]] = _nothing_more,
+        place: Callable[[Path], str] | None = None,
+        map_files: Sequence[Path] = (),
+        search_s: float = math.inf,
+        progress: Progress = no_progress,
+    ) -> Completed:
+        """Finish the run, and write the rest of its folder: figures, place on the globe, maps, and the report.
+
+        `more` adds figures computed from the result. `place` georeferences the folder before the maps are written, and
+        returns what it found. `search_s` and `progress` as in `finish`. A failure of place or maps leaves a report.
+        """
+        from segslam.output.report import write_report
+
+        result, metrics = self.finish(search_s=search_s, progress=progress)
+        if self._reference is not None:
+            metrics |= accuracy(result, self._reference)
+        metrics |= more(result)
+        write_metrics(self.folder, metrics)
+        placed = ""
+        try:
+            if place is not None:
+                placed = place(self.folder)
+                metrics = read_metrics(self.folder)
+            if map_files:
+                from segslam.output.export import write_maps
+
+                log = read_log(self.folder)
+                metrics |= write_maps(log, map_files, config=log.config.map, show=progress)
+                metrics["peak_rss_mb"] = peak_mb()
+                write_metrics(self.folder, metrics)
+        finally:
+            with room_for(self.folder):
+                write_report(self.folder)
+        return Completed(metrics, placed)
 
     def _vertical_angle(self, result: SlamResult) -> dict[str, float]:
         """The remaining vertical angle of the scans as figures; empty if too few scans show it."""
@@ -300,22 +362,9 @@ class Run:
         else:
             self._unreported.append(bad)
 
-    def _why_nothing(self) -> str:
-        if not self._unreported:
-            return "no scan was mapped"
-        return f"none of {len(self._unreported)} scans could be used; the first: {self._unreported[0]}"
-
     def _note_ms(self, stage: str, seconds: float) -> None:
         self._stage_ms[stage].append(1000 * seconds)
 
 
-def _count(result: SlamResult, *states: MotionState) -> int:
-    return sum(motion.state in states for motion in result.motions)
-
-
 def _other_data(log: Path, difference: str) -> SegslamError:
     return SegslamError(f"{log}: {difference}; resume with the data of the interrupted run")
-
-
-def _median_and_p95(times: list[float]) -> dict[str, float]:
-    return {"median": median(times), "p95": float(np.percentile(times, 95))}

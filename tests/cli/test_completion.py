@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from segslam.cli import completion
-from segslam.cli.completion import METHODS, datasets, labels_or_files, presets, settings, simulation_settings
+from segslam.cli.completion import datasets, labels_or_files, methods, presets, settings, simulation_settings
 from segslam.core.config import Config
 
 
@@ -20,7 +20,7 @@ def test_keys_of_settings_and_their_values_are_completed() -> None:
 
 def test_names_are_completed() -> None:
     assert presets("") == ["auto", "driving", "campus", "indoor"]
-    assert METHODS("segregator") == ["segregator", "segregator-c2f"]
+    assert methods("segregator") == ["segregator", "segregator-c2f"]
     assert "kitti" in datasets("k")
 
 

@@ -10,7 +10,7 @@ from helpers.finished_run import METRICS, T_CAMERA_LIDAR, make_run
 from segslam import cli
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
-from segslam.output.scores import scores
+from segslam.output.accuracy import scores
 
 
 def _eval(*arguments: object) -> int:

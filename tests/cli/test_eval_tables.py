@@ -11,7 +11,7 @@ from helpers.finished_run import make_run
 
 from segslam.cli.tables import SHORT, as_text
 from segslam.core.trajectory import write_kitti
-from segslam.output.scores import scores
+from segslam.output.accuracy import scores
 
 TRUTH = round_drive()[1]
 ESTIMATE = drifting(TRUTH).T_world_lidar

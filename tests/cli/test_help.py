@@ -8,7 +8,7 @@ from typer.main import get_command
 
 from segslam import cli
 from segslam.cli import commands
-from segslam.cli.groups import ALIASES
+from segslam.cli.commands import ALIASES
 
 
 def _shown(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
@@ -31,7 +31,7 @@ def test_commands_are_in_groups_with_map_first_and_whole_lines_in_80_columns(
 
 
 def test_no_help_names_types_of_python(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    commands.add_all(cli.app)
+    commands.add(cli.app)
     for name, _ in all_commands(get_command(cli.app)):
         text = _shown(capsys, monkeypatch, *name.split())
         found = re.search(r"<(path|str|int|float|list|bool)\b|list\[|int range|float range|\{[A-Z]", text)

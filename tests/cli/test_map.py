@@ -87,7 +87,7 @@ def test_a_run_that_cannot_start_leaves_no_process(
         assert multiprocessing.active_children(), "the odometry has started"
         raise SegslamError("no room")
 
-    monkeypatch.setattr("segslam.run.run.Run", refuse)
+    monkeypatch.setattr("segslam.run.map_folder.Run", refuse)
     assert run("map", kitti, "--out", tmp_path / "run") == 2
     assert not multiprocessing.active_children()
 
@@ -124,7 +124,7 @@ def test_a_given_odometry_is_cropped_by_the_ranges_of_the_preset(
         ranges_m.append(config.max_range_m)
         raise SegslamError("far enough")
 
-    monkeypatch.setattr("segslam.run.given_odometry.given_odometry", given)
+    monkeypatch.setattr("segslam.run.map_folder.given_odometry", given)
     words = ("--odometry", "poses.txt", "--preset", "indoor")
     assert run("map", kitti, "--out", tmp_path / "run", *words) == 2
     assert ranges_m == [40.0]

@@ -121,7 +121,7 @@ def test_a_map_that_cannot_be_made_does_not_affect_other_results(
     kitti, out = tmp_path / "kitti", tmp_path / "run"
     write_kitti_sequence(kitti, num_scans=3)
     with monkeypatch.context() as broken:
-        broken.setattr("segslam.cli.ending.write_maps", no_room)
+        broken.setattr("segslam.output.export.write_maps", no_room)
         assert run("map", kitti, "--out", out, "--map", "--quiet") != 0
     assert json.loads((out / "metrics.json").read_text())["num_scans"] == 3
     assert (out / "report.html").is_file()

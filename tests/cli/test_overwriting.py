@@ -8,10 +8,10 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 
-from segslam.cli.overwriting import make_room
+from segslam.cli.checks import make_room
 from segslam.core.errors import SegslamError
 from segslam.output.log import read_log
-from segslam.output.log.output import Output
+from segslam.output.log.writer import Output
 
 GRAPH = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
 VERTEX_SE3:QUAT 1 1 0 0 0 0 0 1

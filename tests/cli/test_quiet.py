@@ -125,7 +125,7 @@ def words(request: pytest.FixtureRequest, data: Path, tmp_path: Path, monkeypatc
 
 
 def test_every_command_is_tried_here() -> None:
-    commands.add_all(cli.app)
+    commands.add(cli.app)
     elsewhere = {"live", "merge", "georeference"}  # an endless source, longer drives: tests/live, sessions, run
     assert {*COMMANDS, *OF_MAPPED} | elsewhere == {name for name, _ in all_commands(get_command(cli.app))}
 

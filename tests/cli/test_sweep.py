@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from helpers.commands import run
 
-from segslam.cli.sweep import grid_of
+from segslam.cli.compare import grid_of
 from segslam.core.errors import SegslamError
 from segslam.output.finished import read_run
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.terminal import in_terminal
 
-from segslam.cli.console import progress
+from segslam.cli.console import Terminal
 from segslam.core import kernels
 
 DRIVER = """
@@ -83,7 +83,7 @@ def test_every_command_works_in_a_terminal(tmp_path: Path, num_scans: int) -> No
 
 def test_a_bar_passes_all_items_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert list(progress(iter(range(3)), total=3, title="count")) == [0, 1, 2]
+    assert list(Terminal().progress(iter(range(3)), total=3, title="count")) == [0, 1, 2]
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from segslam.cli.warn import FirstOfEachKind
+from segslam.cli.console import FirstOfEachKind
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

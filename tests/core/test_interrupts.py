@@ -13,7 +13,7 @@ import pytest
 from helpers.drives import write_kitti_sequence
 
 from segslam import cli
-from segslam.cli import map as map_module
+from segslam.cli.console import Terminal
 
 pytestmark = pytest.mark.usefixtures("ctrl_c_works", "short_runs")
 
@@ -29,7 +29,7 @@ WRITING = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from segslam.output.map import TemporaryDirectory
+from segslam.output.map.write import TemporaryDirectory
 from segslam.core.interrupts import ctrl_c_in_order, removed_when_stopped
 from segslam.core.whole_files import whole_file
 with ctrl_c_in_order(), whole_file(Path(sys.argv[1], "half.txt")) as part:
@@ -90,13 +90,13 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def interrupt_after(num_scans: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C is pressed when the bar of `map` has come so far."""
 
-    def interrupted(items: Iterable[Any], **_: object) -> Iterator[Any]:
+    def interrupted(_: Terminal, items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
         for number, item in enumerate(items):
-            if number == num_scans:
+            if title == "map" and number == num_scans:
                 signal.raise_signal(signal.SIGINT)
             yield item
 
-    monkeypatch.setattr(map_module, "progress", interrupted)
+    monkeypatch.setattr(Terminal, "progress", interrupted)
 
 
 def test_an_interrupted_run_continues_with_the_printed_command(

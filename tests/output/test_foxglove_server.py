@@ -23,11 +23,12 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from segslam.cli.foxglove import serve_foxglove
+from segslam.cli.console import Terminal
+from segslam.cli.viewers import serve_foxglove
 from segslam.core.types import SegslamError
 from segslam.output.foxglove_server import MOST_MESSAGES, FoxgloveServer, parse_address
 from segslam.output.log import read_log, schema
-from segslam.output.log.channels import channels
+from segslam.output.log.schema import channels
 from segslam.output.origin_check import is_allowed
 
 
@@ -91,7 +92,7 @@ def test_a_page_of_another_site_is_refused_and_others_are_served() -> None:
 def test_an_address_that_others_reach_is_announced(capsys: pytest.CaptureFixture[str]) -> None:
     for address, shown in (("0.0.0.0:0", True), ("127.0.0.1:0", False)):
         with ExitStack() as stack:
-            serve_foxglove(address, stack, quiet=False)
+            serve_foxglove(address, stack, Terminal())
         assert ("there is no password" in capsys.readouterr().err) == shown
 
 

@@ -27,8 +27,7 @@ from segslam.output.georeferenced import Globe, read_globe
 from segslam.output.log import read_log, schema
 from segslam.output.log.locations import write_locations
 from segslam.output.map.projected import Utm, _affine
-from segslam.output.report.figures import STYLE
-from segslam.output.report.fixes import draw_fixes
+from segslam.output.report.figures import STYLE, draw_fixes
 from segslam.output.tracks import track
 from segslam.scans import open_dataset
 

@@ -13,11 +13,11 @@ from segslam.core import geometry
 from segslam.core.config import MapConfig
 from segslam.core.types import GraphEstimate, Keyframe, Label, Transform
 from segslam.labels.class_colors import COLORS
-from segslam.output.map import write_map
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import LEAST_PX
 from segslam.output.map.overhead import cut_heights, visible
 from segslam.output.map.picture import MARGIN_M
+from segslam.output.map.write import write_map
 
 CEILING_M = 2.6 - SENSOR_M
 PATH = np.column_stack([np.arange(0.0, 60.0, 2.0), np.zeros(30), np.zeros(30)])

@@ -20,7 +20,7 @@ from segslam.core.config import Config, load_config
 from segslam.core.types import SegslamError
 from segslam.output.accuracy import accuracy
 from segslam.output.finished import FIGURES, read_run
-from segslam.output.folder import write_alone, write_metrics
+from segslam.output.folder import ALONE, write_metrics, write_poses
 from segslam.output.map.from_above import small_png
 from segslam.output.report import write_report
 from segslam.output.report.figures import draw_loops, paths_of
@@ -120,7 +120,7 @@ def test_kiss_icp_alone_is_drawn_and_scored_beside_the_repaired_odometry(tmp_pat
     made = make_run(tmp_path / "run")
     off = made.result.odometry.T_world_lidar.copy()
     off[60:, 1, 3] += 8.0
-    write_alone(made.folder, replace(made.result.odometry, T_world_lidar=off), None)
+    write_poses(made.folder, ALONE, replace(made.result.odometry, T_world_lidar=off), None)
     run = read_run(made.folder)
     assert run.reference is not None
     figures = accuracy(run.result, run.reference)
@@ -138,7 +138,7 @@ def test_kiss_icp_alone_is_drawn_and_scored_beside_the_repaired_odometry(tmp_pat
 def test_poses_of_kiss_icp_alone_of_other_scans_are_refused(tmp_path: Path) -> None:
     made = make_run(tmp_path / "run")
     later = replace(made.result.odometry, stamp_ns=made.result.odometry.stamp_ns + 1)
-    write_alone(made.folder, later, None)
+    write_poses(made.folder, ALONE, later, None)
     with pytest.raises(SegslamError, match=r"kiss_icp_tum\.txt: not of the scans of this run; remove the file"):
         read_run(made.folder)
 

@@ -9,7 +9,7 @@ from evo.core.trajectory import PosePath3D
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses
-from segslam.output.scores import Align, aligned_by, pairs_at_distance, scale_of, scores
+from segslam.output.accuracy import Align, aligned_by, pairs_at_distance, scale_of, scores
 
 RNG = np.random.default_rng(4)
 

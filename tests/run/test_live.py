@@ -13,7 +13,7 @@ from helpers.hanging_source import HangingSource
 from helpers.live_command import LiveCommand, record, write_scan
 from helpers.terminal import in_terminal
 
-from segslam.cli.live_status import too_slow
+from segslam.cli.live import too_slow
 from segslam.core import geometry
 from segslam.core.config import Config, OdometryConfig
 from segslam.core.evaluation import trajectory_metrics
@@ -23,8 +23,7 @@ from segslam.output.finished import read_run
 from segslam.output.log import LogWriter, read_log
 from segslam.run.live import FolderSource, Front
 from segslam.run.live.folder import stamp_of_name
-from segslam.run.live.rhythm import Rhythm
-from segslam.run.live.waiting import Waiting
+from segslam.run.live.waiting import Rhythm, Waiting
 
 INTERVAL_NS = 100_000_000
 SETTINGS = ("--set", "odometry.min_range_m=1")
@@ -59,8 +58,8 @@ def test_gaps_are_counted_by_stamp_with_the_scans_that_they_lack() -> None:
     rhythm = Rhythm()
     for number in (0, 1, 2, 3, 6, 7, 8, 18):
         rhythm.note(number * INTERVAL_NS)
-    assert (rhythm.num_gaps, rhythm.num_missing) == (2, 2 + 9)
-    assert rhythm.longest_gap_s == pytest.approx(1.0)
+    assert (rhythm.gaps.num_gaps, rhythm.gaps.num_missing) == (2, 2 + 9)
+    assert rhythm.gaps.longest_gap_s == pytest.approx(1.0)
     assert rhythm.intervals(0, 3 * INTERVAL_NS) == pytest.approx(3.0)
     assert rhythm.intervals(0, int(1.2 * INTERVAL_NS)) == 1.0
     assert rhythm.intervals(0, 1000 * INTERVAL_NS) == 10.0
@@ -71,7 +70,7 @@ def test_stamps_continue_when_the_clock_of_the_sender_is_set_back() -> None:
     stamps = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
     again = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
     assert np.all(np.diff([*stamps, *again]) == INTERVAL_NS)
-    assert (rhythm.num_clock_set, rhythm.num_gaps) == (1, 0)
+    assert (rhythm.gaps.num_clock_set, rhythm.gaps.num_gaps) == (1, 0)
 
 
 @pytest.mark.parametrize("ahead_ns", [25 * 3600 * 10**9, 2_000_000_000 * 10**9])
@@ -82,14 +81,14 @@ def test_stamps_of_a_clock_that_is_set_forward_continue_and_count_no_missing_sca
     sent[4] += ahead_ns
     sent[8:] = [stamp_ns + ahead_ns for stamp_ns in sent[8:]]
     assert np.all(np.diff([rhythm.note(stamp_ns) for stamp_ns in sent]) == INTERVAL_NS)
-    assert (rhythm.num_clock_set, rhythm.num_gaps, rhythm.num_missing) == (3, 0, 0)
+    assert (rhythm.gaps.num_clock_set, rhythm.gaps.num_gaps, rhythm.gaps.num_missing) == (3, 0, 0)
 
 
 def test_a_pause_of_an_hour_is_a_gap() -> None:
     rhythm = Rhythm()
     for stamp_s in (0, 1, 2, 3, 3603):
         rhythm.note(stamp_s * 10**9)
-    assert (rhythm.num_clock_set, rhythm.num_gaps, rhythm.longest_gap_s) == (0, 1, 3600.0)
+    assert (rhythm.gaps.num_clock_set, rhythm.gaps.num_gaps, rhythm.gaps.longest_gap_s) == (0, 1, 3600.0)
 
 
 @pytest.mark.parametrize(

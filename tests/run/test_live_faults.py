@@ -23,8 +23,7 @@ from segslam.core.types import BadScan, Scan, SegslamError
 from segslam.odometry import Tracked, Tracker
 from segslam.output.log import read_log
 from segslam.run.live import FolderSource, Front, Placed
-from segslam.run.live.placed import Past
-from segslam.run.live.serve import OdometryEnded, _place_all
+from segslam.run.live.serve import OdometryEnded, Past, _place_all
 from segslam.run.live.waiting import Arrival, Waiting
 
 SETTINGS = ("--set", "odometry.min_range_m=1")
@@ -72,7 +71,7 @@ def test_a_file_removed_before_it_is_read_is_counted_and_changes_no_stamp(
         arrivals[1].read(1, 0)
     stamps = [arrivals[number].stamp_ns for number in (0, 2, 3)]
     assert 0 < stamps[2] - stamps[0] < 5_000_000_000
-    assert (waiting.num_arrived, waiting.rhythm.num_clock_set, waiting.rhythm.num_missing) == (4, 0, 0)
+    assert (waiting.num_arrived, waiting.rhythm.gaps.num_clock_set, waiting.rhythm.gaps.num_missing) == (4, 0, 0)
 
 
 @pytest.mark.parametrize("stem", ["9999999999999900001", "9999999999999999"])

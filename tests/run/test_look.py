@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from helpers.drives import round_drive
 
+from segslam.cli.console import Terminal
 from segslam.cli.preset import live_config
 from segslam.core.errors import SegslamError
 from segslam.core.types import BadScan, Scan, Transform
-from segslam.run.live.look import extent_in_folder, extent_of_first
-from segslam.run.live.waiting import Arrival, Waiting
+from segslam.run.live.waiting import Arrival, Waiting, extent_in_folder, extent_of_first
 from segslam.scans.presets import extent_of, preset
 
 
@@ -63,14 +63,14 @@ def test_scans_in_the_folder_choose_the_preset_as_for_map(tmp_path: Path, capsys
     assert extent_in_folder(tmp_path / "street") == pytest.approx(float(expected), rel=0.05)
     for number in range(3):
         np.save(tmp_path / f"{number}.npy", _ring(6.0))
-    assert live_config("auto", tmp_path, None, quiet=False) == preset("indoor")
+    assert live_config("auto", tmp_path, None, Terminal()) == preset("indoor")
     assert "using --preset indoor" in capsys.readouterr().err
 
 
 def test_without_scans_the_preset_is_driving_with_a_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert extent_in_folder(tmp_path) is None
-    assert live_config("auto", tmp_path, None, quiet=False) == preset("driving")
+    assert live_config("auto", tmp_path, None, Terminal()) == preset("driving")
     assert "no scan yet: using --preset driving" in capsys.readouterr().err
-    assert live_config("campus", tmp_path, None, quiet=False) == preset("campus")
+    assert live_config("campus", tmp_path, None, Terminal()) == preset("campus")
     with pytest.raises(SegslamError, match="unknown preset"):
-        live_config("moon", tmp_path, None, quiet=True)
+        live_config("moon", tmp_path, None, Terminal(quiet=True))

@@ -9,7 +9,7 @@ from helpers.finished_run import make_run
 
 from segslam.candidates.proximity import MIN_GAP_M
 from segslam.core.config import ProximityConfig
-from segslam.run.near_fixes import pairs_near
+from segslam.run.replay import pairs_near
 
 SPACING_M = 2.0
 ROUND = 100

@@ -25,7 +25,7 @@ from segslam.core.config import load_config
 from segslam.core.types import Keyframe, Label, Transform
 from segslam.labels.late import computed
 from segslam.output.log import read_log
-from segslam.output.map import write_map
+from segslam.output.map.write import write_map
 from tools.benchmarks import common
 
 STANDING = {

@@ -199,13 +199,9 @@ def _record(offset: int, opcode: int, body: bytes) -> object:
 
 def _records_of_chunk(offset: int, chunk: Chunk) -> list[object]:
     try:
-        if max(chunk.uncompressed_size, _claimed_size(chunk)) > _MOST_CHUNK_BYTES:
+        allocated = frame_content_size(chunk.data) if chunk.compression == "zstd" else 0  # as zstd will do
+        if max(chunk.uncompressed_size, allocated) > _MOST_CHUNK_BYTES:
             raise CutError(offset)
         return list(breakup_chunk(chunk, validate_crc=True))
     except _DAMAGE as error:
         raise CutError(offset) from error
-
-
-def _claimed_size(chunk: Chunk) -> int:
-    """The size of the data after decompression, as zstd allocates it."""
-    return frame_content_size(chunk.data) if chunk.compression == "zstd" else 0

@@ -1,9 +1,10 @@
-"""Visualisation of a run, step by step, as Foxglove messages."""
+"""Visualisation of a run, step by step, as Foxglove messages: drawings, and what happens in words."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 from segslam.core import geometry
@@ -15,6 +16,8 @@ from segslam.core.types import (
     Label,
     Labels,
     LoopAttempt,
+    LoopClosure,
+    MotionState,
     Points,
     Rejected,
     RejectReason,
@@ -22,9 +25,10 @@ from segslam.core.types import (
     Trajectory,
     Transform,
     Vector,
+    probability_text,
 )
 from segslam.output.log import foxglove, schema
-from segslam.output.log.messages import messages_of
+from segslam.output.log.foxglove import timestamp
 from segslam.output.log.records import codec
 
 ACCEPTED_COLOR = "#2ca02cff"
@@ -62,6 +66,9 @@ MAP_RANGE_M, MAP_VOXEL_M = 40.0, 0.2
 Topical = tuple[str, Message]
 CloudOf = Callable[[int], tuple[Points, Labels]]
 """Function from the id of a keyframe to its points, in its frame, and their labels."""
+INFO, WARNING = Log.Level.Value("INFO"), Log.Level.Value("WARNING")
+NAME = "segslam"
+REPAIRS = (MotionState.REPAIRED, MotionState.REJOINED)
 
 
 class Drawing:
@@ -102,14 +109,12 @@ class Drawing:
         self._T_world_odom = estimate.T_world_keyframe[last] @ geometry.inverse(self._T_odom_keyframe[last])
         yield self._odom_in_world(stamp_ns)
         if path:
-            poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
-            yield schema.TRAJECTORY, poses
+            yield schema.TRAJECTORY, foxglove.path(estimate.T_world_keyframe.values(), stamp_ns=stamp_ns)
             yield schema.GRAPH, self._graph(estimate, stamp_ns)
 
     def draw_path(self, estimate: GraphEstimate, *, stamp_ns: int) -> Topical:
         """The path before the adjustment of the whole map."""
-        poses = foxglove.poses_in_frame(estimate.T_world_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
-        return schema.TRAJECTORY_BEFORE, poses
+        return schema.TRAJECTORY_BEFORE, foxglove.path(estimate.T_world_keyframe.values(), stamp_ns=stamp_ns)
 
     def draw_map(self, estimate: GraphEstimate, cloud: CloudOf, *, stamp_ns: int) -> Iterator[Topical]:
         """One cloud of the whole drive in world.
@@ -137,11 +142,10 @@ class Drawing:
         )
         if len(self._T_odom_keyframe) >= PATH_GROWTH * self._num_on_path:
             self._num_on_path = len(self._T_odom_keyframe)
-            path = foxglove.poses_in_frame(self._T_odom_keyframe.values(), frame=schema.WORLD, stamp_ns=stamp_ns)
-            yield schema.ODOMETRY, path
+            yield schema.ODOMETRY, foxglove.path(self._T_odom_keyframe.values(), stamp_ns=stamp_ns)
             if corrected:
                 poses = [self._in_world(number) for number in self._T_odom_keyframe]
-                yield schema.TRAJECTORY, foxglove.poses_in_frame(poses, frame=schema.WORLD, stamp_ns=stamp_ns)
+                yield schema.TRAJECTORY, foxglove.path(poses, stamp_ns=stamp_ns)
 
     def _attempts(self, attempts: tuple[LoopAttempt, ...], stamp_ns: int) -> Iterator[Topical]:
         for topic, wanted in ((schema.ACCEPTED, False), (schema.REJECTED, True)):
@@ -166,7 +170,6 @@ class Drawing:
             f"{pair[0]} to {pair[1]}",
             foxglove.line([self._position(keyframe_id) for keyframe_id in pair], [color]),
             numbers_and_words(codec(LoopAttempt).encode(attempt)),
-            frame=schema.WORLD,
             stamp_ns=stamp_ns,
         )
 
@@ -175,7 +178,7 @@ class Drawing:
         colors = [weight_color(weight) for weight in estimate.closure_weights.values()]
         about = {"error": f"{estimate.error:g}", "closures": str(len(colors))}
         lines = foxglove.line(ends, colors)
-        return foxglove.scene([foxglove.entity("closures", lines, about, frame=schema.WORLD, stamp_ns=stamp_ns)])
+        return foxglove.scene([foxglove.entity("closures", lines, about, stamp_ns=stamp_ns)])
 
     def _position(self, keyframe_id: int) -> Vector:
         """Position in world, by the last estimate and the odometry since."""
@@ -219,7 +222,7 @@ def ground_truth(reference: Trajectory, *, stamp_ns: int) -> Topical:
     """The true path, moved to start at the origin of world."""
     T_first_true = geometry.inverse(reference.T_world_lidar[0])
     path = (T_first_true @ T_true_lidar for T_true_lidar in reference.T_world_lidar)
-    return schema.GROUND_TRUTH, foxglove.poses_in_frame(path, frame=schema.WORLD, stamp_ns=stamp_ns)
+    return schema.GROUND_TRUTH, foxglove.path(path, stamp_ns=stamp_ns)
 
 
 def weight_color(weight: float) -> str:
@@ -239,3 +242,27 @@ def numbers_and_words(values: Mapping[str, Any], prefix: str = "") -> dict[str, 
         elif not isinstance(value, list):
             flat[prefix + key] = str(value)
     return flat
+
+
+def warning(text: str, *, stamp_ns: int) -> Log:
+    """A warning, for example about a scan that was skipped."""
+    return Log(timestamp=timestamp(stamp_ns), level=WARNING, message=text, name=NAME)
+
+
+def messages_of(step: Step) -> Iterator[Log]:
+    """Repairs and breaks of the odometry as warnings, accepted loops as information."""
+    motion = step.motion
+    if motion is not None and motion.state in REPAIRS:
+        by = "" if motion.moved_m is None else f", by {motion.moved_m:.2f} m"
+        yield warning(f"scan {step.scan_index}: motion of the odometry repaired{by}", stamp_ns=step.stamp_ns)
+    elif motion is not None and motion.state is MotionState.BROKEN:
+        yield warning(f"scan {step.scan_index}: break, the scans do not support the motion", stamp_ns=step.stamp_ns)
+    for attempt in step.attempts:
+        if isinstance(attempt.outcome, LoopClosure):
+            closure, found = attempt.outcome, attempt.outcome.alignment
+            probable = "" if found.probability is None else probability_text(found.probability, found.evidence) + ", "
+            text = (
+                f"loop from keyframe {closure.source_id} to {closure.target_id}: {probable}"
+                f"overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m"
+            )
+            yield Log(timestamp=timestamp(step.stamp_ns), level=INFO, message=text, name=NAME)

@@ -23,17 +23,15 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 from segslam.core import geometry
 from segslam.core.types import Labels, Points, Transform, Vector
 from segslam.labels.class_colors import of_classes
+from segslam.output.log.schema import WORLD
 
 _POINT = np.dtype([("xyz", "<f4", 3), ("label", "u1"), ("rgba", "u1", 4)])
 _POINT_FIELDS = [
-    PackedElementField(name="x", offset=0, type=PackedElementField.FLOAT32),
-    PackedElementField(name="y", offset=4, type=PackedElementField.FLOAT32),
-    PackedElementField(name="z", offset=8, type=PackedElementField.FLOAT32),
-    PackedElementField(name="label", offset=12, type=PackedElementField.UINT8),
-    PackedElementField(name="red", offset=13, type=PackedElementField.UINT8),
-    PackedElementField(name="green", offset=14, type=PackedElementField.UINT8),
-    PackedElementField(name="blue", offset=15, type=PackedElementField.UINT8),
-    PackedElementField(name="alpha", offset=16, type=PackedElementField.UINT8),
+    *(PackedElementField(name=axis, offset=4 * k, type=PackedElementField.FLOAT32) for k, axis in enumerate("xyz")),
+    *(
+        PackedElementField(name=name, offset=12 + k, type=PackedElementField.UINT8)
+        for k, name in enumerate(("label", "red", "green", "blue", "alpha"))
+    ),
 ]
 _IDENTITY = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 
@@ -65,10 +63,10 @@ def point_cloud(points: Points, labels: Labels, *, frame: str, stamp_ns: int) ->
     )
 
 
-def poses_in_frame(T_frame_each: Iterable[Transform], *, frame: str, stamp_ns: int) -> PosesInFrame:
-    """Message with a path; `transforms` recovers its poses to float64 precision."""
-    stack = np.array(list(T_frame_each)).reshape(-1, 4, 4)
-    return PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=frame, poses=_poses(stack))
+def path(T_world_each: Iterable[Transform], *, stamp_ns: int) -> PosesInFrame:
+    """Message with a path in world; `transforms` recovers its poses to float64 precision."""
+    stack = np.array(list(T_world_each)).reshape(-1, 4, 4)
+    return PosesInFrame(timestamp=timestamp(stamp_ns), frame_id=WORLD, poses=_poses(stack))
 
 
 def transforms(poses: PosesInFrame) -> list[Transform]:
@@ -93,13 +91,11 @@ def line(points: Sequence[Vector], colors: Sequence[str], *, width_px: float = 2
     )
 
 
-def entity(
-    identity: str, lines: LinePrimitive, metadata: Mapping[str, str], *, frame: str, stamp_ns: int
-) -> SceneEntity:
-    """Lines that remain until an entity of the same identity replaces them; a click shows the metadata."""
+def entity(identity: str, lines: LinePrimitive, metadata: Mapping[str, str], *, stamp_ns: int) -> SceneEntity:
+    """Lines in world that remain until an entity of the same identity replaces them; a click shows the metadata."""
     return SceneEntity(
         timestamp=timestamp(stamp_ns),
-        frame_id=frame,
+        frame_id=WORLD,
         id=identity,
         metadata=[KeyValuePair(key=key, value=value) for key, value in metadata.items()],
         lines=[lines],

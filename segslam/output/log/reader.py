@@ -2,9 +2,9 @@
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,31 +17,73 @@ from segslam.core.errors import brief
 from segslam.core.types import (
     GraphEstimate,
     Keyframe,
+    Labels,
     LateLoops,
     LoopAttempt,
+    Points,
     SegslamError,
     Step,
     Trajectory,
     Transform,
 )
+from segslam.output.folder import log_of
 from segslam.output.log import container, schema
 from segslam.output.log.cloud import KeyframePoints, intensities, place_of, points_and_labels
-from segslam.output.log.container import CutError
+from segslam.output.log.container import CutError, Span, messages_within
 from segslam.output.log.foxglove import transforms
-from segslam.output.log.keyframes import RecordedKeyframe, RecordedKeyframes
-from segslam.output.log.origin import restored
 from segslam.output.log.records import codec
+from segslam.output.log.schema import restored
 from segslam.slam.adjustment import Adjustment
 
 logger = logging.getLogger(__name__)
-
 NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
 NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, RecursionError, DecodeError)
 """Exceptions on content of another program, or damaged in spite of a correct checksum."""
 Parts = Mapping[str, bytes]
 """The latest message of each topic."""
-Encoded = TypeVar("Encoded")
 Decoded = TypeVar("Decoded")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedKeyframe:
+    """A keyframe without its points, and their position in the file."""
+
+    keyframe: Keyframe
+    chunk: Span
+    channel_id: int
+
+
+class RecordedKeyframes:
+    """Keyframes by id; the `segslam.keyframes.Clouds` of a finished run."""
+
+    def __init__(self, path: Path, kept: Sequence[RecordedKeyframe]) -> None:
+        self._path = path
+        self._kept = {one.keyframe.id: one for one in kept}
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __getitem__(self, keyframe_id: int) -> Keyframe:
+        """A keyframe, without points."""
+        return self._kept[keyframe_id].keyframe
+
+    def keep(self, keyframe: Keyframe) -> None:
+        """Raises TypeError: keyframes cannot be added to a recorded drive."""
+        raise TypeError(f"keyframe {keyframe.id}: the log {self._path} is read only")
+
+    def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
+        """Points and labels of a keyframe. Raises SegslamError if the file has changed since it was opened."""
+        one = self._kept[keyframe_id]
+        try:
+            with self._path.open("rb") as stream:
+                stream.seek(one.chunk.offset)
+                records = stream.read(one.chunk.size)
+            for channel_id, data in messages_within(records):
+                if channel_id == one.channel_id:
+                    return points_and_labels(KeyframePoints.FromString(data))
+        except (OSError, CutError, ValueError, DecodeError) as error:
+            raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
+        raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +103,9 @@ class RunLog:
     @property
     def T_camera_lidar(self) -> Transform | None:  # noqa: N802  (a transform)
         """Calibration of KITTI data; None for other data."""
-        return self._decoded(_calibration, self.run["T_camera_lidar"]) if "T_camera_lidar" in self.run else None
+        if "T_camera_lidar" not in self.run:
+            return None
+        return self._decoded(lambda: np.array(json.loads(self.run["T_camera_lidar"]), np.float64).reshape(4, 4))
 
     def num_steps(self) -> int:
         """Number of complete steps in the log."""
@@ -77,12 +121,12 @@ class RunLog:
         num_steps = 0
         parts: dict[str, bytes] = {}
         try:
-            for topic, data in self._messages():
-                parts[topic] = data
-                if topic == schema.STEP:
+            for message in self._messages():
+                parts[message.topic] = message.data
+                if message.topic == schema.STEP:
                     if not clouds and schema.KEYFRAME in parts:
                         parts[schema.KEYFRAME] = b""  # encodes zero points
-                    yield self._decoded(_step, parts)
+                    yield self._decoded(lambda: _step(parts))
                     num_steps += 1
                     parts.clear()
         except CutError as cut:
@@ -91,40 +135,47 @@ class RunLog:
                 "%s: cut or damaged at byte %d of %d: kept the first %d steps", self.path, cut.offset, size, num_steps
             )
 
+    def whole_steps(self, num_keyframes: int) -> Iterator[Step]:
+        """As `steps`; the loops tried after the last scan belong to the step of the last of so many keyframes."""
+        late = self.late_loops()
+        for step in self.steps():
+            is_last = step.keyframe is not None and step.keyframe.id == num_keyframes - 1
+            yield replace(step, attempts=(*step.attempts, *late)) if is_last else step
+
     def reference(self) -> Trajectory | None:
         """The true poses of the scans, if known."""
         with suppress(CutError):
-            for topic, data in self._messages():
-                if topic == schema.REFERENCE:
-                    return self._decoded(_trajectory, data)
-                if topic == schema.STEP:
+            for message in self._messages():
+                if message.topic == schema.REFERENCE:
+                    return self._record(Trajectory, message.data)
+                if message.topic == schema.STEP:
                     return None
         return None
 
     def result(self) -> tuple[GraphEstimate, Trajectory] | None:
         """The last estimate and the pose of every scan; None if the run did not finish."""
         parts = self._ending()
-        return (self._decoded(_estimate, parts), self._decoded(_trajectory, parts[schema.RESULT])) if parts else None
+        if not parts:
+            return None
+        return self._decoded(lambda: _estimate(parts)), self._record(Trajectory, parts[schema.RESULT])
 
     def late_loops(self) -> tuple[LoopAttempt, ...]:
         """Loops tried after the last scan; empty if the run did not finish."""
         parts = self._ending()
-        if schema.LATE_LOOPS not in parts:
-            return ()
-        return self._decoded(_late_loops, parts[schema.LATE_LOOPS]).attempts
+        return self._record(LateLoops, parts[schema.LATE_LOOPS]).attempts if schema.LATE_LOOPS in parts else ()
 
     def adjustment(self) -> Adjustment | None:
         """The adjustment of the whole map; None without one, or if the run did not finish."""
         parts = self._ending()
-        return self._decoded(_adjustment, parts[schema.ADJUSTMENT]) if schema.ADJUSTMENT in parts else None
+        return self._record(Adjustment, parts[schema.ADJUSTMENT]) if schema.ADJUSTMENT in parts else None
 
     def _ending(self) -> Parts:
         """The messages of the result; empty if the run did not finish."""
         parts: dict[str, bytes] = {}
         with suppress(CutError):
-            for topic, data in self._messages(since_last=schema.TRAJECTORY):
-                parts[topic] = data
-                if topic == schema.RESULT:
+            for message in self._messages(since_last=schema.TRAJECTORY):
+                parts[message.topic] = message.data
+                if message.topic == schema.RESULT:
                     return parts
         return {}
 
@@ -134,25 +185,20 @@ class RunLog:
         parts: dict[str, bytes] = {}
         cloud: container.Stored | None = None
         with suppress(CutError):
-            for message in self._stored():
+            for message in self._messages():
                 parts[message.topic] = message.data
                 if message.topic == schema.KEYFRAME:
                     cloud = message
                 if message.topic == schema.STEP:
-                    if cloud is not None:
-                        kept.append(self._decoded(_recorded_keyframe, (parts, cloud)))
+                    if (found := cloud) is not None:
+                        kept.append(self._decoded(lambda: _recorded_keyframe(parts, found)))
                         if kept[-1].keyframe.id != len(kept) - 1:
                             raise SegslamError(f"{self.path}: keyframe {len(kept) - 1} is missing; map the data again")
                     parts.clear()
                     cloud = None
         return RecordedKeyframes(self.path, kept)
 
-    def _messages(self, *, since_last: str | None = None) -> Iterator[tuple[str, bytes]]:
-        """Topic and data, as `_stored`."""
-        for message in self._stored(since_last=since_last):
-            yield message.topic, message.data
-
-    def _stored(self, *, since_last: str | None = None) -> Iterator[container.Stored]:
+    def _messages(self, *, since_last: str | None = None) -> Iterator[container.Stored]:
         """As `container.messages`. Raises CutError, and SegslamError if the records are not those of this version."""
         own = schema.json_schemas()
         for message in container.messages(self.path, since_last=since_last):
@@ -163,25 +209,24 @@ class RunLog:
                 )
             yield message
 
-    def _decoded(self, decode: Callable[[Encoded], Decoded], encoded: Encoded) -> Decoded:
+    def _decoded(self, decode: Callable[[], Decoded]) -> Decoded:
         try:
-            return decode(encoded)
-        except (
-            LookupError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            OverflowError,
-            RecursionError,
-            DecodeError,
-        ) as error:
+            return decode()
+        except NOT_OURS as error:
             raise SegslamError(
                 f"{self.path}: not written by segslam ({brief(repr(error))}); map the data again"
             ) from error
 
+    def _record(self, record: Callable[..., Decoded], data: bytes) -> Decoded:
+        return self._decoded(lambda: codec(record).decode(json.loads(data), {}))
 
-def read_log(path: Path) -> RunLog:
-    """Open the log of a run, complete or not. Raises SegslamError if it is missing or has another schema version."""
+
+def read_log(run: Path) -> RunLog:
+    """Open the log of a run, complete or not, given its folder or the log.
+
+    Raises SegslamError if it is missing or has another schema version.
+    """
+    path = log_of(run)
     remedy = "give the log.mcap of a run"
     try:
         metadata, cut = container.metadata(path)
@@ -192,18 +237,18 @@ def read_log(path: Path) -> RunLog:
         raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}") from cut
     if check is not None and check.get("crc32") != str(schema.checksum(metadata)):
         raise SegslamError(f"{path}: the settings at its start are damaged (wrong checksum); map the data again")
-    run = restored(metadata.get(schema.RUN_METADATA, {}))
-    if "yaml" not in metadata.get(schema.CONFIG_METADATA, {}) or "schema_version" not in run:
+    about = restored(metadata.get(schema.RUN_METADATA, {}))
+    if "yaml" not in metadata.get(schema.CONFIG_METADATA, {}) or "schema_version" not in about:
         raise SegslamError(f"{path}: an MCAP file, but not a log of segslam; {remedy}")
     packages = metadata.get(schema.PACKAGES_METADATA, {})
-    if run["schema_version"] != str(schema.VERSION):
+    if about["schema_version"] != str(schema.VERSION):
         raise SegslamError(
-            f"{path}: a log of schema version {brief(run['schema_version'])}, but this version reads {schema.VERSION}; "
-            f"use segslam {brief(packages.get('segslam', 'of that time'))}, which wrote it"
+            f"{path}: a log of schema version {brief(about['schema_version'])}, but this version reads "
+            f"{schema.VERSION}; use segslam {brief(packages.get('segslam', 'of that time'))}, which wrote it"
         )
     config = config_from_yaml(metadata[schema.CONFIG_METADATA]["yaml"], f"{path} (settings)")
     options = restored(metadata.get(schema.OPTIONS_METADATA, {}))
-    return RunLog(path=path, config=config, run=run, packages=packages, options=options)
+    return RunLog(path=path, config=config, run=about, packages=packages, options=options)
 
 
 def _is_readable(written: bytes, own: dict[str, Any]) -> bool:
@@ -223,8 +268,7 @@ def _step(parts: Parts) -> Step:
     return codec(Step).decode(json.loads(parts[schema.STEP]), {Step: {"estimate": estimate}, Keyframe: keyframe})
 
 
-def _recorded_keyframe(found: tuple[Parts, container.Stored]) -> RecordedKeyframe:
-    parts, stored = found
+def _recorded_keyframe(parts: Parts, stored: container.Stored) -> RecordedKeyframe:
     message = KeyframePoints.FromString(stored.data)
     step = codec(Step).decode(
         json.loads(parts[schema.STEP]),
@@ -241,19 +285,3 @@ def _estimate(parts: Parts) -> GraphEstimate:
     poses = transforms(PosesInFrame.FromString(parts[schema.TRAJECTORY]))
     T_world_keyframe = dict(zip(values["keyframe_ids"], poses, strict=True))
     return codec(GraphEstimate).decode(values, {GraphEstimate: {"T_world_keyframe": T_world_keyframe}})
-
-
-def _calibration(text: str) -> Transform:
-    return np.array(json.loads(text), np.float64).reshape(4, 4)
-
-
-def _late_loops(data: bytes) -> LateLoops:
-    return codec(LateLoops).decode(json.loads(data), {})
-
-
-def _adjustment(data: bytes) -> Adjustment:
-    return codec(Adjustment).decode(json.loads(data), {})
-
-
-def _trajectory(data: bytes) -> Trajectory:
-    return codec(Trajectory).decode(json.loads(data), {})

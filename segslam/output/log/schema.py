@@ -1,11 +1,28 @@
-"""Topics, frames and metadata of a log, and the version of this format."""
+"""Topics, channels, frames and metadata of a log, and the version of this format."""
 
 import json
+import os
+import platform
+import re
+import shlex
+import sys
 import zlib
 from collections.abc import Mapping
-from typing import Any
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from segslam.core.types import GraphEstimate, LateLoops, Step, Trajectory
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from segslam.core.config import Config, config_to_yaml
+from segslam.core.types import GraphEstimate, LateLoops, Step, Trajectory, Transform
+from segslam.output.log.cloud import KeyframePoints
 from segslam.output.log.records import codec
 from segslam.slam.adjustment import Adjustment
 
@@ -71,6 +88,25 @@ PACKAGES_METADATA = "segslam.packages"
 
 CHECK_METADATA = "segslam.check"
 """Metadata record: `crc32`, the checksum of the other records, because MCAP has none; missing in older logs."""
+PROTOBUF_TOPICS: dict[str, Any] = {
+    TRANSFORMS: FrameTransform,
+    KEYFRAME: KeyframePoints,
+    POINTS: PointCloud,
+    MAP: PointCloud,
+    ODOMETRY: PosesInFrame,
+    TRAJECTORY: PosesInFrame,
+    TRAJECTORY_BEFORE: PosesInFrame,
+    GROUND_TRUTH: PosesInFrame,
+    LOG: Log,
+    ACCEPTED: SceneUpdate,
+    REJECTED: SceneUpdate,
+    GRAPH: SceneUpdate,
+}
+CPU_INFO = Path("/proc/cpuinfo")
+ESCAPED = re.compile(r"\\u(dc[89a-f][0-9a-f])")
+"""A byte of a file name that is not UTF-8, as Python writes it (PEP 383)."""
+PACKAGES = ("segslam", "numpy", "gtsam", "kiss-icp", "open3d", "small-gicp", "numba", "scipy", "mcap")
+"""Packages whose versions a log records, because results depend on them."""
 
 
 def checksum(metadata: Mapping[str, Mapping[str, str]]) -> int:
@@ -95,11 +131,6 @@ def json_schemas() -> dict[str, dict[str, Any]]:
     }
 
 
-def schema_text(schema: dict[str, Any]) -> bytes:
-    """A JSON Schema as stored in the file."""
-    return json.dumps(schema).encode()
-
-
 def is_readable(written: dict[str, Any], own: dict[str, Any]) -> bool:
     """True if records written with one JSON Schema contain all fields that a reader of `own` needs, with equal types.
 
@@ -116,3 +147,88 @@ def is_readable(written: dict[str, Any], own: dict[str, Any]) -> bool:
         elif name in own.get("required", ()):
             return False
     return all(key in theirs and is_readable(theirs[key], ours[key]) for theirs, ours, key in parts)
+
+
+class Channel(NamedTuple):
+    """A topic and the encoding of its messages."""
+
+    topic: str
+    encoding: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+
+
+def channels() -> list[Channel]:
+    """Every topic of a log."""
+    descriptions = {
+        message: build_file_descriptor_set(message).SerializeToString()
+        for message in dict.fromkeys(PROTOBUF_TOPICS.values())
+    }
+    protobuf = [
+        Channel(topic, "protobuf", message.DESCRIPTOR.full_name, "protobuf", descriptions[message])
+        for topic, message in PROTOBUF_TOPICS.items()
+    ]
+    own = [
+        Channel(topic, "json", values["title"], "jsonschema", json.dumps(values).encode())
+        for topic, values in json_schemas().items()
+    ]
+    return protobuf + own
+
+
+def metadata(
+    config: Config, dataset: str, T_camera_lidar: Transform | None, options: Mapping[str, str]
+) -> dict[str, dict[str, str]]:
+    """Metadata records by name, as documented in `schema`."""
+    calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
+    written = {
+        RUN_METADATA: {
+            "schema_version": str(VERSION),
+            "dataset": dataset,
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "command": _command(),
+            "processor": f"{_processor()}, {os.cpu_count()} cores",
+            **calibration,
+        },
+        CONFIG_METADATA: {"yaml": config_to_yaml(config)},
+        OPTIONS_METADATA: dict(options),
+        PACKAGES_METADATA: {name: _version(name) for name in PACKAGES},
+    }
+    records = {name: {key: _printable(text) for key, text in values.items()} for name, values in written.items()}
+    return {**records, CHECK_METADATA: {"crc32": str(checksum(records))}}
+
+
+def _printable(text: str) -> str:
+    """The text with bytes of file names that are not UTF-8, which a log cannot hold, as escapes."""
+    return text.replace(r"\udc", r"\x5cudc").encode(errors="backslashreplace").decode()
+
+
+def restored(values: Mapping[str, str]) -> dict[str, str]:
+    """The values of a metadata record with the bytes of which `metadata` has made escapes."""
+    return {
+        key: ESCAPED.sub(lambda found: chr(int(found[1], 16)), text).replace(r"\x5cudc", r"\udc")
+        for key, text in values.items()
+    }
+
+
+def _command() -> str:
+    name = Path(sys.argv[0]).name
+    return shlex.join(["segslam" if name == "__main__.py" else name, *sys.argv[1:]])
+
+
+def _processor() -> str:
+    """Name of the processor from Linux; on other systems, from Python."""
+    if CPU_INFO.is_file():
+        for line in CPU_INFO.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:  # open3d is also distributed under other names
+        return "not installed"

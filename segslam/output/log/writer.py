@@ -1,17 +1,20 @@
 """Writes the steps of a run to an MCAP file that is readable up to its last complete step at any time."""
 
+import fcntl
 import json
+import os
 import resource
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import IO, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
 from segslam.core.config import Config
+from segslam.core.interrupts import interrupts_wait
 from segslam.core.types import (
     GraphEstimate,
     Keyframe,
@@ -26,14 +29,11 @@ from segslam.core.types import (
     WorkFailed,
 )
 from segslam.output.log import schema
-from segslam.output.log.channels import channels
 from segslam.output.log.cloud import KeyframePoints, keyframe_points, points_and_labels
 from segslam.output.log.container import messages_within
-from segslam.output.log.drawing import Drawing, Topical, ground_truth
-from segslam.output.log.messages import warning
-from segslam.output.log.origin import metadata
-from segslam.output.log.output import Output
+from segslam.output.log.drawing import Drawing, Topical, ground_truth, warning
 from segslam.output.log.records import codec
+from segslam.output.log.schema import channels, metadata
 from segslam.slam.adjustment import Adjusted, Adjustment
 
 POSES_PER_KEYFRAME = 50
@@ -41,13 +41,81 @@ POSES_PER_KEYFRAME = 50
 only. All estimates are logged until the limit is reached; then every second estimate, and so on."""
 CHUNK_BYTES = 4 * 2**20
 """Larger than any step: a chunk ends with its step, so that a step is complete or missing."""
-
 _STATM = Path("/proc/self/statm")
-
 Encoded = tuple[str, bytes]
 """Topic and data of a message."""
 Mirror = Callable[[str, bytes, int], None]
 """Called with topic, data and stamp (ns) of each message after it is written."""
+
+
+class Output:
+    """Unbuffered stream with the methods that MCAP's writer uses: write, tell, flush.
+
+    After a failure no data is pending. While it is open, no other process can write the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises OSError if the file cannot be written, or another process writes it."""
+        self._raw = path.open("a+b", buffering=0)
+        fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._raw.truncate(0)
+        self._raw.seek(0)
+
+    @property
+    def closed(self) -> bool:
+        """True after `close`."""
+        return self._raw.closed
+
+    def write(self, data: bytes) -> int:
+        """Write all data; a single write to a raw file may be partial."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._raw.write(rest) :]
+        return len(data)
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Bytes written earlier."""
+        return os.pread(self._raw.fileno(), size, offset)
+
+    def tell(self) -> int:
+        """Number of bytes written."""
+        return self._raw.tell()
+
+    def flush(self) -> None:
+        """No effect: the stream is unbuffered."""
+
+    def close(self) -> None:
+        """Close the file."""
+        self._raw.close()
+
+    def sync(self) -> None:
+        """Wait until all data is on the disk and survives a power failure."""
+        os.fsync(self._raw.fileno())
+
+    @contextmanager
+    def whole(self) -> Iterator[None]:
+        """Context manager that writes its data completely or not at all. Ctrl-C takes effect at its end.
+
+        On any exception, such as the OSError of a full disk, the file is truncated to its previous size and closed.
+        """
+        size = self.tell()
+        with interrupts_wait():
+            try:
+                yield
+            except BaseException:
+                self._raw.truncate(size)
+                self._raw.close()
+                raise
+
+
+def is_being_written(path: Path) -> bool:
+    """True if any process has an `Output` open on the file."""
+    with path.open("rb") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        return False
 
 
 class LogWriter:
@@ -95,7 +163,9 @@ class LogWriter:
                 self._mcap.add_metadata(name, data)
             self._channels = _register_channels(self._mcap)
         if reference is not None and len(reference):
-            self._write(_reference_messages(reference), stamp_ns=int(reference.stamp_ns[0]))
+            first_ns = int(reference.stamp_ns[0])
+            drawn = _serialised([ground_truth(reference, stamp_ns=first_ns)])
+            self._write([*drawn, (schema.REFERENCE, _json(Trajectory, reference))], stamp_ns=first_ns)
 
     def write(self, step: Step) -> None:
         """Add a step."""
@@ -166,9 +236,7 @@ class LogWriter:
     def __enter__(self) -> "LogWriter":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _step_messages(self, step: Step) -> Iterator[Encoded]:
@@ -240,11 +308,6 @@ def _serialised(drawn: Iterable[Topical]) -> Iterator[Encoded]:
 
 def _estimate_message(estimate: GraphEstimate) -> Encoded:
     return schema.ESTIMATE, _json(GraphEstimate, estimate, keyframe_ids=list(estimate.T_world_keyframe))
-
-
-def _reference_messages(reference: Trajectory) -> Iterator[Encoded]:
-    yield from _serialised([ground_truth(reference, stamp_ns=int(reference.stamp_ns[0]))])
-    yield schema.REFERENCE, _json(Trajectory, reference)
 
 
 def _rss_mb() -> float | None:

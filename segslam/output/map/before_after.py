@@ -15,8 +15,7 @@ from segslam.core import geometry
 from segslam.core.points import within_range
 from segslam.core.types import GROUND_LABELS, GraphEstimate, Keyframe, Label, Mask, Points, Transform
 from segslam.output.map.from_above import draw_path, png, scale_bar
-from segslam.output.map.overhead import cut_heights, visible
-from segslam.output.map.part import Window
+from segslam.output.map.overhead import Window, cut_heights, visible
 
 MOST_PIXELS = 900
 """Chosen: largest number of pixels along the longer side of a panel."""

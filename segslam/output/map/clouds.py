@@ -3,15 +3,17 @@
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from segslam.core.config import MapConfig
 from segslam.core.extras import how_to_install
 from segslam.core.types import Label, Points, SegslamError
-from segslam.gnss.geodesy import Origin
 from segslam.output.map.part import Extent, Part
+
+if TYPE_CHECKING:
+    from segslam.gnss.geodesy import Origin
 
 PLY_ROW = [("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")]
 PCD_ROW = [("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")]
@@ -33,23 +35,47 @@ ASPRS_OF_LABEL = {
 """Classes of the LAS 1.4 specification, table 17: 2 ground, 5 high vegetation, 6 building, 11 road; else 1."""
 
 
-class PlyCloud:
-    """Binary PLY: x y z (float32, m), red green blue, label (SemanticKITTI learning id), intensity if known."""
+class _BinaryCloud:
+    """A header, then a row of a fixed layout for each point; the header is written last."""
+
+    row: ClassVar[list[Any]]
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
-        self._stream = _begin(file)
-        self._more = [] if extent.brightest is None else INTENSITY
-        self._row = np.dtype([*PLY_ROW, *self._more])
+        self._stream = file.open("wb")
+        self._stream.write(bytes(HEADER_BYTES))
+        self._has_intensities = extent.brightest is not None
+        self._row = np.dtype([*self.row, *(INTENSITY if self._has_intensities else [])])
         self._num_points = 0
 
     def add(self, part: Part) -> None:
         """Append the points of a part."""
-        rows = np.empty(len(part.points), self._row)
-        rows["xyz"], rows["rgb"], rows["label"] = part.points, part.colors, part.labels
-        for name, _ in self._more:
-            rows[name] = part.intensities
+        rows = np.zeros(len(part.points), self._row)
+        rows["xyz"], rows["label"] = part.points, part.labels
+        self._color(rows, part)
+        if self._has_intensities:
+            rows["intensity"] = part.intensities
         rows.tofile(self._stream)
         self._num_points += len(rows)
+
+    def _color(self, rows: np.ndarray, part: Part) -> None:
+        raise NotImplementedError
+
+    def _close(self, lines: list[str], *, filler: str, last: str) -> None:
+        """Write the header into the reserved bytes, padded with a comment, and close the file."""
+        text = "".join(f"{line}\n" for line in lines)
+        spaces = HEADER_BYTES - len(text) - len(filler) - len(last) - 2
+        self._stream.seek(0)
+        self._stream.write(f"{text}{filler}{' ' * spaces}\n{last}\n".encode("ascii"))
+        self._stream.close()
+
+
+class PlyCloud(_BinaryCloud):
+    """Binary PLY: x y z (float32, m), red green blue, label (SemanticKITTI learning id), intensity if known."""
+
+    row = PLY_ROW
+
+    def _color(self, rows: np.ndarray, part: Part) -> None:
+        rows["rgb"] = part.colors
 
     def close(self) -> None:
         """Complete the file."""
@@ -59,33 +85,22 @@ class PlyCloud:
             f"element vertex {self._num_points}",
             *(f"property float {name}" for name in "xyz"),
             *(f"property uchar {name}" for name in ("red", "green", "blue", "label")),
-            *(f"property float {name}" for name, _ in self._more),
+            *(["property float intensity"] if self._has_intensities else []),
         ]
-        _end(self._stream, lines, filler="comment", last="end_header")
+        self._close(lines, filler="comment", last="end_header")
 
 
-class PcdCloud:
+class PcdCloud(_BinaryCloud):
     """Binary PCD 0.7: x y z (float32, m), rgb packed as in PCL, label, intensity if known."""
 
-    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
-        self._stream = _begin(file)
-        self._more = [] if extent.brightest is None else INTENSITY
-        self._row = np.dtype([*PCD_ROW, *self._more])
-        self._num_points = 0
+    row = PCD_ROW
 
-    def add(self, part: Part) -> None:
-        """Append the points of a part."""
-        rows = np.zeros(len(part.points), self._row)
-        rows["xyz"], rows["label"] = part.points, part.labels
+    def _color(self, rows: np.ndarray, part: Part) -> None:
         rows["bgra"][:, :3] = part.colors[:, ::-1]
-        for name, _ in self._more:
-            rows[name] = part.intensities
-        rows.tofile(self._stream)
-        self._num_points += len(rows)
 
     def close(self) -> None:
         """Complete the file."""
-        names = ["x", "y", "z", "rgb", "label", *(name for name, _ in self._more)]
+        names = ["x", "y", "z", "rgb", "label", *(["intensity"] if self._has_intensities else [])]
         lines = [
             "VERSION 0.7",
             f"FIELDS {' '.join(names)}",
@@ -97,7 +112,7 @@ class PcdCloud:
             "VIEWPOINT 0 0 0 1 0 0 0",
             f"POINTS {self._num_points}",
         ]
-        _end(self._stream, lines, filler="#", last="DATA binary")
+        self._close(lines, filler="#", last="DATA binary")
 
 
 class LasCloud:
@@ -135,7 +150,7 @@ class LasCloud:
         self._writer.close()
 
 
-def _utm(origin: Origin, header: Any) -> Callable[[Points], Points]:
+def _utm(origin: "Origin", header: Any) -> Callable[[Points], Points]:
     """UTM coordinates of points, whose zone and offsets are written into the header of a LAS file."""
     from pyproj import CRS
 
@@ -154,18 +169,3 @@ def check_las(file: Path, *, is_projected: bool) -> None:
         raise SegslamError(f"{file}: LAS and LAZ need extra packages: {how_to_install('las')}; .ply and .pcd do not")
     if is_projected and find_spec("pyproj") is None:
         raise SegslamError(f"{file}: a coordinate system needs extra packages: {how_to_install('geo')}; .ply does not")
-
-
-def _begin(file: Path) -> BinaryIO:
-    stream = file.open("wb")
-    stream.write(bytes(HEADER_BYTES))
-    return stream
-
-
-def _end(stream: BinaryIO, lines: list[str], *, filler: str, last: str) -> None:
-    """Write the header into the reserved bytes, padded with a comment, and close the file."""
-    text = "".join(f"{line}\n" for line in lines)
-    spaces = HEADER_BYTES - len(text) - len(filler) - len(last) - 2
-    stream.seek(0)
-    stream.write(f"{text}{filler}{' ' * spaces}\n{last}\n".encode("ascii"))
-    stream.close()

@@ -1,4 +1,4 @@
-"""Free range of each keyframe: distance, by direction, up to which it sees the ground and no obstacle.
+"""Free space: heights above the ground, and how far each keyframe sees the ground without an obstacle, by direction.
 
 Beams hit the ground in rings. There are no points between two rings, but the ray to the outer ring passed over the gap.
 """
@@ -7,11 +7,14 @@ from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
 
 from segslam.core.types import GROUND_LABELS, Label, Labels, Points, Vector
-from segslam.output.map.lowest_ground import OBSTACLE_M, lowest_ground
 from segslam.output.map.tiles import Tile, distance_m
 
+OBSTACLE_M = (0.3, 2.0)
+"""Chosen: heights above the ground where a voxel is an obstacle (m)."""
+GROUND_CELL_M = 2.0
 NUM_DIRECTIONS = 720
 """Chosen: steps of half a degree; one step is a cell of 0.2 m at 23 m."""
 REACH_M = 40.0
@@ -64,3 +67,20 @@ def free_range_m(points: Points, labels: Labels, *, low_m: float, high_m: float)
 def _direction(x: Vector, y: Vector) -> np.ndarray:
     turn = (np.arctan2(y, x) / (2 * np.pi)) % 1.0
     return (turn * NUM_DIRECTIONS).astype(np.int64) % NUM_DIRECTIONS
+
+
+def lowest_ground(points: Points, ground: Points, side_m: float) -> Vector:
+    """Height (n,) of the ground (m) below each point: the lowest point of `ground` in its cell, or in the nearest cell.
+
+    All points lie within a square of `side_m`, with x and y measured from its corner.
+    """
+    size = round(side_m / GROUND_CELL_M)
+    lowest = np.full((size, size), np.inf)
+    np.minimum.at(lowest, _cells(ground, size), ground[:, 2])
+    nearest = distance_transform_edt(np.isinf(lowest), return_distances=False, return_indices=True)
+    return lowest[tuple(nearest)][_cells(points, size)]
+
+
+def _cells(points: Points, size: int) -> tuple[np.ndarray, np.ndarray]:
+    column, row = np.clip((points[:, :2] / GROUND_CELL_M).astype(np.int64), 0, size - 1).T
+    return column, row

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from segslam.core.types import Points
-from segslam.output.map.part import Window
+from segslam.output.map.overhead import Window
 
 DPI = 100
 PATH = "#d62728"

@@ -12,7 +12,7 @@ import yaml
 
 from segslam.core.config import MapConfig
 from segslam.core.types import GROUND_LABELS
-from segslam.output.map.lowest_ground import OBSTACLE_M, lowest_ground
+from segslam.output.map.free_ranges import OBSTACLE_M, lowest_ground
 from segslam.output.map.part import Extent, Part
 from segslam.output.map.tiles import TILE_M, corner
 

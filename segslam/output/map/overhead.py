@@ -8,6 +8,8 @@ from scipy.spatial import cKDTree
 
 from segslam.core.types import Points, Vector
 
+Window = tuple[float, float, float, float]
+"""West, east, south and north end of a top view (m)."""
 BESIDE_M = 0.5
 """Chosen: a point within this horizontal distance of a keyframe's position, above it, hangs over it."""
 LOWEST_M = 0.5

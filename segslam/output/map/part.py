@@ -1,18 +1,19 @@
-"""Input of the map writers: the extent of the map, then its parts."""
+"""Input of the map writers: the extent of the map, then its parts; and colours by height or intensity."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
 
 from segslam.core.config import MapConfig
 from segslam.core.types import Labels, Points, Vector
-from segslam.gnss.geodesy import Origin
 from segslam.labels.class_colors import Colors
 from segslam.output.map.free_ranges import FreeRanges
 from segslam.output.map.tiles import Tile
 
-Window = tuple[float, float, float, float]
-"""West, east, south and north end of an image (m)."""
+if TYPE_CHECKING:
+    from segslam.gnss.geodesy import Origin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +34,7 @@ class Extent:
     """Free space observed by the keyframes."""
     cut_m: Vector | None = None
     """Heights (n,) of `overhead.cut_heights` for each position of the path; None if no picture is drawn."""
-    origin: Origin | None = None
+    origin: "Origin | None" = None
     """Place of the world frame (east, north, up) on the globe, if it is known."""
 
 
@@ -60,3 +61,22 @@ class MapFile(Protocol):
 
     def close(self) -> None:
         """Complete the file."""
+
+
+def scale_of(span: tuple[float, float], *, steps: int = 6) -> list[tuple[float, str]]:
+    """(text, colour) of evenly spaced values from the end of a span to its start, as `of_numbers` colours them."""
+    values = np.linspace(span[1], span[0], steps)
+    return [
+        (float(value), f"#{r:02x}{g:02x}{b:02x}")
+        for value, (r, g, b) in zip(values, of_numbers(values, span=span), strict=True)
+    ]
+
+
+def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:
+    """Colours (n, 3) from dark violet, at the start of the span and below, to yellow, at its end and above."""
+    from matplotlib import colormaps
+
+    low, high = span
+    table = (255 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+    share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
+    return table[(share * (len(table) - 1)).astype(np.int64)]

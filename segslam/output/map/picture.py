@@ -8,9 +8,8 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from segslam.core.config import MapConfig
 from segslam.labels.class_colors import COLORS
-from segslam.output.map.colors import scale_of
-from segslam.output.map.overhead import visible
-from segslam.output.map.part import Extent, Part, Window
+from segslam.output.map.overhead import Window, visible
+from segslam.output.map.part import Extent, Part, scale_of
 from segslam.output.map.tiles import TILE_M, corner
 
 MAX_SIDE = 4000

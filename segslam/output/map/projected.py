@@ -2,14 +2,17 @@
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from segslam.core.extras import how_to_install
 from segslam.core.types import Points, SegslamError
-from segslam.gnss.geodesy import WGS84_3D, Origin, geodetic_from_enu, utm_epsg
-from segslam.output.map.part import Window
+from segslam.output.map.overhead import Window
 from segslam.output.map.picture import Picture
+
+if TYPE_CHECKING:
+    from segslam.gnss.geodesy import Origin
 
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
@@ -17,8 +20,10 @@ CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 class Utm:
     """Coordinates in the UTM zone of an origin; heights stay ellipsoidal."""
 
-    def __init__(self, origin: Origin) -> None:
+    def __init__(self, origin: "Origin") -> None:
         from pyproj import Transformer
+
+        from segslam.gnss.geodesy import WGS84_3D, utm_epsg
 
         self._origin = origin
         self.epsg = utm_epsg(origin.latitude_deg, origin.longitude_deg)
@@ -26,6 +31,8 @@ class Utm:
 
     def __call__(self, enu_m: Points) -> Points:
         """(n, 3) easting, northing, height (m) of points (n, 3) in the local frame of the origin."""
+        from segslam.gnss.geodesy import geodetic_from_enu
+
         latitude, longitude, height_m = geodetic_from_enu(enu_m, self._origin).T
         easting, northing = self._transformer.transform(longitude, latitude)
         return np.column_stack([easting, northing, height_m])
@@ -74,7 +81,7 @@ def _affine(utm: Utm, window: Window, rows: int, columns: int, height_m: float) 
     return solution.T
 
 
-def check_projected(file: Path, origin: Origin | None) -> None:
+def check_projected(file: Path, origin: "Origin | None") -> None:
     """Raises SegslamError if packages are missing, or if the run was not georeferenced."""
     missing = [name for name in ("pyproj", "rasterio") if find_spec(name) is None]
     if missing:

@@ -10,13 +10,11 @@ from segslam.core.config import MapConfig
 from segslam.core.points import within_range
 from segslam.core.types import Keyframe, Label, Labels, Points, SegslamError, Transform, Vector
 from segslam.labels.class_colors import Colors, of_classes
-from segslam.output.map import colors
-from segslam.output.map.cleaning import moved
 from segslam.output.map.free_ranges import FreeRanges
 from segslam.output.map.overhead import BESIDE_M, cut_heights
-from segslam.output.map.part import Extent, Part
+from segslam.output.map.part import Extent, Part, of_numbers
 from segslam.output.map.tiles import Tile, Tiles, corner, distance_m
-from segslam.output.map.views import Views
+from segslam.output.map.views import Views, moved
 
 
 class MapStore:
@@ -108,9 +106,9 @@ class MapStore:
             case "class":
                 return of_classes(labels)
             case "height":
-                return colors.of_numbers(heights, span=self._span())
+                return of_numbers(heights, span=self._span())
             case "intensity":
-                return colors.of_numbers(intensities, span=self._span())
+                return of_numbers(intensities, span=self._span())
 
     def _span(self) -> tuple[float, float]:
         """Values at both ends of the colour scale."""

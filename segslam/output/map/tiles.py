@@ -1,4 +1,4 @@
-"""Voxels in square tiles on disk.
+"""Voxels in square tiles on disk: mean point and intensity, number of points, and most frequent class.
 
 Points of several keyframes are collected, merged to voxels and appended to the file of their tile. Tiles are read in
 pieces. The files grow with the length of the drive; memory depends only on the surface within one tile.
@@ -10,9 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
+from segslam.core.points import hash_keys
 from segslam.core.types import Indices, Labels, Points, Vector
-from segslam.output.map.histogram import Histogram
-from segslam.output.map.voxels import MAX_HEIGHT_M, VOXEL, merged
+
+VOXEL = np.dtype([("point", "<f4", 3), ("count", "<u4"), ("label", "u1"), ("intensity", "<f4")])
+"""`point` (m): x and y from the corner of the tile, z in the world."""
+NUM_LABELS = 32
+"""Larger than the number of classes."""
+MAX_HEIGHT_M = 2000.0
+"""Largest height of a point, above or below the origin."""
 
 TILE_M = 32.0
 """Chosen: about 100,000 voxels of 0.2 m in a street."""
@@ -26,6 +32,25 @@ SHARES = 0.01, 0.99
 
 Tile = tuple[int, int]
 """Column (along x) and row (along y)."""
+
+
+class Histogram:
+    """Counts numbers between fixed edges. Numbers beyond the outermost edges count in the outermost bins."""
+
+    def __init__(self, edges: Vector) -> None:
+        self._edges = edges
+        self._counts = np.zeros(len(edges) - 1, np.int64)
+
+    def add(self, values: Vector) -> None:
+        """Count these numbers."""
+        bins = np.searchsorted(self._edges[1:-1], values, side="right")
+        self._counts += np.bincount(bins, minlength=len(self._counts))
+
+    def span(self, low_share: float, high_share: float) -> tuple[float, float]:
+        """Edges of the bins that contain two quantiles: the lower edge for `low_share`, the upper for `high_share`."""
+        shares = np.cumsum(self._counts) / max(self._counts.sum(), 1)
+        low, high = np.searchsorted(shares, (low_share, high_share))
+        return float(self._edges[low]), float(self._edges[high + 1])
 
 
 class Tiles:
@@ -120,3 +145,49 @@ def _groups(tiles: np.ndarray) -> Iterator[tuple[Tile, Indices]]:
     for rows in np.split(order, starts[1:]):
         column, row = tiles[rows[0]].tolist()
         yield (column, row), rows
+
+
+def merged(voxels: np.ndarray, voxel_m: float) -> np.ndarray:
+    """VOXEL rows, merged to one row per cell: means weighted by count, and the class with the most points.
+
+    Ties between classes are resolved to the smallest id. Cells are in the order of their first occurrence.
+    """
+    keys = _cell_keys(voxels["point"], voxel_m)
+    cells = _numbered(keys)
+    num_cells = int(cells.max()) + 1 if len(cells) else 0
+    result = np.zeros(num_cells, VOXEL)
+    weights = voxels["count"].astype(np.float64)
+    counts = np.bincount(cells, weights, minlength=num_cells)
+    means = [*result["point"].T, result["intensity"]]
+    for mean, values in zip(means, [*voxels["point"].T, voxels["intensity"]], strict=True):
+        mean[:] = np.bincount(cells, weights * values, minlength=num_cells) / np.maximum(counts, 1)
+    result["count"] = counts
+    result["label"] = _commonest_labels(cells, voxels["label"], weights)
+    return result
+
+
+def _cell_keys(points: np.ndarray, voxel_m: float) -> Indices:
+    """A number for each point's cell, floor(p / voxel_m); tiles are less than 2^20 cells wide."""
+    x, y = (np.floor(points[:, axis] / voxel_m).astype(np.int64) + 1 for axis in range(2))  # -1 by rounding at a border
+    z = np.floor((points[:, 2] + MAX_HEIGHT_M) / voxel_m).astype(np.int64)
+    return (x << 42) | (y << 21) | z
+
+
+def _numbered(keys: Indices) -> Indices:
+    """0, 1, ... for each key, in the order of first occurrence."""
+    _, first = hash_keys(keys)
+    is_first = first == np.arange(len(keys))
+    return (np.cumsum(is_first) - 1)[first]
+
+
+def _commonest_labels(cells: Indices, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(num_cells,) uint8 label with the largest weight in each cell."""
+    pairs = cells * NUM_LABELS + labels
+    numbers = _numbered(pairs)
+    counts = np.bincount(numbers, weights)
+    _, first = np.unique(numbers, return_index=True)
+    pair = pairs[first]
+    cell, label = pair // NUM_LABELS, pair % NUM_LABELS
+    order = np.lexsort((-label, counts, cell))
+    last_of_cell = np.append(np.diff(cell[order]) > 0, True) if len(order) else np.zeros(0, bool)
+    return label[order[last_of_cell]].astype(np.uint8)

@@ -1,6 +1,7 @@
 """The report of a run: one HTML page with map, plots, figures and settings, without network access."""
 
 from collections.abc import Collection, Iterable, Iterator
+from html import escape
 from itertools import islice
 from pathlib import Path
 
@@ -8,14 +9,13 @@ import matplotlib
 
 from segslam.core.types import Keyframe, LoopAttempt
 from segslam.core.whole_files import write_whole
-from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import LOG
+from segslam.output.finished import FIGURES, FinishedRun, read_run
 from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, gallery, interactive
-from segslam.output.report.fixes import draw_fixes
-from segslam.output.report.page import Pictures, page
+from segslam.output.report.figures import draw_fixes
+from segslam.output.report.page import Pictures, number, page
 
 __all__ = ["BEFORE_AFTER", "draw_before_after", "write_before_after", "write_report"]
 
@@ -32,7 +32,7 @@ def write_report(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     run = read_run(folder)
-    log = read_log(folder / LOG)
+    log = read_log(folder)
     with matplotlib.rc_context(figures.STYLE):
         plots = _plots(run)
     about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
@@ -99,7 +99,7 @@ def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[
     kept: dict[int, Keyframe] = {}
 
     def keyframes() -> Iterator[Keyframe]:
-        steps = read_log(run.folder / LOG).steps()
+        steps = read_log(run.folder).steps()
         return islice((step.keyframe for step in steps if step.keyframe is not None), len(poses))
 
     drawn = (keyframe for keyframe in keyframes() if keyframe.id % every == 0)
@@ -110,3 +110,16 @@ def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[
         if keyframe.id in wanted:
             kept[keyframe.id] = before_after.below_ceiling(keyframe)
     return before_after.draw(), kept
+
+
+SHOWN = ("num_scans", "length_m", "num_loops_accepted", "ate_m", "odometry_ate_m", "kiss_icp_ate_m")
+
+
+def as_html(run: FinishedRun) -> str:
+    """HTML with an SVG of the paths, in top view, and a table of figures."""
+    with matplotlib.rc_context(figures.STYLE):
+        picture = figures.draw_paths(run)
+    known = [key for key in SHOWN if key in run.metrics]
+    rows = "".join(f"<tr><td>{FIGURES[key]}</td><td>{number(run.metrics[key])}</td></tr>" for key in known)
+    start = picture.find("<svg")
+    return f"<b>{escape(str(run.folder))}</b><table>{rows}</table>{picture[max(start, 0) :]}"

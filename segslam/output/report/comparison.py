@@ -1,6 +1,7 @@
 """Figures that compare several runs, or an estimate and its reference."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 
 import matplotlib
@@ -8,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from segslam.core.evaluation import Up, align_positions, pose_errors
-from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
+from segslam.core.evaluation import Up, align_positions
+from segslam.core.trajectory import Poses, rows_of_same_scan
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import check_target, whole_file
 from segslam.output.finished import FinishedRun
@@ -40,7 +41,7 @@ def draw_scored(file: Path, estimate: Poses, reference: Poses, *, up: Up = "z") 
         above, error = figure.subplots(1, 2)
         _plot_above(above, "reference", reference, figures.TRUTH, width=4.0, up=up)
         _plot_above(above, "estimate", aligned, COLORS[0], up=up)
-        _plot_error(error, "estimate", aligned, reference, COLORS[0])
+        figures.plot_error(error, "estimate", aligned, reference, COLORS[0])
         _finish(figure, [above], error, file, up=up)
 
 
@@ -50,7 +51,7 @@ def draw_runs(file: Path, runs: Mapping[str, FinishedRun]) -> None:
     The runs of a data set are aligned with its ground truth, or with the first of them if it has none, by common scans.
     """
     groups = by_data(runs)
-    colors = dict(zip(runs, _colors(len(runs)), strict=True))
+    colors = dict(zip(runs, cycle(COLORS), strict=False))
     has_truth = [any(runs[name].reference is not None for name in names) for names in groups]
     with matplotlib.rc_context(figures.STYLE):
         figure = Figure(figsize=(6.4 * (len(groups) + 1), 6.0), layout="constrained")
@@ -98,22 +99,12 @@ def _plot_group(above: Axes, error: Axes, runs: Mapping[str, FinishedRun], color
         target = common.T_world_lidar[rows[:, 1]]
         if len(rows):
             poses = align_positions(poses[rows[:, 0], :3, 3], target[:, :3, 3]) @ poses
-            _plot_error(error, name, poses[rows[:, 0]], target, colors[name])
+            figures.plot_error(error, name, poses[rows[:, 0]], target, colors[name])
         _plot_above(above, name, poses, colors[name])
-
-
-def _colors(count: int) -> Sequence[str]:
-    return [COLORS[number % len(COLORS)] for number in range(count)]
 
 
 def _plot_above(axes: Axes, name: str, poses: Poses, color: str, *, width: float = 1.4, up: Up = "z") -> None:
     axes.plot(*poses[:, ACROSS[up], 3].T, color=color, label=name, linewidth=width)
-
-
-def _plot_error(axes: Axes, name: str, aligned: Poses, reference: Poses, color: str) -> None:
-    error_m = pose_errors(aligned, reference).translation_m
-    label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
-    axes.plot(travelled_m(reference), error_m, color=color, label=label, linewidth=1.4)
 
 
 def _finish(
@@ -125,6 +116,6 @@ def _finish(
     error.set(xlabel="distance travelled (m)", ylabel=f"{error_of} after alignment (m)")
     error.set_ylim(bottom=0)
     for axes in (*above, error):
-        axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2, fontsize=10)
+        figures.legend_on_top(axes, num_columns=2)
     with whole_file(file) as part:
         figure.savefig(part, format=file.suffix.lower()[1:], dpi=100)

@@ -1,9 +1,12 @@
 """The plots of a run."""
 
+import csv
 import io
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import cycle
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -13,7 +16,7 @@ from matplotlib.figure import Figure
 
 from segslam.core.evaluation import align_positions, false_loops, pose_errors
 from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
-from segslam.core.types import LoopClosure, MotionState, Rejected, RejectReason, Vector
+from segslam.core.types import MotionState, Rejected, RejectReason
 from segslam.output.accuracy import judged_closures
 from segslam.output.finished import FinishedRun
 
@@ -31,6 +34,7 @@ STYLE: Any = {
 }
 WIDTH_IN = 5.4
 """Text of 11 points is then 10 pixels high on a phone."""
+RESIDUALS = ("residual_east_m", "residual_north_m")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +106,18 @@ def draw_paths(run: FinishedRun) -> str:
 def draw_loops(run: FinishedRun) -> str:
     """All loop candidates on the corrected trajectory: closures as lines between their ends, rejected ones as dots."""
     figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
-    _plot_attempts(figure.subplots(), run)
+    axes = figure.subplots()
+    positions = run.result.trajectory.T_world_lidar[:, :2, 3]
+    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
+    ends = positions[run.result.keyframe_rows]
+    for label, color, is_closed, pairs in _by_outcome(run):
+        if not is_closed:
+            axes.plot(*ends[[source for source, _ in pairs]].T, ".", color=color, markersize=7, label=label, zorder=2)
+            continue
+        for pair in pairs:
+            axes.plot(*ends[list(pair)].T, "o-", color=color, markersize=3, linewidth=1.5)
+        axes.plot([], [], "o-", color=color, label=label)
+    _finish_map(axes, num_columns=2)
     return svg(figure, "loops")
 
 
@@ -112,21 +127,14 @@ def draw_loops_over_time(run: FinishedRun) -> str:
     axes = figure.subplots()
     time_s = (run.result.odometry.stamp_ns - run.result.odometry.stamp_ns[0]) / 1e9
     keyframe_s = time_s[run.result.keyframe_rows]
-    for (reason, pairs), color in zip(_rejected_pairs(run).items(), cycle(REJECTED), strict=False):
-        _plot_times(axes, keyframe_s, pairs, f"{reason.replace('_', ' ')} ({len(pairs)})", color, "x")
-    for name, color, closures in _closure_kinds(run):
-        if closures:
-            pairs = [(closure.source_id, closure.target_id) for closure in closures]
-            _plot_times(axes, keyframe_s, pairs, f"{name} ({len(pairs)})", color, "o")
+    for label, color, is_closed, pairs in _by_outcome(run):
+        sources, targets = np.array(pairs).T
+        marker = "o" if is_closed else "x"
+        axes.plot(keyframe_s[sources], keyframe_s[targets], marker, color=color, label=label, markersize=5)
     axes.plot([0, keyframe_s[-1]], [0, keyframe_s[-1]], color=TRUTH, linewidth=1.0)
     axes.set(xlabel="time of the new keyframe (s)", ylabel="time of the old keyframe (s)")
-    _legend_on_top(axes, num_columns=2)
+    legend_on_top(axes, num_columns=2)
     return svg(figure, "times")
-
-
-def _plot_times(axes: Axes, time_s: Vector, pairs: list[tuple[int, int]], label: str, color: str, marker: str) -> None:
-    sources, targets = np.array(pairs).T
-    axes.plot(time_s[sources], time_s[targets], marker, color=color, label=label, markersize=5)
 
 
 def draw_errors(poses: Compared) -> str:
@@ -139,15 +147,20 @@ def draw_errors(poses: Compared) -> str:
         drives = [("KISS-ICP alone", poses.alone, ALONE), ("odometry after repairs", *drives[0][1:]), drives[1]]
     for name, estimate, color in drives:
         aligned = align_positions(estimate[:, :3, 3], poses.truth[:, :3, 3]) @ estimate
-        error_m = pose_errors(aligned, poses.truth).translation_m
-        label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
-        whole.plot(along_m, error_m, color=color, label=label, linewidth=1.4)
+        plot_error(whole, name, aligned, poses.truth, color)
         height.plot(along_m, (aligned - poses.truth)[:, 2, 3], color=color, linewidth=1.4)
     whole.set(ylabel="error (m)")
     whole.set_ylim(bottom=0)
     height.set(xlabel="distance travelled (m)", ylabel="height error (m)")
-    _legend_on_top(whole, num_columns=1)
+    legend_on_top(whole, num_columns=1)
     return svg(figure, "errors")
+
+
+def plot_error(axes: Axes, name: str, aligned: Poses, reference: Poses, color: str) -> None:
+    """Draw the position error of aligned poses against the distance travelled."""
+    error_m = pose_errors(aligned, reference).translation_m
+    label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
+    axes.plot(travelled_m(reference), error_m, color=color, label=label, linewidth=1.4)
 
 
 def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
@@ -159,7 +172,7 @@ def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
     axes.barh(stages, [stage_ms[stage]["median"] for stage in stages], color=CORRECTED, height=0.45, label="median")
     axes.grid(visible=False, axis="y")
     axes.set(xlabel="time (ms)", xscale="log")  # from a keyframe's fraction of a millisecond to minutes of adjustment
-    _legend_on_top(axes)
+    legend_on_top(axes)
     return svg(figure, "stages")
 
 
@@ -188,50 +201,44 @@ def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:
             axes.plot(*T_corrected[rows, :2, 3].T, marker, color=color, markersize=7, zorder=4, label=label)
 
 
-def _plot_attempts(axes: Axes, run: FinishedRun) -> None:
-    positions = run.result.trajectory.T_world_lidar[:, :2, 3]
-    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
-    ends = positions[run.result.keyframe_rows]
-    for (reason, pairs), color in zip(_rejected_pairs(run).items(), cycle(REJECTED), strict=False):
-        label = f"{reason.replace('_', ' ')} ({len(pairs)})"
-        axes.plot(*ends[[source for source, _ in pairs]].T, ".", color=color, markersize=7, label=label, zorder=2)
-    for name, color, closures in _closure_kinds(run):
-        for closure in closures:
-            axes.plot(*ends[[closure.source_id, closure.target_id]].T, "o-", color=color, markersize=3, linewidth=1.5)
-        if closures:
-            axes.plot([], [], "o-", color=color, label=f"{name} ({len(closures)})")
-    _finish_map(axes, num_columns=2)
-
-
 def _finish_map(axes: Axes, *, num_columns: int) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
-    _legend_on_top(axes, num_columns=num_columns)
+    legend_on_top(axes, num_columns=num_columns)
 
 
-def _rejected_pairs(run: FinishedRun) -> dict[RejectReason, list[tuple[int, int]]]:
-    """New and old keyframe of each rejected candidate, by reason, in the order of the pipeline."""
-    pairs: dict[RejectReason, list[tuple[int, int]]] = {}
+class _Outcome(NamedTuple):
+    """The loop candidates with one outcome, of which there is one at least."""
+
+    label: str
+    color: str
+    is_closed: bool
+    pairs: list[tuple[int, int]]
+    """New and old keyframe of each."""
+
+
+def _by_outcome(run: FinishedRun) -> list[_Outcome]:
+    """Rejected candidates by reason, in the order of the pipeline; then closures: accepted, rejected later, false."""
+    rejected, closed = defaultdict[RejectReason, list[tuple[int, int]]](list), []
     for attempt in run.result.attempts:
+        pair = (attempt.candidate.source_id, attempt.candidate.target_id)
         if isinstance(attempt.outcome, Rejected):
-            ids = (attempt.candidate.source_id, attempt.candidate.target_id)
-            pairs.setdefault(attempt.outcome.reason, []).append(ids)
-    return {reason: pairs[reason] for reason in RejectReason if reason in pairs}
-
-
-def _closure_kinds(run: FinishedRun) -> list[tuple[str, str, list[LoopClosure]]]:
-    """Name, colour and closures: accepted, rejected by the optimiser, or false by the ground truth."""
-    closures = [attempt.outcome for attempt in run.result.attempts if isinstance(attempt.outcome, LoopClosure)]
+            rejected[attempt.outcome.reason].append(pair)
+        else:
+            closed.append(pair)
     false = _false_closures(run)
     off = run.result.estimate.rejected - false
-    pairs = [(closure.source_id, closure.target_id) for closure in closures]
-    kinds = (
-        ("accepted", ACCEPTED, set(pairs) - off - false),
-        ("rejected by the optimiser", OPTIMISED_AWAY, off),
-        ("false", FALSE, false),
-    )
+    reasons = [reason for reason in RejectReason if reason in rejected]
+    groups = [
+        *(
+            (reason.replace("_", " "), color, False, rejected[reason])
+            for reason, color in zip(reasons, cycle(REJECTED), strict=False)
+        ),
+        ("accepted", ACCEPTED, True, [pair for pair in closed if pair not in off | false]),
+        ("rejected by the optimiser", OPTIMISED_AWAY, True, [pair for pair in closed if pair in off]),
+        ("false", FALSE, True, [pair for pair in closed if pair in false]),
+    ]
     return [
-        (name, color, [closure for pair, closure in zip(pairs, closures, strict=True) if pair in members])
-        for name, color, members in kinds
+        _Outcome(f"{name} ({len(pairs)})", color, is_closed, pairs) for name, color, is_closed, pairs in groups if pairs
     ]
 
 
@@ -245,7 +252,8 @@ def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:
     return {(c.source_id, c.target_id) for c, is_false in zip(closures, false, strict=True) if is_false}
 
 
-def _legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
+def legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
+    """Draw the legend above the axes, on the left."""
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=num_columns, borderaxespad=0.2, fontsize=10)
 
 
@@ -255,3 +263,45 @@ def svg(figure: Figure, name: str) -> str:
     with matplotlib.rc_context({"svg.hashsalt": name}):
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()
+
+
+def draw_fixes(folder: Path) -> str | None:
+    """SVG text: fixes over the path in top view, and residuals over time; None for a run without fixes."""
+    file = folder / "gnss.csv"
+    if not file.is_file():
+        return None
+    from segslam.output.georeferenced import read_globe
+
+    globe = read_globe(folder)
+    if globe is None:
+        return None
+    with file.open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["residual_east_m"]]
+    enu_m, residual_m = (_columns(rows, *names) for names in (("east_m", "north_m"), RESIDUALS))
+    minutes = np.array([int(row["stamp_ns"]) for row in rows], float) / 60e9
+    kept = np.array([row["kept"] == "1" for row in rows], bool)
+    figure = Figure(figsize=(WIDTH_IN, 1.5 * WIDTH_IN), layout="constrained")
+    above, over_time = figure.subplots(2, 1, height_ratios=(2, 1))
+    above.plot(*globe.T_enu_lidar[:, :2, 3].T, color=CORRECTED, linewidth=1.2, label="trajectory", zorder=3)
+    for chosen, color, name in ((kept, ACCEPTED, "kept"), (~kept, FALSE, "not kept")):
+        above.plot(
+            *enu_m[chosen].T,
+            ".",
+            color=color,
+            markersize=4,
+            label=f"{name}: {chosen.sum()}",
+            scalex=False,
+            scaley=False,
+        )
+        distance_m = np.hypot(*residual_m[chosen].T)
+        over_time.plot(minutes[chosen] - minutes.min(initial=np.inf), distance_m, ".", color=color, markersize=4)
+    above.set(xlabel="east (m)", ylabel="north (m)")
+    above.set_aspect("equal", adjustable="datalim")
+    figure.legend(loc="outside upper center", ncols=3)
+    over_time.set(xlabel="time (minutes)", ylabel="residual (m)", yscale="log")
+    over_time.yaxis.set_major_formatter("{x:g}")
+    return svg(figure, "fixes")
+
+
+def _columns(rows: list[dict[str, str]], *names: str) -> np.ndarray:
+    return np.array([[float(row[name]) for name in names] for row in rows]).reshape(-1, len(names))

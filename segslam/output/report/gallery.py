@@ -1,8 +1,10 @@
 """Pictures of loop candidates: the best accepted ones, and the rejected ones closest to acceptance."""
 
+import io
 from collections.abc import Iterable, Mapping
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from segslam.core import geometry
 from segslam.core.types import (
@@ -13,14 +15,16 @@ from segslam.core.types import (
     Points,
     Rejected,
     RejectReason,
+    Transform,
 )
 from segslam.output.finished import FinishedRun
-from segslam.output.report.pairs import draw_pair
 from segslam.slam import slam_result
 
 NUM_EACH = 3
 APART = 10
 """Chosen: keyframes between two pictures of one kind, so that they show different places."""
+SOURCE, TARGET = "#D55E00", "#4D4D4D"
+VIEW_M = 50.0
 
 
 def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
@@ -74,3 +78,21 @@ def _miss(attempt: LoopAttempt) -> tuple[int, float]:
 def _standing(keyframe: Keyframe) -> Points:
     """The points above ground; all points if none is labelled as ground."""
     return keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))].astype(np.float64)
+
+
+def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform], title: str) -> bytes:
+    """The two scans as a PNG, a panel for each of `poses`: a name and T_target_source."""
+    figure = Figure(figsize=(3.6 * len(poses), 4.4), layout="compressed")
+    figure.suptitle(title, fontsize=11)
+    panels = figure.subplots(1, len(poses), squeeze=False)[0]
+    for axes, (name, T_target_source) in zip(panels, poses.items(), strict=True):
+        for points, color, label in (
+            (target, TARGET, "target"),
+            (geometry.apply(T_target_source, source), SOURCE, "source"),
+        ):
+            near = points[np.abs(points[:, :2]).max(axis=1) < VIEW_M]
+            axes.plot(near[:, 0], near[:, 1], ",", color=color, label=label, rasterized=True)
+        axes.set(title=name, xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), aspect="equal", xlabel="x (m)")
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=140)
+    return image.getvalue()

@@ -56,6 +56,7 @@ def top_view(run: FinishedRun, keyframes: Mapping[int, Keyframe]) -> str:
         "clouds": {str(number): _cloud(keyframe) for number, keyframe in keyframes.items()},
         "step_m": STEP_M,
     }
+    script = resources.files("segslam.output.report").joinpath("interactive.js").read_text(encoding="utf-8")
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
     return (
         "<p>Scroll or pinch to zoom, drag to move. Point at a dot to see its figures; click on a loop to see its two "
@@ -64,7 +65,7 @@ def top_view(run: FinishedRun, keyframes: Mapping[int, Keyframe]) -> str:
         '<div id="topview"></div><div id="pair"></div><noscript>This view needs JavaScript.</noscript>'
         f'<script type="application/json" id="topview-data">{text}</script>'
         f'<script type="text/plain" id="plotly-packed">{packed_plotly()}</script>'
-        f"<script>{_script()}</script>"
+        f"<script>{script}</script>"
     )
 
 
@@ -73,10 +74,6 @@ def packed_plotly() -> str:
     """plotly.js (MIT licence), compressed, in base64; the page unpacks it."""
     source = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_bytes()
     return base64.b64encode(gzip.compress(source, 9, mtime=0)).decode("ascii")
-
-
-def _script() -> str:
-    return resources.files("segslam.output.report").joinpath("interactive.js").read_text(encoding="utf-8")
 
 
 def _path(name: str, poses: Poses, color: str) -> dict[str, Any]:

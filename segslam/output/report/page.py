@@ -8,10 +8,8 @@ from html import escape
 from types import MappingProxyType
 from typing import Any
 
-from pydantic.fields import FieldInfo
-
 from segslam.core.config import Config, Section, changed_settings
-from segslam.core.types import Rejected, RejectReason
+from segslam.core.types import Rejected
 from segslam.odometry.calibration import vertical_angle_advice
 from segslam.output.finished import COMPARED, FIGURES, FinishedRun
 from segslam.output.words import REASONS, WORDS
@@ -45,6 +43,7 @@ CONDITIONS = {
     "python": "Python",
 }
 """Key in the log -> text on the page."""
+TEXT = ' style="text-align: left; width: auto"'
 STYLE = """
 :root { color-scheme: light; --line: #d8dee4; --soft: #57606a; }
 body { margin: 0 auto; max-width: 76rem; padding: 1rem; font: 16px/1.45 system-ui, sans-serif; color: #1f2328; }
@@ -125,15 +124,13 @@ def _gallery(loops: Mapping[str, bytes]) -> str:
 def _files(run: FinishedRun) -> str:
     """Links to the existing files beside the page."""
     there = [(name, text) for name, text in FILES.items() if (run.folder / name).is_file()]
-    rows = (f'<tr><td><a href="{escape(name)}">{escape(name)}</a></td><td>{text}</td></tr>' for name, text in there)
-    return f"<table>{''.join(rows)}</table>"
+    return table((f'<a href="{escape(name)}">{escape(name)}</a>', text) for name, text in there)
 
 
 def _conditions(run: FinishedRun, about: Mapping[str, str]) -> str:
     facts = {name: about[key] for key, name in CONDITIONS.items() if key in about}
     facts["settings other than the defaults"] = settings_not_default(run.config) or "none"
-    rows = (f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in facts.items())
-    return f"<table>{''.join(rows)}</table>"
+    return table((escape(name), escape(value)) for name, value in facts.items())
 
 
 def settings_not_default(config: Config) -> str:
@@ -169,16 +166,12 @@ def _tiles(metrics: dict[str, Any]) -> str:
 
 def plot_section(caption: str, svg: str) -> str:
     """A plot and its caption."""
-    return _picture_section(caption, svg.encode(), "svg+xml")
+    return section(caption, _picture(caption, svg.encode(), "svg+xml"))
 
 
 def png_section(caption: str, png: bytes) -> str:
     """A picture and its caption."""
-    return _picture_section(caption, png, "png")
-
-
-def _picture_section(caption: str, picture: bytes, kind: str) -> str:
-    return section(caption, _picture(caption, picture, kind))
+    return section(caption, _picture(caption, png, "png"))
 
 
 def _picture(caption: str, picture: bytes, kind: str) -> str:
@@ -192,32 +185,30 @@ def _figures(metrics: dict[str, Any]) -> str:
     rest = [key for key, value in metrics.items() if key not in FIGURES and isinstance(value, int | float)]
     of_run = [key for key in known + rest if not key.startswith(COMPARED)]
     titles = {prefix: title for prefix, title in zip(COMPARED, ODOMETRIES, strict=True) if prefix + "ate_m" in metrics}
-    rows = [(_meaning(key), metrics[key], *(metrics.get(prefix + key) for prefix in titles)) for key in of_run]
-    return _table(("", "run", *titles.values()), rows)
-
-
-def _meaning(key: str) -> str:
-    return f"{FIGURES.get(key, '')} <code>{escape(key)}</code>"
+    rows = [
+        (
+            f"{FIGURES.get(key, '')} <code>{escape(key)}</code>",
+            metrics[key],
+            *(metrics.get(prefix + key) for prefix in titles),
+        )
+        for key in of_run
+    ]
+    return table(rows, head=("", "run", *titles.values()))
 
 
 def _outcomes(run: FinishedRun) -> str:
+    """How often each outcome came, with what the words of `loops.csv` mean."""
     if not run.result.attempts:
         return "<p>No place was visited twice, according to the estimate.</p>"
     outcomes = (attempt.outcome for attempt in run.result.attempts)
     names = Counter(outcome.reason.value if isinstance(outcome, Rejected) else "accepted" for outcome in outcomes)
-    rows = ((_outcome(name), count) for name, count in names.most_common())
-    return _table(("", "attempts"), rows) + _words()
-
-
-def _outcome(name: str) -> str:
-    """An outcome as in `loops.csv`, with what it means."""
-    meaning = "" if name == "accepted" else f'<div class="soft">{REASONS[RejectReason(name)]}</div>'
-    return f"{name.replace('_', ' ')}{meaning}"
-
-
-def _words() -> str:
-    rows = (f"<tr><td>{word}</td><td>{escape(meaning)}</td></tr>" for word, meaning in WORDS.items())
-    return f'<details id="words"><summary>What the words mean</summary><table>{"".join(rows)}</table></details>'
+    meanings = {reason.value: f'<div class="soft">{meaning}</div>' for reason, meaning in REASONS.items()}
+    rows = ((f"{name.replace('_', ' ')}{meanings.get(name, '')}", count) for name, count in names.most_common())
+    words = table((word, escape(meaning)) for word, meaning in WORDS.items())
+    return (
+        table(rows, head=("", "attempts"))
+        + f'<details id="words"><summary>What the words mean</summary>{words}</details>'
+    )
 
 
 def settings_tables(config: Config) -> str:
@@ -229,17 +220,12 @@ def settings_tables(config: Config) -> str:
 
 def _setting_section(name: str, section: Section, default: Section) -> str:
     values, usual = section.model_dump(mode="json"), default.model_dump(mode="json")
-    rows = "".join(
-        _setting(key, values[key], field, changed=values[key] != usual[key])
-        for key, field in type(section).model_fields.items()
-    )
+    rows = ""
+    for key, setting in type(section).model_fields.items():
+        kind = ' class="changed"' if values[key] != usual[key] else ""
+        cells = f"<code>{key}</code>", escape(str(values[key])), escape(setting.description or "")
+        rows += f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
     return f"<details{' open' if values != usual else ''}><summary>{name}</summary><table>{rows}</table></details>"
-
-
-def _setting(key: str, value: Any, field: FieldInfo, *, changed: bool) -> str:
-    kind = ' class="changed"' if changed else ""
-    cells = f"<code>{key}</code>", escape(str(value)), escape(field.description or "")
-    return f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
 def section(title: str, body: str) -> str:
@@ -247,15 +233,21 @@ def section(title: str, body: str) -> str:
     return f"<section><h2>{escape(title)}</h2>{body}</section>\n"
 
 
-def _table(head: tuple[str, ...], rows: Iterable[tuple[str, *tuple[float | None, ...]]]) -> str:
-    """Rows of a name and numbers; unknown numbers are None."""
-    titles = "".join(f"<th>{title}</th>" for title in head)
-    return f"<table><tr>{titles}</tr>{''.join(_row(*row) for row in rows)}</table>"
+def table(rows: Iterable[Iterable[str | float | None]], *, head: Iterable[str] = ()) -> str:
+    """Rows of HTML and numbers; unknown numbers are None. Heads of columns with HTML are on the left, as these."""
+    cells = [tuple(row) for row in rows]
+    titles = ""
+    for column, title in enumerate(head):
+        has_text = column > 0 and any(isinstance(row[column], str) for row in cells)
+        titles += f"<th{TEXT if has_text else ''}>{title}</th>"
+    lines = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in cells)
+    return f"<table>{f'<tr>{titles}</tr>' if titles else ''}{lines}</table>"
 
 
-def _row(name: str, *values: float | None) -> str:
-    cells = ("" if value is None else number(value) for value in values)
-    return f"<tr><td>{name}</td>" + "".join(f'<td class="number">{cell}</td>' for cell in cells) + "</tr>"
+def _cell(value: str | float | None) -> str:
+    if isinstance(value, str):
+        return f"<td>{value}</td>"
+    return f'<td class="number">{"" if value is None else number(value)}</td>'
 
 
 def number(value: float) -> str:

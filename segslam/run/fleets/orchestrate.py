@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -17,12 +17,11 @@ from segslam.run.fleets.relations import Components, Relation
 from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
 from segslam.run.sessions.session_pose import MIN_FOUND
+from segslam.slam.adjustment import Progress, no_progress
 
 FILE = "fleet.json"
 CORES_OF_WORKER = 2
 """A drive is mapped by two threads."""
-Shown = Callable[[Iterable[Any], int, str], Iterator[Any]]
-"""Passes items on and shows progress: takes the items, their number, and the step's name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,10 +42,6 @@ class FleetResult:
         return sum(int(component.get("num_loops_between", 0)) for component in self.components)
 
 
-def _not_shown(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
-    return iter(items)
-
-
 def fleet(
     drives: str | Path | Sequence[Drive | str | Path],
     out: str | Path,
@@ -55,7 +50,7 @@ def fleet(
     num_workers: int | None = None,
     same_reference: bool = False,
     settings: Sequence[str] = (),
-    shown: Shown = _not_shown,
+    shown: Progress = no_progress,
     say: Callable[[str], object] = lambda text: None,
 ) -> FleetResult:
     """Map drives and join those that share places, in the folder `out`; what is there already is not done again.
@@ -84,7 +79,7 @@ def fleet(
 class _Fleet:
     """The steps in turn."""
 
-    def __init__(self, folder: Path, run: Workers, shown: Shown, say: Callable[[str], object]) -> None:
+    def __init__(self, folder: Path, run: Workers, shown: Progress, say: Callable[[str], object]) -> None:
         self._folder, self._run, self._shown, self._say = folder, run, shown, say
         self._seconds: dict[str, float] = {}
         self._reasons: dict[str, str] = {}
@@ -176,7 +171,10 @@ class _Fleet:
                     raise WorkFailed(f"{mapped[pair[0]].name}: {outcome.failure}; call `segslam fleet` again to go on")
                 relation: Relation = outcome.value
                 components.add(*pair, relation)
-                self._say(_line(mapped[pair[0]].name, mapped[pair[1]].name, relation))
+                how = f"is not joined to {mapped[pair[1]].name}: {relation.reason}"
+                if relation.T_earlier_later is not None:
+                    how = f"is joined to {mapped[pair[1]].name} by {len(relation.found)} of its keyframes"
+                self._say(f"{mapped[pair[0]].name} {how}")
         return components
 
     def _joined(self, mapped: Sequence[Mapped], components: Components, same: bool) -> list[dict[str, Any]]:
@@ -196,12 +194,6 @@ class _Fleet:
             one |= {"reason": outcome.failure} if outcome.failure else {}
         steps.remove_components(self._folder, keep=len(made))
         return made
-
-
-def _line(later: str, earlier: str, relation: Relation) -> str:
-    if relation.T_earlier_later is None:
-        return f"{later} is not joined to {earlier}: {relation.reason}"
-    return f"{later} is joined to {earlier} by {len(relation.found)} of its keyframes"
 
 
 def _write(result: FleetResult) -> None:

@@ -38,15 +38,18 @@ def read_relation(file: Path) -> Relation:
     """Raises SegslamError, naming the file, if it is damaged."""
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
-        found = tuple((int(own), int(target), _alignment(one)) for own, target, one in values["found"])
+        found = tuple(
+            (
+                int(own),
+                int(target),
+                Alignment(**one | {name: _registration(one[name]) for name in ("coarse", "fine")}),
+            )
+            for own, target, one in values["found"]
+        )
         pose = values["T_earlier_later"]
         return Relation(None if pose is None else np.array(pose, float).reshape(4, 4), found, str(values["reason"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SegslamError(f"{file}: damaged ({error!r}); remove it, and call `segslam fleet` again") from error
-
-
-def _alignment(values: dict[str, Any]) -> Alignment:
-    return Alignment(**{**values, "coarse": _registration(values["coarse"]), "fine": _registration(values["fine"])})
 
 
 def _registration(values: dict[str, Any]) -> Registration:

@@ -11,19 +11,19 @@ from matplotlib.figure import Figure
 from segslam.core.trajectory import Poses, read_poses
 from segslam.core.whole_files import write_whole
 from segslam.output.report import figures
-from segslam.output.report.page import document, plot_section, section
+from segslam.output.report.page import document, plot_section, section, table
 
 if TYPE_CHECKING:
     from segslam.run.fleets.orchestrate import FleetResult
-
-TEXT = '<th style="text-align: left; width: auto">'
-"""Head of a column of text; the other columns after the first are numbers."""
 
 
 def write_report(result: "FleetResult") -> Path:
     """Write `report.html` into the folder of a fleet; returns its path."""
     plots = "".join(
-        plot_section(_title(number, component), _drawn(result.folder / component["folder"], component["drives"]))
+        plot_section(
+            f"Component {number}: {', '.join(component['drives'])}",
+            _drawn(result.folder / component["folder"], component["drives"]),
+        )
         for number, component in enumerate(result.components)
         if "reason" not in component
     )
@@ -40,31 +40,24 @@ def write_report(result: "FleetResult") -> Path:
     return file
 
 
-def _title(number: int, component: Mapping[str, Any]) -> str:
-    return f"Component {number}: {', '.join(component['drives'])}"
-
-
 def _components(result: "FleetResult") -> str:
-    rows = [f"<tr><th>component</th>{TEXT}drives</th><th>loops between them</th><th>error</th></tr>"]
+    rows = []
     for number, one in enumerate(result.components):
         error = one.get("reason") or (f"{one['ate_m']:.3f} m" if "ate_m" in one else "no truth in one frame")
         link = f'<a href="{escape(one["folder"])}/report.html">{number}</a>'
-        figures_of = (str(one.get("num_loops_between", 0)), escape(error))
-        numbers = "".join(f'<td class="number">{cell}</td>' for cell in figures_of)
-        rows.append(f"<tr><td>{link}</td><td>{escape(', '.join(one['drives']))}</td>{numbers}</tr>")
-    return f"<table>{''.join(rows)}</table>"
+        rows.append((link, escape(", ".join(one["drives"])), one.get("num_loops_between", 0), escape(error)))
+    return table(rows, head=("component", "drives", "loops between them", "error"))
 
 
 def _drives(drives: Mapping[str, Mapping[str, Any]]) -> str:
-    rows = [f"<tr><th>drive</th>{TEXT}state</th><th>component</th></tr>"]
+    rows = []
     for name, drive in drives.items():
         link = escape(name)
         if drive["state"] == "mapped":
             link = f'<a href="runs/{link}/report.html">{link}</a>'
         state = f"{drive['state']}: {drive['reason']}" if "reason" in drive else drive["state"]
-        number = "" if drive["component"] is None else drive["component"]
-        rows.append(f'<tr><td>{link}</td><td>{escape(state)}</td><td class="number">{number}</td></tr>')
-    return f"<table>{''.join(rows)}</table>"
+        rows.append((link, escape(state), drive["component"]))
+    return table(rows, head=("drive", "state", "component"))
 
 
 def _drawn(folder: Path, names: list[str]) -> str:

@@ -8,7 +8,7 @@ import logging
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
 from uuid import uuid4
@@ -23,13 +23,11 @@ from segslam.gnss.reading import read_fixes
 from segslam.labels.encodings import Encoding
 from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
-from segslam.output.georeferenced import georeference
-from segslam.output.report import write_report
+from segslam.output.georeferenced import georeference, summary
 from segslam.run.fleets.drives import Drive
 from segslam.run.fleets.relations import Relation, read_relation, write_relation
-from segslam.run.given_odometry import given_odometry
 from segslam.run.locator import Locator
-from segslam.run.map_folder import map_folder, open_scans
+from segslam.run.map_folder import given_odometry, map_source, open_scans
 from segslam.run.sessions.merge import arranged, write_merged
 from segslam.run.sessions.recorded import Session, read_session
 from segslam.run.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
@@ -91,32 +89,19 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
     odometry = None
     if drive.odometry:
         odometry = given_odometry(Path(drive.odometry), open_scans(source, config), config.odometry)
-    map_folder(
-        source.data,
-        part,
-        config=config,
-        sequence=source.sequence,
-        dataset=source.dataset,
-        labels=source.labels,
-        encoding=source.encoding,
-        frames=source.frames,
-        topic=source.topic,
-        odometry=odometry,
-    )
-    if fixes is not None:
-        _georeference(part, drive.name, fixes)
+    place = None if fixes is None else partial(_georeference, drive.name, fixes)
+    map_source(source, part, config=config, odometry=odometry, place=place)
     _made(part, mapped.folder(fleet), key)
     return mapped
 
 
-def _georeference(part: Path, name: str, fixes: Fixes) -> None:
+def _georeference(name: str, fixes: Fixes, part: Path) -> str:
     """Place a mapped drive by its fixes; where they do not determine a place, the drive remains without."""
     try:
-        georeference(part, fixes)
+        return summary(georeference(part, fixes))
     except SegslamError as error:
         logger.warning("%s: has no place on the globe: %s", name, error)
-        return
-    write_report(part)
+        return ""
 
 
 def _config(drive: Drive, source: DataSource) -> Config:

@@ -4,9 +4,10 @@ import gc
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 from segslam.core.cluster import cluster
@@ -24,13 +25,8 @@ class Outcome(NamedTuple):
     failure: str | None = None
 
 
-@runtime_checkable
-class Workers(Protocol):
-    """Runs a function for several tuples of arguments."""
-
-    def __call__(self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Outcome]]:
-        """Yields the number and outcome of each task when it is done."""
-        ...
+Workers = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[tuple[int, Outcome]]]
+"""Calls a function with several tuples of arguments; yields the number and outcome of each task when it is done."""
 
 
 def here(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Outcome]]:
@@ -71,7 +67,7 @@ def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tup
 
     with dask.config.set({"distributed.worker.daemon": False}), cluster(workers=number, scheduler=scheduler) as client:
         _check(client, folder, scheduler)
-        yield _On(client), client.dashboard_link if scheduler else ""
+        yield partial(_on_cluster, client), client.dashboard_link if scheduler else ""
 
 
 def _check(client: Any, folder: Path, scheduler: str | None) -> None:
@@ -88,23 +84,19 @@ def _check(client: Any, folder: Path, scheduler: str | None) -> None:
             raise SegslamError(f"worker {worker}: does not see {folder}; give a folder that all workers share")
 
 
-class _On:
-    """Tasks on a Dask cluster, which repeats those of a worker that dies."""
+def _on_cluster(
+    client: Any, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]
+) -> Iterator[tuple[int, Outcome]]:
+    """Tasks on a Dask cluster, which repeats those of a worker that dies. Raises SegslamError if it is lost."""
+    from distributed import KilledWorker, as_completed
 
-    def __init__(self, client: Any) -> None:
-        self._client = client
-
-    def __call__(self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Outcome]]:
-        """Raises SegslamError if the scheduler is lost."""
-        from distributed import KilledWorker, as_completed
-
-        name, submit = function.__name__, self._client.submit  # the dashboard groups tasks by name
-        futures = [submit(attempted, function, *task, key=f"{name}-{uuid4().hex}") for task in tasks]
-        numbers = {future.key: number for number, future in enumerate(futures)}
-        for future in as_completed(futures):
-            if future.status in ("cancelled", "lost"):
-                raise SegslamError("the scheduler is lost; start it again, and call `segslam fleet` again to go on")
-            try:
-                yield numbers[future.key], future.result()
-            except KilledWorker:
-                yield numbers[future.key], Outcome(None, DIED)
+    name, submit = function.__name__, client.submit  # the dashboard groups tasks by name
+    futures = [submit(attempted, function, *task, key=f"{name}-{uuid4().hex}") for task in tasks]
+    numbers = {future.key: number for number, future in enumerate(futures)}
+    for future in as_completed(futures):
+        if future.status in ("cancelled", "lost"):
+            raise SegslamError("the scheduler is lost; start it again, and call `segslam fleet` again to go on")
+        try:
+            yield numbers[future.key], future.result()
+        except KilledWorker:
+            yield numbers[future.key], Outcome(None, DIED)

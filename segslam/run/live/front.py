@@ -20,10 +20,8 @@ from segslam.core.config import Config
 from segslam.core.memory import note_peak_of
 from segslam.core.types import SegslamError, Step
 from segslam.odometry import Tracked
-from segslam.run.live.placed import Ended, Past, Placed
-from segslam.run.live.serve import END_S, READY, serve
-from segslam.run.live.source import Source
-from segslam.run.live.waiting import Tally
+from segslam.run.live.serve import END_S, READY, Ended, Past, Placed, serve
+from segslam.run.live.waiting import Source, Tally
 
 CLOUDS_KEPT = 20
 """Chosen: number of keyframes whose points are kept for a new front process, about 1.5 MB each."""

@@ -1,13 +1,18 @@
-"""The map so far, drawn by a separate thread when it has changed."""
+"""The map so far: drawn by a separate thread when it has changed, or written to a file."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from threading import Condition, Thread
 from time import monotonic
 from typing import NamedTuple
 
-from segslam.core.types import Labels, Points, SegslamError, Transform
+import numpy as np
+
+from segslam.core.config import MapConfig
+from segslam.core.types import Keyframe, Labels, Points, SegslamError, Transform
 from segslam.output.log.drawing import CloudOf, map_points
+from segslam.output.map.write import MapSummary, write_map
 
 logger = logging.getLogger(__name__)
 
@@ -86,3 +91,22 @@ class LiveMap:
                 logger.warning("the map is not shown: %s", error)
                 return
             rest_s = max(LEAST_S, (monotonic() - started) * (1 / SHARE - 1))
+
+
+def save_map(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, file: Path, *, config: MapConfig) -> MapSummary:
+    """Write the map of these keyframes, as `segslam export` does at the end of a run.
+
+    The log keeps intensities for the end of the run only, so `map.color=intensity` gives way to classes here.
+    Raises SegslamError if there is no keyframe, and OSError where the disk is full.
+    """
+    if not T_world_keyframe:
+        raise SegslamError("there is no keyframe yet")
+    if config.color == "intensity":
+        config = config.model_copy(update={"color": "class"})
+    return write_map(_keyframes(T_world_keyframe, cloud), [file], config=config)
+
+
+def _keyframes(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf) -> Iterator[tuple[Keyframe, Transform]]:
+    for number, T_world in T_world_keyframe.items():
+        points, labels = cloud(number)
+        yield Keyframe(number, 0, 0, np.eye(4), 0.0, points, labels), T_world

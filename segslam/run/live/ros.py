@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path as FilePath
 from threading import Event, Thread
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
@@ -44,6 +44,7 @@ try:
 except ImportError:  # a minimal installation
     Trigger = None
 
+SpunNode = TypeVar("SpunNode", bound="_Spun")
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 NAMESPACE = "segslam"
 ODOM, MAP = "odom", "map"
@@ -192,7 +193,30 @@ class TopicSource:
         return SetParametersResult(successful=True)
 
 
-class MappingPublisher:
+class _Spun:
+    """A node that is served in a thread of its own while the context manager is open."""
+
+    def __init__(self, name: str) -> None:
+        self._context, self._node = start_node(name)
+        self._thread = Thread(target=self._spin, name=name, daemon=True)
+
+    def __enter__(self: SpunNode) -> SpunNode:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.try_shutdown()
+        self._thread.join()
+        self._node.destroy_node()
+
+    def _spin(self) -> None:
+        executor = SingleThreadedExecutor(context=self._context)
+        executor.add_node(self._node)
+        with suppress(ExternalShutdownException):
+            executor.spin()
+
+
+class MappingPublisher(_Spun):
     """The node `/segslam/mapping`: publishes corrected path, map and the transform map -> odom; a context manager.
 
     Its service `/segslam/save_map` (std_srvs/Trigger) calls `save`.
@@ -200,25 +224,15 @@ class MappingPublisher:
 
     def __init__(self, save: Callable[[], str]) -> None:
         """`save` writes the map so far and returns a message; it raises SegslamError or OSError if it cannot."""
+        super().__init__("mapping")
         self._save = save
-        self._context, self._node = start_node("mapping")
         if Trigger is not None:
             self._node.create_service(Trigger, f"/{NAMESPACE}/save_map", self._save_map)
-        self._services = Thread(target=_spin, args=(self._context, self._node), name="services", daemon=True)
         self._path = self._node.create_publisher(Path, f"/{NAMESPACE}/path", LATCHED)
         self._map = self._node.create_publisher(PointCloud2, f"/{NAMESPACE}/map", LATCHED)
         self._correction = self._node.create_publisher(TransformStamped, f"/{NAMESPACE}/map_to_odom", LATCHED)
         self._transforms = self._node.create_publisher(TFMessage, "/tf", 100) if TFMessage else None
         self._T_map_odom = np.eye(4)
-
-    def __enter__(self) -> "MappingPublisher":
-        self._services.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._context.try_shutdown()
-        self._services.join()
-        self._node.destroy_node()
 
     def note_step(self, stamp_ns: int, T_odom_keyframe: Transform | None, estimate: GraphEstimate | None) -> None:
         """Publish `map -> odom` after an optimisation, and on /tf at every step."""
@@ -253,7 +267,7 @@ class MappingPublisher:
         return response
 
 
-class FixTopic:
+class FixTopic(_Spun):
     """Collects the position fixes of a topic, sensor_msgs/NavSatFix, in its own thread; a context manager."""
 
     def __init__(self, topic: str) -> None:
@@ -263,27 +277,9 @@ class FixTopic:
             validate_full_topic_name(topic)
         except (InvalidTopicNameException, ValueError) as error:
             raise SegslamError(f"--gnss {topic}: not a topic name ({error}); give it as in --gnss /fix") from error
-        self._context, self._node = start_node("gnss")
+        super().__init__("gnss")
         profile = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)  # receives from both kinds
         self._node.create_subscription(NavSatFix, topic, lambda message: self.rows.append(row_of(message)), profile)
-        self._listening = Thread(target=_spin, args=(self._context, self._node), name="gnss", daemon=True)
-
-    def __enter__(self) -> "FixTopic":
-        self._listening.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._context.try_shutdown()
-        self._listening.join()
-        self._node.destroy_node()
-
-
-def _spin(context: Any, node: Any) -> None:
-    """Serve a node until its context is shut down."""
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    with suppress(ExternalShutdownException):
-        executor.spin()
 
 
 def start_node(name: str) -> tuple[Any, Any]:

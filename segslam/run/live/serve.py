@@ -1,7 +1,9 @@
 """The front process: receives scans, estimates their poses by odometry and publishes the poses."""
 
 import signal
+from collections import deque
 from contextlib import suppress
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from threading import Event, Thread
@@ -13,11 +15,9 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.memory import keep_freed_memory
-from segslam.core.types import BadScan, Scan, SegslamError
+from segslam.core.types import BadScan, Points, Scan, SegslamError, Step
 from segslam.odometry import KissOdometry, OdometryApart, Tracked, Tracker
-from segslam.run.live.placed import Ended, Gaps, Past, Placed
-from segslam.run.live.source import Source
-from segslam.run.live.waiting import Arrival, Tally, Waiting
+from segslam.run.live.waiting import Arrival, Gaps, Source, Tally, Waiting
 
 READY = b"ready"
 END_S = 5.0
@@ -27,6 +27,44 @@ ROWS_CONTINUED = 30
 median of 21."""
 MOST_SHOWN = 200
 """Chosen: number of characters shown of an exception, which may contain the content of a file."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A scan with its odometry pose, or an unusable scan, and the counts so far."""
+
+    tracked: Tracked | BadScan
+    latency_s: float
+    """Time from the arrival of the scan to the publication of its pose."""
+    placed_s: float
+    """Time of the publication, by time.monotonic."""
+    num_dropped: int
+    gaps: Gaps
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """End of the stream: reason and final counts."""
+
+    why: str = ""
+    """Empty if the stop was requested."""
+    failed: bool = False
+    died: bool = False
+    """True if the process can be started again."""
+    num_arrived: int = 0
+    num_dropped: int = 0
+    gaps: Gaps = field(default_factory=Gaps)
+
+
+@dataclass(slots=True, eq=False)
+class Past:
+    """The scans of front processes that have ended."""
+
+    steps: list[Step]
+    """Poses and motions only."""
+    clouds: deque[tuple[int, Points]]
+    """Row and points of the last keyframes."""
+    gaps: Gaps = field(default_factory=Gaps)
 
 
 class OdometryEnded(Exception):
@@ -69,7 +107,7 @@ def serve(pipe: Connection, source: Source, config: Config, idle_s: float | None
     finally:
         if feeder is None or not feeder.is_alive():
             source.close()
-    to_send.put(Ended(why, failed, died, waiting.num_arrived, waiting.num_dropped, Gaps.of(waiting)))
+    to_send.put(Ended(why, failed, died, waiting.num_arrived, waiting.num_dropped, waiting.rhythm.gaps))
     to_send.put(None)
     sender.join()
 
@@ -92,8 +130,7 @@ def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
         tracker.note(step)
     for step in past.steps[-ROWS_CONTINUED:]:
         waiting.rhythm.note(step.stamp_ns)
-    rhythm = waiting.rhythm
-    rhythm.num_gaps, rhythm.num_missing, rhythm.longest_gap_s, rhythm.num_clock_set = past.gaps
+    waiting.rhythm.gaps = past.gaps
     keyframes = [row for row, _ in past.clouds]
     last = range(max(len(past.steps) - ROWS_CONTINUED, keyframes[0]), len(past.steps))
     rows = sorted({*keyframes, *last})
@@ -123,7 +160,7 @@ def _place_all(
             last_ns = arrival.stamp_ns
             _publish(source, arrival, tracked, to_send)
         now = monotonic()
-        to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.num_dropped, Gaps.of(waiting)))
+        to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.num_dropped, waiting.rhythm.gaps))
     return not waiting.is_closed
 
 

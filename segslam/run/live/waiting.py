@@ -1,19 +1,34 @@
-"""Queue of scans that wait for the odometry; the oldest are dropped if it is full."""
+"""Live scans: their sources, and the queue of scans that wait for the odometry; a full queue drops the oldest."""
 
 import ctypes
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from threading import Condition
+from pathlib import Path
+from statistics import median
+from threading import Condition, Event, Thread
 from time import monotonic
+from typing import NamedTuple, Protocol, runtime_checkable
 
-from segslam.core.types import BadScan, Scan
-from segslam.run.live.rhythm import Rhythm
+from segslam.core.types import BadScan, Scan, SegslamError, Transform
+from segslam.scans import open_dataset
+from segslam.scans.presets import extent_m, extent_of
 
 MOST_WAITING = 4
 """Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
 END_NS = 2**62
 """Stamps are below this one, in the year 2116: 64 bits hold them also if they are shifted."""
+LONG_GAP = 1.5
+"""Chosen: there is a gap if stamps are farther apart than this many usual intervals."""
+LONGEST_PREDICTED = 10.0
+"""Chosen: after more intervals (1 s at 10 Hz), prediction with constant velocity is useless."""
+SET_BACK_NS = 1_000_000_000
+"""Chosen: the sender's clock was set back if a stamp is this much earlier than the last, as in a replay."""
+SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
+"""Chosen: the sender's clock was set forward if a stamp is this much later than the last: no drive has such a gap."""
+PATIENCE_S = 2.0
+"""Chosen: time to wait for the first cloud of a topic; a sensor that runs sends ten a second."""
 
 
 class Tally(ctypes.Structure):
@@ -100,3 +115,121 @@ class Waiting:
         with self._changed:
             self.is_closed = True
             self._changed.notify()
+
+
+class Gaps(NamedTuple):
+    """Gaps in the stamps so far."""
+
+    num_gaps: int = 0
+    num_missing: int = 0
+    """Number of missing scans, estimated from the length of the gaps."""
+    longest_gap_s: float = 0.0
+    num_clock_set: int = 0
+
+
+class Rhythm:
+    """Tracks the stamps of arriving scans."""
+
+    def __init__(self) -> None:
+        self._intervals_ns: deque[int] = deque(maxlen=21)
+        self._last_ns: int | None = None
+        self._shift_ns = 0
+        self.gaps = Gaps()
+
+    def note(self, sent_ns: int) -> int:
+        """The stamp of the next scan: as sent, or shifted to follow the last one if the clock was set."""
+        stamp_ns = sent_ns + self._shift_ns
+        last_ns = self._last_ns
+        if last_ns is not None and not last_ns - SET_BACK_NS <= stamp_ns <= last_ns + SET_FORWARD_NS:
+            self._shift_ns += last_ns + self._usual_ns() - stamp_ns
+            stamp_ns = sent_ns + self._shift_ns
+            self.gaps = self.gaps._replace(num_clock_set=self.gaps.num_clock_set + 1)
+        if last_ns is not None and stamp_ns > last_ns:
+            self._note_interval(stamp_ns - last_ns)
+        self._last_ns = max(stamp_ns, last_ns or 0)
+        return stamp_ns
+
+    def intervals(self, from_ns: int, to_ns: int) -> float:
+        """The time between two stamps in usual intervals: 1 if no scan is missing between them."""
+        usual_ns = self._usual_ns()
+        if usual_ns == 0:
+            return 1.0
+        gap = (to_ns - from_ns) / usual_ns
+        return 1.0 if gap < LONG_GAP else min(gap, LONGEST_PREDICTED)
+
+    def _note_interval(self, interval_ns: int) -> None:
+        usual_ns = self._usual_ns()
+        if usual_ns and interval_ns > LONG_GAP * usual_ns:
+            num_gaps, num_missing, longest_s, num_clock_set = self.gaps
+            num_missing += round(interval_ns / usual_ns) - 1
+            self.gaps = Gaps(num_gaps + 1, num_missing, max(longest_s, interval_ns * 1e-9), num_clock_set)
+        self._intervals_ns.append(interval_ns)
+
+    def _usual_ns(self) -> int:
+        return int(median(self._intervals_ns)) if self._intervals_ns else 0
+
+
+@runtime_checkable
+class Source(Protocol):
+    """A stream of scans; it is sent to the front process before it is opened."""
+
+    @property
+    def name(self) -> str:
+        """Name for messages and logs, such as `live/scans`."""
+        ...
+
+    def open(self, tell: Callable[[str], None]) -> None:
+        """Start to listen; `tell` prints messages, now and later.
+
+        Raises SegslamError if the source is not available.
+        """
+        ...
+
+    def feed(self, waiting: Waiting, stopped: Event) -> str:
+        """Put scans as they arrive until `stopped`; returns the reason if it ended otherwise.
+
+        Runs in its own thread.
+        """
+        ...
+
+    def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
+        """Publish the pose of a scan to subscribers; must be fast, because the next scan waits."""
+        ...
+
+    def close(self) -> None:
+        """Release the resources of `open`."""
+        ...
+
+
+def extent_in_folder(folder: Path) -> float | None:
+    """The extent (m), as `segslam.presets.extent_m`, of the scans already in a folder; None if there are none."""
+    with suppress(SegslamError):
+        return extent_m(open_dataset(folder, labels="none"))
+    return None
+
+
+def extent_of_topic(topic: str) -> float | None:
+    """The extent (m) of the first cloud of a ROS 2 topic; None if none arrives within two seconds.
+
+    Raises SegslamError if the topic cannot be opened.
+    """
+    from segslam.run.live.ros import TopicSource
+
+    return extent_of_first(TopicSource(topic))
+
+
+def extent_of_first(source: Source) -> float | None:
+    """The extent (m) of the first readable scan of a source, which is closed; None if none arrives in time."""
+    waiting, stopped = Waiting(), Event()
+    source.open(lambda text: None)
+    feeder = Thread(target=source.feed, args=(waiting, stopped), daemon=True)
+    feeder.start()
+    try:
+        while (arrival := waiting.take(PATIENCE_S)) is not None:
+            with suppress(BadScan):
+                return extent_of(arrival.read(arrival.index, arrival.stamp_ns).points)
+    finally:
+        stopped.set()
+        feeder.join(timeout=PATIENCE_S)
+        source.close()
+    return None

@@ -1,7 +1,9 @@
-"""Localisation of a drive in an existing map, with one call per scan."""
+"""Localisation of a drive in the map of a finished run: scan by scan, or a whole recording."""
 
 import math
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,20 @@ from segslam.core.trajectory import travelled_m
 from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
 from segslam.graph import Graph
 from segslam.odometry import Odometry
+from segslam.output.finished import FinishedRun
+from segslam.output.georeferenced import take_over
 from segslam.registration.prepared import Labeller
 from segslam.run.locator import Locator
+from segslam.run.map_folder import SlamOf, map_folder
 from segslam.run.sessions.anchored import AnchoredGraph
 from segslam.run.sessions.placer import Placer
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.slam import Slam, SlamResult
+
+
+def localiser_in(run: str | Path) -> SlamOf:
+    """What makes pipelines that localise in the map of a finished run, which is read now."""
+    return partial(Localiser, Locator.from_run(run))
 
 
 class Localiser(Slam):
@@ -74,3 +84,16 @@ class Localiser(Slam):
             around = own[np.column_stack([np.maximum(after - 1, 0), after])]
             distance_m[rows] = np.abs(travel_m[rows, None] - travel_m[around]).min(axis=1)
         return distance_m
+
+
+def localise(run: str | Path, data: str | Path, out: str | Path, **options: Any) -> FinishedRun:
+    """Localise a folder of scans or a recording in the map of a finished run, like `segslam localise`.
+
+    The new folder `out` has the files of `map_folder`; its world frame, and its place on the globe, is that
+    of the finished run. Options are those of `map_folder`. Raises SegslamError as `map_folder`, and if the run did not
+    finish or is damaged.
+    """
+    in_map = {"in_map": str(Path(run).expanduser().resolve())}
+    made = map_folder(data, out, slam_of=localiser_in(run), options=in_map, **options)
+    take_over(made.folder, run)
+    return made

@@ -13,14 +13,14 @@ from segslam.core.config import Config
 from segslam.core.types import REJECTED_WEIGHT, LoopAttempt, SegslamError, Step, Trajectory
 from segslam.gnss import Use
 from segslam.gnss.fixes import Row
-from segslam.output.accuracy import accuracy
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import new_folder, write_metrics
+from segslam.output.folder import new_folder
 from segslam.output.georeferenced import georeference_if_possible, recorded_fixes, use_of
 from segslam.run.locator import Locator
 from segslam.run.run import Run
 from segslam.run.sessions.recorded import Session, Shift, next_shift, read_sessions, shifted_steps
-from segslam.run.sessions.session_pose import Progress, SessionPose, attempt, find_session, no_progress
+from segslam.run.sessions.session_pose import SessionPose, attempt, find_session
+from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.slam import Slam, SlamResult
 
 OPTIMIZE_EVERY = 25
@@ -74,6 +74,17 @@ class Merged:
             for session, shift in zip(self.sessions, self.shifts, strict=True)
         ]
         return {"sessions": json.dumps(rows)}
+
+    def begun(self, folder: Path, config: Config) -> Run:
+        """The merged run in its folder, before it takes over the first of `steps`."""
+        return Run(
+            folder,
+            Slam(config),
+            dataset=self.dataset,
+            T_camera_lidar=self.sessions[0].run.T_camera_lidar,
+            reference=self.reference,
+            options=self.options(),
+        )
 
     def steps(self) -> Iterator[StepToTake]:
         """The steps of all sessions; loops with earlier sessions are searched for the later ones."""
@@ -182,31 +193,11 @@ def write_merged(
     merged: Merged, folder: Path, config: Config, *, on_step: Callable[[Step], object] = lambda step: None
 ) -> FinishedRun:
     """The merged run, in an empty folder."""
-    from segslam.output.report import write_report
-
-    with run_of(merged, folder, config) as run:
+    with merged.begun(folder, config) as run:
         for step in run.take(merged.steps()):
             on_step(step)
-        result, metrics = run.finish()
-    metrics |= merged.figures(result)
-    if merged.reference is not None:
-        metrics |= accuracy(result, merged.reference)
-    write_metrics(folder, metrics)
-    merged.georeference(folder)
-    write_report(folder)
+        run.complete(more=merged.figures, place=merged.georeference)
     return read_run(folder)
-
-
-def run_of(merged: Merged, folder: Path, config: Config) -> Run:
-    """The run that takes over the steps of all sessions."""
-    return Run(
-        folder,
-        Slam(config),
-        dataset=merged.dataset,
-        T_camera_lidar=merged.sessions[0].run.T_camera_lidar,
-        reference=merged.reference,
-        options=merged.options(),
-    )
 
 
 def _find_in_any(

@@ -7,8 +7,8 @@ again without initial guess.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -16,11 +16,11 @@ from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.stopwatch import Stopwatch
-from segslam.core.types import Placement, Registration, Rejected, RejectReason, Transform
+from segslam.core.types import Placement, Rejected, RejectReason, Transform
 from segslam.keyframes.submaps import Submaps
 from segslam.registration import refinement
 from segslam.registration.prepared import Observed, prepare_observed
-from segslam.run.locator import Located, Locator
+from segslam.run.locator import Locator
 from segslam.run.sessions.anchored import AnchoredGraph
 from segslam.verification.patches import agreement
 from segslam.verification.verdict import judged
@@ -45,14 +45,6 @@ REMEMBERED_M = 60.0
 NUM_PREPARED = 64
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pose:
-    """A keyframe with a pose in the map's world."""
-
-    keyframe_id: int
-    T_world_keyframe: Transform
-
-
 class Placer:
     """Replaces the loop closer in a drive that is localised; the calls come in the same order."""
 
@@ -61,8 +53,8 @@ class Placer:
         self._config, self._locator, self._graph, self._submaps = config, locator, graph, submaps
         ids = sorted(locator.T_world_keyframe)
         self._T_world_map = np.array([locator.T_world_keyframe[number] for number in ids])
-        self._map_seen: Callable[[int], Observed] = lru_cache(NUM_PREPARED)(self._seen_of_map)
-        self._last: _Pose | None = None
+        self._map_seen: Callable[[int], Observed] = lru_cache(NUM_PREPARED)(partial(self._seen, locator.submaps))
+        self._last: Placement | None = None
         """The newest placed keyframe."""
         self._found: list[Placement] = []
         """Locations that are not yet confirmed."""
@@ -86,19 +78,19 @@ class Placer:
             found = self._locator.locate(submap.points, submap.labels)
         if isinstance(found, Rejected):
             return (), found
-        return self._confirmed(_placement(keyframe_id, found))
+        fine, target_id = found.alignment.fine, found.keyframe_id
+        place = Placement(keyframe_id, target_id, found.T_world_lidar, fine.information, found.alignment, is_found=True)
+        return self._confirmed(place)
 
     def _tracked(self, keyframe_id: int, since_m: float, watch: Stopwatch) -> Placement | Rejected:
         """The keyframe registered with the nearest ones of the map, starting at the odometry's prediction."""
-        T_world_predicted = self._predicted(keyframe_id)
+        assert self._last is not None
+        T_world_predicted = self._last.T_world_keyframe @ self._motion(self._last.keyframe_id, keyframe_id)
         apart_m = np.hypot(*(self._T_world_map[:, :2, 3] - T_world_predicted[:2, 3]).T)
         apart_m = np.hypot(apart_m, self._T_world_map[:, 2, 3] - T_world_predicted[2, 3])
         outcome: Placement | Rejected = Rejected(RejectReason.NO_PLACE, f"{apart_m.min():.0f} m from the map")
         with watch("prepare"):
-            submap = self._submaps.submap(keyframe_id)
-            own = prepare_observed(
-                submap.points, submap.labels, config=self._config, seen_from_here=submap.seen_from_here
-            )
+            own = self._seen(self._submaps, keyframe_id)
         tried: list[int] = []
         for target_id in np.argsort(apart_m)[: 10 * NUM_TRIED].tolist():
             near = [np.linalg.norm(self._T_world_map[target_id, :3, 3] - self._T_world_map[t, :3, 3]) for t in tried]
@@ -146,19 +138,19 @@ class Placer:
 
     def _confirmed(self, found: Placement) -> tuple[tuple[Placement, ...], Rejected | None]:
         """The location with an earlier one that is consistent with it; it waits if there is none."""
-        if self._last is not None and self._agree(self._last, found):
+        if self._last is not None and self._agree(self._last, found, BREAK_TRAVEL_M):
             return self._taken((found,)), None
         for earlier in reversed(self._found):
-            if self._agree(earlier, found):
+            if self._agree(earlier, found, REMEMBERED_M):
                 return self._taken((earlier, found)), None
         self._found.append(found)
         return (), Rejected(RejectReason.UNCONFIRMED, "found, but not yet confirmed by another keyframe")
 
-    def _agree(self, earlier: "Placement | _Pose", later: Placement) -> bool:
-        """True if odometry leads from one location to the other."""
+    def _agree(self, earlier: Placement, later: Placement, within_m: float) -> bool:
+        """True if odometry leads from one location to the other, over less than this travel."""
         travel_m = self._graph.travel_m
         way_m = float(travel_m[later.keyframe_id] - travel_m[earlier.keyframe_id])
-        if way_m >= (REMEMBERED_M if isinstance(earlier, Placement) else BREAK_TRAVEL_M):
+        if way_m >= within_m:
             return False
         T_earlier_later = self._motion(earlier.keyframe_id, later.keyframe_id)
         off = geometry.inverse(earlier.T_world_keyframe @ T_earlier_later) @ later.T_world_keyframe
@@ -167,28 +159,15 @@ class Placer:
     def _taken(self, placements: tuple[Placement, ...]) -> tuple[Placement, ...]:
         for placement in placements:
             self._graph.place(placement)
-        newest = placements[-1]
-        self._last = _Pose(newest.keyframe_id, newest.T_world_keyframe)
-        self._found = []
+        self._last, self._found = placements[-1], []
         return placements
-
-    def _predicted(self, keyframe_id: int) -> Transform:
-        assert self._last is not None
-        return self._last.T_world_keyframe @ self._motion(self._last.keyframe_id, keyframe_id)
 
     def _motion(self, earlier_id: int, later_id: int) -> Transform:
         return geometry.inverse(self._submaps.T_odom[earlier_id]) @ self._submaps.T_odom[later_id]
 
-    def _seen_of_map(self, map_keyframe_id: int) -> Observed:
-        submap = self._locator.submaps.submap(map_keyframe_id)
+    def _seen(self, submaps: Submaps, keyframe_id: int) -> Observed:
+        submap = submaps.submap(keyframe_id)
         return prepare_observed(submap.points, submap.labels, config=self._config, seen_from_here=submap.seen_from_here)
-
-
-def _placement(keyframe_id: int, found: Located) -> Placement:
-    fine: Registration = found.alignment.fine
-    return Placement(
-        keyframe_id, found.keyframe_id, found.T_world_lidar, fine.information, found.alignment, is_found=True
-    )
 
 
 def _within(T: Transform, most_m: float, most_rad: float) -> bool:

@@ -1,32 +1,27 @@
 """A finished run as one session of a merged run: its keyframes, and its steps with new numbers."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from segslam.candidates.proximity import BREAK_TRAVEL_M
-from segslam.core.config import Config
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
     Information,
-    Labels,
     LoopAttempt,
     LoopClosure,
     Motion,
     MotionState,
-    Points,
     SegslamError,
     Step,
     Transform,
     Vector,
 )
-from segslam.keyframes.submaps import Submaps
-from segslam.labels import geometric_labels
 from segslam.odometry import information_of
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import folder_of, log_of
+from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
 
 GAP_NS = 1_000_000_000
@@ -56,8 +51,8 @@ class Session:
 
 def read_session(folder: Path) -> Session:
     """The session of a run folder, or of its log. Raises SegslamError as `read_run`, or if keyframes are missing."""
-    run = read_run(folder_of(folder))
-    log = read_log(log_of(folder))
+    run = read_run(folder)
+    log = read_log(folder)
     estimate = run.result.estimate.T_world_keyframe
     T_odom, travel_m, informations = [], [], []
     since: list[Motion] = []
@@ -114,16 +109,10 @@ class Shift:
 
 
 def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopAttempt, ...]]) -> Iterator[Step]:
-    """The steps of a session with their points; `more`: further loops of its keyframes, by original id.
-
-    Loops tried after the session's last scan are added to the step of its last keyframe.
-    """
-    late = session.log.late_loops()
-    last_id = len(session.travel_m) - 1
-    for number, step in enumerate(session.log.steps()):
+    """The steps of a session (`RunLog.whole_steps`); `more`: further loops of its keyframes, by original id."""
+    for number, step in enumerate(session.log.whole_steps(len(session.travel_m))):
         attempts, keyframe, motion = [shift.attempt(attempt) for attempt in step.attempts], step.keyframe, step.motion
         if keyframe is not None:
-            attempts += [shift.attempt(attempt) for attempt in (late if keyframe.id == last_id else ())]
             attempts += more.get(keyframe.id, ())
             keyframe = replace(
                 keyframe,
@@ -158,17 +147,3 @@ def next_shift(before: Shift, session: Session, T_new_old: Transform, following:
         travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_TRAVEL_M,
         T_new_old=T_new_old,
     )
-
-
-def submaps(session: Session, config: Config) -> Callable[[int], tuple[Points, Labels]]:
-    """Function from a keyframe's id to its points and labels; sparse keyframes are merged with their neighbours."""
-    recorded = session.log.keyframes()
-    made = Submaps(config, lambda: recorded, geometric_labels, lambda: session.travel_m)
-    for number in range(len(recorded)):
-        made.add(session.T_odom_keyframe[number], labelled_by_shape=bool(recorded[number].labelled_by_shape))
-
-    def of(keyframe_id: int) -> tuple[Points, Labels]:
-        submap = made.submap(keyframe_id)
-        return submap.points, submap.labels
-
-    return of

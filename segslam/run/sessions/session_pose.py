@@ -5,10 +5,8 @@ noise (`segslam.graph.closure_pairs`). A wrong location is consistent with few o
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -17,8 +15,9 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import PoseGraph
-from segslam.run.locator import Locator
-from segslam.run.sessions.recorded import FIRST_MOTION, Session, submaps
+from segslam.run.locator import Locator, submaps_of
+from segslam.run.sessions.recorded import FIRST_MOTION, Session
+from segslam.slam.adjustment import Progress, no_progress
 
 NUM_QUERIES = 60
 """Chosen: number of keyframes of a session that are searched in another, spread over its travel."""
@@ -33,14 +32,6 @@ MIN_SPREAD_M = 10.0
 """Chosen: smallest travel between the first and the last of them; a single place may be a wrong one."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 """Golden ratio less 1: steps of it, modulo 1, are spread evenly at any number."""
-
-Progress = Callable[[Iterable[Any], int, str], Iterator[Any]]
-"""Passes items on and shows progress: takes the items, their number, and a title."""
-
-
-def no_progress(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
-    """Passes the items on and shows nothing."""
-    return iter(items)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +62,8 @@ def find_session(
     `likely`: these keyframes are searched instead, in this order, and those before and after each that is found, until
     the first `MOST_FAILED` were not.
     """
-    submap = submaps(session, config)
+    recorded = session.log.keyframes()
+    submaps = submaps_of([recorded[number] for number in range(len(recorded))], recorded, config)
     found: list[tuple[int, int, Alignment]] = []
     count = len(session.travel_m)
     queries = (
@@ -80,7 +72,8 @@ def find_session(
     num_tried = 0
     for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
         num_tried += 1
-        place = locator.locate(*submap(keyframe_id))
+        submap = submaps.submap(keyframe_id)
+        place = locator.locate(submap.points, submap.labels)
         if not isinstance(place, Rejected):
             found.append((keyframe_id, place.keyframe_id, place.alignment))
         if len(found) == NUM_ENOUGH or (likely is not None and not found and num_tried == MOST_FAILED):
@@ -146,14 +139,9 @@ def _both(earlier: Session, session: Session, config: Config) -> tuple[PoseGraph
     """A graph of the keyframes of two sessions, each with the estimate of its run; and the first id of the second."""
     graph = PoseGraph(config.graph)
     first_id = len(earlier.travel_m)
-    add = partial(_add, graph)
     for number, one in enumerate((earlier, session)):
         shift_m = number * (float(earlier.travel_m[-1]) + BREAK_TRAVEL_M)
         for row, (T_world, travel_m) in enumerate(zip(one.T_world_keyframe, one.travel_m, strict=True)):
             information = FIRST_MOTION.information if number and row == 0 else one.informations[row]
-            add(T_world, float(travel_m) + shift_m, information)
+            graph.add_keyframe(graph.num_keyframes, T_world, float(travel_m) + shift_m, information=information)
     return graph, first_id
-
-
-def _add(graph: PoseGraph, T_world_keyframe: Transform, travel_m: float, information: Any) -> None:
-    graph.add_keyframe(graph.num_keyframes, T_world_keyframe, travel_m, information=information)

@@ -1,5 +1,6 @@
 """Logs that are cut, damaged or of another version; failing disks and Ctrl-C."""
 
+import json
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,7 +13,7 @@ from mcap.writer import Writer
 
 from segslam.core.types import SegslamError, Step, WorkFailed
 from segslam.output.log import LogWriter, read_log, schema
-from segslam.output.log.output import Output
+from segslam.output.log.writer import Output
 
 
 def test_a_cut_log_gives_every_complete_step_wherever_it_is_cut(
@@ -178,7 +179,7 @@ def test_records_that_changed_without_a_new_version_are_refused_not_misread(tmp_
 
 def test_a_step_that_contradicts_its_schema_is_refused(tmp_path: Path) -> None:
     metadata = {"segslam": {"schema_version": str(schema.VERSION)}, "segslam.config": {"yaml": ""}}
-    step_schema = schema.schema_text(schema.json_schemas()[schema.STEP])
+    step_schema = json.dumps(schema.json_schemas()[schema.STEP]).encode()
     log = read_log(_foreign(tmp_path / "broken.mcap", metadata, step_schema))
     with pytest.raises(SegslamError, match="not written by segslam"):
         list(log.steps())

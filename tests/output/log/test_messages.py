@@ -10,8 +10,8 @@ from helpers.made_logs import CONFIG, decoded, write_log
 from segslam.core import geometry
 from segslam.core.types import LoopClosure, Motion, MotionState, Step
 from segslam.output.log import LogWriter, read_log, schema
+from segslam.output.log.drawing import INFO, WARNING
 from segslam.output.log.foxglove import transforms
-from segslam.output.log.messages import INFO, WARNING
 
 
 def test_repairs_breaks_and_loops_are_messages_and_skipped_scans_warnings(steps: list[Step], tmp_path: Path) -> None:

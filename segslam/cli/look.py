@@ -1,13 +1,16 @@
-"""`segslam info`."""
+"""`segslam info`, `view` and `report`: what a run contains."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists
-from segslam.cli.console import JsonOption, QuietOption, announce, print_json, print_out
+from segslam.cli.checks import check_free, check_links, check_run
+from segslam.cli.console import Terminal
+from segslam.cli.options import LogArgument, OverwriteOption
 from segslam.cli.tables import figure
+from segslam.cli.viewers import check_display, close_scene, open_scene
 
 if TYPE_CHECKING:
     from segslam.output.log import RunLog
@@ -20,28 +23,68 @@ SHOWN = (
 """Figures of the run that are shown, if known."""
 
 
-def info(
-    run: Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, finished or not.")],
-    json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+def info(run: LogArgument, *, terminal: Terminal) -> None:
     """Show what a run contains: its data, state, figures, changed settings and files.
 
     Example: segslam info runs/00
     """
-    check_exists(run, "give a run folder, or its log.mcap")
-    announce(f"info: reading {run}", quiet=quiet)
-    from segslam.output.folder import log_of
+    check_run(run)
+    terminal.announce(f"info: reading {run}")
     from segslam.output.log import read_log
 
-    found = found_in(read_log(log_of(run)))
-    if json:
-        print_json(found)
-    elif not quiet:
-        print_out(lines(found))
+    found = _found_in(read_log(run))
+    terminal.table(found, _lines(found))
 
 
-def found_in(log: "RunLog") -> dict[str, Any]:
+def view(
+    run: Annotated[Path, typer.Argument(help="Run folder, finished or not.")],
+    *,
+    save: Annotated[
+        Path | None, typer.Option(help="Write a .rrd file for Rerun instead of opening the viewer.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+    terminal: Terminal,
+) -> None:
+    """Open a run in the Rerun viewer: trajectory, clouds and loops, step by step.
+
+    Example: segslam view runs/00
+    """
+    if save is None:
+        check_display()
+    check_free([save], overwrite=overwrite)
+    terminal.announce(f"view: reading {run}")
+    from segslam.core.whole_files import whole_file
+    from segslam.output.log import read_log
+
+    log = read_log(run)
+    with nullcontext() if save is None else whole_file(save) as part:
+        scene = open_scene(part, view_every=log.config.log.view_every, named=save)
+        num_steps = 0
+        for step in terminal.progress(log.steps(), log.num_steps(), "view"):
+            scene.add(step)
+            num_steps += 1
+        close_scene(scene, save)
+    figures = {"num_steps": num_steps, "file": str(save) if save else None}
+    terminal.answer(figures, f"written to {save}" if save else "all steps are in the viewer")
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="Run folder; report.html is written there.")], *, terminal: Terminal
+) -> None:
+    """Write the report of a run again: one HTML page with the map, plots and tables.
+
+    Example: segslam report runs/00
+    """
+    terminal.announce(f"report: reading {run}")
+    from segslam.output.folder import folder_of
+    from segslam.output.report import write_report
+
+    check_links(folder_of(run))
+    page = write_report(folder_of(run))
+    terminal.answer({"report": str(page)}, f"report written to {page}")
+
+
+def _found_in(log: "RunLog") -> dict[str, Any]:
     """Data, state, figures, options, changed settings and files (bytes) of a run."""
     from segslam.core.config import Config, changed_settings
     from segslam.output.finished import read_metrics
@@ -50,20 +93,19 @@ def found_in(log: "RunLog") -> dict[str, Any]:
     folder = log.path.parent
     state = "in progress" if is_being_written(log.path) else "finished" if log.result() else "interrupted"
     metrics = read_metrics(folder) if (folder / METRICS).is_file() else {}
-    figures = {key: metrics[key] for key in SHOWN if key in metrics}
     return {
         "run": str(folder),
         "data": log.run.get("dataset", ""),
         "state": state,
         "num_steps": log.num_steps(),
-        "figures": figures,
+        "figures": {key: metrics[key] for key in SHOWN if key in metrics},
         "options": {key: value for key, value in log.options.items() if value not in ("", "[]")},
         "changed_settings": {key: str(now) for key, _, now in changed_settings(Config(), log.config)},
         "files": {file.name: file.stat().st_size for file in sorted(folder.iterdir()) if file.is_file()},
     }
 
 
-def lines(found: dict[str, Any]) -> str:
+def _lines(found: dict[str, Any]) -> str:
     """The content as text, for 80 columns."""
     from segslam.output.finished import FIGURES
 

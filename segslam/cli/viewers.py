@@ -1,55 +1,36 @@
-"""`segslam view`."""
+"""Viewers of a run while it is made: Rerun (`--view`) and Foxglove (`--foxglove`)."""
 
 import os
 import sys
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from segslam.cli.console import JsonOption, QuietOption, announce, print_json, progress, say
-from segslam.cli.overwriting import OverwriteOption, check_free
+from segslam.cli.console import Terminal
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.extras import how_to_install
 
 if TYPE_CHECKING:
+    from segslam.output.foxglove_server import FoxgloveServer
     from segslam.output.viewer import Scene
 
 
-def view(
-    run: Annotated[Path, typer.Argument(help="Run folder, finished or not.")],
-    save: Annotated[
-        Path | None, typer.Option(help="Write a .rrd file for Rerun instead of opening the viewer.")
-    ] = None,
-    overwrite: OverwriteOption = False,
-    json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
-    """Open a run in the Rerun viewer: trajectory, clouds and loops, step by step.
+def serve_foxglove(address: str | None, stack: ExitStack, terminal: Terminal) -> "FoxgloveServer | None":
+    """A server that runs until the stack is closed; None without an address.
 
-    Example: segslam view runs/00
+    Raises SegslamError if foxglove-sdk is missing or the port is not available.
     """
-    if save is None:
-        check_display()
-    check_free([save] if save else [], overwrite=overwrite)
-    announce(f"view: reading {run}", quiet=quiet)
-    from segslam.core.whole_files import whole_file
-    from segslam.output.folder import log_of
-    from segslam.output.log import read_log
-
-    log = read_log(log_of(run))
-    with nullcontext() if save is None else whole_file(save) as part:
-        scene = open_scene(part, view_every=log.config.log.view_every, named=save)
-        num_steps = 0
-        for step in progress(log.steps(), total=log.num_steps(), title="view", quiet=quiet):
-            scene.add(step)
-            num_steps += 1
-        close_scene(scene, save)
-    if json:
-        print_json({"num_steps": num_steps, "file": str(save) if save else None})
-    else:
-        say(f"written to {save}" if save else "all steps are in the viewer", quiet=quiet)
+    if address is None:
+        return None
+    try:
+        from segslam.output.foxglove_server import FoxgloveServer
+    except ImportError as error:
+        raise SegslamError(f"--foxglove needs a package: {how_to_install('foxglove')}") from error
+    server = stack.enter_context(FoxgloveServer(address))
+    terminal.say(f"Foxglove: open connection to {server.url}")
+    if server.is_public:
+        terminal.say("Foxglove: there is no password; whoever reaches this address can read the run")
+    return server
 
 
 def check_display() -> None:
@@ -75,8 +56,8 @@ def open_scene(file: Path | None, *, view_every: int, named: Path | None = None)
         ) from error
     viewer = rerun.RecordingStream("segslam")
     try:
-        if file is None:
-            _find_beside_python()
+        if file is None:  # the program of the viewer is beside Python
+            os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
             viewer.spawn()
         else:
             viewer.save(file)
@@ -98,8 +79,3 @@ def _no_viewer(file: Path | None, error: Exception) -> SegslamError:
     if file is None:
         return SegslamError(f"the viewer cannot be opened or does not answer ({reason}); use --save FILE.rrd instead")
     return WorkFailed(f"{file}: cannot be written ({reason}); free space there, or give another file")
-
-
-def _find_beside_python() -> None:
-    """Add Python's folder to the search path, so that the viewer is found."""
-    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])

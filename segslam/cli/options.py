@@ -1,0 +1,225 @@
+"""Options that several commands share. `with_options` makes an option of each field of a record of options."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from segslam.cli import completion
+from segslam.core.whole_files import check_target
+
+if TYPE_CHECKING:
+    from segslam.core.config import Config
+    from segslam.scans import DataSource
+
+WITH_MAP = ("map.ply", "map.png")
+"""Files that `--map` writes into the run folder."""
+
+DataArgument = Annotated[Path, typer.Argument(help="Folder of scans, recording, or KITTI folder (with sequences/).")]
+LogArgument = Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, finished or not.")]
+DatasetOption = Annotated[
+    str | None,
+    typer.Option(
+        "--dataset",
+        autocompletion=completion.datasets,
+        help="Kind of data: kitti, or a reader of kiss-icp; detected by default.",
+    ),
+]
+EncodingOption = Annotated[
+    Literal["raw", "learning", "learning-0"] | None,
+    typer.Option(
+        "--encoding",
+        help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18).",
+    ),
+]
+FoxgloveOption = Annotated[
+    str | None,
+    typer.Option(
+        "--foxglove",
+        metavar="PORT",
+        help="Serve the run live to Foxglove on this port of 127.0.0.1; ADDRESS:PORT for another address.",
+    ),
+]
+LabelsOption = Annotated[
+    str,
+    typer.Option(
+        "--labels",
+        autocompletion=completion.labels_or_files,
+        help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder.",
+    ),
+]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the run or the files that exist under this name.")
+]
+PresetOption = Annotated[
+    str,
+    typer.Option(
+        "--preset",
+        autocompletion=completion.presets,
+        help="Settings for an environment: driving, campus or indoor; auto: by the scans.",
+    ),
+]
+SequenceOption = Annotated[str, typer.Option("--sequence", help="Sequence of the data set.")]
+ViewOption = Annotated[bool, typer.Option("--view", help="Show the run in the Rerun viewer while it is mapped.")]
+WithMapOption = Annotated[
+    bool, typer.Option("--map", help="Also write the map: map.ply (cloud) and map.png (top view).")
+]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings of a command."""
+
+    config: Annotated[
+        Path | None, typer.Option("--config", help="YAML file with the settings that differ from the defaults.")
+    ] = None
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="SECTION.KEY=VALUE",
+            autocompletion=completion.settings,
+            help="Change one setting: section.key=value; may be repeated.",
+        ),
+    ] = None
+
+    def overrides(self) -> list[str]:
+        """Changes of single settings, as for `load_config`."""
+        return self.settings or []
+
+    def load(self, *, base: "Config | None" = None) -> "Config":
+        """The settings. Raises SegslamError as `load_config`; called early, it reports a wrong setting at once."""
+        from segslam.core.config import load_config
+
+        return load_config(self.config, self.overrides(), base=base)
+
+
+@dataclass(frozen=True)
+class RunSettings(Settings):
+    """The settings of a command that makes a run."""
+
+    refine_minutes: Annotated[
+        float | None,
+        typer.Option(
+            "--refine-minutes",
+            metavar="MINUTES",
+            help="Time limit of the adjustment of the whole map after the loops; 60 by default, 0: no adjustment.",
+        ),
+    ] = None
+
+    def overrides(self) -> list[str]:
+        """Those of `--set`, followed by that of `--refine-minutes`."""
+        minutes = [] if self.refine_minutes is None else [f"adjustment.max_minutes={self.refine_minutes}"]
+        return [*super().overrides(), *minutes]
+
+
+@dataclass(frozen=True)
+class RunOutput(RunSettings):
+    """Settings, and what a run writes and shows beside its results: of `map`, `localise` and `live`."""
+
+    with_map: WithMapOption = False
+    map_file: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Also write the map to this file in the run folder: .ply .pcd .las .laz .png .yaml; may be repeated."
+        ),
+    ] = None
+    view: ViewOption = False
+    foxglove: FoxgloveOption = None
+    overwrite: OverwriteOption = False
+
+    def maps(self, folder: Path) -> tuple[list[Path], list[Path]]:
+        """Map files as given, and as paths in the run folder. Raises SegslamError if one cannot be written."""
+        names = [*map(Path, WITH_MAP if self.with_map else ()), *(self.map_file or ())]
+        if not names:
+            return [], []
+        from segslam.output.map.write import check_names
+
+        files = [folder / name for name in names]
+        check_names(files)
+        for file in files:
+            if folder not in file.parents:
+                check_target(file)
+        return names, files
+
+
+@dataclass(frozen=True)
+class ScanOptions:
+    """Which scans of the data are used."""
+
+    dataset: DatasetOption = None
+    sequence: SequenceOption = "00"
+    frames: Annotated[
+        str | None,
+        typer.Option("--frames", metavar="A:B[:STEP]", help="Use scans A to B by number, B excluded; every STEP-th."),
+    ] = None
+    topic: Annotated[
+        str, typer.Option("--topic", help="Point cloud topic, if the recording (rosbag, mcap) has more than one.")
+    ] = ""
+
+    def source(
+        self, data: Path, labels: str = "none", encoding: Any = None, *, vertical_angle_deg: float | None = None
+    ) -> "DataSource":
+        """What opens the scans."""
+        from segslam.scans import DataSource
+
+        return DataSource(
+            data,
+            self.sequence,
+            self.dataset,
+            labels,
+            encoding,
+            self.frames,
+            self.topic,
+            vertical_angle_deg=vertical_angle_deg,
+        )
+
+
+@dataclass(frozen=True)
+class RunOptions(ScanOptions):
+    """What is mapped, and how: of `map` and `localise`."""
+
+    labels: LabelsOption = "auto"
+    encoding: EncodingOption = None
+    odometry: Annotated[
+        Path | None,
+        typer.Option("--odometry", help="Trajectory to use instead of KISS-ICP (KITTI or TUM format, LiDAR frame)."),
+    ] = None
+    preset: PresetOption = "auto"
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in --out.")] = False
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the fields of each parameter that is annotated with a dataclass in place of that parameter."""
+    own = inspect.signature(command, eval_str=True)
+    records: dict[str, type[Any]] = {
+        name: one.annotation
+        for name, one in own.parameters.items()
+        if isinstance(one.annotation, type) and is_dataclass(one.annotation)
+    }
+
+    @wraps(command)
+    def flat(**values: Any) -> None:
+        for name, record in records.items():
+            values[name] = record(**{field.name: values.pop(field.name) for field in fields(record)})
+        command(**values)
+
+    parameters = [
+        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, one in own.parameters.items()
+        for parameter in (_parameters(records[name]) if name in records else [one])
+    ]
+    flat.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    flat.__annotations__ = {one.name: one.annotation for one in parameters}
+    return flat
+
+
+def _parameters(record: type[Any]) -> list[inspect.Parameter]:
+    return [
+        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=field.type, default=field.default)
+        for field in fields(record)
+    ]

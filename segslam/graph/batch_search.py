@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from segslam.core.types import Mask, Vector
 from segslam.graph import noise
-from segslam.graph.closure_pairs import consistent_pairs, ends_m, largest_consistent, neighbours
+from segslam.graph.closure_pairs import MAX_PAIRED, consistent_pairs, ends_m, largest_consistent, neighbours
 from segslam.graph.contradictions import contradicting, turned, unknown_motion
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph
@@ -20,8 +20,6 @@ from segslam.graph.selection import exchange_groups, large_groups
 logger = logging.getLogger(__name__)
 IMPLAUSIBLE = 1e-6
 """A fit less probable than this, under the noise of the edges, is implausible. Chosen."""
-MAX_PAIRED = 5_000
-"""Largest number of closures compared pairwise, in 8 s; for more, graduated non-convexity selects."""
 NEAR_IDS = 10
 """Closures whose ends are this near in ids join the same two places. Chosen: a ring of `sphere2500` has 50 vertices."""
 MIN_KEPT = 0.8

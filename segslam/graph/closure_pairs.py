@@ -30,6 +30,8 @@ from segslam.core.types import Indices, Mask, Vector
 from segslam.graph.edges import Edge, Transforms
 from segslam.registration.cliques import maximum_cliques, pack_rows
 
+MAX_PAIRED = 5_000
+"""Largest number of closures compared pairwise (10 s, 450 MB); for more, graduated non-convexity selects."""
 MOST_NODES = 20_000
 """Bound of the clique search: a second where 1,500 true closures are almost all consistent; any large set of them will
 do."""

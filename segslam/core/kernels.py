@@ -41,7 +41,6 @@ MODULES = (
     "registration.segregator.ground_patches",
     "registration.segregator.plan",
     "scans.lzf",
-    "scans.numbers",
     "slam.adjustment.alignment",
 )
 """Modules of this package that define kernels."""

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,20 @@ logger = logging.getLogger(__name__)
 ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
 NO_TIMES = np.empty(0)
 NO_LIMIT = 2**63 - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The points of one scan, as its reader finds them: float32 if they are stored so, otherwise float64."""
+
+    points: Points
+    """(n, 3); NaN for beams without return."""
+    times: Vector = field(default_factory=lambda: np.empty(0))
+    """(n,) in any unit, from any origin; empty if there are none."""
+    intensities: Vector | None = None
+    """(n,) in the sensor's unit; None if there are none."""
+    stamp_ns: int | None = None
+    """None if the scan itself has no stamp."""
 
 
 class Dataset:

@@ -6,6 +6,7 @@ The number of a scan is its position in the recording.
 import contextlib
 import io
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ import numpy as np
 
 from segslam.core.errors import brief
 from segslam.core.trajectory import read_poses
-from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory, Vector
+from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.scans.bag_clouds import BagClouds
-from segslam.scans.clouds import read_intensities
+from segslam.scans.clouds import read_file
 from segslam.scans.dataset import (
     ASSUMED_PERIOD_NS,
+    Cloud,
     Dataset,
     DataSource,
     check_num_poses,
@@ -28,8 +30,8 @@ from segslam.scans.dataset import (
     selected_rows,
 )
 from segslam.scans.mcap_clouds import McapClouds
-from segslam.scans.message_clouds import MessageClouds
 from segslam.scans.ouster import OusterFrames
+from segslam.scans.point_cloud2 import MessageClouds
 from segslam.scans.scan_folder import ScanFolder, scan_files
 from segslam.scans.sweep_times import sweep_times
 
@@ -68,51 +70,46 @@ class Recording(Dataset):
         """The scan. Raises BadScan if its reader fails on it or its labels cannot be used."""
         index = int(self.scan_index[row])
         file = self._file(index)
-        points, times = self._read(index, file)
-        intensities = self._intensities(file, len(points))
-        stamp_ns = self._stamp_ns(index)
+        cloud = self._read(index, file)
+        stamp_ns = self._stamp_ns(index, cloud)
         if abs(stamp_ns) >= 2**63:
             raise BadScan(f"{file}: its stamp {stamp_ns} ns is more than 292 years; correct the sensor's clock")
         return make_scan(
             file,
             index,
             stamp_ns,
-            points,
-            self.labels.read(file.stem, points, intensities),
-            sweep_times(times, len(points), stamp_ns * 1e-9),
-            intensities=intensities if self._has_intensities else None,
+            cloud.points,
+            self.labels.read(file.stem, cloud.points, cloud.intensities),
+            sweep_times(cloud.times, len(cloud.points), stamp_ns * 1e-9),
+            intensities=cloud.intensities if self._has_intensities else None,
             vertical_angle_deg=self.vertical_angle_deg,
         )
 
-    def _read(self, index: int, file: Path) -> tuple[np.ndarray, np.ndarray]:
+    def _read(self, index: int, file: Path) -> Cloud:
+        """The cloud of a scan; readers of kiss_icp give points, or points and times."""
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 item = self._loader[index]
-            points, times = item if isinstance(item, tuple) else (item, np.empty(0))
-            points = np.asarray(points).reshape(-1, 3)
+            if not isinstance(item, Cloud):
+                item = Cloud(*item) if isinstance(item, tuple) else Cloud(item)
+                if self._has_intensities or self.labels.network:
+                    with contextlib.suppress(SegslamError):  # a file with another layout than KITTI's
+                        item = replace(item, intensities=read_file(file).intensities)
+            points = np.asarray(item.points).reshape(-1, 3)
             points = points if points.dtype == np.float32 else points.astype(np.float64)
-            return points, np.asarray(times, dtype=np.float64).ravel()
+            fits = item.intensities is not None and len(item.intensities) == len(points)
+            times = np.asarray(item.times, dtype=np.float64).ravel()
+            return Cloud(points, times, item.intensities if fits else None, item.stamp_ns)
         except BadScan:
             raise
         except FOREIGN_ERRORS as error:
             raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
 
-    def _intensities(self, file: Path, num_points: int) -> Vector | None:
-        """Intensities of the scan read last, if requested and known."""
-        if not self._has_intensities and self.labels.network is None:
-            return None
-        known = getattr(self._loader, "intensities", None)
-        if not hasattr(self._loader, "intensities"):
-            with contextlib.suppress(SegslamError):  # a file with another layout than KITTI's
-                known = read_intensities(file)
-        return known if known is not None and len(known) == num_points else None
-
-    def _stamp_ns(self, index: int) -> int:
-        """Stamp of the scan that was read last; some readers know it only then."""
+    def _stamp_ns(self, index: int, cloud: Cloud | None = None) -> int:
         if self._stamps is not None:
             return int(self._stamps[index])
-        if hasattr(self._loader, "stamp_ns"):
-            return int(self._loader.stamp_ns)
+        if cloud is not None and cloud.stamp_ns is not None:
+            return cloud.stamp_ns
         if not hasattr(self._loader, "get_frames_timestamps"):
             return index * ASSUMED_PERIOD_NS
         return round(float(np.squeeze(self._loader.get_frames_timestamps()[index])) * 1e9)

@@ -10,9 +10,8 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.types import Mask, Points, SegslamError, Transform, Vector
-from segslam.gnss.chain import longest_chain
 from segslam.gnss.matching import Drive, Matched, Prepared
-from segslam.gnss.statistics import axis_sigma, correlated, horizontal_noise, horizontal_sigma, weight
+from segslam.gnss.statistics import axis_sigma, correlated, fix_noise, horizontal_sigma, longest_chain, weight
 
 NUM_GUESSES = 400
 """Chosen: pairs of fixes that propose a heading; half of the fixes may be wrong, and 100 good pairs are left."""
@@ -122,7 +121,7 @@ def refined(drive: Drive, matched: Matched, start: Transform, arm_m: Vector) -> 
     T_enu_map = start
     for _ in range(ROUNDS):
         residual, columns = linearised(drive, matched, T_enu_map, arm_m)
-        chain = longest_chain(residual, matched.travel_m, sigma_m=horizontal_noise(residual))
+        chain = longest_chain(residual, matched.travel_m, sigma_m=fix_noise(residual))
         sigma = _sigmas(residual, chain)
         many = correlated(residual[chain][:, :2])
         precision = _precision(residual, sigma, chain) / many

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row
-from segslam.gnss.text import bad_line, check_degrees, number_in
-from segslam.gnss.times import stamp_of
+from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of
 
 NOTE = (
     "heights: altitude above the geoid and geoid separation, as the receiver gives them, added to ellipsoidal heights"

@@ -9,8 +9,7 @@ import numpy as np
 from segslam.core.types import Vector
 from segslam.gnss.fixes import Row
 from segslam.gnss.geodesy import Origin, geodetic_from_ecef, rotation_ecef_enu
-from segslam.gnss.text import bad_line, check_degrees, number_in
-from segslam.gnss.times import stamp_of, stamp_of_week, utc_of_gps
+from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, stamp_of_week, utc_of_gps
 
 
 def is_rtklib(lines: Sequence[str]) -> bool:

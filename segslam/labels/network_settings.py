@@ -9,7 +9,7 @@ from segslam.core.config import LabelName, Section
 from segslam.core.config.yaml_text import parse_yaml
 from segslam.core.errors import brief
 from segslam.core.types import SegslamError
-from segslam.labels.network_import import ARCH, DATA, Architecture, ClassMap, class_map_file, is_architecture
+from segslam.labels.network_import import ARCH, DATA, Architecture, ClassMap, is_architecture
 
 Channel = Literal["range", "x", "y", "z", "intensity", "mask"]
 Model = TypeVar("Model", bound=BaseModel)
@@ -103,7 +103,7 @@ def _imported(architecture: Path, given: dict[str, Any]) -> dict[str, Any]:
     settings = _checked(Architecture, _read_yaml(architecture), architecture).settings()
     if "classes" in given:
         return settings
-    file = class_map_file(architecture)
+    file = architecture.with_name(DATA)
     if not file.is_file():
         raise SegslamError(
             f"{file}: no such file; {architecture.name} does not contain the classes: copy the network's "

@@ -64,7 +64,7 @@ def yaw(
     Example: segslam bench yaw kitti --sequence 05 --step-deg 5 --out yaw05
     """
     job = make_job(data, options)
-    from segslam.bench.experiments.variations import PAPER_PAIR, turned_trials
+    from segslam.bench.experiments.trials import PAPER_PAIR, turned_trials
 
     reference = reference_of(job)
     lists = read_lists(options, reference, default=PAPER_PAIR)
@@ -90,7 +90,7 @@ def deterioration(
     Example: segslam bench deterioration kitti --sequence 05 --labels predictions --clouds one --out lost05
     """
     job = make_job(data, options)
-    from segslam.bench.experiments.variations import PAPER_PAIR, unlabelled_trials
+    from segslam.bench.experiments.trials import PAPER_PAIR, unlabelled_trials
 
     reference = reference_of(job)
     lists = read_lists(options, reference, default=PAPER_PAIR)
@@ -144,7 +144,7 @@ def places(
 def _run_pairs(experiment: str, data: Path, options: Options) -> None:
     # as in `yaw`, what loads scipy is imported after the first message, which is that of make_job
     job = make_job(data, options)
-    from segslam.bench.experiments.variations import pair_trials
+    from segslam.bench.experiments.trials import pair_trials
 
     reference = reference_of(job)
     lists = read_lists(options, reference)

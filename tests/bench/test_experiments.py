@@ -14,8 +14,14 @@ from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.bench.experiments.pairs import PairList, cut_pairs, read_pairs, sample_pairs, true_poses
 from segslam.bench.experiments.rows import Row, read_rows, write_rows
 from segslam.bench.experiments.summary import figures, results, worst_failures
-from segslam.bench.experiments.trials import ScanVariant, trial
-from segslam.bench.experiments.variations import PAPER_PAIR, pair_trials, turned_trials, unlabelled_trials
+from segslam.bench.experiments.trials import (
+    PAPER_PAIR,
+    ScanVariant,
+    pair_trials,
+    trial,
+    turned_trials,
+    unlabelled_trials,
+)
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import SegslamError, Trajectory
@@ -217,7 +223,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[ScanVariant]:
         prepared.append(variant)
         return SharedScan({}, unusable=True)
 
-    monkeypatch.setattr("segslam.bench.experiments.workers.shared_scan", shared_scan)
+    monkeypatch.setattr("segslam.bench.experiments.benchmark.shared_scan", shared_scan)
     return prepared
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
-from segslam.bench.experiments.estimate import Estimate
+from segslam.bench.experiments.baselines import Estimate
 from segslam.bench.experiments.meter import Cost, measured
 from segslam.bench.experiments.methods import METHODS, Part, prepare_parts
 from segslam.bench.experiments.rows import Row
@@ -22,6 +22,8 @@ logger = logging.getLogger(__name__)
 
 BAD_SCAN = "bad_scan"
 """Reject reason of a row whose scan cannot be read."""
+LOST_WORKER = "worker_lost"
+"""Reject reason of a row whose pair terminated every worker that tried it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -108,10 +108,15 @@ def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
 def read_calibration(file: Path) -> Transform:
     """T_camera_lidar of a calib.txt. Raises SegslamError if the file or the entry is missing or invalid."""
     try:
-        lines = file.read_text(encoding="ascii").splitlines()
+        text = file.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(f"{file}: cannot read the calibration ({error}); put KITTI's calib.txt there") from error
-    for number, line in enumerate(lines, start=1):
+    return parse_calibration(text, file)
+
+
+def parse_calibration(text: str, file: Path) -> Transform:
+    """T_camera_lidar of the text of a calib.txt, as `read_calibration`; `file` is its name in messages."""
+    for number, line in enumerate(text.splitlines(), start=1):
         key, _, values = line.replace(":", " ", 1).strip().partition(" ")
         if key in LIDAR_KEYS:
             return _rigid(values.split(), f"{file}:{number}")

@@ -14,9 +14,8 @@ from segslam.bench.simulation import (
     example_drive,
     simulate_drive,
 )
-from segslam.bench.simulation.drive import drive_sweeps
 from segslam.bench.simulation.files import uncorrected
-from segslam.bench.simulation.sensor import Sweep
+from segslam.bench.simulation.sensor import Sweep, drive_sweeps
 from segslam.bench.simulation.world import build_world
 from segslam.core import geometry
 from segslam.core.config import load_config

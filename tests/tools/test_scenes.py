@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from segslam.bench.simulation.scene_sensors import SENSORS, scan_points
-from segslam.bench.simulation.scenes import SCENES, corridor
+from segslam.bench.simulation.scenes import SCENES, SENSORS, corridor, scan_points
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Alignment, Registration, Rejected

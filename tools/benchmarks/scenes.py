@@ -17,8 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.bench.simulation.scene_sensors import SENSORS, scan_points
-from segslam.bench.simulation.scenes import SCENES, Scene, pose
+from segslam.bench.simulation.scenes import SCENES, SENSORS, Scene, pose, scan_points
 from segslam.candidates.prior import far_from_prior
 from segslam.core import geometry
 from segslam.core.config import Config, load_config

@@ -9,7 +9,9 @@ from segslam.bench.simulation.levelling import level_revisits, level_world
 from segslam.bench.simulation.routes import example_loop
 from segslam.core import geometry
 from segslam.core.trajectory import Poses, lidar_from_camera, read_poses
-from segslam.core.types import SegslamError, Transform, Vector
+from segslam.core.types import SegslamError, Vector
+from segslam.scans.dataset import read_stamps
+from segslam.scans.kitti import parse_calibration, read_calibration
 
 PERIOD_S = 0.1
 # The camera looks along the x axis of the LiDAR: nominal mounting of KITTI's car.
@@ -57,10 +59,16 @@ def read_drive(poses_file: Path, *, sequence: str) -> Drive:
     """
     T_world_camera = read_poses(poses_file, format="kitti").T_a_b
     calib_file, times_file = (_beside(poses_file, name, sequence) for name in ("calib.txt", "times.txt"))
-    calib = NOMINAL_CALIB if calib_file is None else _text(calib_file)
-    T_camera_lidar = parse_calib(calib, source=str(calib_file))
+    calib = NOMINAL_CALIB
+    T_camera_lidar = parse_calibration(calib, Path("calib.txt")) if calib_file is None else read_calibration(calib_file)
+    if calib_file is not None:
+        calib = calib_file.read_text(encoding="ascii")
     count = len(T_world_camera)
-    time_s = np.arange(count) * PERIOD_S if times_file is None else _times(times_file, count)
+    time_s = np.arange(count) * PERIOD_S
+    if times_file is not None:
+        time_s = read_stamps(times_file)[:count] / 1e9
+        if len(time_s) < count:
+            raise SegslamError(f"{times_file}: expected {count} ascending times, one per pose; found {len(time_s)}")
     return Drive(level_revisits(level_world(lidar_from_camera(T_world_camera, T_camera_lidar))), time_s, calib)
 
 
@@ -69,40 +77,3 @@ def _beside(poses_file: Path, name: str, sequence: str) -> Path | None:
     sequences = poses_file.parent.parent / "sequences"
     folders = (poses_file.parent, sequences / poses_file.stem, sequences / sequence)
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
-
-
-def parse_calib(text: str, *, source: str) -> Transform:
-    """T_camera_lidar from the line `Tr`. Raises SegslamError, naming the source."""
-    for line in text.splitlines():
-        name, _, values = line.partition(":")
-        if name.strip() in ("Tr", "Tr_velo_to_cam"):
-            rows = _numbers(values)
-            if rows.shape == (12,) and np.isfinite(rows).all():
-                rows = rows.reshape(3, 4)
-                return geometry.nearest_transform(rows)
-    raise SegslamError(f"{source}: no line `Tr:` with 12 numbers; take calib.txt from the KITTI odometry data")
-
-
-def _numbers(text: str) -> Vector:
-    """The numbers in a line; empty if one of the words is not a number."""
-    try:
-        return np.array([float(word) for word in text.split()])
-    except ValueError:
-        return np.empty(0)
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{path}: cannot read the calibration ({error}); take it from the KITTI data") from error
-
-
-def _times(path: Path, count: int) -> Vector:
-    try:
-        times = np.loadtxt(path, ndmin=1)
-    except (OSError, ValueError) as error:
-        raise SegslamError(f"{path}: cannot read the times ({error}); write one number of seconds per line") from error
-    if len(times) < count or not (np.diff(times) > 0).all():
-        raise SegslamError(f"{path}: expected {count} ascending times, one per pose; found {len(times)}")
-    return times[:count]

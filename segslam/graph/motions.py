@@ -30,7 +30,7 @@ from segslam.graph.closure_pairs import (
     neighbours,
     num_near,
 )
-from segslam.graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, values_of
+from segslam.graph.edges import Edge, factor_graph, joined, poses_by_id, values_of
 from segslam.graph.selection import MIN_GROUP, select_consistent
 
 PLACE_M = 30.0
@@ -172,7 +172,9 @@ def _jump(drive: Drive, odometry: Sequence[Edge], group: Mask, weights: Vector) 
         return None
     rows = first + np.flatnonzero(against <= against.min() + 1e-9)
     T_world = np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
-    T_drift = _drift(drive.closures[np.flatnonzero(group)[group.sum() // 2]], T_world)
+    closure = drive.closures[np.flatnonzero(group)[group.sum() // 2]]
+    T_drift = T_world[closure.a] @ closure.T_a_b @ geometry.inverse(T_world[closure.b])  # of later poses, by the jump
+    T_drift = T_drift if closure.a < closure.b else geometry.inverse(T_drift)
     corrected = np.linalg.inv(T_world[rows]) @ T_drift @ T_world[rows + 1]
     gains = [
         _roughness(odometry, row, odometry[row].T_a_b) - _roughness(odometry, row, T_a_b)
@@ -181,12 +183,6 @@ def _jump(drive: Drive, odometry: Sequence[Edge], group: Mask, weights: Vector) 
     best = int(np.argmax(gains))
     row = int(rows[best])
     return Edge(row, row + 1, corrected[best], noise.UNKNOWN_MOTION)
-
-
-def _drift(closure: Edge, T_world: Transforms) -> Transform:
-    """The transform, in the world frame, by which the jump moved all later poses."""
-    T_drift = T_world[closure.a] @ closure.T_a_b @ geometry.inverse(T_world[closure.b])
-    return T_drift if closure.a < closure.b else geometry.inverse(T_drift)
 
 
 def _roughness(odometry: Sequence[Edge], row: int, T_a_b: Transform) -> float:

@@ -11,7 +11,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, ChunkIndex, Message, MessageIndex, Schema
+from mcap.records import Channel, Chunk, Message, MessageIndex, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
@@ -135,16 +135,11 @@ def _places(stream: IO[bytes], summary: Summary, channels: dict[int, Channel]) -
     for chunk in summary.chunk_indexes:
         for channel in channels.keys() & chunk.message_index_offsets.keys():
             with suppress(*DAMAGE):
-                entries = _message_index(stream, chunk, channel)
+                stream.seek(chunk.message_index_offsets[channel] + RECORD_HEADER_BYTES)
+                index = MessageIndex.read(ReadDataStream(stream))
+                entries = index.records if index.channel_id == channel else []
                 places += [_Place(log_ns, chunk.chunk_start_offset, offset) for log_ns, offset in entries]
     return sorted(places)
-
-
-def _message_index(stream: IO[bytes], chunk: ChunkIndex, channel: int) -> list[tuple[int, int]]:
-    """Time and offset of each message of a channel in a chunk."""
-    stream.seek(chunk.message_index_offsets[channel] + RECORD_HEADER_BYTES)
-    index = MessageIndex.read(ReadDataStream(stream))
-    return index.records if index.channel_id == channel else []
 
 
 def _chunk_data(stream: IO[bytes], start: int) -> bytes:

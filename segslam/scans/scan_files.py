@@ -30,7 +30,8 @@ class Field(NamedTuple):
 def read_bytes(file: Path) -> bytes:
     """The content of a scan file. Raises BadScan if it cannot be read, or has more than MAX_SCAN_BYTES."""
     try:
-        with open(file, "rb", opener=_without_waiting) as stream:
+        # a pipe is opened without waiting for its writer
+        with open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
             status = os.fstat(stream.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise BadScan(f"{file}: not a regular file; give a scan")
@@ -105,13 +106,12 @@ def text_columns(content: bytes, start: int, num_rows: int, fields: Sequence[Fie
         raise ValueError(brief(str(error))) from error
     rows = numbers.reshape(num_rows, num_columns)
     ends = np.cumsum([field.num_values for field in fields])
-    last = zip(fields, ends, strict=True)
     with np.errstate(over="ignore"):
-        return _by_name([(one.name, rows[:, end - 1].astype(_kept(one))) for one, end in last if one.num_values == 1])
-
-
-def _kept(field: Field) -> type[np.floating]:
-    return np.float32 if field.dtype.kind == "f" and field.dtype.itemsize == 4 else np.float64
+        return _by_name(
+            (one.name, rows[:, end - 1].astype(np.float32 if one.dtype.str[1:] == "f4" else np.float64))
+            for one, end in zip(fields, ends, strict=True)
+            if one.num_values == 1
+        )
 
 
 def check_size(num_bytes: int, expected: int, num_rows: int, *, tolerated: int | None) -> None:
@@ -135,8 +135,3 @@ def _by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
 
 def _empty(fields: Sequence[Field]) -> Columns:
     return {field.name: np.empty(0, field.dtype) for field in fields}
-
-
-def _without_waiting(name: str, flags: int) -> int:
-    """Opens a pipe without waiting for its writer."""
-    return os.open(name, flags | os.O_NONBLOCK)

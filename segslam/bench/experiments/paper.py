@@ -98,8 +98,13 @@ def with_paper_values(
     errors if the pair is scans 0 and 10 of 05. The comparison also applies to lists that were sampled.
     """
     whole = {one.name: one.num_whole for one in lists}
-    timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and _are_all(whole, TIMING_SEQUENCE)
-    reduced = experiment == "deterioration" and sequence.zfill(2) == "05" and _is_paper_pair(lists)
+    all_lists = {
+        f"kitti{TIMING_SEQUENCE}_{band}": number
+        for band, number in zip(LISTS.values(), NUM_PAIRS[TIMING_SEQUENCE], strict=True)
+    }
+    is_paper_pair = len(lists) == 1 and lists[0].pairs.tolist() == [[0, 10]]
+    timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and whole == all_lists
+    reduced = experiment == "deterioration" and sequence.zfill(2) == "05" and is_paper_pair
     return {
         method: own
         | ({"paper": TIMING[method]} if timed and method in TIMING else {})
@@ -116,12 +121,3 @@ def _paper_of(method: str, one: dict[str, Any], whole: dict[str, int], *, reduce
         return {}
     value = success_percent(method, one["list"], whole[one["list"]])
     return {} if value is None else {"paper": {"success_percent": value}}
-
-
-def _are_all(whole: dict[str, int], sequence: str) -> bool:
-    theirs = {f"kitti{sequence}_{band}": NUM_PAIRS[sequence][place] for place, band in enumerate(LISTS.values())}
-    return whole == theirs
-
-
-def _is_paper_pair(lists: Sequence[PairList]) -> bool:
-    return len(lists) == 1 and lists[0].pairs.tolist() == [[0, 10]]

@@ -40,7 +40,7 @@ MODULES = (
     "registration.segregator.gaussians",
     "registration.segregator.ground_patches",
     "registration.segregator.plan",
-    "scans.lzf",
+    "scans.pcd",
     "slam.adjustment.alignment",
 )
 """Modules of this package that define kernels."""

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.core.paths import expanded
 from segslam.core.types import BadScan, Label, Labels, Mask, Points, ScanLabels, SegslamError, Vector
-from segslam.core.whole_files import whole_file
+from segslam.core.whole_files import expanded, whole_file
 from segslam.labels.encodings import Encoding, Histogram, Ids, detect_encoding, to_ids, to_labels
 from segslam.labels.network import Network, open_network
 

@@ -1,15 +1,56 @@
-"""Point clouds on one topic of ROS bags: .bag files of ROS 1, and folders of ROS 2."""
+"""Messages with point clouds that can only be read one after the other, as those of ROS bags (ROS 1 and ROS 2)."""
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from segslam.core.config.yaml_text import parse_yaml
 from segslam.core.extras import how_to_install
-from segslam.scans.in_order import InOrder
-from segslam.scans.mcap_clouds import MESSAGE
+
+MESSAGE = "sensor_msgs/msg/PointCloud2"
+Message = TypeVar("Message")
+MIN_BYTES = 32
+"""Fewest bytes of a message with a cloud, compressed or not: its record header and stamp."""
+
+
+class InOrder(Generic[Message]):
+    """The messages of an iterator, which is started again to go back.
+
+    Raises ValueError for a number of messages that a file of `num_bytes` cannot have.
+    """
+
+    def __init__(self, start: Callable[[], Iterator[Message]], num_messages: int, *, num_bytes: int) -> None:
+        if num_messages > num_bytes // MIN_BYTES:
+            raise ValueError(f"its index is damaged: it claims {num_messages} messages in {num_bytes} bytes")
+        self._start = start
+        self._num_messages = num_messages
+        self._messages = start()
+        self._next = 0
+        self._damage = ""
+
+    def __len__(self) -> int:
+        return self._num_messages
+
+    def __getitem__(self, index: int) -> Message:
+        """Raises the exception of the iterator, and then ValueError for all messages after it."""
+        if index < self._next:
+            self._messages, self._next, self._damage = self._start(), 0, ""
+        if self._damage:
+            raise ValueError(self._damage)
+        try:
+            while True:
+                message = next(self._messages)
+                self._next += 1
+                if self._next > index:
+                    return message
+        except StopIteration:
+            self._damage = f"the recording ends after {self._next} of {self._num_messages} messages"
+            raise ValueError(self._damage) from None
+        except Exception as error:  # of a foreign reader, whose iterator has ended with it
+            self._damage = f"the recording is damaged after {self._next} messages: {type(error).__name__}"
+            raise
 
 
 class BagClouds:

@@ -9,7 +9,6 @@ import numpy as np
 
 from segslam.core.errors import brief
 from segslam.core.geometry import raise_beams
-from segslam.core.paths import expanded
 from segslam.core.points import squared_ranges
 from segslam.core.trajectory import nanoseconds
 from segslam.core.types import (
@@ -23,6 +22,7 @@ from segslam.core.types import (
     Transform,
     Vector,
 )
+from segslam.core.whole_files import expanded
 from segslam.labels.encodings import Encoding
 from segslam.labels.label_files import LabelSource
 from segslam.labels.late import of_rows

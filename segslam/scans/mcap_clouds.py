@@ -16,10 +16,9 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
 from segslam.core.extras import how_to_install
-from segslam.scans.in_order import InOrder
+from segslam.scans.bag_clouds import MESSAGE, InOrder
 from segslam.scans.scan_files import MAX_SCAN_BYTES
 
-MESSAGE = "sensor_msgs/msg/PointCloud2"
 RECORD_HEADER_BYTES = 9
 DAMAGE = (McapError, ValueError, OverflowError, struct.error)
 """Exceptions of the library for damaged records."""

@@ -13,7 +13,7 @@ from segslam.core.config import Config, config_to_yaml, load_config
 from segslam.core.trajectory import read_poses, write_kitti, write_tum
 from segslam.scans.clouds import read_file
 from segslam.scans.dataset import read_stamps
-from segslam.scans.lzf import decompress
+from segslam.scans.pcd import decompress
 from segslam.scans.point_cloud2 import read_message
 
 steady = settings(derandomize=True, deadline=None, max_examples=60)

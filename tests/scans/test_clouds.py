@@ -10,7 +10,7 @@ import pytest
 from segslam.core.types import BadScan
 from segslam.scans import open_dataset
 from segslam.scans.clouds import read_cloud, read_file, read_intensities
-from segslam.scans.lzf import _decompress
+from segslam.scans.pcd import _decompress
 from segslam.scans.scan_files import Columns, Field, text_columns
 
 NUM = 200

@@ -4,9 +4,8 @@ from segslam.bench.simulation.drift import SweepError, sweep_errors
 from segslam.bench.simulation.files import prepare_folder, write_drive, write_sequence
 from segslam.bench.simulation.label_errors import LabelErrorConfig, network_like
 from segslam.bench.simulation.levelling import level_revisits, level_world
-from segslam.bench.simulation.routes import example_loop
 from segslam.bench.simulation.sensor import Sensor, Sweep, drive_sweeps, make_sensor, simulate_drive, sweep
-from segslam.bench.simulation.tracks import Drive, example_drive, in_lane, read_drive
+from segslam.bench.simulation.tracks import Drive, example_drive, example_loop, in_lane, read_drive
 from segslam.bench.simulation.world import Hits, World, build_world
 from segslam.bench.simulation.world_settings import (
     SensorConfig,

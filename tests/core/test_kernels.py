@@ -28,7 +28,7 @@ def test_a_build_compiles_all_kernels_once_and_is_remembered(monkeypatch: pytest
     modules = ["registration.cliques.bits"]
     assert not kernels.are_built(modules)
     code = f"from segslam.core import kernels; print(*kernels.build({modules}), sep='\\n')"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # compiles anew
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # compiles again
     names = ran.stdout.split()
     assert len(names) == len(set(names)) == kernels.num_kernels(modules) >= 5
     assert kernels.are_built(modules)

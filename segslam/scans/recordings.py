@@ -16,7 +16,7 @@ from segslam.core.errors import brief
 from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
-from segslam.scans.bag_clouds import BagClouds
+from segslam.scans.bag_messages import BagMessages
 from segslam.scans.clouds import read_file
 from segslam.scans.dataset import (
     ASSUMED_PERIOD_NS,
@@ -29,7 +29,7 @@ from segslam.scans.dataset import (
     read_stamps,
     selected_rows,
 )
-from segslam.scans.mcap_clouds import McapClouds
+from segslam.scans.mcap_messages import McapMessages
 from segslam.scans.ouster import OusterFrames
 from segslam.scans.point_cloud2 import MessageClouds
 from segslam.scans.scan_folder import ScanFolder, scan_files
@@ -165,9 +165,9 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
         case "generic":
             return ScanFolder(source)
         case "mcap":
-            return MessageClouds(McapClouds(source, topic))
+            return MessageClouds(McapMessages(source, topic))
         case "rosbag":
-            return MessageClouds(BagClouds(source, topic))
+            return MessageClouds(BagMessages(source, topic))
         case "ouster":
             return OusterFrames(source)
     from kiss_icp.datasets import dataset_factory

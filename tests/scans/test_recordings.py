@@ -10,7 +10,7 @@ from segslam.core import geometry
 from segslam.core.trajectory import write_kitti
 from segslam.core.types import BadScan, Label, SegslamError
 from segslam.scans import open_dataset
-from segslam.scans.bag_clouds import InOrder
+from segslam.scans.bag_messages import InOrder
 from segslam.scans.dataset import Cloud
 
 

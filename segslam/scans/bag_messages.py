@@ -1,7 +1,7 @@
-"""Messages with point clouds that can only be read one after the other, as those of ROS bags (ROS 1 and ROS 2)."""
+"""Messages on one topic that can only be read one after the other, as those of ROS bags (ROS 1 and ROS 2)."""
 
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from segslam.core.config.yaml_text import parse_yaml
 from segslam.core.extras import how_to_install
 
-MESSAGE = "sensor_msgs/msg/PointCloud2"
+CLOUD = "sensor_msgs/msg/PointCloud2"
 Message = TypeVar("Message")
 MIN_BYTES = 32
 """Fewest bytes of a message with a cloud, compressed or not: its record header and stamp."""
@@ -18,11 +18,11 @@ MIN_BYTES = 32
 class InOrder(Generic[Message]):
     """The messages of an iterator, which is started again to go back.
 
-    Raises ValueError for a number of messages that a file of `num_bytes` cannot have.
+    Raises ValueError for a number of clouds that a file of `num_bytes` cannot have; None: of smaller messages.
     """
 
-    def __init__(self, start: Callable[[], Iterator[Message]], num_messages: int, *, num_bytes: int) -> None:
-        if num_messages > num_bytes // MIN_BYTES:
+    def __init__(self, start: Callable[[], Iterator[Message]], num_messages: int, *, num_bytes: int | None) -> None:
+        if num_bytes is not None and num_messages > num_bytes // MIN_BYTES:
             raise ValueError(f"its index is damaged: it claims {num_messages} messages in {num_bytes} bytes")
         self._start = start
         self._num_messages = num_messages
@@ -53,8 +53,8 @@ class InOrder(Generic[Message]):
             raise
 
 
-class BagClouds:
-    """Messages with clouds, read in order. Replaces kiss_icp's reader, which ends the program for a missing topic.
+class BagMessages:
+    """Messages of one kind, read in order. Replaces kiss_icp's reader, which ends the program for a missing topic.
 
     Raises ValueError if the bag has no such topic, SegslamError if its metadata are damaged, ImportError if the package
     is missing, and what rosbags raises.
@@ -62,7 +62,8 @@ class BagClouds:
 
     is_sequential = True
 
-    def __init__(self, data: Path, topic: str) -> None:
+    def __init__(self, data: Path, topic: str, *, kind: str = CLOUD, option: str = "--topic") -> None:
+        """`option` is that which names the topic, for messages; an empty topic is the only one of this kind."""
         try:
             from rosbags.highlevel import AnyReader
         except ImportError as error:
@@ -75,16 +76,12 @@ class BagClouds:
         self._bag = AnyReader(files or [data])
         self._bag.open()
         weakref.finalize(self, _close, self._bag)
-        counts = {name: info.msgcount for name, info in self._bag.topics.items() if info.msgtype == MESSAGE}
-        found = [name for name in counts if name == topic or not topic]
-        if len(found) != 1:
-            known = ", ".join(f"--topic {name}" for name in sorted(counts)) or "none"
-            raise ValueError(f"give one topic of type {MESSAGE}; the recording has: {known}")
-        self._connections = [connection for connection in self._bag.connections if connection.topic == found[0]]
+        counts = {name: info.msgcount for name, info in self._bag.topics.items() if info.msgtype == kind}
+        topic = one_topic(counts, topic, kind=kind, option=option)
+        self._connections = [connection for connection in self._bag.connections if connection.topic == topic]
         stored = [file for path in files or [data] for file in ([path] if path.is_file() else path.iterdir())]
-        self._raw = InOrder(
-            self._messages, counts[found[0]], num_bytes=sum(file.stat().st_size for file in stored if file.is_file())
-        )
+        num_bytes = sum(file.stat().st_size for file in stored if file.is_file())
+        self._raw = InOrder(self._messages, counts[topic], num_bytes=num_bytes if kind == CLOUD else None)
 
     def __len__(self) -> int:
         return len(self._raw)
@@ -97,6 +94,15 @@ class BagClouds:
     def _messages(self) -> Iterator[tuple[int, bytes, str]]:
         for connection, log_ns, data in self._bag.messages(connections=self._connections):
             yield log_ns, data, connection.msgtype
+
+
+def one_topic(known: Collection[str], wanted: str, *, kind: str, option: str) -> str:
+    """The wanted topic, or the only one. Raises ValueError with the known ones."""
+    found = [name for name in known if name == wanted or not wanted]
+    if len(found) != 1:
+        topics = ", ".join(f"{option} {name}" for name in sorted(known)) or "none"
+        raise ValueError(f"give one topic of type {kind}; the recording has: {topics}")
+    return found[0]
 
 
 def _close(bag: Any) -> None:

@@ -3,7 +3,7 @@
 from segslam.bench.simulation.drift import SweepError, sweep_errors
 from segslam.bench.simulation.files import prepare_folder, write_drive, write_sequence
 from segslam.bench.simulation.levelling import level_revisits, level_world
-from segslam.bench.simulation.sensor import drive_sweeps, make_sensor, simulate_drive, sweep
+from segslam.bench.simulation.sensor import drive_sweeps, make_sensor, sweep
 from segslam.bench.simulation.tracks import Drive, example_drive, example_loop, in_lane, read_drive
 from segslam.bench.simulation.world import build_world
 from segslam.bench.simulation.world_settings import (
@@ -29,7 +29,6 @@ __all__ = [
     "make_sensor",
     "prepare_folder",
     "read_drive",
-    "simulate_drive",
     "simulation_config",
     "sweep",
     "sweep_errors",

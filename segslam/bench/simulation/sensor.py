@@ -10,8 +10,8 @@ import numpy as np
 
 from segslam.bench.simulation.drift import NO_ERROR, SweepError, distorted, sweep_errors
 from segslam.bench.simulation.mesh import Instances
-from segslam.bench.simulation.world import Hits, World, build_world
-from segslam.bench.simulation.world_settings import SensorConfig, SensorName, SimulationConfig
+from segslam.bench.simulation.world import Hits, World
+from segslam.bench.simulation.world_settings import SensorConfig, SensorName
 from segslam.core.trajectory import Poses
 from segslam.core.types import Label, Labels, Points, Scan, Transform, Vector
 
@@ -137,19 +137,6 @@ def _table(column: int) -> Vector:
 
 
 MEAN_INTENSITY, SPREAD_INTENSITY = _table(0), _table(1)
-
-
-def simulate_drive(
-    T_world_lidar: Poses, time_s: Vector, *, seed: int = 0, config: SimulationConfig | None = None
-) -> Iterator[Scan]:
-    """Labelled scans from level poses (n, 4, 4) at the times `time_s` (n,), ascending.
-
-    `drive_sweeps` also returns intensities and instances.
-    """
-    config = config or SimulationConfig()
-    world = build_world(T_world_lidar, time_s, config=config.world, seed=seed)
-    for index, one in enumerate(drive_sweeps(world, T_world_lidar, time_s, config=config.sensor, seed=seed)):
-        yield one.scan(index=index, stamp_ns=round(time_s[index] * 1e9))
 
 
 def drive_sweeps(

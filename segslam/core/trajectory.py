@@ -112,8 +112,8 @@ def rows_of_same_stamp(stamp_ns_a: Indices, stamp_ns_b: Indices, *, max_differen
     """Rows (of a, of b) that are mutually nearest in time and at most `max_difference_ns` apart; ascending in a."""
     if len(stamp_ns_a) == 0 or len(stamp_ns_b) == 0:
         return np.empty((0, 2), dtype=np.int64)
-    nearest_b = _nearest(stamp_ns_b, stamp_ns_a)
-    nearest_a = _nearest(stamp_ns_a, stamp_ns_b)
+    nearest_b = nearest_rows(stamp_ns_b, stamp_ns_a)
+    nearest_a = nearest_rows(stamp_ns_a, stamp_ns_b)
     rows_a = np.arange(len(stamp_ns_a))
     mutual = nearest_a[nearest_b] == rows_a
     close = np.abs(stamp_ns_b[nearest_b] - stamp_ns_a) <= max_difference_ns
@@ -173,7 +173,8 @@ def _surroundings(keyframe_rows: Indices, travel_m: np.ndarray) -> tuple[Indices
     return before, after, np.clip(share, 0.0, 1.0)
 
 
-def _nearest(values: Indices, targets: Indices) -> Indices:
+def nearest_rows(values: np.ndarray, targets: np.ndarray) -> Indices:
+    """(n,) row of the value that is nearest to each target, the smaller one of two; there is a value at least."""
     order = np.argsort(values, kind="stable")
     ascending = values[order]
     right = np.clip(np.searchsorted(ascending, targets), 1, max(len(values) - 1, 1))

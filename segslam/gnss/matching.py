@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.core.trajectory import Poses, travelled_m
+from segslam.core.trajectory import Poses, nearest_rows, travelled_m
 from segslam.core.types import Indices, Mask, Points, SegslamError, Vector
 from segslam.gnss.fixes import OUTSIDE, Fixes, origin_of
 from segslam.gnss.geodesy import Geodetic, Origin, enu_from_geodetic
@@ -87,10 +87,7 @@ class Prepared:
         begin = int(drive.stamp_ns[0])
         time_s = 1e-9 * (stamps[rows] - begin)
         scan_s = 1e-9 * (drive.stamp_ns - begin)
-        keyframe_s = scan_s[drive.keyframe_rows]
-        right = np.clip(np.searchsorted(keyframe_s, time_s), 1, max(len(keyframe_s) - 1, 1))
-        is_left = time_s - keyframe_s[right - 1] <= np.abs(keyframe_s[np.minimum(right, len(keyframe_s) - 1)] - time_s)
-        keyframe = np.where(is_left, right - 1, np.minimum(right, len(keyframe_s) - 1))
+        keyframe = nearest_rows(scan_s[drive.keyframe_rows], time_s)
         T_map_keyframe = drive.T_map_keyframe[keyframe]
         R_map_keyframe = T_map_keyframe[:, :3, :3]
         T_map_lidar = interpolated(drive, scan_s, time_s)
@@ -136,10 +133,7 @@ def prepare(fixes: Fixes, drive: Drive, *, offset_s: float = 0.0) -> Prepared:
 
 def has_pose(drive: Drive, stamp_ns: Indices) -> Mask:
     """(n,) True for times within the drive and near enough to a scan."""
-    right = np.clip(np.searchsorted(drive.stamp_ns, stamp_ns), 1, max(len(drive.stamp_ns) - 1, 1))
-    right = np.minimum(right, len(drive.stamp_ns) - 1)
-    left = np.maximum(right - 1, 0)
-    away = np.minimum(np.abs(stamp_ns - drive.stamp_ns[left]), np.abs(stamp_ns - drive.stamp_ns[right]))
+    away = np.abs(stamp_ns - drive.stamp_ns[nearest_rows(drive.stamp_ns, stamp_ns)])
     inside = (stamp_ns >= drive.stamp_ns[0]) & (stamp_ns <= drive.stamp_ns[-1])
     return inside & (away <= 1e9 * LONGEST_GAP_S)
 

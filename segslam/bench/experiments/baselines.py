@@ -41,7 +41,7 @@ class Estimate:
     probability: float | None = None
     """That the pose is right."""
     evidence: dict[str, float] | None = None
-    """As that of `segslam.types.Alignment`."""
+    """As that of `segslam.core.types.Alignment`."""
 
 
 class GicpScan:

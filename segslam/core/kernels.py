@@ -6,6 +6,8 @@ numba is imported with the first kernel that is called: commands that call none 
 import hashlib
 import os
 import platform
+import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -44,6 +46,8 @@ MODULES = (
     "slam.adjustment.alignment",
 )
 """Modules of this package that define kernels."""
+DONE = "done "
+"""Start of the line that is printed for each compiled kernel."""
 
 _all: list["Kernel"] = []
 _lock = threading.RLock()
@@ -92,15 +96,41 @@ def are_built(modules: Sequence[str] = MODULES) -> bool:
 
 
 def build(modules: Sequence[str] = MODULES) -> Iterator[str]:
-    """Compile all kernels of these modules; yields the name of each when it is done."""
+    """Compile all kernels of these modules; yields the name of each when it is done.
+
+    Another process does it, so that this one does not load all libraries of the modules. Raises RuntimeError, with the
+    last line that it wrote, if it fails.
+    """
+    code = f"from segslam.core.kernels import _build; _build({list(modules)})"
+    path = os.pathsep.join([str(PACKAGE.parent), *filter(None, sys.path)])
+    environment = os.environ | {"PYTHONPATH": path}
+    last = ""
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in map(str.strip, process.stdout):
+                last = line or last
+                if line.startswith(DONE):
+                    yield line.removeprefix(DONE)
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode:
+        raise RuntimeError(f"the kernels were not compiled: {last or 'the process was stopped'}")
+    stamp = _stamp(modules)
+    stamp.parent.mkdir(parents=True, exist_ok=True)
+    stamp.touch()
+
+
+def _build(modules: Sequence[str]) -> None:
+    """Compile the kernels one by one, and print a line for each."""
     for name in modules:
         module = import_module(f"segslam.{name}").__name__
         for one in [one for one in _all if one.__module__ == module]:
             one.compiled  # noqa: B018  (compiles on access)
-            yield f"{module}.{one.py_func.__qualname__}"
-    stamp = _stamp(modules)
-    stamp.parent.mkdir(parents=True, exist_ok=True)
-    stamp.touch()
+            print(f"{DONE}{module}.{one.py_func.__qualname__}", flush=True)
 
 
 def cache_folder() -> Path | None:

@@ -20,6 +20,7 @@ from segslam.odometry import GivenOdometry
 from segslam.output.log import read_log, schema
 from segslam.output.log.container import messages
 from segslam.run.run import Run
+from segslam.scans import Dataset
 from segslam.slam.slam import Slam
 
 UNLABELLED = open_labels("none", beside=Path(), scan_names=[], encoding=None)
@@ -32,24 +33,19 @@ FULL = 300
 """Scans after which the caches are full: 64 keyframes ready for alignment."""
 
 
-class Rounds:
-    """Repeats one round for a given time; a `Dataset`."""
+class Rounds(Dataset):
+    """Repeats one round for a given time."""
 
     name = "rounds"
     labels = UNLABELLED
     reference = None
-    T_camera_lidar = None
     scan_index = np.arange(200_000)
-    is_sequential = False
     vertical_angle_deg = 0.0
     names: tuple[str, ...] = ()
     num_recorded = len(scan_index)
 
     def __init__(self, seconds: float) -> None:
         self._end = monotonic() + seconds
-
-    def __len__(self) -> int:
-        return len(self.scan_index)
 
     def __getitem__(self, row: int) -> Scan:
         return replace(round_drive()[0][row % ROUND], index=row, stamp_ns=row * 300_000_000)
@@ -58,9 +54,6 @@ class Rounds:
         """Given, for KISS-ICP takes ten times as long as all else and keeps no more than its local map."""
         rows = self.scan_index
         return Trajectory(rows, rows * 300_000_000, round_drive()[1].T_world_lidar[rows % ROUND])
-
-    def __iter__(self) -> Iterator[Scan]:
-        return (self[row] for row in range(len(self)))
 
     def until_the_end(self, steps: Iterator[Step]) -> Iterator[Step]:
         for step in steps:

@@ -304,11 +304,11 @@ def _experiment(
 ) -> None:
     """Register the pairs, print the results, and write the report if a folder is given.
 
-    `vary` returns the function of the module `variations` that makes the trials of a list; the module loads scipy and
+    `vary` returns the function of the module `trials` that makes the trials of a list; the module loads scipy and
     is imported after the first message. `of_paper`: the default is the pair of the paper. `asked` is for the report.
     """
     job = _make_job(data, options, changes, terminal)
-    from segslam.bench.experiments import variations
+    from segslam.bench.experiments import trials as variations
     from segslam.bench.experiments.job import open_once
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account

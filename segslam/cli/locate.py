@@ -17,7 +17,7 @@ from segslam.cli.options import EncodingOption, Settings
 from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
-    from segslam.bench.experiments.estimate import Estimate
+    from segslam.bench.experiments.baselines import Estimate
     from segslam.core.config import Config
     from segslam.core.stopwatch import Stopwatch
     from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels

@@ -142,7 +142,8 @@ def upward_axis(poses: Poses) -> Up | None:
 def pose_errors(estimate: Poses, reference: Poses) -> PoseErrors:
     """Distance and angle between poses of the same frame, row by row."""
     difference = np.linalg.inv(reference) @ estimate
-    return PoseErrors(np.linalg.norm(difference[:, :3, 3], axis=1), _angles_deg(difference))
+    angles = ScipyRotation.from_matrix(difference[:, :3, :3]).magnitude() if len(difference) else np.empty(0)
+    return PoseErrors(np.linalg.norm(difference[:, :3, 3], axis=1), np.degrees(angles))
 
 
 def relative_errors(estimate: Poses, reference: Poses) -> PoseErrors:
@@ -208,12 +209,6 @@ def _turn_about_line_deg(positions: Points, error_m: float) -> float:
     """Rotation about the line fitted to the positions that errors of this size can cause (degrees)."""
     along, across, _ = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
     return float(np.degrees(error_m / across)) if across > LINE_TOLERANCE * along else np.inf
-
-
-def _angles_deg(T_a_b: Poses) -> Vector:
-    if len(T_a_b) == 0:
-        return np.empty(0)
-    return np.degrees(ScipyRotation.from_matrix(T_a_b[:, :3, :3]).magnitude())
 
 
 def _rms(values: Vector) -> float:

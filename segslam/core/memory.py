@@ -41,12 +41,16 @@ _others_mb = 0.0
 def note_peak_of(pid: int | None) -> None:
     """Note the peak memory of another process, before it ends, for `peak_mb` (Linux only)."""
     global _others_mb
+    _others_mb = max(_others_mb, status_mb("VmHWM", pid) or 0.0)
+
+
+def status_mb(key: str, pid: int | str | None = "self") -> float | None:
+    """A figure of the status of a process (MB), for example VmRSS or VmHWM (Linux); None if it is unknown."""
     try:
-        found = re.search(r"VmHWM:\s*(\d+) kB", Path(f"/proc/{pid}/status").read_text(encoding="ascii"))
+        found = re.search(rf"{key}:\s*(\d+) kB", Path(f"/proc/{pid}/status").read_text(encoding="ascii"))
     except OSError:
-        return
-    if found is not None:
-        _others_mb = max(_others_mb, int(found[1]) / 1024)
+        return None
+    return None if found is None else int(found[1]) / 1024
 
 
 def peak_mb() -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from segslam.core.types import Vector
 
 CONTROL_FACTOR = 1.4
-"""Growth of mu in the paper."""
+"""Growth of mu in the paper, and in the program of Segregator's authors."""
 
 
 def first_control(worst_squared: float, squared_bound: float) -> float:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
 from segslam.core.errors import brief
-from segslam.core.types import IndexPairs, Indices, Mask, SegslamError, Transform
+from segslam.core.types import IndexPairs, Indices, Mask, SegslamError, Transform, Vector
 
 Poses = Float[np.ndarray, "_ 4 4"]
 """Rigid transforms T_a_b, one per row."""
@@ -50,11 +50,25 @@ def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: boo
     lines = _number_lines(path)
     if skips_names and len(lines) > 1 and not re.match(r"[-+.\d]", lines[0][1][0]):
         lines = lines[1:]
-    chosen = format or _format_of(path, *lines[0])
-    rows = np.array([_numbers(path, number, fields, chosen) for number, fields in lines])
-    poses = _poses_from_matrices(rows) if chosen == "kitti" else _poses_from_quaternions(rows)
-    _require_rotations(path, [number for number, _ in lines], rows, poses, chosen)
-    return PoseFile(poses, _stamps(path, lines) if chosen == "tum" else None)
+    first, fields = lines[0]
+    chosen = format or next((name for name, columns in COLUMNS.items() if len(fields) == columns), None)
+    if chosen is None:
+        raise SegslamError(f"{path}:{first}: found {len(fields)} numbers; {LAYOUT['kitti']}, {LAYOUT['tum']}")
+    numbers, stamps = [], []
+    for line, fields in lines:
+        try:
+            numbers.append(_numbers(fields, chosen))
+            stamps.append(nanoseconds(fields[0]) if chosen == "tum" else 0)
+        except ValueError as error:
+            raise SegslamError(f"{path}:{line}: {error}; correct or remove the line") from error
+    poses, off = (_from_matrices if chosen == "kitti" else _from_quaternions)(np.array(numbers))
+    worst = int(np.argmax(off))
+    if off[worst] > ROTATION_TOLERANCE:
+        what = "3x3 part" if chosen == "kitti" else "quaternion"
+        raise SegslamError(
+            f"{path}:{lines[worst][0]}: the {what} is not a rotation (error {off[worst]:.3g}); correct the line"
+        )
+    return PoseFile(poses, np.array(stamps, dtype=np.int64) if chosen == "tum" else None)
 
 
 def write_kitti(path: Path, T_a_b: Poses) -> None:
@@ -98,8 +112,8 @@ def rows_of_same_stamp(stamp_ns_a: Indices, stamp_ns_b: Indices, *, max_differen
     """Rows (of a, of b) that are mutually nearest in time and at most `max_difference_ns` apart; ascending in a."""
     if len(stamp_ns_a) == 0 or len(stamp_ns_b) == 0:
         return np.empty((0, 2), dtype=np.int64)
-    nearest_b = _nearest(stamp_ns_b, stamp_ns_a)
-    nearest_a = _nearest(stamp_ns_a, stamp_ns_b)
+    nearest_b = nearest_rows(stamp_ns_b, stamp_ns_a)
+    nearest_a = nearest_rows(stamp_ns_a, stamp_ns_b)
     rows_a = np.arange(len(stamp_ns_a))
     mutual = nearest_a[nearest_b] == rows_a
     close = np.abs(stamp_ns_b[nearest_b] - stamp_ns_a) <= max_difference_ns
@@ -159,7 +173,8 @@ def _surroundings(keyframe_rows: Indices, travel_m: np.ndarray) -> tuple[Indices
     return before, after, np.clip(share, 0.0, 1.0)
 
 
-def _nearest(values: Indices, targets: Indices) -> Indices:
+def nearest_rows(values: np.ndarray, targets: np.ndarray) -> Indices:
+    """(n,) row of the value that is nearest to each target, the smaller one of two; there is a value at least."""
     order = np.argsort(values, kind="stable")
     ascending = values[order]
     right = np.clip(np.searchsorted(ascending, targets), 1, max(len(values) - 1, 1))
@@ -184,63 +199,31 @@ def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
     return lines
 
 
-def _format_of(path: Path, number: int, fields: list[str]) -> PoseFormat:
-    for name, columns in COLUMNS.items():
-        if len(fields) == columns:
-            return name
-    raise SegslamError(f"{path}:{number}: found {len(fields)} numbers; {LAYOUT['kitti']}, {LAYOUT['tum']}")
-
-
-def _numbers(path: Path, number: int, fields: list[str], format: PoseFormat) -> list[float]:
+def _numbers(fields: list[str], format: PoseFormat) -> list[float]:
+    """Raises ValueError, with the reason, unless a line has as many finite numbers as the format."""
     if len(fields) != COLUMNS[format]:
-        raise SegslamError(
-            f"{path}:{number}: found {len(fields)} numbers; {LAYOUT[format]}: correct or remove the line"
-        )
+        raise ValueError(f"found {len(fields)} numbers; {LAYOUT[format]}")
     try:
         values = [float(field) for field in fields]
     except ValueError as error:
-        raise SegslamError(
-            f"{path}:{number}: {brief(str(error))}; {LAYOUT[format]}: correct or remove the line"
-        ) from error
+        raise ValueError(f"{brief(str(error))}; {LAYOUT[format]}") from error
     if not np.isfinite(values).all():
-        raise SegslamError(f"{path}:{number}: {brief(' '.join(fields))}: every number must be finite")
+        raise ValueError(f"{brief(' '.join(fields))}: every number must be finite")
     return values
 
 
-def _stamps(path: Path, lines: list[tuple[int, list[str]]]) -> Indices:
-    stamps = []
-    for number, fields in lines:
-        try:
-            stamps.append(nanoseconds(fields[0]))
-        except ValueError as error:
-            raise SegslamError(f"{path}:{number}: {error}; correct or remove the line") from error
-    return np.array(stamps, dtype=np.int64)
+def _from_matrices(rows: np.ndarray) -> tuple[Poses, Vector]:
+    """The poses, and the distance of each 3x3 part from a rotation."""
+    matrices, poses = rows.reshape(-1, 3, 4), np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = [geometry.nearest_rotation(matrix) for matrix in matrices[:, :, :3]]
+    poses[:, :3, 3] = matrices[:, :, 3]
+    return poses, np.abs(matrices[:, :, :3] - poses[:, :3, :3]).max(axis=(1, 2))
 
 
-def _poses_from_matrices(rows: np.ndarray) -> Poses:
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows.reshape(-1, 3, 4)
-    poses[:, :3, :3] = [geometry.nearest_rotation(matrix) for matrix in poses[:, :3, :3]]
-    return poses
-
-
-def _poses_from_quaternions(rows: np.ndarray) -> Poses:
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    norms = np.linalg.norm(rows[:, 4:], axis=1)
-    quaternions = np.where(norms[:, None] > 0, rows[:, 4:], [0.0, 0.0, 0.0, 1.0])  # zeros are rejected below
+def _from_quaternions(rows: np.ndarray) -> tuple[Poses, Vector]:
+    """The poses, and the difference of each quaternion's length from 1."""
+    norms, poses = np.linalg.norm(rows[:, 4:], axis=1), np.tile(np.eye(4), (len(rows), 1, 1))
+    quaternions = np.where(norms[:, None] > 0, rows[:, 4:], [0.0, 0.0, 0.0, 1.0])  # zeros are then rejected
     poses[:, :3, :3] = ScipyRotation.from_quat(quaternions).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
-    return poses
-
-
-def _require_rotations(path: Path, numbers: list[int], rows: np.ndarray, poses: Poses, format: PoseFormat) -> None:
-    if format == "kitti":
-        off = np.abs(rows.reshape(-1, 3, 4)[:, :, :3] - poses[:, :3, :3]).max(axis=(1, 2))
-    else:
-        off = np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0)
-    worst = int(np.argmax(off))
-    if off[worst] > ROTATION_TOLERANCE:
-        what = "3x3 part" if format == "kitti" else "quaternion"
-        raise SegslamError(
-            f"{path}:{numbers[worst]}: the {what} is not a rotation (error {off[worst]:.3g}); correct the line"
-        )
+    return poses, np.abs(norms - 1.0)

@@ -255,8 +255,19 @@ class LoopCandidate(Record):
     """Length of the shortest chain of odometry and closures between the two."""
 
 
+class Found(Record):
+    """Base of what is not `Rejected`."""
+
+    __slots__ = ()
+
+    @property
+    def ok(self) -> bool:
+        """True; False for `Rejected`."""
+        return True
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Registration(Record):
+class Registration(Found):
     """The pose of the source in the target: `p_target = T_target_source @ p_source`."""
 
     T_target_source: Transform
@@ -267,11 +278,6 @@ class Registration(Record):
     information: Information
     num_edges: int = 0
     """Edges of the consistency graph (0 if the method has none)."""
-
-    @property
-    def ok(self) -> bool:
-        """True; False for `Rejected`."""
-        return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +301,7 @@ class Rejected:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Alignment(Record):
+class Alignment(Found):
     """A refined and verified registration."""
 
     coarse: Registration
@@ -318,14 +324,9 @@ class Alignment(Record):
         """The pose of the source in the target: `p_target = T_target_source @ p_source`, (4, 4)."""
         return self.fine.T_target_source
 
-    @property
-    def ok(self) -> bool:
-        """True; False for `Rejected`."""
-        return True
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class LoopClosure(Record):
+class LoopClosure(Found):
     """A verified loop, a between-factor of the graph. `information`: of `T_target_source`, right perturbation."""
 
     source_id: int
@@ -338,11 +339,6 @@ class LoopClosure(Record):
     def of(cls, source_id: int, target_id: int, alignment: Alignment) -> "LoopClosure":
         """The loop between two keyframes with the pose and information of their alignment."""
         return cls(source_id, target_id, alignment.fine.T_target_source, alignment.fine.information, alignment)
-
-    @property
-    def ok(self) -> bool:
-        """True; False for `Rejected`."""
-        return True
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -1,11 +1,19 @@
-"""Atomic writing of files: a file appears under its name when it is complete, or not at all."""
+"""Paths as users give them, and atomic writing: a file appears under its name when it is complete, or not at all."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from segslam.core.errors import SegslamError, WorkFailed, reason
+from segslam.core.errors import SegslamError, WorkFailed, brief, reason
 from segslam.core.interrupts import removed_when_stopped
+
+
+def expanded(path: str | Path) -> Path:
+    """The path with the home folder in place of `~`. Raises SegslamError for a user who does not exist."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise SegslamError(f"{brief(str(path))}: there is no user with this name; write the folder in full") from error
 
 
 def check_target(file: Path) -> None:

@@ -10,9 +10,8 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.types import Mask, Points, SegslamError, Transform, Vector
-from segslam.gnss.chain import longest_chain
 from segslam.gnss.matching import Drive, Matched, Prepared
-from segslam.gnss.statistics import axis_sigma, correlated, horizontal_noise, horizontal_sigma, weight
+from segslam.gnss.statistics import axis_sigma, correlated, fix_noise, horizontal_sigma, longest_chain, weight
 
 NUM_GUESSES = 400
 """Chosen: pairs of fixes that propose a heading; half of the fixes may be wrong, and 100 good pairs are left."""
@@ -122,13 +121,14 @@ def refined(drive: Drive, matched: Matched, start: Transform, arm_m: Vector) -> 
     T_enu_map = start
     for _ in range(ROUNDS):
         residual, columns = linearised(drive, matched, T_enu_map, arm_m)
-        chain = longest_chain(residual, matched.travel_m, sigma_m=horizontal_noise(residual))
+        chain = longest_chain(residual, matched.travel_m, sigma_m=fix_noise(residual))
         sigma = _sigmas(residual, chain)
         many = correlated(residual[chain][:, :2])
         precision = _precision(residual, sigma, chain) / many
         prior, six = PRIOR[:6] ** -2.0, columns[:, :, :6]
+        tilt = np.array([-T_enu_map[1, 2], T_enu_map[0, 2], 0.0, 0.0, 0.0, 0.0])  # heading, position: no prior value
         system = np.einsum("nij,ni,nik->jk", six, precision, six) + np.diag(prior)
-        right = np.einsum("nij,ni,ni->j", six, precision, np.nan_to_num(residual)) - prior * _tilt(T_enu_map)
+        right = np.einsum("nij,ni,ni->j", six, precision, np.nan_to_num(residual)) - prior * tilt
         covariance = np.linalg.inv(system)
         T_enu_map = moved(T_enu_map, covariance @ right)
     heading_deg = float(np.degrees(np.sqrt(covariance[2, 2])))
@@ -160,12 +160,6 @@ def moved(T_enu_map: Transform, step: Vector) -> Transform:
     turn = geometry.exp(geometry.tangent(rotation_rad=step[:3], translation_m=0.0))
     rotation = geometry.nearest_rotation(turn[:3, :3] @ T_enu_map[:3, :3])
     return geometry.transform(rotation, T_enu_map[:3, 3] + step[3:6])
-
-
-def _tilt(T_enu_map: Transform) -> Vector:
-    """(6,) rotation of the map from level; heading and position have no prior value."""
-    up = T_enu_map[:3, 2]
-    return np.array([-up[1], up[0], 0.0, 0.0, 0.0, 0.0])
 
 
 def _sigmas(residual: Points, chain: Mask) -> Vector:

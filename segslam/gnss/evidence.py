@@ -29,9 +29,10 @@ from scipy.sparse.linalg import splu
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses
-from segslam.core.types import Information, Points, Transform, Vector
+from segslam.core.types import Points, Transform, Vector
 from segslam.gnss.matching import Matched
 from segslam.graph import Edge
+from segslam.graph.closure_pairs import adjoints
 
 MOST_FIXES = 150
 """Chosen: fixes compared, spread over the drive; the result differs little from 100 on."""
@@ -87,7 +88,8 @@ class DriveCovariance:
         self._T = T
         rows, columns, blocks = [0], [0], [np.diag(HELD**-2.0)]
         for edge in edges:
-            minus = -adjoint(geometry.inverse(T[edge.b]) @ T[edge.a])  # derivative by a; that by b is the identity
+            T_b_a = geometry.inverse(T[edge.b]) @ T[edge.a]
+            minus = -adjoints(T_b_a[None])[0]  # derivative by a; that by b is the identity
             pairs = ((edge.a, edge.a, minus.T @ edge.information @ minus), (edge.b, edge.b, edge.information))
             cross = minus.T @ edge.information
             for row, column, block in (*pairs, (edge.a, edge.b, cross), (edge.b, edge.a, cross.T)):
@@ -122,13 +124,6 @@ class DriveCovariance:
                 dense[block * n + row, 6 * key : 6 * key + 6] = jacobian[row, axis]
         covariance = dense @ self._solver.solve(np.ascontiguousarray(dense.T))
         return (covariance + covariance.T) / 2
-
-
-def adjoint(T_a_b: Transform) -> Information:
-    """(6, 6) matrix that turns a tangent of frame b into one of frame a."""
-    rotation, (x, y, z) = T_a_b[:3, :3], T_a_b[:3, 3].tolist()
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.block([[rotation, np.zeros((3, 3))], [cross @ rotation, rotation]])
 
 
 def estimated(

@@ -18,8 +18,7 @@ from segslam.core.types import Mask, Points, Vector
 from segslam.gnss.alignment import PRIOR, Placement, linearised, moved, refined
 from segslam.gnss.evidence import DriveCovariance, Estimate, Noise, estimated
 from segslam.gnss.matching import Drive, Matched, Prepared
-from segslam.gnss.robust_weights import KEPT_WEIGHT, robust_weights
-from segslam.gnss.statistics import Weights, axis_noise, axis_sigma, horizontal_noise, horizontal_sigma
+from segslam.gnss.statistics import KEPT_WEIGHT, Weights, axis_sigma, fix_noise, horizontal_sigma, robust_weights
 from segslam.graph import Edge, PositionedGraph
 
 NUM_WINDOWS = 6
@@ -99,7 +98,7 @@ def calibrate(
             columns[kept],
             PRIOR * np.repeat([True, *free], [6, 1, 2]),
             axes=[0, 1],
-            white_m=horizontal_noise(residual[kept]),
+            white_m=fix_noise(residual[kept]),
         )
         clock, arm = found.constants[6], found.constants[7:9]
         total = abs(measured_s + clock), np.abs(arm_m[:2] + arm)
@@ -131,7 +130,7 @@ def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> Fused:
             columns[used],
             PRIOR * np.repeat([True, False], [6, 3]),
             axes=[2],
-            white_m=axis_noise(residual[used, 2]),
+            white_m=fix_noise(residual[used, 2]),
         ).noise
     level = constants.level.noise
     soft = np.array(
@@ -165,16 +164,12 @@ def _chosen(problem: _Problem, soft: Vector, close: Vector) -> tuple[Vector, tup
     nothing = (0.0, 0.0, 0.0)
     if len(problem.matched) < LEAST_FUSED:
         return sigma, (nothing, nothing)
-    level, costs_level = _best(problem, [_level_only(one) for one in (sigma, soft, close)], 0)
+    level, costs_level = _best(problem, [np.array([*one[:2], RIGID_M]) for one in (sigma, soft, close)], 0)
     if not np.isfinite(close[2]):
         return level, (costs_level, nothing)
     with_up = [np.array([*level[:2], one]) for one in (RIGID_M, soft[2], close[2])]
     both, costs_up = _best(problem, with_up, 1)
     return both, (costs_level, costs_up)
-
-
-def _level_only(sigma: Vector) -> Vector:
-    return np.array([sigma[0], sigma[1], RIGID_M])
 
 
 def _best(problem: _Problem, candidates: Sequence[Vector], axis: int) -> tuple[Vector, Costs]:

@@ -114,13 +114,5 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
     return (32600 if latitude_deg >= 0.0 else 32700) + zone
 
 
-def length_of_degree_m(latitude_deg: float) -> tuple[float, float]:
-    """Length of a degree of latitude and of longitude (m) on the ellipsoid at a latitude (Groves, eq. (2.105))."""
-    sine = math.sin(math.radians(latitude_deg))
-    root = math.sqrt(1.0 - ECCENTRICITY2 * sine**2)
-    meridian = SEMI_MAJOR_M * (1.0 - ECCENTRICITY2) / root**3
-    return math.radians(meridian), math.radians(SEMI_MAJOR_M / root * math.cos(math.radians(latitude_deg)))
-
-
 def _ecef_of(origin: Origin) -> Vector:
     return ecef_from_geodetic(np.array([[origin.latitude_deg, origin.longitude_deg, origin.height_m]]))[0]

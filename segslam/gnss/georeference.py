@@ -13,8 +13,7 @@ from segslam.gnss.fixes import Fixes
 from segslam.gnss.fusion import RIGID_M, Constants, calibrate, fuse
 from segslam.gnss.geodesy import Origin
 from segslam.gnss.matching import Drive, outside_reasons, prepare
-from segslam.gnss.robust_weights import KEPT_WEIGHT, robust_weights
-from segslam.gnss.statistics import Weights
+from segslam.gnss.statistics import KEPT_WEIGHT, Weights, robust_weights
 from segslam.graph import Edge
 
 CONTRADICTED = "contradicts_drive"

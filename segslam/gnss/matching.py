@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.core.trajectory import Poses, travelled_m
+from segslam.core.trajectory import Poses, nearest_rows, travelled_m
 from segslam.core.types import Indices, Mask, Points, SegslamError, Vector
 from segslam.gnss.fixes import OUTSIDE, Fixes, origin_of
 from segslam.gnss.geodesy import Geodetic, Origin, enu_from_geodetic
@@ -14,7 +14,6 @@ LONGEST_GAP_S = 2.0
 """Chosen: a fix between two scans farther apart than this, or so long before the first scan, has no pose."""
 SPEED_OVER_S = 0.2
 """Chosen: time over which the velocity at a fix is measured."""
-LEAP_SECONDS = {18.0: "GPS time instead of UTC, since 2017", 37.0: "TAI instead of UTC, since 2017"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,16 +87,18 @@ class Prepared:
         begin = int(drive.stamp_ns[0])
         time_s = 1e-9 * (stamps[rows] - begin)
         scan_s = 1e-9 * (drive.stamp_ns - begin)
-        keyframe_s = scan_s[drive.keyframe_rows]
-        right = np.clip(np.searchsorted(keyframe_s, time_s), 1, max(len(keyframe_s) - 1, 1))
-        is_left = time_s - keyframe_s[right - 1] <= np.abs(keyframe_s[np.minimum(right, len(keyframe_s) - 1)] - time_s)
-        keyframe = np.where(is_left, right - 1, np.minimum(right, len(keyframe_s) - 1))
-        R_map_keyframe, p_keyframe = _split(drive.T_map_keyframe[keyframe])
+        keyframe = nearest_rows(scan_s[drive.keyframe_rows], time_s)
+        T_map_keyframe = drive.T_map_keyframe[keyframe]
+        R_map_keyframe = T_map_keyframe[:, :3, :3]
         T_map_lidar = interpolated(drive, scan_s, time_s)
         T_keyframe_lidar = np.tile(np.eye(4), (len(rows), 1, 1))
         T_keyframe_lidar[:, :3, :3] = R_map_keyframe.transpose(0, 2, 1) @ T_map_lidar[:, :3, :3]
-        T_keyframe_lidar[:, :3, 3] = _rotated_into(R_map_keyframe, T_map_lidar[:, :3, 3] - p_keyframe)
-        ends = [_positions(drive, scan_s, time_s + sign * SPEED_OVER_S / 2) for sign in (-1, 1)]
+        T_keyframe_lidar[:, :3, 3] = _rotated_into(R_map_keyframe, T_map_lidar[:, :3, 3] - T_map_keyframe[:, :3, 3])
+        path = drive.T_map_lidar[:, :3, 3].T
+        before, after = (
+            np.column_stack([np.interp(time_s + sign * SPEED_OVER_S / 2, scan_s, axis) for axis in path])
+            for sign in (-1, 1)
+        )
         return Matched(
             rows=rows,
             time_s=time_s,
@@ -105,7 +106,7 @@ class Prepared:
             sigma_m=self.fixes.sigma_m[rows],
             keyframe=keyframe,
             T_keyframe_lidar=T_keyframe_lidar,
-            velocity=_rotated_into(R_map_keyframe, (ends[1] - ends[0]) / SPEED_OVER_S),
+            velocity=_rotated_into(R_map_keyframe, (after - before) / SPEED_OVER_S),
             travel_m=np.interp(time_s, scan_s, travelled_m(drive.T_map_lidar)),
         )
 
@@ -132,10 +133,7 @@ def prepare(fixes: Fixes, drive: Drive, *, offset_s: float = 0.0) -> Prepared:
 
 def has_pose(drive: Drive, stamp_ns: Indices) -> Mask:
     """(n,) True for times within the drive and near enough to a scan."""
-    right = np.clip(np.searchsorted(drive.stamp_ns, stamp_ns), 1, max(len(drive.stamp_ns) - 1, 1))
-    right = np.minimum(right, len(drive.stamp_ns) - 1)
-    left = np.maximum(right - 1, 0)
-    away = np.minimum(np.abs(stamp_ns - drive.stamp_ns[left]), np.abs(stamp_ns - drive.stamp_ns[right]))
+    away = np.abs(stamp_ns - drive.stamp_ns[nearest_rows(drive.stamp_ns, stamp_ns)])
     inside = (stamp_ns >= drive.stamp_ns[0]) & (stamp_ns <= drive.stamp_ns[-1])
     return inside & (away <= 1e9 * LONGEST_GAP_S)
 
@@ -159,14 +157,6 @@ def interpolated(drive: Drive, scan_s: Vector, time_s: Vector) -> Poses:
     poses[:, :3, :3] = (before * ScipyRotation.from_rotvec(share[:, None] * motion.as_rotvec())).as_matrix()
     poses[:, :3, 3] += share[:, None] * (drive.T_map_lidar[after, :3, 3] - poses[:, :3, 3])
     return poses
-
-
-def _positions(drive: Drive, scan_s: Vector, time_s: Vector) -> Points:
-    return np.column_stack([np.interp(time_s, scan_s, column) for column in drive.T_map_lidar[:, :3, 3].T])
-
-
-def _split(poses: Poses) -> tuple[np.ndarray, Points]:
-    return poses[:, :3, :3], poses[:, :3, 3]
 
 
 def _rotated_into(rotations: np.ndarray, vectors: Points) -> Points:

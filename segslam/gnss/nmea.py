@@ -6,8 +6,7 @@ from pathlib import Path
 
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row
-from segslam.gnss.text import bad_line, check_degrees, number_in
-from segslam.gnss.times import stamp_of
+from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of
 
 NOTE = (
     "heights: altitude above the geoid and geoid separation, as the receiver gives them, added to ellipsoidal heights"
@@ -31,7 +30,9 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     position with a right checksum that is none.
     """
     found: dict[str, list[Row]] = {"GGA": [], "RMC": []}
-    day, last, num_wrong, num_right = _first_date(lines), None, 0, 0
+    dates = (_date(words) for words in map(_words, lines) if words)
+    day = next((one for one in dates if one), NO_DATE)  # fixes before the first date are of the same day
+    last, num_wrong, num_right = None, 0, 0
     for number, line in enumerate(lines, 1):
         words = _words(line)
         if words is None:
@@ -108,9 +109,3 @@ def _date(words: Sequence[str]) -> date | None:
     except ValueError:
         return None
     return None
-
-
-def _first_date(lines: Sequence[str]) -> date:
-    """The first date in the file: fixes before it are of the same day."""
-    dates = (_date(words) for words in map(_words, lines) if words)
-    return next((one for one in dates if one), NO_DATE)

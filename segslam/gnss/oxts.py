@@ -5,8 +5,7 @@ from pathlib import Path
 
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row
-from segslam.gnss.text import bad_line, check_degrees, number_in, text_lines
-from segslam.gnss.times import stamp_of
+from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, text_lines
 
 ACCURACY = 23
 """Column of the accuracy of the position (m), counted from 0, as the devkit's dataformat.txt lists them."""

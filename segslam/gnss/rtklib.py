@@ -6,11 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.core.types import Vector
 from segslam.gnss.fixes import Row
 from segslam.gnss.geodesy import Origin, geodetic_from_ecef, rotation_ecef_enu
-from segslam.gnss.text import bad_line, check_degrees, number_in
-from segslam.gnss.times import stamp_of, stamp_of_week, utc_of_gps
+from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, stamp_of_week, utc_of_gps
 
 
 def is_rtklib(lines: Sequence[str]) -> bool:
@@ -44,7 +42,8 @@ def _row(file: Path, number: int, words: Sequence[str], *, is_ecef: bool, is_gps
         latitude, longitude, height_m = (
             geodetic_from_ecef(position[None])[0] if np.isfinite(position).all() else position
         )
-        sigma_m = _rotated(errors, Origin(float(latitude), float(longitude), float(height_m)))
+        rotation = rotation_ecef_enu(Origin(float(latitude), float(longitude), float(height_m)))
+        sigma_m = np.sqrt((rotation.T**2) @ errors**2)  # without the correlations of the axes of ECEF
     else:
         latitude, longitude, height_m = position
         sigma_m = errors[[1, 0, 2]]  # north comes before east
@@ -52,12 +51,6 @@ def _row(file: Path, number: int, words: Sequence[str], *, is_ecef: bool, is_gps
     east, north, up = (float(value) for value in sigma_m)
     stamp_ns = _stamp(file, number, words[0], words[1], is_gpst=is_gpst)
     return Row(stamp_ns, float(latitude), float(longitude), float(height_m), (east, north, up), words[5] != "0")
-
-
-def _rotated(errors: Vector, origin: Origin) -> Vector:
-    """(3,) standard deviations east, north, up of those along the axes of ECEF, without their correlations."""
-    rotation = rotation_ecef_enu(origin)
-    return np.sqrt((rotation.T**2) @ errors**2)
 
 
 def _stamp(file: Path, number: int, first: str, second: str, *, is_gpst: bool) -> int:

@@ -1,9 +1,13 @@
-"""Robust statistics of residuals: their scale, and for how many fixes in a row they are similar."""
+"""Robust statistics of residuals: their scale, their weights, and which fixes are consistent with the drive.
+
+Wrong fixes come in runs, under trees or beside a building: within the run they are consistent with each other, but the
+drive from a correct fix into the run, and out of it, contradicts them.
+"""
 
 import numpy as np
 from jaxtyping import Float
 
-from segslam.core.types import Vector
+from segslam.core.types import Mask, Points, Vector
 
 Weights = Float[np.ndarray, "_ 2"]
 """Robust weights of fixes, horizontally and in height."""
@@ -17,6 +21,14 @@ LEAST_NOISE_M = 0.05
 """Chosen: the position of a scan between two others is not known better at the time of a fix."""
 CLIPPED_AT = 3.0
 """Chosen: residuals beyond this many standard deviations count as this many for the autocorrelation."""
+RUN_S = 15.0
+"""Chosen: the weight of a fix is at most that of the median residual within this time before and after it."""
+KEPT_WEIGHT = 0.25
+"""A fix is kept if its weight is that of a residual within three standard deviations, or more."""
+DRIFT = 0.02
+"""Chosen: share of the travel by which the drive may have drifted; odometry drifts by 1 or 2 %."""
+BOUND = 3.5
+"""Chosen: two fixes are consistent within this many standard deviations of their difference."""
 
 
 def horizontal_sigma(residual_m: np.ndarray) -> float:
@@ -29,16 +41,13 @@ def axis_sigma(residual_m: Vector) -> float:
     return max(float(np.median(np.abs(residual_m))) / MEDIAN_OF_ABS, LEAST_SIGMA_M)
 
 
-def horizontal_noise(residual_m: np.ndarray) -> float:
-    """Standard deviation of one axis from fix to fix, from the changes of horizontal residuals (n, 2 or 3)."""
-    changes = np.diff(residual_m[:, :2], axis=0)
-    return max(horizontal_sigma(changes) / np.sqrt(2.0), LEAST_NOISE_M) if len(changes) else LEAST_NOISE_M
-
-
-def axis_noise(residual_m: Vector) -> float:
-    """The same for residuals (n,) of one axis."""
-    changes = np.diff(residual_m)
-    return max(axis_sigma(changes) / np.sqrt(2.0), LEAST_NOISE_M) if len(changes) else LEAST_NOISE_M
+def fix_noise(residual_m: np.ndarray) -> float:
+    """Standard deviation of one axis from fix to fix, from changes of residuals: (n,), or (n, 2 or 3) horizontally."""
+    changes = np.diff(residual_m, axis=0)
+    if not len(changes):
+        return LEAST_NOISE_M
+    sigma = axis_sigma(changes) if changes.ndim == 1 else horizontal_sigma(changes)
+    return max(sigma / np.sqrt(2.0), LEAST_NOISE_M)
 
 
 def weight(squared: Vector, bound: float = 9.0) -> Vector:
@@ -67,3 +76,44 @@ def correlated(residuals: np.ndarray) -> float:
             break
         total += 2.0 * share
     return float(np.clip(total, 1.0, n / 4))
+
+
+def robust_weights(residual: Points, sigma: Vector, time_s: Vector) -> Weights:
+    """(n, 2) weights horizontally and vertically; a fix in a run of wrong ones has the weight of the run."""
+    level = np.hypot(*residual[:, :2].T) / sigma[0]
+    up = np.abs(residual[:, 2]) / sigma[2]
+    level, up = (np.maximum(values, _median_near(values, time_s)) for values in (level, up))
+    return np.column_stack([weight(level**2), np.where(np.isfinite(up), weight(np.nan_to_num(up) ** 2), 0.0)])
+
+
+def _median_near(values: Vector, time_s: Vector) -> Vector:
+    """Median of the known values within `RUN_S` of each; 0 if there are none."""
+    first = np.searchsorted(time_s, time_s - RUN_S)
+    last = np.searchsorted(time_s, time_s + RUN_S, side="right")
+    near = (values[a:b] for a, b in zip(first, last, strict=True))
+    known = (some[np.isfinite(some)] for some in near)
+    return np.array([float(np.median(some)) if len(some) else 0.0 for some in known])
+
+
+def longest_chain(residual_m: Points, travel_m: Vector, *, sigma_m: float) -> Mask:
+    """(n,) the largest subset in which each fix is consistent with the next one.
+
+    `residual_m`: measured minus estimated position of each fix, in the order of time; only its first two columns are
+    used. Two fixes are consistent if their residuals differ by their noise and the drift of the drive between them.
+    """
+    n = len(residual_m)
+    allowed = BOUND * np.sqrt(2.0) * sigma_m
+    length, previous = np.ones(n), np.full(n, -1)
+    for row in range(1, n):
+        gap = np.hypot(*(residual_m[row, :2] - residual_m[:row, :2]).T)
+        reach = allowed + DRIFT * (travel_m[row] - travel_m[:row])
+        before = np.where(gap <= reach, length[:row], 0.0)
+        best = row - 1 - int(np.argmax(before[::-1]))  # the latest of equals: the least drift between
+        if before[best] > 0.0:
+            length[row], previous[row] = length[best] + 1.0, best
+    kept = np.zeros(n, dtype=bool)
+    row = int(np.argmax(length)) if n else -1
+    while row >= 0:
+        kept[row] = True
+        row = previous[row]
+    return kept

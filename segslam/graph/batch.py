@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import compress
 from time import perf_counter
 from typing import Literal
@@ -134,9 +134,10 @@ def _described(
     spread = np.concatenate([squared_errors(odometry, found.values), after[fitted]])
     redundancy = problem.redundancy(fitted.astype(float))
     chi2 = float(spread.sum())
+    poses = dict(zip(sorted(graph.T_world_vertex), poses_by_id(found.values), strict=True))
     median, p95, most = np.quantile(spread, [0.5, 0.95, 1.0]).tolist() if len(spread) else (0.0, 0.0, 0.0)
     return Optimized(
-        graph=_moved(graph, found.values),
+        graph=replace(graph, T_world_vertex={vertex: poses[vertex] for vertex in graph.T_world_vertex}),
         robust=robust,
         initial_error=odometry.error(start) + 0.5 * float(before[kept].sum()),
         final_error=odometry.error(found.values) + 0.5 * float(after[kept].sum()),
@@ -198,8 +199,3 @@ def _anchors(graph: G2oGraph, start: gtsam.Values) -> gtsam.NonlinearFactorGraph
     for vertex in graph.fixed or (next(iter(graph.T_world_vertex)),):
         anchors.add(gtsam.PriorFactorPose3(vertex, start.atPose3(vertex), noise.first_pose()))
     return anchors
-
-
-def _moved(graph: G2oGraph, values: gtsam.Values) -> G2oGraph:
-    poses = dict(zip(sorted(graph.T_world_vertex), poses_by_id(values), strict=True))
-    return G2oGraph({vertex: poses[vertex] for vertex in graph.T_world_vertex}, graph.edges, graph.fixed)

@@ -1,16 +1,19 @@
 """The search for the optimum of a graph from a file, and for the inliers among its closures."""
 
 import logging
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import gtsam
 import numpy as np
 from scipy.special import chdtrc
 
+from segslam.core import geometry
 from segslam.core.types import Mask, Vector
 from segslam.graph import noise
-from segslam.graph.closure_pairs import consistent_pairs, ends_m, largest_consistent, neighbours
-from segslam.graph.contradictions import contradicting, turned, unknown_motion
+from segslam.graph.closure_pairs import MAX_PAIRED, adjoints, consistent_pairs, ends_m, largest_consistent, neighbours
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph
 from segslam.graph.gnc import Solution, TruncatedProblem, better, settle, solve
@@ -20,8 +23,6 @@ from segslam.graph.selection import exchange_groups, large_groups
 logger = logging.getLogger(__name__)
 IMPLAUSIBLE = 1e-6
 """A fit less probable than this, under the noise of the edges, is implausible. Chosen."""
-MAX_PAIRED = 5_000
-"""Largest number of closures compared pairwise, in 8 s; for more, graduated non-convexity selects."""
 NEAR_IDS = 10
 """Closures whose ends are this near in ids join the same two places. Chosen: a ring of `sphere2500` has 50 vertices."""
 MIN_KEPT = 0.8
@@ -30,6 +31,10 @@ GOOD_START = 0.5
 """The file's poses are a start of their own where this share of the closures fits them. Chosen."""
 GENEROUS = 4.0
 """Closures with an error below this many bounds are also tried as inliers. Chosen: twice the error of an inlier."""
+
+
+CONSISTENT = 0.999
+"""Two correct measurements of one motion differ by less than this quantile of the chi-square distribution. Chosen."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +58,7 @@ class FileProblem:
         groups = contradicting([edge for edge in graph.edges if abs(edge.a - edge.b) == 1])
         moved = {id(edge) for edges in groups for edge in edges}
         odometry = [edge for edge in graph.edges if abs(edge.a - edge.b) == 1 and id(edge) not in moved]
-        odometry += [unknown_motion(edges) for edges in groups]
+        odometry += [replace(edges[0], information=noise.UNKNOWN_MOTION) for edges in groups]
         closures = [edge for edge in graph.edges if abs(edge.a - edge.b) != 1 or id(edge) in moved]
         each = 1.0 - (1.0 - inlier_probability) / max(1, len(closures))
         first_id = min(graph.T_world_vertex)
@@ -155,3 +160,29 @@ def _generous(truncated: TruncatedProblem, solution: Solution) -> Solution:
 
 def _renumbered(edges: list[Edge], first: int) -> list[Edge]:
     return [Edge(edge.a - first, edge.b - first, edge.T_a_b, edge.information) for edge in edges]
+
+
+def contradicting(odometry: Sequence[Edge]) -> list[list[Edge]]:
+    """Groups of edges between the same two vertices of which at least two differ by more than their noise allows.
+
+    Which of them is correct, only the other edges show.
+    """
+    same: dict[int, list[Edge]] = defaultdict(list)
+    for edge in odometry:
+        same[min(edge.a, edge.b)].append(edge)
+    bound = noise.inlier_bound(CONSISTENT)
+    return [edges for edges in same.values() if any(_chi2(one, other) > bound for one, other in combinations(edges, 2))]
+
+
+def turned(edge: Edge) -> Edge:
+    """The same measurement from the other vertex."""
+    turn = adjoints(geometry.inverse(edge.T_a_b)[None])[0]  # of information: the inverse transposed of covariances'
+    return Edge(edge.b, edge.a, geometry.inverse(edge.T_a_b), turn.T @ edge.information @ turn)
+
+
+def _chi2(one: Edge, other: Edge) -> float:
+    """Chi-square of the difference between two measurements of one motion."""
+    same_way = other if other.a == one.a else turned(other)
+    difference = geometry.log(geometry.inverse(one.T_a_b) @ same_way.T_a_b)
+    covariance = np.linalg.inv(one.information) + np.linalg.inv(same_way.information)
+    return float(difference @ np.linalg.solve(covariance, difference))

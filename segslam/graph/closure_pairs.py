@@ -19,7 +19,6 @@ the paper: odometry shared by both stretches cancels if both are driven the same
 import math
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -30,21 +29,13 @@ from segslam.core.types import Indices, Mask, Vector
 from segslam.graph.edges import Edge, Transforms
 from segslam.registration.cliques import maximum_cliques, pack_rows
 
+MAX_PAIRED = 5_000
+"""Largest number of closures compared pairwise (10 s, 450 MB); for more, graduated non-convexity selects."""
 MOST_NODES = 20_000
 """Bound of the clique search: a second where 1,500 true closures are almost all consistent; any large set of them will
 do."""
 Matrices = Float[np.ndarray, "_ 6 6"]
 Pairs = Bool[np.ndarray, "_ _"]
-
-
-class Shifts(NamedTuple):
-    """The drift that each closure measures, a row each, in one frame."""
-
-    T_world_drifted: Transforms
-    covariances: Matrices
-    """Covariances of the closures' own noise."""
-    sources: Indices
-    targets: Indices
 
 
 def consistent_pairs(odometry: Sequence[Edge], closures: Sequence[Edge], bound: float) -> Pairs:
@@ -71,21 +62,16 @@ def pairwise_chi2(
     odometry: Sequence[Edge], closures: Sequence[Edge], *, enough: float = math.inf
 ) -> Float[np.ndarray, "_ _"]:
     """(k, k) chi-square of the loop that two closures make; above `enough`, a lower bound of it, which is faster."""
-    T_world = _chained(odometry)
-    shifts = _shifts(T_world, closures)
+    T_world = np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
+    T_world[:, :3, 3] -= T_world[:, :3, 3].mean(axis=0)  # an origin amid the poses limits rounding errors
+    targets, sources = np.array([(edge.a, edge.b) for edge in closures]).T.copy()
+    T_world_moved = T_world[targets] @ np.array([edge.T_a_b for edge in closures])
+    T_world_drifted = T_world_moved @ np.linalg.inv(T_world[sources])  # the drift that each closure measures
+    own = _carried(T_world_moved, closures)
     summed = np.cumsum(np.concatenate([np.zeros((1, 6, 6)), _carried(T_world[1:], odometry)]), axis=0)
     chi2 = np.zeros((len(closures), len(closures)))
-    _fill(
-        shifts.T_world_drifted,
-        np.linalg.inv(shifts.T_world_drifted),
-        adjoints(shifts.T_world_drifted),
-        shifts.covariances,
-        summed,
-        shifts.sources,
-        shifts.targets,
-        enough,
-        chi2,
-    )
+    inverses, turns = np.linalg.inv(T_world_drifted), adjoints(T_world_drifted)
+    _fill(T_world_drifted, inverses, turns, own, summed, sources, targets, enough, chi2)
     return chi2
 
 
@@ -114,19 +100,6 @@ def adjoints(T_a_b: Transforms) -> Matrices:
     whole[:, :3, :3] = whole[:, 3:, 3:] = T_a_b[:, :3, :3]
     whole[:, 3:, :3] = cross @ T_a_b[:, :3, :3]
     return whole
-
-
-def _chained(odometry: Sequence[Edge]) -> Transforms:
-    """(n, 4, 4) poses along odometry; the origin is at the middle pose, which limits rounding errors."""
-    T_world = np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
-    T_world[:, :3, 3] -= T_world[:, :3, 3].mean(axis=0)
-    return T_world
-
-
-def _shifts(T_world: Transforms, closures: Sequence[Edge]) -> Shifts:
-    targets, sources = (np.array([(edge.a, edge.b) for edge in closures])).T.copy()
-    T_world_moved = T_world[targets] @ np.array([edge.T_a_b for edge in closures])
-    return Shifts(T_world_moved @ np.linalg.inv(T_world[sources]), _carried(T_world_moved, closures), sources, targets)
 
 
 def _carried(T_world_end: Transforms, edges: Sequence[Edge]) -> Matrices:

@@ -67,7 +67,9 @@ def read_g2o(path: Path) -> G2oGraph:
         raise SegslamError(f"{path}: holds no vertex; a graph needs lines of {VERTEX}")
     row_of = _row_of_vertex(vertices)
     for table in (edges, fixes):
-        _require_known(table, row_of)
+        for row, vertex in ((row, vertex) for row, ids in enumerate(table.ids) for vertex in ids):
+            if vertex not in row_of:
+                raise table.refusal(row, f"vertex {vertex} has no {VERTEX} line")
     graph = G2oGraph(
         dict(zip(row_of, _poses(vertices), strict=True)), _edges(edges), tuple(ids[0] for ids in fixes.ids)
     )
@@ -147,13 +149,6 @@ def _row_of_vertex(vertices: _Table) -> dict[int, int]:
         if row_of.setdefault(vertex, row) != row:
             raise vertices.refusal(row, f"vertex {vertex} is in line {vertices.line_numbers[row_of[vertex]]} already")
     return row_of
-
-
-def _require_known(table: _Table, row_of: dict[int, int]) -> None:
-    for row, ids in enumerate(table.ids):
-        for vertex in ids:
-            if vertex not in row_of:
-                raise table.refusal(row, f"vertex {vertex} has no {VERTEX} line")
 
 
 def _poses(table: _Table) -> Transforms:

@@ -21,10 +21,9 @@ from segslam.graph.adjusted import solve_adjusted, weighted_edges, without_share
 from segslam.graph.breaks import is_break, relinked
 from segslam.graph.closure_pairs import consistent_pairs, largest_consistent
 from segslam.graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, squared_errors, values_of
-from segslam.graph.final import Measured, solve_consistent, solve_gnc
 from segslam.graph.g2o import G2oGraph, write_g2o
 from segslam.graph.levenberg_marquardt import Search, Unsolvable, search
-from segslam.graph.motions import MotionSolution, without
+from segslam.graph.motions import Drive, MotionSolution, solve_consistent, solve_gnc, without
 from segslam.graph.noise import INLIER_PROBABILITY
 from segslam.graph.rows import Rows
 from segslam.graph.steady_drift import noise_factor, steady_drift, turned
@@ -236,18 +235,12 @@ class PoseGraph:
         return self._estimate(found.error, self._weights), factors
 
     def _solve_final(self) -> MotionSolution:
-        measured = Measured(
-            self._prior(),
-            self._odometry,
-            self._closures,
-            self.travel_m,
-            self._inlier_bound,
-            noise.inlier_bound(INLIER_PROBABILITY),
-        )
+        claimed_bound = noise.inlier_bound(INLIER_PROBABILITY)
+        drive = Drive(self._prior(), self._closures, self.travel_m, self._inlier_bound, claimed_bound)
         if self._config.final == "gnc":
-            final = solve_gnc(measured, self._values)
+            final = solve_gnc(drive, self._odometry, self._values)
         else:
-            final = solve_consistent(measured, self._values, self._rejected_motions())
+            final = solve_consistent(drive, self._odometry, self._values, self._rejected_motions())
         self._rejected = final.rejected
         self._rebuild_backbone()
         self._take(final.solution.search.values)

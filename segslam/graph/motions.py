@@ -1,4 +1,4 @@
-"""Motions of odometry that closures contradict: rejected like closures, at a higher cost.
+"""The final optimisation of a drive: which closures are inliers, and which motions of odometry are not.
 
 If odometry jumps between two keyframes, all closures across the jump measure the same drift, and they do not fit the
 rest of the drive unless that motion is rejected. A group of rejected closures that are consistent with each other is
@@ -11,6 +11,7 @@ to less than that of a motion.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -19,40 +20,61 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.types import Mask, Transform, Vector
-from segslam.graph import noise
-from segslam.graph.closure_pairs import Pairs, consistent_pairs, largest_consistent
-from segslam.graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, values_of
-from segslam.graph.gnc import Solution, TruncatedProblem
+from segslam.graph import gnc, noise
+from segslam.graph.closure_pairs import (
+    MAX_PAIRED,
+    Pairs,
+    consistent_pairs,
+    ends_m,
+    largest_consistent,
+    neighbours,
+    num_near,
+)
+from segslam.graph.edges import Edge, factor_graph, joined, poses_by_id, values_of
 from segslam.graph.selection import MIN_GROUP, select_consistent
 
+PLACE_M = 30.0
+"""Closures whose ends are this near in travel join the same two places, and may be wrong together. Chosen."""
+PLACE_PENALTY = 2.0
+"""Closures joining the same two places are correlated; together they weigh at most as much as this many independent
+ones. Chosen from 0.5 to 5 with `tools/benchmarks/back_end`: below, correct closures are rejected; above, a repeated
+street outweighs odometry."""
 MOTION_PENALTY = 2.5
 """Cost of rejecting a motion, in rejected closures. Chosen: above the 2 of one place, below the 3 of a revisit of 60 m
 with a closure each 12 m."""
 MAX_TRIALS = 10
 """Chosen: largest number of rejected motions; drives with more need a better odometry."""
-TURN_M = 5.0
-"""Distance equivalent to a rotation by one radian in comparisons of motions (m). Chosen: `GraphConfig.turn_m`."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Constants:
+@dataclass(frozen=True, eq=False)
+class Drive:
     """The constant data of the problem while motions are rejected."""
 
     prior: gtsam.NonlinearFactorGraph
+    """The factor of the first pose."""
     closures: list[Edge]
-    penalties: Vector
-    near: Pairs
-    """(k, k) True for closures that join the same places."""
+    travel_m: Vector
     inlier_bound: float
-    strict_bound: float
-    """Chi-square within which closures of a group are consistent: errors as claimed, without an allowance."""
+    """Chi-square of an inlier, with the allowance for errors larger than claimed."""
+    claimed_bound: float
+    """The same without the allowance: within it closures of a group are consistent."""
 
-    def problem(self, odometry: Sequence[Edge]) -> TruncatedProblem:
+    @cached_property
+    def penalties(self) -> Vector:
+        """(k,) cost of rejecting each closure."""
+        return np.minimum(1.0, PLACE_PENALTY / num_near(ends_m(self.closures, self.travel_m), PLACE_M))
+
+    @cached_property
+    def near(self) -> Pairs:
+        """(k, k) True for closures that join the same places."""
+        return neighbours(ends_m(self.closures, self.travel_m), PLACE_M)
+
+    def problem(self, odometry: Sequence[Edge]) -> gnc.TruncatedProblem:
         """The truncated least-squares problem with this odometry."""
         backbone = joined(self.prior, factor_graph(odometry))
-        return TruncatedProblem(backbone, self.closures, self.inlier_bound, penalties=self.penalties)
+        return gnc.TruncatedProblem(backbone, self.closures, self.inlier_bound, penalties=self.penalties)
 
-    def solve(self, odometry: Sequence[Edge], start: gtsam.Values) -> Solution:
+    def solve(self, odometry: Sequence[Edge], start: gtsam.Values) -> gnc.Solution:
         """Poses and inliers near `start` and near consistent sets of closures."""
         consistent = consistent_pairs(odometry, self.closures, self.inlier_bound)
         return select_consistent(self.problem(odometry), start, consistent, self.near)
@@ -61,7 +83,7 @@ class Constants:
 class MotionSolution(NamedTuple):
     """A solution and the motions that it rejects (n - 1,)."""
 
-    solution: Solution
+    solution: gnc.Solution
     rejected: Mask
 
     def cost(self, inlier_bound: float) -> float:
@@ -77,8 +99,18 @@ def without(odometry: Sequence[Edge], rejected: Mask) -> list[Edge]:
     ]
 
 
-def solve(drive: Constants, odometry: Sequence[Edge], start: gtsam.Values, rejected: Mask) -> MotionSolution:
-    """The best solution near `start`, where motions that were rejected before are rejected again or restored."""
+def solve_gnc(drive: Drive, odometry: Sequence[Edge], start: gtsam.Values) -> MotionSolution:
+    """Poses and inliers by graduated non-convexity; all motions are kept."""
+    return MotionSolution(gnc.solve(drive.problem(odometry), start), np.zeros(len(odometry), dtype=bool))
+
+
+def solve_consistent(drive: Drive, odometry: Sequence[Edge], start: gtsam.Values, rejected: Mask) -> MotionSolution:
+    """Poses and inliers near `start` or the largest pairwise-consistent set.
+
+    Motions that were `rejected` before are rejected again or restored.
+    """
+    if len(drive.closures) > MAX_PAIRED:
+        return solve_gnc(drive, odometry, start)
     none = np.zeros(len(odometry), dtype=bool)
     found = _reject(drive, odometry, MotionSolution(drive.solve(odometry, start), none))
     if not rejected.any():
@@ -88,7 +120,7 @@ def solve(drive: Constants, odometry: Sequence[Edge], start: gtsam.Values, rejec
     return min(again, found, key=lambda each: each.cost(drive.inlier_bound))
 
 
-def _reject(drive: Constants, odometry: Sequence[Edge], best: MotionSolution) -> MotionSolution:
+def _reject(drive: Drive, odometry: Sequence[Edge], best: MotionSolution) -> MotionSolution:
     """The solution without the motions that groups of rejected closures contradict.
 
     Without such a group the solution stays as it is.
@@ -100,7 +132,7 @@ def _reject(drive: Constants, odometry: Sequence[Edge], best: MotionSolution) ->
         if drive.penalties[left].sum() <= MOTION_PENALTY:
             break
         if consistent is None:
-            consistent = consistent_pairs(odometry, drive.closures, drive.strict_bound)
+            consistent = consistent_pairs(odometry, drive.closures, drive.claimed_bound)
         group = largest_consistent(consistent, left)
         if group.sum() < MIN_GROUP or drive.penalties[group].sum() <= MOTION_PENALTY:
             break
@@ -109,10 +141,12 @@ def _reject(drive: Constants, odometry: Sequence[Edge], best: MotionSolution) ->
         if jump is None:
             continue
         trial_odometry = [*odometry[: jump.a], jump, *odometry[jump.b :]]
-        start = values_of(_bent(poses_by_id(best.solution.search.values), jump))
+        T_world = poses_by_id(best.solution.search.values)
+        T_new_old = T_world[jump.a] @ jump.T_a_b @ geometry.inverse(T_world[jump.b])
+        bent = np.concatenate([T_world[: jump.b], T_new_old @ T_world[jump.b :]])  # all later poses move along
         rejected = best.rejected.copy()
         rejected[jump.a] = True
-        trial = MotionSolution(drive.solve(trial_odometry, start), rejected)
+        trial = MotionSolution(drive.solve(trial_odometry, values_of(bent)), rejected)
         if trial.cost(drive.inlier_bound) < best.cost(drive.inlier_bound):
             best, consistent, left = trial, None, trial.solution.weights == 0.0
             T_world_a, T_world_b = poses_by_id(trial.solution.search.values)[jump.a : jump.b + 1]
@@ -120,13 +154,7 @@ def _reject(drive: Constants, odometry: Sequence[Edge], best: MotionSolution) ->
     return best
 
 
-def _bent(T_world: Transforms, motion: Edge) -> Transforms:
-    """The poses with another motion between two keyframes; all later ones move along."""
-    T_new_old = T_world[motion.a] @ motion.T_a_b @ geometry.inverse(T_world[motion.b])
-    return np.concatenate([T_world[: motion.b], T_new_old @ T_world[motion.b :]])
-
-
-def _jump(drive: Constants, odometry: Sequence[Edge], group: Mask, weights: Vector) -> Edge | None:
+def _jump(drive: Drive, odometry: Sequence[Edge], group: Mask, weights: Vector) -> Edge | None:
     """The motion that a group of closures contradicts, as they measure it; None if rejecting it costs more.
 
     Only motions that all closures of the group span are possible. Inliers that span a motion contradict the group, so
@@ -144,7 +172,9 @@ def _jump(drive: Constants, odometry: Sequence[Edge], group: Mask, weights: Vect
         return None
     rows = first + np.flatnonzero(against <= against.min() + 1e-9)
     T_world = np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
-    T_drift = _drift(drive.closures[np.flatnonzero(group)[group.sum() // 2]], T_world)
+    closure = drive.closures[np.flatnonzero(group)[group.sum() // 2]]
+    T_drift = T_world[closure.a] @ closure.T_a_b @ geometry.inverse(T_world[closure.b])  # of later poses, by the jump
+    T_drift = T_drift if closure.a < closure.b else geometry.inverse(T_drift)
     corrected = np.linalg.inv(T_world[rows]) @ T_drift @ T_world[rows + 1]
     gains = [
         _roughness(odometry, row, odometry[row].T_a_b) - _roughness(odometry, row, T_a_b)
@@ -155,14 +185,8 @@ def _jump(drive: Constants, odometry: Sequence[Edge], group: Mask, weights: Vect
     return Edge(row, row + 1, corrected[best], noise.UNKNOWN_MOTION)
 
 
-def _drift(closure: Edge, T_world: Transforms) -> Transform:
-    """The transform, in the world frame, by which the jump moved all later poses."""
-    T_drift = T_world[closure.a] @ closure.T_a_b @ geometry.inverse(T_world[closure.b])
-    return T_drift if closure.a < closure.b else geometry.inverse(T_drift)
-
-
 def _roughness(odometry: Sequence[Edge], row: int, T_a_b: Transform) -> float:
     """Difference of a motion from the motions before and after it (m)."""
     around = [odometry[k].T_a_b for k in (row - 1, row + 1) if 0 <= k < len(odometry)]
     apart = [geometry.inverse(T_other) @ T_a_b for T_other in around]
-    return sum(geometry.distance(T) + TURN_M * geometry.angle(T) for T in apart)
+    return sum(geometry.distance(T) + noise.TURN_M * geometry.angle(T) for T in apart)

@@ -1,6 +1,7 @@
 """Noise models of the edges: odometry, closures, first pose."""
 
 import math
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -101,14 +102,9 @@ def inlier_bound(probability: float, *, error_allowance: float = 1.0) -> float:
 def robust_kernel(name: str, inlier_bound: float) -> Kernel | None:
     """A robust kernel as wide as the bound of inliers; None for least squares (`none`)."""
     estimators = gtsam.noiseModel.mEstimator
-    width = math.sqrt(inlier_bound)
-    match name:
-        case "none":
-            return None
-        case "huber":
-            return estimators.Huber.Create(width)
-        case "cauchy":
-            return estimators.Cauchy.Create(width)
-        case "geman-mcclure":
-            return estimators.GemanMcClure.Create(width)
-    raise ValueError(f"no kernel {name}")
+    kinds: dict[str, Any] = {
+        "huber": estimators.Huber,
+        "cauchy": estimators.Cauchy,
+        "geman-mcclure": estimators.GemanMcClure,
+    }
+    return None if name == "none" else kinds[name].Create(math.sqrt(inlier_bound))

@@ -32,18 +32,14 @@ class KeyframeSelector:
         elif self._T_odom_last is not None:
             self.travel_m += geometry.distance(geometry.inverse(self._T_odom_last) @ T_odom_lidar)
         self._T_odom_last = T_odom_lidar
-        is_keyframe = (
-            break_m > 0
-            or self._T_odom_keyframe is None
-            or self._is_far(geometry.inverse(self._T_odom_keyframe) @ T_odom_lidar)
-        )
+        is_keyframe = break_m > 0 or self._T_odom_keyframe is None
+        if self._T_odom_keyframe is not None:
+            moved = geometry.inverse(self._T_odom_keyframe) @ T_odom_lidar
+            is_keyframe |= geometry.distance(moved) >= self._config.distance_m
+            is_keyframe |= geometry.angle(moved) >= math.radians(self._config.angle_deg)
         if is_keyframe:
             self._T_odom_keyframe = T_odom_lidar
         return is_keyframe
-
-    def _is_far(self, T_keyframe_lidar: Transform) -> bool:
-        distance_m, angle_rad = geometry.distance(T_keyframe_lidar), geometry.angle(T_keyframe_lidar)
-        return distance_m >= self._config.distance_m or angle_rad >= math.radians(self._config.angle_deg)
 
 
 def downsample_keyframe(

@@ -91,14 +91,21 @@ def detect_encoding(num_points_of_id: Histogram) -> Encoding:
     one encoding remains.
     """
     ids = np.flatnonzero(num_points_of_id)
-    possible = [encoding for encoding in ENCODINGS if _has_all(encoding, ids)]
-    if len(possible) > 1:
-        possible = [encoding for encoding in possible if _looks_like_a_street(num_points_of_id, encoding)]
+    fitting = [
+        encoding for encoding, table in _TABLES.items() if (table[np.minimum(ids, len(table) - 1)] != UNKNOWN).all()
+    ]
+    possible = fitting
+    if len(fitting) > 1:
+        possible = [encoding for encoding in fitting if _looks_like_a_street(num_points_of_id, encoding)]
     if len(possible) != 1:
         shown = ", ".join(str(value) for value in ids[:30]) or "none"
+        why = "no encoding contains all of them"
+        if fitting:
+            shares = "the shares of road and two-wheelers do not decide between these"
+            why = f"they fit {' and '.join(fitting)}, and {shares}"
         raise SegslamError(
-            f"the numbering of the classes cannot be detected (ids: {shown}): "
-            f"{_why_undecided(ids)}; pass --encoding {'|'.join(ENCODINGS)}"
+            f"the numbering of the classes cannot be detected (ids: {shown}): {why}; "
+            f"pass --encoding {'|'.join(ENCODINGS)}"
         )
     return possible[0]
 
@@ -108,18 +115,6 @@ def _looks_like_a_street(num_points_of_id: Histogram, encoding: Encoding) -> boo
     share = np.bincount(to_labels(ids, encoding), num_points_of_id[ids], minlength=len(Label))
     share = share / max(1, num_points_of_id.sum())
     return bool(share[list(RARE)].sum() <= RARE_MAX_SHARE and share[Label.ROAD] >= ROAD_MIN_SHARE)
-
-
-def _why_undecided(ids: Ids) -> str:
-    fitting = [encoding for encoding in ENCODINGS if _has_all(encoding, ids)]
-    if not fitting:
-        return "no encoding contains all of them"
-    return f"they fit {' and '.join(fitting)}, and the shares of road and two-wheelers do not decide between these"
-
-
-def _has_all(encoding: Encoding, ids: Ids) -> bool:
-    table = _TABLES[encoding]
-    return bool((table[np.minimum(ids, len(table) - 1)] != UNKNOWN).all())
 
 
 def _table(label_of_id: dict[int, Label]) -> Labels:

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.core.paths import expanded
 from segslam.core.types import BadScan, Label, Labels, Mask, Points, ScanLabels, SegslamError, Vector
-from segslam.core.whole_files import whole_file
+from segslam.core.whole_files import expanded, whole_file
 from segslam.labels.encodings import Encoding, Histogram, Ids, detect_encoding, to_ids, to_labels
 from segslam.labels.network import Network, open_network
 
@@ -156,13 +155,8 @@ def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | N
     named = _labelled(folder, scan_names)
     if len(named) < len(scan_names):
         logger.warning("%s: %d of %d scans have no label file", folder, len(scan_names) - len(named), len(scan_names))
-    return LabelFiles(folder, encoding or encoding_of(_spread(folder, named)))
-
-
-def _spread(folder: Path, names: list[str]) -> list[Path]:
-    """Files from which the encoding is detected, spread over the drive."""
-    rows = np.unique(np.linspace(0, len(names) - 1, FILES_LOOKED_AT).astype(int))
-    return [folder / f"{names[row]}.label" for row in rows]
+    spread = np.unique(np.linspace(0, len(named) - 1, FILES_LOOKED_AT).astype(int))
+    return LabelFiles(folder, encoding or encoding_of([folder / f"{named[row]}.label" for row in spread]))
 
 
 def _histogram(file: Path) -> Histogram:

@@ -4,10 +4,9 @@ SalsaNext, CENet, SqueezeSegV3, MINet and 3D-MiniNet use the same files. Classes
 numbers differ between data sets.
 """
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel
+from pydantic import AfterValidator, AliasPath, BaseModel, Field
 
 from segslam.core.types import Label, SegslamError
 
@@ -41,71 +40,56 @@ def _check_channels(values: tuple[float, ...]) -> tuple[float, ...]:
 Channels = Annotated[tuple[float, ...], AfterValidator(_check_channels)]
 
 
-class _Size(BaseModel):
-    width: int
-    height: int
+def _at(*keys: str, default: Any = ...) -> Any:
+    """A field whose value is at this place of the file."""
+    return Field(default, validation_alias=AliasPath(*keys))
 
 
-class _Sensor(BaseModel):
-    type: Literal["spherical"] = "spherical"
-    fov_up: float
-    fov_down: float
-    fov_left: float = -180.0
-    fov_right: float = 180.0
-    img_prop: _Size
-    img_means: Channels
-    img_stds: Channels
+SENSOR, VOTES = ("dataset", "sensor"), ("post", "KNN")
 
 
-class _Dataset(BaseModel):
-    sensor: _Sensor
+class VoteParameters(BaseModel):
+    """Parameters of the vote, under their names in the file."""
 
-
-class _VoteParameters(BaseModel):
     knn: int
     search: int
     sigma: float
     cutoff: float
 
 
-class _Votes(BaseModel):
-    use: bool
-    params: _VoteParameters | bool = False
-
-
-class _Post(BaseModel):
-    KNN: _Votes
-
-
 class Architecture(BaseModel):
     """The keys of an `arch_cfg.yaml` that are used; the others concern training."""
 
-    dataset: _Dataset
-    post: _Post
+    projection: Literal["spherical"] = _at(*SENSOR, "type", default="spherical")
+    fov_up: float = _at(*SENSOR, "fov_up")
+    fov_down: float = _at(*SENSOR, "fov_down")
+    fov_left: float = _at(*SENSOR, "fov_left", default=-180.0)
+    fov_right: float = _at(*SENSOR, "fov_right", default=180.0)
+    width: int = _at(*SENSOR, "img_prop", "width")
+    height: int = _at(*SENSOR, "img_prop", "height")
+    mean: Channels = _at(*SENSOR, "img_means")
+    std: Channels = _at(*SENSOR, "img_stds")
+    uses_votes: bool = _at(*VOTES, "use")
+    votes: VoteParameters | bool = _at(*VOTES, "params", default=False)
 
     def settings(self) -> dict[str, Any]:
         """The same as keys of a network's YAML file, without the classes."""
-        sensor = self.dataset.sensor
+        votes: dict[str, Any] = {"window": 1, "neighbours": 1}  # without a vote, a point has the class of its pixel
+        if self.uses_votes and isinstance(self.votes, VoteParameters):
+            votes = {
+                "window": self.votes.search,
+                "neighbours": self.votes.knn,
+                "sigma_px": self.votes.sigma,
+                "cutoff_m": self.votes.cutoff or NO_CUTOFF_M,
+            }
         return {
-            "field_of_view_deg": (sensor.fov_down, sensor.fov_up),
-            "azimuth_deg": (sensor.fov_left, sensor.fov_right),
-            "height": sensor.img_prop.height,
-            "width": sensor.img_prop.width,
-            "mean": sensor.img_means,
-            "std": sensor.img_stds,
-            "votes": self._votes(),
-        }
-
-    def _votes(self) -> dict[str, Any]:
-        """The settings of the vote; without a vote, a point has the class of its pixel."""
-        parameters = self.post.KNN.params
-        if not self.post.KNN.use or isinstance(parameters, bool):
-            return {"window": 1, "neighbours": 1}
-        return {
-            "window": parameters.search,
-            "neighbours": parameters.knn,
-            "sigma_px": parameters.sigma,
-            "cutoff_m": parameters.cutoff or NO_CUTOFF_M,
+            "field_of_view_deg": (self.fov_down, self.fov_up),
+            "azimuth_deg": (self.fov_left, self.fov_right),
+            "height": self.height,
+            "width": self.width,
+            "mean": self.mean,
+            "std": self.std,
+            "votes": votes,
         }
 
 
@@ -130,11 +114,6 @@ class ClassMap(BaseModel):
 def is_architecture(values: Any) -> bool:
     """True if the content of a YAML file is that of an `arch_cfg.yaml`."""
     return isinstance(values, dict) and isinstance(values.get("dataset"), dict) and "sensor" in values["dataset"]
-
-
-def class_map_file(architecture: Path) -> Path:
-    """The file with the classes of a network."""
-    return architecture.with_name(DATA)
 
 
 def _label(name: str) -> Label:

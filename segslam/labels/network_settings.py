@@ -1,18 +1,18 @@
 """Settings of a network: format of its input and meaning of its output, from the YAML file beside the model."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from segslam.core.config import LabelName, Section
+from segslam.core.config.files import validated
 from segslam.core.config.yaml_text import parse_yaml
 from segslam.core.errors import brief
 from segslam.core.types import SegslamError
-from segslam.labels.network_import import ARCH, DATA, Architecture, ClassMap, class_map_file, is_architecture
+from segslam.labels.network_import import ARCH, DATA, Architecture, ClassMap, is_architecture
 
 Channel = Literal["range", "x", "y", "z", "intensity", "mask"]
-Model = TypeVar("Model", bound=BaseModel)
 
 
 def _check_odd(value: int) -> int:
@@ -88,28 +88,28 @@ def read_settings(file: Path) -> NetworkSettings:
     """
     values = _read_yaml(file)
     if is_architecture(values):
-        return _checked(NetworkSettings, _imported(file, {}), file)
+        return validated(NetworkSettings, _imported(file, {}), str(file))
     if isinstance(values, dict) and isinstance(values.get("import"), str):
         source = file.parent / values.pop("import")
         try:
             values = _imported(source, values) | values
         except SegslamError as error:
             raise SegslamError(f"{file}: import: {brief(str(error), 300)}") from error
-    return _checked(NetworkSettings, values, file)
+    return validated(NetworkSettings, values, str(file))
 
 
 def _imported(architecture: Path, given: dict[str, Any]) -> dict[str, Any]:
     """The settings in an `arch_cfg.yaml`, and in the `data_cfg.yaml` beside it unless `classes` are given."""
-    settings = _checked(Architecture, _read_yaml(architecture), architecture).settings()
+    settings = validated(Architecture, _read_yaml(architecture), str(architecture)).settings()
     if "classes" in given:
         return settings
-    file = class_map_file(architecture)
+    file = architecture.with_name(DATA)
     if not file.is_file():
         raise SegslamError(
             f"{file}: no such file; {architecture.name} does not contain the classes: copy the network's "
             "config/labels/semantic-kitti.yaml there"
         )
-    class_map = _checked(ClassMap, _read_yaml(file), file)
+    class_map = validated(ClassMap, _read_yaml(file), str(file))
     try:
         return settings | {"classes": class_map.classes()}
     except SegslamError as error:
@@ -124,13 +124,3 @@ def _read_yaml(file: Path) -> Any:
             f"{file}: cannot be read ({error}); a network needs this file beside its model, or the {ARCH} and {DATA} "
             "that were published with it"
         ) from error
-
-
-def _checked(model: type[Model], values: Any, file: Path) -> Model:
-    try:
-        return model.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = brief(".".join(str(part) for part in first["loc"]))
-        known = f"; known: {', '.join(model.model_fields)}" if first["type"] == "extra_forbidden" else ""
-        raise SegslamError(f"{file}: {key + ': ' if key else ''}{brief(first['msg'], 300)}{known}") from error

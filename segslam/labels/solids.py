@@ -6,8 +6,7 @@ import numpy as np
 from scipy.ndimage import label
 
 from segslam.core.kernels import kernel
-from segslam.core.types import Indices, Mask, Points, Vector
-from segslam.labels.cells import grid_cells
+from segslam.core.types import IndexPairs, Indices, Mask, Points, Vector
 
 CELL_M = 0.3
 """Chosen: objects nearer to each other than this form one segment."""
@@ -45,6 +44,18 @@ def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
     np.maximum.at(top_m, of_point[chosen], heights[chosen])
     sides_m = _tightest_rectangles(points, of_point, chosen, num_pieces, DIRECTIONS)
     return Pieces(of_point, num_points, top_m, sides_m[:, 0], sides_m[:, 1])
+
+
+def grid_cells(points: Points, cell_m: float, *, border: int) -> tuple[IndexPairs, Vector, tuple[int, int]]:
+    """The cell (n, 2) of each point, the corner of the grid (m), and the number of rows and columns.
+
+    The grid contains all points and a margin of `border` empty cells.
+    """
+    whole = [np.floor(points[:, axis] / cell_m) for axis in (0, 1)]
+    first = np.array([column.min() if len(points) else 0.0 for column in whole]) - border
+    cells = np.column_stack([column - start for column, start in zip(whole, first, strict=True)]).astype(np.int64)
+    rows, columns = (int(cells[:, axis].max(initial=0)) + border + 1 for axis in (0, 1))
+    return cells, first * cell_m, (rows, columns)
 
 
 @kernel("float64[:, ::1](float64[:, ::1], int64[::1], boolean[::1], int64, float64[:, ::1])")

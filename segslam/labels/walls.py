@@ -5,7 +5,7 @@ from scipy.ndimage import maximum_filter
 
 from segslam.core.kernels import kernel
 from segslam.core.types import Mask, Points, Vector
-from segslam.labels.cells import grid_cells
+from segslam.labels.solids import grid_cells
 
 CELL_M = 0.6
 """Chosen, like the next constants, by the IoU of buildings on the real KITTI scans 0-2 (`tools/benchmarks/labels`)."""

@@ -52,6 +52,12 @@ class FreeSpace:
     free_path_m: float
     """Median range over the directions with a return: the scale of the place (m); 0 without returns."""
 
+    @property
+    def margins(self) -> Vector:
+        """(2,) distance (m) before a return at which a point violates free space, and its growth per metre of range."""
+        margin_m = min(max(SHARE_OF_PATH * self.free_path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
+        return np.array([margin_m, FREE_SPACE_MARGIN_RATIO])
+
 
 def observe_free_space(points: Points) -> FreeSpace:
     """The spherical image of a scan; `points` (n, 3) in the sensor's frame."""
@@ -90,8 +96,7 @@ def violation(points: Points, seen: FreeSpace, T_view_points: Transform) -> floa
     Only directions with a return count; 0 where there is none.
     """
     moved = geometry.apply(T_view_points, points).astype(np.float32)
-    margins = np.array([_margin_m(seen), FREE_SPACE_MARGIN_RATIO])
-    num_violations, num_seen = _count_violations(moved, seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
+    num_violations, num_seen = _count_violations(moved, seen.nearest_m, seen.lowest_rad, seen.row_rad, seen.margins)
     return num_violations / num_seen if num_seen else 0.0
 
 
@@ -100,13 +105,8 @@ def fates(points: Points, seen: FreeSpace) -> tuple[Mask, Mask]:
 
     `points` (n, 3) in the frame of the scan that sees.
     """
-    margins = np.array([_margin_m(seen), FREE_SPACE_MARGIN_RATIO])
-    found = _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, margins)
+    found = _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, seen.margins)
     return found < 0, found > 0
-
-
-def _margin_m(seen: FreeSpace) -> float:
-    return min(max(SHARE_OF_PATH * seen.free_path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
 
 
 @kernel("UniTuple(int64, 2)(float32, float32, float32, float64, float64)")

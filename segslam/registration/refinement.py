@@ -79,7 +79,7 @@ class Surface:
     @property
     def standing(self) -> Points:
         """(k, 3) points on surfaces steeper than 45 degrees; the scan's z points up."""
-        return self.points[_stands(self.normals)]
+        return self.standing_with_normals[0]
 
     @property
     def standing_with_normals(self) -> tuple[Points, Points]:

@@ -1,11 +1,11 @@
 """Single scans from files: .bin, .npy, .ply, .pcd. All commands read them here."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from segslam.core.types import BadScan, Points, SegslamError, Vector
+from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
 from segslam.scans.npy import parse_npy
 from segslam.scans.pcd import parse_pcd
@@ -18,20 +18,10 @@ TIMES = (*TIME_FIELDS, "timestamps", "stamps")
 """Names of the field with the time of a point; the first that exists is used."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
-    """The points of a file, as stored: float32 if the file has this type, otherwise float64."""
-
-    points: Points
-    times: Vector
-    """(n,) in any unit, from any origin; empty if the file has none."""
-    intensities: Vector | None
-    """The fourth column of .bin and .npy, a field with one of the usual names in .ply and .pcd; None without."""
-
-
 def read_file(file: Path) -> Cloud:
     """The points of a file: .bin (float32 x y z intensity), .npy (n, 3 or more), .ply, .pcd.
 
+    Intensities are the fourth column of .bin and .npy, or a field with one of the usual names in .ply and .pcd.
     Raises SegslamError, naming the file: BadScan for one that is missing, invalid, truncated or too large.
     """
     try:
@@ -74,23 +64,17 @@ def _from_columns(columns: Columns) -> Cloud:
         raise ValueError(f"it has no fields x y z, only {' '.join(columns)[:80] or 'none'}")
     if len(columns["x"]) == 0:
         raise ValueError("it has no points")
+    axes = [columns[axis] for axis in "xyz"]
+    points = np.empty((len(axes[0]), 3), np.result_type(*map(_kind, axes)))
+    for k, axis in enumerate(axes):
+        points[:, k] = axis
     intensities = next((columns[name] for name in INTENSITY_FIELDS if name in columns), None)
     times = next((columns[name] for name in TIMES if name in columns), np.empty(0))
     return Cloud(
-        _stacked([columns[axis] for axis in "xyz"]),
-        times.astype(np.float64),
-        None if intensities is None else _float(intensities),
+        points, times.astype(np.float64), None if intensities is None else intensities.astype(_kind(intensities))
     )
 
 
-def _stacked(axes: list[np.ndarray]) -> Points:
-    dtype = np.float32 if all(axis.dtype.kind == "f" and axis.dtype.itemsize <= 4 for axis in axes) else np.float64
-    points = np.empty((len(axes[0]), 3), dtype)
-    for k, axis in enumerate(axes):
-        points[:, k] = axis
-    return points
-
-
-def _float(values: np.ndarray) -> Vector:
-    """The values as float32 or float64 in the byte order of this machine."""
-    return values.astype(np.float32 if values.dtype.itemsize <= 4 and values.dtype.kind == "f" else np.float64)
+def _kind(values: np.ndarray) -> type[np.floating]:
+    """Type, in the byte order of this machine, that holds the values."""
+    return np.float32 if values.dtype.kind == "f" and values.dtype.itemsize <= 4 else np.float64

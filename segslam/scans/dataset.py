@@ -2,8 +2,8 @@
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from segslam.core.types import (
     Transform,
     Vector,
 )
+from segslam.core.whole_files import expanded
+from segslam.labels.encodings import Encoding
 from segslam.labels.label_files import LabelSource
 from segslam.labels.late import of_rows
 
@@ -32,74 +34,100 @@ NO_TIMES = np.empty(0)
 NO_LIMIT = 2**63 - 1
 
 
-@runtime_checkable
-class Dataset(Protocol):
-    """Scans in order of time, each read when it is accessed.
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """The points of one scan, as its reader finds them: float32 if they are stored so, otherwise float64."""
+
+    points: Points
+    """(n, 3); NaN for beams without return."""
+    times: Vector = field(default_factory=lambda: np.empty(0))
+    """(n,) in any unit, from any origin; empty if there are none."""
+    intensities: Vector | None = None
+    """(n,) in the sensor's unit; None if there are none."""
+    stamp_ns: int | None = None
+    """None if the scan itself has no stamp."""
+
+
+class Dataset:
+    """Scans in order of time, each read when it is accessed; made by `DataSource.open`.
 
     `dataset[row]` raises BadScan for a scan that cannot be used; iteration skips such scans with a warning.
     """
 
-    @property
-    def name(self) -> str:
-        """Name of the data for messages and logs, such as `kitti/00`."""
-        ...
+    name: str
+    """Name of the data for messages and logs, such as `kitti/00`."""
+    scan_index: Indices
+    """The number of each scan."""
+    names: Sequence[str]
+    """The name of each scan, which is also that of its label file."""
+    is_sequential: bool = False
+    """True if reading a scan requires reading those before it, as in a rosbag."""
+    vertical_angle_deg: float
+    """Angle by which the elevation of the points is increased on reading."""
+    labels: LabelSource
+    reference: Trajectory | None
+    """True poses of those scans that have one; None if there is no ground truth."""
+    num_recorded: int
+    """Number of lines in a pose file of the whole data; line n + 1 belongs to scan n, selected or not."""
+    T_camera_lidar: Transform | None = None
+    """Transform if ground-truth files contain camera poses (KITTI); None if they contain LiDAR poses."""
 
-    @property
-    def scan_index(self) -> Indices:
-        """The number of each scan."""
-        ...
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
 
-    @property
-    def is_sequential(self) -> bool:
-        """True if reading a scan requires reading those before it, as in a rosbag."""
-        ...
+    def __len__(self) -> int:
+        return len(self.scan_index)
 
-    @property
-    def names(self) -> Sequence[str]:
-        """The name of each scan, which is also that of its label file."""
-        ...
+    def __getitem__(self, row: int) -> Scan:
+        raise NotImplementedError
 
-    @property
-    def vertical_angle_deg(self) -> float:
-        """Angle by which the elevation of the points is increased on reading."""
-        ...
-
-    @property
-    def labels(self) -> LabelSource:
-        """Source of the labels."""
-        ...
-
-    @property
-    def reference(self) -> Trajectory | None:
-        """True poses of those scans that have one; None if there is no ground truth."""
-        ...
-
-    @property
-    def num_recorded(self) -> int:
-        """Number of lines in a pose file of the whole data; line n + 1 belongs to scan n, selected or not."""
-        ...
-
-    @property
-    def T_camera_lidar(self) -> Transform | None:  # noqa: N802  (a transform)
-        """Transform if ground-truth files contain camera poses (KITTI); None if they contain LiDAR poses."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, row: int) -> Scan: ...
-
-    def __iter__(self) -> Iterator[Scan]: ...
+    def __iter__(self) -> Iterator[Scan]:
+        for row in range(len(self)):
+            try:
+                scan = self[row]
+            except BadScan as error:
+                logger.warning("scan %d skipped: %s", self.scan_index[row], error)
+            else:
+                yield scan
 
 
-def usable_scans(dataset: Dataset) -> Iterator[Scan]:
-    """The scans in order; invalid scans are skipped with a warning."""
-    for row in range(len(dataset)):
+@dataclass(frozen=True, slots=True)
+class DataSource:
+    """Arguments of `open_dataset`, here or on another machine with the same files."""
+
+    data: Path
+    sequence: str = "00"
+    dataset: str | None = None
+    labels: str = "auto"
+    encoding: Encoding | None = None
+    frames: str | None = None
+    topic: str = ""
+    intensities: bool = False
+    vertical_angle_deg: float | None = None
+
+    def open(self) -> Dataset:
+        """The data set, as `open_dataset` opens it."""
+        folder = expanded(self.data)
+        if not folder.exists():
+            raise SegslamError(f"{folder}: no such file or folder; give the folder with sequences/ or with the scans")
+        source = replace(self, data=folder)
+        from segslam.scans.kitti import KittiSequence, is_kitti
+
         try:
-            scan = dataset[row]
-        except BadScan as error:
-            logger.warning("scan %d skipped: %s", dataset.scan_index[row], error)
-        else:
-            yield scan
+            if self.dataset == "kitti" or (self.dataset is None and is_kitti(folder)):
+                if self.topic:
+                    raise no_topics(self.topic)
+                return KittiSequence(source)
+            from segslam.scans.recordings import Recording  # with the libraries of recordings
+
+            return Recording(source)
+        except OSError as error:
+            raise SegslamError(f"{folder}: cannot be read ({error}); check the path and its permissions") from error
+
+
+def no_topics(topic: str) -> SegslamError:
+    """An error for a topic of data that have none."""
+    return SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); omit the option")
 
 
 def make_scan(

@@ -4,8 +4,6 @@ The number of a scan is that of its file. It is also its row in times.txt and in
 files hold poses of the left camera in the frame of the first; this module returns LiDAR poses.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +13,8 @@ from segslam.core import geometry
 from segslam.core.errors import brief
 from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera, read_poses
 from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory, Transform
-from segslam.labels.encodings import Encoding
-from segslam.labels.label_files import LabelSource, open_labels
-from segslam.scans.dataset import check_num_poses, make_scan, read_stamps, selected_rows, usable_scans
+from segslam.labels.label_files import open_labels
+from segslam.scans.dataset import Dataset, DataSource, check_num_poses, make_scan, read_stamps, selected_rows
 from segslam.scans.scan_files import read_bytes
 
 VERTICAL_ANGLE_DEG = 0.205
@@ -30,36 +27,30 @@ LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 """Names of T_camera_lidar in calib.txt, in KITTI's odometry, object and tracking benchmarks."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class KittiSequence:
+class KittiSequence(Dataset):
     """The selected scans of one drive, one row per scan."""
 
-    name: str
-    scan_files: tuple[Path, ...]
-    scan_index: Indices
-    stamp_ns: Indices
-    labels: LabelSource
-    T_camera_lidar: Transform
-    reference: Trajectory | None
-    num_recorded: int
-    has_intensities: bool
-    vertical_angle_deg: float
+    def __init__(self, source: DataSource) -> None:
+        """The sequence of a folder with `sequences/`, or the folder itself if it is a sequence.
 
-    @property
-    def is_sequential(self) -> bool:
-        """False: each scan has its own file."""
-        return False
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Name of each scan's file, without extension."""
-        return tuple(file.stem for file in self.scan_files)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
-
-    def __len__(self) -> int:
-        return len(self.scan_files)
+        Raises SegslamError if the sequence, its scans, its calibration or its times are missing.
+        """
+        folder, poses_file = _find_sequence(source.data, source.sequence)
+        velodyne = folder / "velodyne"
+        files, numbers = _numbered_scans(velodyne)
+        stamps = _stamps_of(folder / "times.txt", numbers)
+        self.T_camera_lidar = read_calibration(folder / "calib.txt")
+        rows = selected_rows(numbers, source.frames, velodyne)
+        self.name = f"kitti/{folder.name}"
+        self.scan_files = [files[row] for row in rows]
+        self.names = [file.stem for file in self.scan_files]
+        self.scan_index = numbers[rows]
+        self.stamp_ns = stamps[self.scan_index]
+        self.num_recorded = len(stamps)
+        self.labels = open_labels(source.labels, beside=folder, scan_names=self.names, encoding=source.encoding)
+        self.reference = _reference(poses_file, self.scan_index, stamps, self.T_camera_lidar)
+        self.vertical_angle_deg = VERTICAL_ANGLE_DEG if source.vertical_angle_deg is None else source.vertical_angle_deg
+        self._has_intensities = source.intensities
 
     def __getitem__(self, row: int) -> Scan:
         """The scan, with corrected vertical angles. Raises BadScan if the file or its labels cannot be used."""
@@ -72,51 +63,14 @@ class KittiSequence:
             int(self.stamp_ns[row]),
             points,
             self.labels.read(file.stem, points, intensities),
-            intensities=intensities if self.has_intensities else None,
+            intensities=intensities if self._has_intensities else None,
             vertical_angle_deg=self.vertical_angle_deg,
         )
-
-    def __iter__(self) -> Iterator[Scan]:
-        return usable_scans(self)
 
 
 def is_kitti(data: Path) -> bool:
     """True if the folder contains KITTI sequences, or is one."""
     return (data / "sequences").is_dir() or _is_sequence(data)
-
-
-def open_kitti(
-    data: Path,
-    *,
-    sequence: str,
-    labels: str,
-    encoding: Encoding | None,
-    frames: str | None,
-    intensities: bool = False,
-    vertical_angle_deg: float | None = None,
-) -> KittiSequence:
-    """The sequence `sequence` of a folder with `sequences/`, or the folder itself if it is a sequence.
-
-    Raises SegslamError if the sequence, its scans, its calibration or its times are missing.
-    """
-    folder, poses_file = _find_sequence(data, sequence)
-    files, numbers = _numbered_scans(folder / "velodyne")
-    all_stamps = _stamps_of(folder / "times.txt", numbers)
-    T_camera_lidar = read_calibration(folder / "calib.txt")
-    rows = selected_rows(numbers, frames, folder / "velodyne")
-    chosen = tuple(files[row] for row in rows)
-    return KittiSequence(
-        name=f"kitti/{folder.name}",
-        scan_files=chosen,
-        scan_index=numbers[rows],
-        stamp_ns=all_stamps[numbers[rows]],
-        labels=open_labels(labels, beside=folder, scan_names=[file.stem for file in chosen], encoding=encoding),
-        T_camera_lidar=T_camera_lidar,
-        reference=_reference(poses_file, numbers[rows], all_stamps, T_camera_lidar),
-        num_recorded=len(all_stamps),
-        has_intensities=intensities,
-        vertical_angle_deg=VERTICAL_ANGLE_DEG if vertical_angle_deg is None else vertical_angle_deg,
-    )
 
 
 def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
@@ -154,10 +108,15 @@ def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
 def read_calibration(file: Path) -> Transform:
     """T_camera_lidar of a calib.txt. Raises SegslamError if the file or the entry is missing or invalid."""
     try:
-        lines = file.read_text(encoding="ascii").splitlines()
+        text = file.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(f"{file}: cannot read the calibration ({error}); put KITTI's calib.txt there") from error
-    for number, line in enumerate(lines, start=1):
+    return parse_calibration(text, file)
+
+
+def parse_calibration(text: str, file: Path) -> Transform:
+    """T_camera_lidar of the text of a calib.txt, as `read_calibration`; `file` is its name in messages."""
+    for number, line in enumerate(text.splitlines(), start=1):
         key, _, values = line.replace(":", " ", 1).strip().partition(" ")
         if key in LIDAR_KEYS:
             return _rigid(values.split(), f"{file}:{number}")

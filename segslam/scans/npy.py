@@ -24,7 +24,11 @@ def parse_npy(content: bytes) -> np.ndarray:
     (num_header,) = struct.unpack_from(size, content, 8)
     if num_header > MAX_HEADER_BYTES or start + num_header > len(content):
         raise ValueError("its header is damaged or truncated")
-    match _dictionary(content[start : start + num_header].decode("latin-1")):
+    try:
+        header = ast.literal_eval(content[start : start + num_header].decode("latin-1").strip())
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
+        raise ValueError(f"its header is damaged ({type(error).__name__})") from error
+    match header:
         case {"descr": str(kind), "fortran_order": bool(by_columns), "shape": (int(rows), int(columns))}:
             pass
         case _:
@@ -38,10 +42,3 @@ def parse_npy(content: bytes) -> np.ndarray:
     if rows == 0:
         raise ValueError("it has no points")
     return np.frombuffer(content, kind, offset=start).reshape((rows, columns), order="F" if by_columns else "C")
-
-
-def _dictionary(text: str) -> object:
-    try:
-        return ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
-        raise ValueError(f"its header is damaged ({type(error).__name__})") from error

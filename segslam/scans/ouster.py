@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from segslam.core.types import Points, Vector
+from segslam.scans.dataset import Cloud
 from segslam.scans.pcap import udp_payloads
 
 
@@ -99,7 +99,7 @@ class _Sensor:
 
 
 class OusterFrames:
-    """The frames of a recording: points in the sensor's frame with their times. Replaces kiss_icp's reader.
+    """The frames of a recording: points in the sensor's frame. Replaces kiss_icp's reader.
 
     Raises ValueError if the file is not a pcap or the metadata do not match its packets, FileNotFoundError if there are
     no metadata.
@@ -110,35 +110,30 @@ class OusterFrames:
         with file.open("rb") as stream:
             self._content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self._frames = self._find_frames()
-        self.stamp_ns = 0
-        """Stamp of the first column of the last frame read."""
-        self.intensities = np.empty(0)
-        """Reflectivity of each point of the last frame read, in the sensor's unit."""
 
     def __len__(self) -> int:
         return len(self._frames)
 
-    def __getitem__(self, index: int) -> tuple[Points, Vector]:
-        """(n, 3) points (m) of the beams that returned, and (n,) times (s) since the first column."""
+    def __getitem__(self, index: int) -> Cloud:
+        """The beams that returned; times (s) count from the first column, whose stamp is that of the cloud."""
         columns = np.concatenate([self._columns(payload) for payload in self._frames[index]])
         columns = columns[(columns["status"] & 1).astype(bool)]
         if len(columns) == 0:
             raise ValueError("no valid column in this frame")
-        self.stamp_ns = int(columns["stamp_ns"].min())
+        first_ns = columns["stamp_ns"].min()
         channel = CHANNELS[self._sensor.profile]
         counts = columns["channels"]["range"] & ((1 << channel.range_bits) - 1)
         ranges_mm = counts.astype(np.float64) * channel.mm_per_count
         column, beam = np.nonzero(ranges_mm)
-        self.intensities = columns["channels"]["reflectivity"][column, beam].astype(np.float64)
         rays, origins = self._rays_and_origins
         measured = columns["measurement"][column].astype(np.intp)
         points_mm = rays[measured, beam] * ranges_mm[column, beam, None] + origins[measured, beam]
-        times = (columns["stamp_ns"] - np.uint64(self.stamp_ns)) * 1e-9
-        return points_mm * 1e-3, times[column]
-
-    def get_frames_timestamps(self) -> list[float]:
-        """Start of the last frame read, in seconds of the sensor's clock."""
-        return [self.stamp_ns * 1e-9]
+        return Cloud(
+            points_mm * 1e-3,
+            ((columns["stamp_ns"] - first_ns) * 1e-9)[column],
+            columns["channels"]["reflectivity"][column, beam].astype(np.float64),
+            int(first_ns),
+        )
 
     def _find_frames(self) -> list[list[list[slice]]]:
         """Payloads by frame. A frame starts where the column number decreases by more than half a revolution."""

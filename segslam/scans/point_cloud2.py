@@ -1,10 +1,13 @@
-"""Points and times of ROS's PointCloud2 messages."""
+"""Clouds of ROS's PointCloud2 messages."""
 
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from segslam.core.types import Points, Vector
+from segslam.scans.dataset import Cloud
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time")
 """Names that drivers (Ouster, Velodyne, Hesai, Robosense, Livox) use for the time of a point, in any unit."""
@@ -14,27 +17,46 @@ KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of sensor_msgs/PointField by number."""
 
 
-class CloudReader:
-    """Replaces kiss_icp's function, which misaligns points and times if a cloud contains a NaN."""
+class MessageClouds:
+    """Clouds of a recording that gives the log time (ns) and the decoded message of each.
 
-    def __init__(self) -> None:
-        self.stamp_ns = 0
-        """Stamp in the last message's header; 0 if there was none."""
-        self.intensities: Vector | None = None
-        """Intensities of the last message's points; None if there were none."""
+    The stamp is that in the header, or the log time if the headers have none.
+    """
 
-    def __call__(self, message: Any) -> tuple[Points, Vector]:
-        """Points (n, 3) and times (n,) of a message; NaN for beams without return; no times if it has none.
+    def __init__(self, messages: Any) -> None:
+        self._messages: Sequence[tuple[int, Any]] = messages
+        self.is_sequential: bool = messages.is_sequential
+        stamps_ns = []  # of the first two messages: one alone may be 0, at the start of a clock
+        for index in range(min(2, len(self))):
+            with suppress(Exception):  # a damaged message, which is reported when its scan is read
+                stamps_ns.append(stamp_ns_of(messages[index][1]))
+        self._has_stamps = any(stamps_ns) or not stamps_ns
 
-        Raises KeyError, TypeError or ValueError for an inconsistent message or one without x, y, z.
-        """
-        self.stamp_ns = stamp_ns_of(message)
-        rows = _rows(message)
-        points = np.column_stack([rows[axis].ravel() for axis in "xyz"]).astype(np.float64)
-        name = next((name for name in INTENSITY_FIELDS if name in (rows.dtype.names or ())), None)
-        self.intensities = rows[name].ravel().astype(np.float64) if name else None
-        time_field = next((field.name for field in message.fields if field.name in TIME_FIELDS), None)
-        return points, rows[time_field].ravel().astype(np.float64) if time_field else np.empty(0)
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def __getitem__(self, index: int) -> Cloud:
+        """Raises what the reader raises for a damaged message."""
+        log_ns, message = self._messages[index]
+        cloud = read_message(message)
+        return cloud if self._has_stamps else replace(cloud, stamp_ns=log_ns)
+
+
+def read_message(message: Any) -> Cloud:
+    """The cloud of a message. Replaces kiss_icp's function, which misaligns points and times if a cloud contains a NaN.
+
+    Raises KeyError, TypeError or ValueError for an inconsistent message or one without x, y, z.
+    """
+    rows = _rows(message)
+    points = np.column_stack([rows[axis].ravel() for axis in "xyz"]).astype(np.float64)
+    intensity = next((name for name in INTENSITY_FIELDS if name in (rows.dtype.names or ())), None)
+    time = next((field.name for field in message.fields if field.name in TIME_FIELDS), None)
+    return Cloud(
+        points,
+        rows[time].ravel().astype(np.float64) if time else np.empty(0),
+        rows[intensity].ravel().astype(np.float64) if intensity else None,
+        stamp_ns_of(message),
+    )
 
 
 def stamp_ns_of(message: Any) -> int:

@@ -6,7 +6,7 @@ The number of a scan is its position in the recording.
 import contextlib
 import io
 import warnings
-from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +14,24 @@ import numpy as np
 
 from segslam.core.errors import brief
 from segslam.core.trajectory import read_poses
-from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory, Vector
-from segslam.labels.encodings import Encoding
-from segslam.labels.label_files import LabelSource, open_labels
-from segslam.scans.bag_clouds import BagClouds
-from segslam.scans.clouds import read_intensities
+from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory
+from segslam.labels.label_files import open_labels
+from segslam.scans.bag_messages import BagMessages
+from segslam.scans.clouds import read_file
 from segslam.scans.dataset import (
     ASSUMED_PERIOD_NS,
+    Cloud,
+    Dataset,
+    DataSource,
     check_num_poses,
     make_scan,
+    no_topics,
     read_stamps,
     selected_rows,
-    usable_scans,
 )
-from segslam.scans.mcap_clouds import McapClouds
-from segslam.scans.message_clouds import MessageClouds
+from segslam.scans.mcap_messages import McapMessages
 from segslam.scans.ouster import OusterFrames
+from segslam.scans.point_cloud2 import MessageClouds
 from segslam.scans.scan_folder import ScanFolder, scan_files
 from segslam.scans.sweep_times import sweep_times
 
@@ -43,95 +45,71 @@ FOREIGN_ERRORS = (Exception, SystemExit)
 """Readers of other projects raise anything for damaged data; it becomes an error that names the file."""
 
 
-class Recording:
+class Recording(Dataset):
     """The selected scans of a recording. If it can only be read in order, going back restarts it."""
 
-    T_camera_lidar = None
+    def __init__(self, source: DataSource) -> None:
+        """The kind is that named by `source.dataset`, or found from the file or folder.
 
-    def __init__(
-        self,
-        kind: str,
-        source: Path,
-        loader: Any,
-        *,
-        labels: str,
-        encoding: Encoding | None,
-        frames: str | None,
-        intensities: bool,
-        vertical_angle_deg: float,
-    ) -> None:
-        beside = _beside(source)
+        Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan.
+        """
+        kind, self._source, self._loader = _opened(source)
+        beside = _beside(self._source)
         self.name = f"{kind}/{beside.resolve().name}"
-        self._source = source
-        self._loader = loader
-        self._has_intensities = intensities
-        self.vertical_angle_deg = vertical_angle_deg
-        self.is_sequential = bool(getattr(loader, "is_sequential", False))
-        self._stamps = _whole_stamps(beside / "times.txt", len(loader)) if kind == "generic" else None
-        self.num_recorded = len(loader)
-        self.scan_index = selected_rows(np.arange(len(loader)), frames, source)
+        self._has_intensities = source.intensities
+        self.vertical_angle_deg = source.vertical_angle_deg or 0.0
+        self.is_sequential = bool(getattr(self._loader, "is_sequential", False))
+        self.num_recorded = len(self._loader)
+        self._stamps = _whole_stamps(beside / "times.txt", self.num_recorded) if kind == "generic" else None
+        self.scan_index = selected_rows(np.arange(self.num_recorded), source.frames, self._source)
         self.names = [self._file(int(index)).stem for index in self.scan_index]
-        self.labels: LabelSource = open_labels(labels, beside=beside, scan_names=self.names, encoding=encoding)
+        self.labels = open_labels(source.labels, beside=beside, scan_names=self.names, encoding=source.encoding)
         self.reference = self._reference(beside / "poses.txt" if kind == "generic" else None)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
-
-    def __len__(self) -> int:
-        return len(self.scan_index)
 
     def __getitem__(self, row: int) -> Scan:
         """The scan. Raises BadScan if its reader fails on it or its labels cannot be used."""
         index = int(self.scan_index[row])
         file = self._file(index)
-        points, times = self._read(index, file)
-        intensities = self._intensities(file, len(points))
-        stamp_ns = self._stamp_ns(index)
+        cloud = self._read(index, file)
+        stamp_ns = self._stamp_ns(index, cloud)
         if abs(stamp_ns) >= 2**63:
             raise BadScan(f"{file}: its stamp {stamp_ns} ns is more than 292 years; correct the sensor's clock")
         return make_scan(
             file,
             index,
             stamp_ns,
-            points,
-            self.labels.read(file.stem, points, intensities),
-            sweep_times(times, len(points), stamp_ns * 1e-9),
-            intensities=intensities if self._has_intensities else None,
+            cloud.points,
+            self.labels.read(file.stem, cloud.points, cloud.intensities),
+            sweep_times(cloud.times, len(cloud.points), stamp_ns * 1e-9),
+            intensities=cloud.intensities if self._has_intensities else None,
             vertical_angle_deg=self.vertical_angle_deg,
         )
 
-    def __iter__(self) -> Iterator[Scan]:
-        return usable_scans(self)
-
-    def _read(self, index: int, file: Path) -> tuple[np.ndarray, np.ndarray]:
+    def _read(self, index: int, file: Path) -> Cloud:
+        """The cloud of a scan; readers of kiss_icp give points, or points and times."""
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 item = self._loader[index]
-            points, times = item if isinstance(item, tuple) else (item, np.empty(0))
-            points = np.asarray(points).reshape(-1, 3)
+            if not isinstance(item, Cloud):
+                item = Cloud(*item) if isinstance(item, tuple) else Cloud(item)
+                if self._has_intensities or self.labels.network:
+                    with contextlib.suppress(SegslamError):  # a file with another layout than KITTI's
+                        item = replace(item, intensities=read_file(file).intensities)
+            points = np.asarray(item.points).reshape(-1, 3)
             points = points if points.dtype == np.float32 else points.astype(np.float64)
-            return points, np.asarray(times, dtype=np.float64).ravel()
+            fits = item.intensities is not None and len(item.intensities) == len(points)
+            times = np.asarray(item.times, dtype=np.float64).ravel()
+            return Cloud(points, times, item.intensities if fits else None, item.stamp_ns)
         except BadScan:
             raise
         except FOREIGN_ERRORS as error:
             raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
 
-    def _intensities(self, file: Path, num_points: int) -> Vector | None:
-        """Intensities of the scan read last, if requested and known."""
-        if not self._has_intensities and self.labels.network is None:
-            return None
-        known = getattr(self._loader, "intensities", None)
-        if not hasattr(self._loader, "intensities"):
-            with contextlib.suppress(SegslamError):  # a file with another layout than KITTI's
-                known = read_intensities(file)
-        return known if known is not None and len(known) == num_points else None
-
-    def _stamp_ns(self, index: int) -> int:
-        """Stamp of the scan that was read last; some readers know it only then."""
+    def _stamp_ns(self, index: int, cloud: Cloud | None = None) -> int:
         if self._stamps is not None:
             return int(self._stamps[index])
-        if hasattr(self._loader, "stamp_ns"):
-            return int(self._loader.stamp_ns)
+        if cloud is not None and cloud.stamp_ns is not None:
+            return cloud.stamp_ns
         if not hasattr(self._loader, "get_frames_timestamps"):
             return index * ASSUMED_PERIOD_NS
         return round(float(np.squeeze(self._loader.get_frames_timestamps()[index])) * 1e9)
@@ -153,54 +131,32 @@ class Recording:
         return Trajectory(posed, np.array([self._stamp_ns(int(index)) for index in posed]), poses[posed])
 
 
-def open_recording(
-    data: Path,
-    *,
-    kind: str | None,
-    sequence: str,
-    topic: str,
-    labels: str,
-    encoding: Encoding | None,
-    frames: str | None,
-    intensities: bool = False,
-    vertical_angle_deg: float = 0.0,
-) -> Recording:
-    """A recording by the name of its kind, or by detecting the kind from the file or folder.
-
-    Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan.
-    """
+def _opened(source: DataSource) -> tuple[str, Path, Any]:
+    """Kind of the data, file or folder with the scans, and their reader."""
     kinds = known_kinds()
-    if kind is not None and kind not in kinds:
-        raise SegslamError(f"--dataset {kind}: no such kind of data; known: {', '.join(kinds)}")
-    kind = kind or _kind_of(data)
-    if topic and kind not in WITH_TOPICS:
-        raise SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); omit the option")
-    source = _scans_folder(data) if kind == "generic" else data
+    if source.dataset is not None and source.dataset not in kinds:
+        raise SegslamError(f"--dataset {source.dataset}: no such kind of data; known: {', '.join(kinds)}")
+    kind = source.dataset or _kind_of(source.data)
+    if source.topic and kind not in WITH_TOPICS:
+        raise no_topics(source.topic)
+    place = _scans_folder(source.data) if kind == "generic" else source.data
     printed = io.StringIO()
     try:
         silence = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO())
         with silence[0], silence[1], warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings about kiss_icp's sources, which it parses to find its readers
-            loader = _loader(kind, source, sequence, topic)
+            loader = _loader(kind, place, source.sequence, source.topic)
             num_scans = len(loader)
     except SegslamError:
         raise
     except FOREIGN_ERRORS as error:
         complaint = " ".join(printed.getvalue().split()) if isinstance(error, SystemExit) else _reason(error)
         remedy = REMEDIES.get(kind, "") if "mcap recover" not in complaint else ""
-        raise SegslamError(f"{data}: cannot be opened as {kind} data ({complaint}); see --dataset{remedy}") from error
+        what = f"cannot be opened as {kind} data ({complaint}); see --dataset{remedy}"
+        raise SegslamError(f"{source.data}: {what}") from error
     if num_scans == 0:
-        raise SegslamError(f"{data}: the reader for {kind} data finds no scan in it; see --dataset")
-    return Recording(
-        kind,
-        source,
-        loader,
-        labels=labels,
-        encoding=encoding,
-        frames=frames,
-        intensities=intensities,
-        vertical_angle_deg=vertical_angle_deg,
-    )
+        raise SegslamError(f"{source.data}: the reader for {kind} data finds no scan in it; see --dataset")
+    return kind, place, loader
 
 
 def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
@@ -209,9 +165,9 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
         case "generic":
             return ScanFolder(source)
         case "mcap":
-            return MessageClouds(McapClouds(source, topic))
+            return MessageClouds(McapMessages(source, topic))
         case "rosbag":
-            return MessageClouds(BagClouds(source, topic))
+            return MessageClouds(BagMessages(source, topic))
         case "ouster":
             return OusterFrames(source)
     from kiss_icp.datasets import dataset_factory

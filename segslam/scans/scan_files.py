@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from segslam.core.errors import brief
 from segslam.core.types import BadScan
-from segslam.scans.numbers import parse_numbers
 
 MAX_SCAN_BYTES = 2**30
 """Largest file that is read as one scan. Chosen: 60 million points of 16 bytes, 200 times the largest known sweep."""
@@ -30,7 +30,8 @@ class Field(NamedTuple):
 def read_bytes(file: Path) -> bytes:
     """The content of a scan file. Raises BadScan if it cannot be read, or has more than MAX_SCAN_BYTES."""
     try:
-        with open(file, "rb", opener=_without_waiting) as stream:
+        # a pipe is opened without waiting for its writer
+        with open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
             status = os.fstat(stream.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise BadScan(f"{file}: not a regular file; give a scan")
@@ -90,18 +91,27 @@ def text_columns(content: bytes, start: int, num_rows: int, fields: Sequence[Fie
         raise ValueError(
             f"it is truncated: its header claims {wanted} numbers, but {len(content) - start} bytes follow"
         )
-    numbers, end = parse_numbers(content, start, wanted + int(is_last))
-    if len(numbers) != wanted or (end == len(content) > 0 and not content[-1:].isspace()):
-        raise ValueError(f"it is truncated or damaged: its header claims {wanted} numbers, the file has {len(numbers)}")
+    words = content[start:].split(None, wanted)
+    if (
+        len(words) < wanted
+        or (is_last and len(words) > wanted)
+        or (len(words) == wanted and not content[-1:].isspace())
+    ):
+        raise ValueError(f"it is truncated or damaged: its header claims {wanted} numbers, the file has {len(words)}")
+    if content.find(b"_", start) >= 0:
+        raise ValueError("its points contain a _, which is no part of a number")  # Python allows it
+    try:
+        numbers = np.fromiter(map(float, words), np.float64, wanted)
+    except ValueError as error:
+        raise ValueError(brief(str(error))) from error
     rows = numbers.reshape(num_rows, num_columns)
     ends = np.cumsum([field.num_values for field in fields])
-    last = zip(fields, ends, strict=True)
     with np.errstate(over="ignore"):
-        return _by_name([(one.name, rows[:, end - 1].astype(_kept(one))) for one, end in last if one.num_values == 1])
-
-
-def _kept(field: Field) -> type[np.floating]:
-    return np.float32 if field.dtype.kind == "f" and field.dtype.itemsize == 4 else np.float64
+        return _by_name(
+            (one.name, rows[:, end - 1].astype(np.float32 if one.dtype.str[1:] == "f4" else np.float64))
+            for one, end in zip(fields, ends, strict=True)
+            if one.num_values == 1
+        )
 
 
 def check_size(num_bytes: int, expected: int, num_rows: int, *, tolerated: int | None) -> None:
@@ -125,8 +135,3 @@ def _by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
 
 def _empty(fields: Sequence[Field]) -> Columns:
     return {field.name: np.empty(0, field.dtype) for field in fields}
-
-
-def _without_waiting(name: str, flags: int) -> int:
-    """Opens a pipe without waiting for its writer."""
-    return os.open(name, flags | os.O_NONBLOCK)

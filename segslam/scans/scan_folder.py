@@ -3,8 +3,9 @@
 import re
 from pathlib import Path
 
-from segslam.core.types import Points, SegslamError, Vector
+from segslam.core.types import SegslamError
 from segslam.scans.clouds import SUFFIXES, read_file
+from segslam.scans.dataset import Cloud
 
 
 class ScanFolder:
@@ -14,17 +15,13 @@ class ScanFolder:
 
     def __init__(self, folder: Path) -> None:
         self.scan_files = scan_files(folder)
-        self.intensities: Vector | None = None
-        """Intensities of the last scan read; None if it has none."""
 
     def __len__(self) -> int:
         return len(self.scan_files)
 
-    def __getitem__(self, index: int) -> tuple[Points, Vector]:
-        """Points and times of a scan. Raises BadScan, naming the file."""
-        cloud = read_file(self.scan_files[index])
-        self.intensities = cloud.intensities
-        return cloud.points, cloud.times
+    def __getitem__(self, index: int) -> Cloud:
+        """Raises BadScan, naming the file."""
+        return read_file(self.scan_files[index])
 
 
 def scan_files(folder: Path) -> list[Path]:

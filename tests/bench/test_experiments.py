@@ -14,8 +14,14 @@ from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.bench.experiments.pairs import PairList, cut_pairs, read_pairs, sample_pairs, true_poses
 from segslam.bench.experiments.rows import Row, read_rows, write_rows
 from segslam.bench.experiments.summary import figures, results, worst_failures
-from segslam.bench.experiments.trials import ScanVariant, trial
-from segslam.bench.experiments.variations import PAPER_PAIR, pair_trials, turned_trials, unlabelled_trials
+from segslam.bench.experiments.trials import (
+    PAPER_PAIR,
+    ScanVariant,
+    pair_trials,
+    trial,
+    turned_trials,
+    unlabelled_trials,
+)
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import SegslamError, Trajectory
@@ -190,7 +196,7 @@ def test_results_are_compared_with_the_paper_for_the_same_list_only() -> None:
 
 @pytest.mark.data
 def test_the_paper_s_lists_have_as_many_pairs_as_its_table(data_dir: Path) -> None:
-    for sequence, counts in paper.NUM_PAIRS.items():
+    for sequence, counts in zip(paper.SEQUENCES, paper.NUM_PAIRS, strict=True):
         for band, count in zip(paper.LISTS.values(), counts, strict=True):
             assert len(read_pairs(data_dir / "pairs" / f"kitti{sequence}_{band}.txt").pairs) == count
 
@@ -217,7 +223,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[ScanVariant]:
         prepared.append(variant)
         return SharedScan({}, unusable=True)
 
-    monkeypatch.setattr("segslam.bench.experiments.workers.shared_scan", shared_scan)
+    monkeypatch.setattr("segslam.bench.experiments.benchmark.shared_scan", shared_scan)
     return prepared
 
 

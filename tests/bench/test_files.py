@@ -182,10 +182,10 @@ def test_calib_and_times_are_found_where_kitti_keeps_them(tmp_path):
     ("name", "text", "complaint"),
     [
         ("calib.txt", "P0: 1 2 3\n", "Tr"),
-        ("calib.txt", "Tr: 1 2 three\n", "Tr"),
+        ("calib.txt", "Tr: 1 2 three\n", "expected 12 numbers"),
         ("times.txt", "0\n0.1\n", "5 ascending times"),
-        ("times.txt", "0\n0.1\n0.1\n0.2\n0.3\n", "ascending"),
-        ("times.txt", "never\n", "cannot read the times"),
+        ("times.txt", "0\n0.1\n0.1\n0.2\n0.3\n", "times must ascend"),
+        ("times.txt", "never\n", "never is not a time in seconds"),
     ],
 )
 def test_a_broken_file_beside_the_poses_is_named(tmp_path, name, text, complaint):

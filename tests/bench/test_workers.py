@@ -12,8 +12,7 @@ from segslam.bench.experiments.benchmark import Pool, in_order, run
 from segslam.bench.experiments.job import Job
 from segslam.bench.experiments.pairs import PairList, cut_pairs
 from segslam.bench.experiments.rows import Row, read_rows
-from segslam.bench.experiments.trials import Trial
-from segslam.bench.experiments.variations import pair_trials
+from segslam.bench.experiments.trials import Trial, pair_trials
 from segslam.core.config import Config
 from segslam.core.types import SegslamError
 from segslam.scans import DataSource

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.drives import simulate_drive
 
 from segslam.bench.simulation import (
     WorldConfig,
@@ -9,7 +10,6 @@ from segslam.bench.simulation import (
     example_loop,
     make_sensor,
     read_drive,
-    simulate_drive,
     sweep,
 )
 from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig

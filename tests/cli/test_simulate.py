@@ -48,7 +48,7 @@ def test_it_follows_a_pose_file(tmp_path):
         (("--seed", -1), "seed"),
         (("--set", "world.cars=99"), "world.cars"),
         (("--set", "world.castles=1"), "known keys: cars, trees"),
-        (("--set", "cars=3"), "world.key=value"),
+        (("--set", "cars=3"), "section.key=value, for example world.cars=3"),
     ],
 )
 def test_bad_usage_is_reported(tmp_path, capsys, arguments, complaint):

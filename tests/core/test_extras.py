@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 from segslam.core.extras import how_to_install, requirements
 from segslam.core.types import SegslamError
 from segslam.output.map import clouds
-from segslam.scans.mcap_clouds import McapClouds
+from segslam.scans.mcap_messages import McapMessages
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
@@ -44,4 +44,4 @@ def test_las_and_ros_messages_have_the_install_command(tmp_path: Path, monkeypat
             clouds.check_las(tmp_path / "map.laz", is_projected=True)
     monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
     with pytest.raises(ImportError, match="pip install 'mcap-ros2-support<"):
-        McapClouds(tmp_path / "drive.mcap", "")
+        McapMessages(tmp_path / "drive.mcap", "")

@@ -27,7 +27,7 @@ from segslam.scans import open_dataset
 from segslam.scans.clouds import read_file
 from segslam.scans.dataset import make_scan, read_stamps
 from segslam.scans.kitti import read_calibration
-from segslam.scans.point_cloud2 import CloudReader
+from segslam.scans.point_cloud2 import read_message
 
 ROBUST = get_args(Robust)
 
@@ -153,7 +153,7 @@ def _message(file: Path) -> None:
     fields = [SimpleNamespace(**field) for field in values.pop("fields")]
     header = SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=5))
     with suppress(KeyError, TypeError, ValueError):  # which the reader documents; its callers name the source
-        CloudReader()(SimpleNamespace(header=header, fields=fields, **values))
+        read_message(SimpleNamespace(header=header, fields=fields, **values))
 
 
 def _mcap_messages(file: Path) -> None:

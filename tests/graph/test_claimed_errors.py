@@ -5,7 +5,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
-from helpers.drives import NUM_SCANS, RADIUS_M, STEP_M
+from helpers.drives import NUM_SCANS, RADIUS_M, STEP_M, simulate_drive
 
 from segslam.bench.simulation import (
     SensorConfig,
@@ -13,7 +13,6 @@ from segslam.bench.simulation import (
     WorldConfig,
     build_world,
     make_sensor,
-    simulate_drive,
     sweep,
     sweep_errors,
 )

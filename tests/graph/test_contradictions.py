@@ -5,7 +5,7 @@ import pytest
 
 from segslam.core import geometry
 from segslam.graph import G2oGraph, optimize_graph
-from segslam.graph.contradictions import contradicting
+from segslam.graph.batch_search import contradicting
 from segslam.graph.edges import Edge
 
 TIGHT = np.diag(geometry.tangent(rotation_rad=0.01, translation_m=0.05) ** -2.0)

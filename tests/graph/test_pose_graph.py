@@ -134,7 +134,7 @@ def test_a_closure_from_the_other_end_is_its_inverse() -> None:
 def test_the_final_optimisation_rejects_false_closures_and_keeps_true_ones(
     final: str, most_paired: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("segslam.graph.final.MAX_PAIRED", most_paired)
+    monkeypatch.setattr("segslam.graph.motions.MAX_PAIRED", most_paired)
     graph = graph_of(DRIFT, TRUE_LOOPS + FALSE_LOOPS, GraphConfig(final=final))
     graph.optimize()
     estimate = graph.finish()

@@ -12,16 +12,14 @@ from segslam.bench.simulation import (
     SimulationConfig,
     WorldConfig,
     example_drive,
-    simulate_drive,
 )
-from segslam.bench.simulation.drive import drive_sweeps
 from segslam.bench.simulation.files import uncorrected
-from segslam.bench.simulation.sensor import Sweep
+from segslam.bench.simulation.sensor import Sweep, drive_sweeps
 from segslam.bench.simulation.world import build_world
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.trajectory import Poses, camera_from_lidar, write_kitti
-from segslam.core.types import Scan, Trajectory
+from segslam.core.types import Scan, Trajectory, Vector
 from segslam.labels.encodings import RAW_OF_LABEL
 from segslam.odometry import GivenOdometry
 from segslam.scans.kitti import read_calibration
@@ -36,6 +34,13 @@ CONFIG = SimulationConfig(
     world=WorldConfig(moving_cars=0.0), sensor=SensorConfig(name="os1-64", sweep_rotation_sigma_deg=0.0)
 )
 SEED = 3
+
+
+def simulate_drive(T_world_lidar: Poses, time_s: Vector, *, seed: int, config: SimulationConfig) -> Iterator[Scan]:
+    """Labelled scans from level poses (n, 4, 4) at the times `time_s` (n,), ascending."""
+    world = build_world(T_world_lidar, time_s, config=config.world, seed=seed)
+    for index, one in enumerate(drive_sweeps(world, T_world_lidar, time_s, config=config.sensor, seed=seed)):
+        yield one.scan(index=index, stamp_ns=round(time_s[index] * 1e9))
 
 
 @cache

@@ -112,7 +112,7 @@ def _made(**options: Any) -> Callable[[Path], Path]:
         (_made(mean=[0.0]), r"net\.yaml: .*mean: 1 numbers for 5 channels"),
         (_made(field_of_view_deg=[3.0, -25.0]), r"net\.yaml: .*lowest elevation, then the highest"),
         (_made(classes=["road", "castle"]), r"net\.yaml: classes\.1: .*no such class"),
-        (_made(colour="red"), r"net\.yaml: colour: .*; known: field_of_view_deg, height"),
+        (_made(colour="red"), r"net\.yaml: unknown key colour; known keys: field_of_view_deg, height"),
         (_made(votes={"window": 4}), r"net\.yaml: votes\.window: .*odd"),
     ],
 )

@@ -12,7 +12,7 @@ from helpers.made_networks import made_network
 from segslam.core.types import Label, SegslamError
 from segslam.labels.encodings import RAW_OF_LABEL
 from segslam.labels.network import open_network
-from segslam.labels.network_import import class_map_file
+from segslam.labels.network_import import DATA
 from segslam.labels.network_settings import read_settings, settings_file
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "network_labels.md"
@@ -123,7 +123,7 @@ def test_a_network_opens_with_the_files_that_it_ships(tmp_path: Path) -> None:
 
 def _without_classes(folder: Path) -> Path:
     own = _write(folder, _architecture())
-    class_map_file(own).unlink()
+    own.with_name(DATA).unlink()
     return own
 
 

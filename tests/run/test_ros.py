@@ -34,7 +34,7 @@ from segslam.gnss import enu_from_geodetic, geodetic_from_enu
 from segslam.output.log import read_log
 from segslam.run.live.live_map import DrawnMap
 from segslam.run.live.ros import LATCHED, MappingPublisher, TopicSource, _common_reliability, point_cloud2
-from segslam.scans.point_cloud2 import CloudReader
+from segslam.scans.point_cloud2 import read_message
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = ("--set", "odometry.min_range_m=1")
@@ -151,7 +151,7 @@ def test_a_publisher_is_followed_through_its_death_and_every_cloud_accounted_for
     recorded = [step.stamp_ns for step in read_log(tmp_path / "run" / "log.mcap").steps()]
     assert set(published) <= set(recorded)
     assert listener.heard["path"][-1].header.frame_id == "map"
-    points, _ = CloudReader()(listener.heard["map"][-1])
+    points = read_message(listener.heard["map"][-1]).points
     assert len(points) > 1000
 
 
@@ -192,7 +192,7 @@ def test_a_pose_and_a_map_are_published_as_they_are(listener: Listener) -> None:
     pose = path.poses[1].pose
     assert [pose.position.x, pose.position.y, pose.position.z] == [3, 2, 1]
     assert [pose.orientation.z, pose.orientation.w] == pytest.approx([np.sqrt(0.5)] * 2)
-    np.testing.assert_array_equal(CloudReader()(cloud)[0], drawn.points)
+    np.testing.assert_array_equal(read_message(cloud).points, drawn.points)
 
 
 def test_a_map_that_cannot_be_saved_is_reported_with_the_reason(listener: Listener) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from segslam.scans.point_cloud2 import CloudReader
+from segslam.scans.point_cloud2 import read_message
 
 FIELDS = [SimpleNamespace(name=name, offset=4 * k, datatype=7, count=1) for k, name in enumerate("xyz")]
 
@@ -20,7 +20,7 @@ def _message(**changed: Any) -> SimpleNamespace:
 
 
 def test_a_consistent_message_is_read() -> None:
-    np.testing.assert_array_equal(CloudReader()(_message())[0], np.arange(30.0).reshape(10, 3))
+    np.testing.assert_array_equal(read_message(_message()).points, np.arange(30.0).reshape(10, 3))
 
 
 @pytest.mark.parametrize(
@@ -41,8 +41,8 @@ def test_a_consistent_message_is_read() -> None:
 )
 def test_points_outside_of_the_data_are_refused(changed: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"not fit into|is not in a point"):
-        CloudReader()(_message(**changed))
+        read_message(_message(**changed))
 
 
 def test_a_message_without_points_has_none() -> None:
-    assert len(CloudReader()(_message(height=0, width=0, data=b""))[0]) == 0
+    assert len(read_message(_message(height=0, width=0, data=b"")).points) == 0

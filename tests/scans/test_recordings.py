@@ -10,7 +10,8 @@ from segslam.core import geometry
 from segslam.core.trajectory import write_kitti
 from segslam.core.types import BadScan, Label, SegslamError
 from segslam.scans import open_dataset
-from segslam.scans.in_order import InOrder
+from segslam.scans.bag_messages import InOrder
+from segslam.scans.dataset import Cloud
 
 
 def _write_clouds(folder: Path, num_clouds: int) -> Path:
@@ -93,17 +94,15 @@ class _InOrder:
 
     def __init__(self) -> None:
         self._raw = InOrder(lambda: iter(range(5)), 5, num_bytes=1000)
-        self.stamp_ns = 0
 
     def __len__(self) -> int:
         return 5
 
-    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+    def __getitem__(self, index: int) -> Cloud:
         number = self._raw[index]
-        self.stamp_ns = 10**9 * (100 + number)
         if number == 2:
             raise ValueError("broken message")
-        return np.full((2, 3), number + 1.0), np.array([])
+        return Cloud(np.full((2, 3), number + 1.0), stamp_ns=10**9 * (100 + number))
 
 
 def test_recording_read_in_order_gives_the_requested_scan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

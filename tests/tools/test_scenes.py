@@ -6,8 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from segslam.bench.simulation.scene_sensors import SENSORS, scan_points
-from segslam.bench.simulation.scenes import SCENES, corridor
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Alignment, Registration, Rejected
@@ -15,6 +13,7 @@ from segslam.labels import geometric_labels
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import pair, register_prepared
 from tools.benchmarks import scenes
+from tools.benchmarks.scene_models import SCENES, SENSORS, corridor, scan_points
 
 CONFIG = Config()
 TARGET_X, SOURCE_X = 20.0, 25.0

@@ -10,8 +10,7 @@ from segslam.bench.experiments import benchmark
 from segslam.bench.experiments.job import Job
 from segslam.bench.experiments.pairs import PairList, read_pairs
 from segslam.bench.experiments.rows import Row
-from segslam.bench.experiments.trials import Trial
-from segslam.bench.experiments.variations import turned_trials
+from segslam.bench.experiments.trials import Trial, turned_trials
 from segslam.core.config import Config
 from segslam.scans import DataSource
 

@@ -17,8 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.bench.simulation.scene_sensors import SENSORS, scan_points
-from segslam.bench.simulation.scenes import SCENES, Scene, pose
 from segslam.candidates.prior import far_from_prior
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
@@ -29,6 +27,7 @@ from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register_prepared
 from segslam.verification.patches import agreement
 from tools.benchmarks import common
+from tools.benchmarks.scene_models import SCENES, SENSORS, Scene, pose, scan_points
 
 DRIFT_M, DRIFT_DEG, HEIGHT_M = 1.5, 3.0, 0.3
 """Standard deviations of the prior."""

@@ -4,14 +4,14 @@
 thread if the library allows it.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import small_gicp
 
-from segslam.bench.experiments.estimate import Estimate
 from segslam.core import geometry
-from segslam.core.types import Points, Rejected, RejectReason
+from segslam.core.types import Points, Rejected, RejectReason, Transform
 
 GICP_VOXEL_M = 0.25
 GICP_DISTANCE_M = 1.0
@@ -27,6 +27,21 @@ KISS_MIN_POINTS = 100
 """Chosen: KISS-Matcher 1.0.2 terminates the process with about a dozen points."""
 KISS_VOXEL_M = 0.3
 """Voxel size that KISS-Matcher's authors use outdoors (Lim et al., ICRA 2025)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The pose of the source in the target, and figures of the method; None for figures that it does not have."""
+
+    T_target_source: Transform
+    num_correspondences: int | None = None
+    num_inliers: int | None = None
+    num_edges: int | None = None
+    """Number of edges of the consistency graph."""
+    probability: float | None = None
+    """That the pose is right."""
+    evidence: dict[str, float] | None = None
+    """As that of `segslam.core.types.Alignment`."""
 
 
 class GicpScan:
@@ -66,11 +81,6 @@ def align_vgicp(source: GicpScan, target: GicpScan) -> Estimate | Rejected:
         target.voxels, source.cloud, max_correspondence_distance=GICP_DISTANCE_M, max_iterations=GICP_ITERATIONS
     )
     return _small_gicp_outcome(found, source)
-
-
-def prepare_points(points: Points) -> Points:
-    """The points, unchanged, for methods without a preparation step."""
-    return points.astype(np.float32)
 
 
 def align_kiss_matcher(source: Points, target: Points) -> Estimate | Rejected:

@@ -2,17 +2,19 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from segslam.bench.experiments.job import Job
+from segslam.bench.experiments.job import LOST_WORKER, Job, failed_row, register_trial, shared_scan
 from segslam.bench.experiments.rows import Row, RowFile, read_rows
 from segslam.bench.experiments.summary import grouped
-from segslam.bench.experiments.trials import Trial
-from segslam.bench.experiments.workers import LOST_WORKER, run_here, run_on
+from segslam.bench.experiments.trials import ScanVariant, Trial
 from segslam.core.cluster import cluster
 from segslam.core.errors import reason
 from segslam.core.types import SegslamError
@@ -20,6 +22,10 @@ from segslam.core.whole_files import write_whole
 
 ROWS_FILE = "details.csv"
 IDENTITY_FILE = "asked.json"
+NUM_SCANS_KEPT = 128
+"""Chosen: scans kept in one process, up to 15 MB each with all methods; consecutive pairs of a drive reuse scans."""
+PAIRS_AHEAD = 8
+"""Pairs submitted per worker: enough that no worker idles, few enough that their scans fit in memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +60,53 @@ def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row
 
 
 def _work(job: Job, trials: Sequence[Trial], pool: Pool) -> Iterator[list[Row]]:
-    if not trials:
-        return
     if pool.workers == 1 and pool.scheduler is None:
-        yield from run_here(job, trials)
-        return
-    with cluster(workers=pool.workers, scheduler=pool.scheduler) as client:
-        yield from run_on(client, job, trials)
+        prepared = lru_cache(NUM_SCANS_KEPT)(partial(shared_scan, job))
+        for trial in trials:
+            yield register_trial(job, trial, prepared(trial.source), prepared(trial.target))
+    elif trials:
+        with cluster(workers=pool.workers, scheduler=pool.scheduler) as client:
+            yield from _run_on(client, job, trials)
+
+
+def _run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row]]:
+    """Yields the rows of each trial when a worker finishes it.
+
+    Each scan is prepared by one worker and sent to those that register it. Dask repeats the work of a worker that dies;
+    a pair for which several workers died is recorded as failed.
+    """
+    from distributed import KilledWorker, as_completed
+
+    uses = Counter(variant for trial in trials for variant in (trial.source, trial.target))
+    scans: dict[ScanVariant, Any] = {}
+
+    def prepared(variant: ScanVariant) -> Any:
+        if variant not in scans:
+            scans[variant] = client.submit(shared_scan, job, variant, pure=False)
+        return scans[variant]
+
+    def submit(trial: Trial) -> Any:
+        future = client.submit(register_trial, job, trial, prepared(trial.source), prepared(trial.target), pure=False)
+        pending[future.key] = trial
+        return future
+
+    pending: dict[str, Trial] = {}
+    waiting = iter(trials)
+    ahead = PAIRS_AHEAD * max(sum(client.nthreads().values()), 1)
+    running = as_completed([submit(trial) for trial in islice(waiting, ahead)])
+    for future in running:
+        trial = pending.pop(future.key)
+        try:
+            rows = future.result()
+        except KilledWorker:
+            rows = [failed_row(method, trial, LOST_WORKER) for method in job.methods]
+        for variant in (trial.source, trial.target):
+            uses[variant] -= 1
+            if not uses[variant]:
+                scans.pop(variant, None)  # the cluster frees the scan
+        for following in islice(waiting, 1):
+            running.add(submit(following))
+        yield rows
 
 
 def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
@@ -82,13 +128,8 @@ def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
         if before.get(key) != identity[key]:
             raise SegslamError(f"{folder}: contains a benchmark with other {key}; choose another --out, or delete it")
     rows = read_rows(folder / ROWS_FILE) if (folder / ROWS_FILE).exists() else []
-    return _of_whole_trials([row for row in rows if row.reason != LOST_WORKER], job)
-
-
-def _of_whole_trials(rows: list[Row], job: Job) -> list[Row]:
-    """The rows of trials that every method has finished."""
-    trials = grouped(rows, lambda row: row.key[:3]).values()
-    return [row for some in trials if {one.method for one in some} == set(job.methods) for row in some]
+    trials_before = grouped([row for row in rows if row.reason != LOST_WORKER], lambda row: row.key[:3]).values()
+    return [row for some in trials_before if {one.method for one in some} == set(job.methods) for row in some]
 
 
 def _identity(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
-from segslam.bench.experiments.estimate import Estimate
+from segslam.bench.experiments.baselines import Estimate
 from segslam.bench.experiments.meter import Cost, measured
 from segslam.bench.experiments.methods import METHODS, Part, prepare_parts
 from segslam.bench.experiments.rows import Row
@@ -22,6 +22,8 @@ logger = logging.getLogger(__name__)
 
 BAD_SCAN = "bad_scan"
 """Reject reason of a row whose scan cannot be read."""
+LOST_WORKER = "worker_lost"
+"""Reject reason of a row whose pair terminated every worker that tried it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +92,8 @@ def _register(method: str, config: Config, trial: Trial, source: SharedScan, tar
     with measured() as cost:
         outcome = METHODS[method].align(values[0], values[1], config, watch)
     costs = [part.cost for parts in scans for part in parts.values()]
-    labelled = [shared.labelling for shared in (source, target) if shared.labelling and _uses_labels(method)]
+    uses_labels = any(part.endswith("description") for part in METHODS[method].parts)
+    labelled = [shared.labelling for shared in (source, target) if shared.labelling and uses_labels]
     reason = outcome.reason.value if isinstance(outcome, Rejected) else ""
     return failed_row(method, trial, reason).model_copy(
         update=_times(cost, costs, labelled, watch) | ({} if isinstance(outcome, Rejected) else _found(outcome, trial))
@@ -120,10 +123,6 @@ def _found(estimate: Estimate, trial: Trial) -> dict[str, object]:
         "num_inliers": estimate.num_inliers,
         "T_target_source": " ".join(f"{value:.9g}" for value in estimate.T_target_source[:3].ravel()),
     }
-
-
-def _uses_labels(method: str) -> bool:
-    return any(part.endswith("description") for part in METHODS[method].parts)
 
 
 def failed_row(method: str, trial: Trial, reason: str) -> Row:

@@ -1,14 +1,14 @@
 """Measurement of time and additional memory."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter, process_time
 
-from segslam.core.memory import give_back
+from segslam.core.memory import give_back, status_mb
 
-PROCESS = Path("/proc/self")
+CLEAR_REFS = Path("/proc/self/clear_refs")
 RESET_PEAK = "5"
 """Value that, written to `clear_refs`, resets the peak memory to the current memory (Linux, proc(5))."""
 
@@ -29,22 +29,12 @@ def measured() -> Iterator[Cost]:
     """Context manager that yields the cost of its block."""
     cost = Cost()
     give_back()
-    before_mb = _memory_mb("VmRSS") if _reset_peak() else None
+    before_mb = None
+    with suppress(OSError):
+        CLEAR_REFS.write_text(RESET_PEAK)
+        before_mb = status_mb("VmRSS")
     started, cpu_started = perf_counter(), process_time()
     yield cost
     cost.seconds, cost.cpu_seconds = perf_counter() - started, process_time() - cpu_started
     if before_mb is not None:
-        cost.peak_mb = max(_memory_mb("VmHWM") - before_mb, 0.0)
-
-
-def _reset_peak() -> bool:
-    try:
-        (PROCESS / "clear_refs").write_text(RESET_PEAK)
-    except OSError:
-        return False
-    return True
-
-
-def _memory_mb(key: str) -> float:
-    lines = (PROCESS / "status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{key}:"))
+        cost.peak_mb = max((status_mb("VmHWM") or 0.0) - before_mb, 0.0)

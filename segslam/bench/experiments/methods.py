@@ -7,7 +7,7 @@ from typing import Any
 
 from segslam import verification as registration
 from segslam.bench.experiments import baselines
-from segslam.bench.experiments.estimate import Estimate
+from segslam.bench.experiments.baselines import Estimate
 from segslam.bench.experiments.meter import Cost, measured
 from segslam.bench.experiments.method_settings import check_method, method_config
 from segslam.core.config import Config, RefineConfig
@@ -56,17 +56,11 @@ def _surface(points: Points, labels: Labels, config: Config) -> SurfaceScan:
     return SurfaceScan(refinement.downsample(points, config=config.refine), observe_free_space(points), config.refine)
 
 
-def _description(points: Points, labels: Labels, config: Config) -> Description:
-    return segregator.describe(points, labels, config=config.segregator)
-
-
-def _fpfh_description(points: Points, labels: Labels, config: Config) -> Description:
-    return segregator.describe(points, labels, config=method_config(config, "teaser").segregator)
-
-
-def _of_points(make: Callable[[Points], Any]) -> Callable[[Points, Labels, Config], Any]:
-    """Wrapper for a part that depends on neither labels nor settings."""
-    return lambda points, labels, config: make(points)
+def _description(method: str) -> Callable[[Points, Labels, Config], Description]:
+    """Description of a scan with the settings of a method."""
+    return lambda points, labels, config: segregator.describe(
+        points, labels, config=method_config(config, method).segregator
+    )
 
 
 def _open3d(name: str) -> Callable[..., Any]:
@@ -75,13 +69,14 @@ def _open3d(name: str) -> Callable[..., Any]:
 
 
 PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
-    "description": _description,
-    "fpfh_description": _fpfh_description,
+    "description": _description("segregator"),
+    "fpfh_description": _description("teaser"),
     "surface": _surface,
-    "gicp": _of_points(baselines.prepare_gicp),
-    "fpfh": _of_points(_open3d("prepare_fpfh")),
-    "points": _of_points(baselines.prepare_points),
+    "gicp": lambda points, *_: baselines.prepare_gicp(points),
+    "fpfh": lambda points, *_: _open3d("prepare_fpfh")(points),
+    "points": lambda points, *_: points.astype("float32"),
 }
+"""The parts by name, from points, labels and configuration."""
 
 
 def prepare_parts(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> dict[str, Part]:
@@ -107,18 +102,15 @@ def find_method(name: str) -> Method:
     return method
 
 
-def _match(source: Values, target: Values, config: Config, watch: Stopwatch, *, part: str) -> Estimate | Rejected:
-    with watch("match"):
-        found = segregator.match(source[part], target[part], config=config.segregator)
-    return found if isinstance(found, Rejected) else _estimate(found, found)
-
-
 def _segregator(name: str, part: str = "description") -> Method:
     """Segregator's coarse pose with the settings of a method."""
-    return Method(
-        (part,),
-        lambda source, target, config, watch: _match(source, target, method_config(config, name), watch, part=part),
-    )
+
+    def run(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:
+        with watch("match"):
+            found = segregator.match(source[part], target[part], config=method_config(config, name).segregator)
+        return found if isinstance(found, Rejected) else _estimate(found, found)
+
+    return Method((part,), run)
 
 
 def _align(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:

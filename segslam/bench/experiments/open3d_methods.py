@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import open3d
 
-from segslam.bench.experiments.estimate import Estimate
+from segslam.bench.experiments.baselines import Estimate
 from segslam.core.types import Points, Rejected, RejectReason
 
 OPEN3D_VOXEL_M = 0.5

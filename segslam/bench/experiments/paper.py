@@ -7,51 +7,17 @@ from segslam.bench.experiments.pairs import PairList
 
 LISTS = {"easy": "3to5", "medium": "8to10", "hard": "10to15"}
 """Names of the lists in their file names, from the distance of the scans (m)."""
-NUM_PAIRS = {
-    "00": (8503, 7527, 21267),
-    "05": (5155, 5243, 11600),
-    "06": (1128, 1113, 2825),
-    "07": (1311, 1169, 2877),
-    "08": (2064, 2750, 9457),
-}
+SEQUENCES = ("00", "05", "06", "07", "08")
+NUM_PAIRS = ((8503, 7527, 21267), (5155, 5243, 11600), (1128, 1113, 2825), (1311, 1169, 2877), (2064, 2750, 9457))
 """Number of pairs in the easy, medium and hard list of each sequence."""
 SUCCESS_PERCENT = {
-    "vgicp": {
-        "00": (95.6, 34.1, 14.9),
-        "05": (82.6, 34.6, 25.3),
-        "06": (94.6, 66.7, 35.1),
-        "07": (80.0, 36.5, 0.8),
-        "08": (0.24, 0.0, 4.9),
-    },
-    "teaser": {
-        "00": (97.0, 65.4, 41.1),
-        "05": (96.4, 73.4, 48.0),
-        "06": (99.8, 94.3, 83.2),
-        "07": (91.1, 49.2, 30.7),
-        "08": (96.6, 74.8, 49.5),
-    },
-    "quatro": {
-        "00": (96.9, 66.2, 41.2),
-        "05": (96.3, 73.7, 48.1),
-        "06": (99.8, 93.9, 83.2),
-        "07": (91.3, 51.0, 31.9),
-        "08": (96.8, 75.2, 49.8),
-    },
-    "segator": {
-        "00": (98.6, 88.3, 75.4),
-        "05": (77.8, 72.2, 59.0),
-        "06": (91.0, 74.6, 63.8),
-        "07": (100.0, 95.5, 81.4),
-        "08": (90.3, 84.4, 78.2),
-    },
-    "segregator": {
-        "00": (99.7, 89.3, 80.7),
-        "05": (98.7, 93.2, 81.8),
-        "06": (100.0, 99.6, 98.3),
-        "07": (100.0, 98.1, 88.0),
-        "08": (96.9, 94.1, 88.8),
-    },
-}
+    "vgicp": ((95.6, 34.1, 14.9), (82.6, 34.6, 25.3), (94.6, 66.7, 35.1), (80.0, 36.5, 0.8), (0.24, 0.0, 4.9)),
+    "teaser": ((97.0, 65.4, 41.1), (96.4, 73.4, 48.0), (99.8, 94.3, 83.2), (91.1, 49.2, 30.7), (96.6, 74.8, 49.5)),
+    "quatro": ((96.9, 66.2, 41.2), (96.3, 73.7, 48.1), (99.8, 93.9, 83.2), (91.3, 51.0, 31.9), (96.8, 75.2, 49.8)),
+    "segator": ((98.6, 88.3, 75.4), (77.8, 72.2, 59.0), (91.0, 74.6, 63.8), (100.0, 95.5, 81.4), (90.3, 84.4, 78.2)),
+    "segregator": ((99.7, 89.3, 80.7), (98.7, 93.2, 81.8), (100.0, 99.6, 98.3), (100.0, 98.1, 88.0),
+                   (96.9, 94.1, 88.8)),
+}  # fmt: skip
 """Success rate (error below 2 m and 5 degrees) on those lists."""
 TIMING_SEQUENCE = "06"
 TIMING = {
@@ -81,12 +47,12 @@ DETERIORATION = {10: (0.09, 0.20), 30: (0.04, 0.22), 50: (0.31, 0.21), 70: (0.06
 def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
     """The paper's value for a list of this name (kittiSS_LOtoHI) and number of pairs; None if the paper has none."""
     name, _, band = pairs.removeprefix("kitti").partition("_")
-    if not pairs.startswith("kitti") or name not in NUM_PAIRS or band not in LISTS.values():
+    if not pairs.startswith("kitti") or name not in SEQUENCES or band not in LISTS.values():
         return None
-    place = list(LISTS.values()).index(band)
-    if NUM_PAIRS[name][place] != num_pairs or method not in SUCCESS_PERCENT:
+    row, place = SEQUENCES.index(name), list(LISTS.values()).index(band)
+    if NUM_PAIRS[row][place] != num_pairs or method not in SUCCESS_PERCENT:
         return None
-    return SUCCESS_PERCENT[method][name][place]
+    return SUCCESS_PERCENT[method][row][place]
 
 
 def with_paper_values(
@@ -98,8 +64,13 @@ def with_paper_values(
     errors if the pair is scans 0 and 10 of 05. The comparison also applies to lists that were sampled.
     """
     whole = {one.name: one.num_whole for one in lists}
-    timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and _are_all(whole, TIMING_SEQUENCE)
-    reduced = experiment == "deterioration" and sequence.zfill(2) == "05" and _is_paper_pair(lists)
+    all_lists = {
+        f"kitti{TIMING_SEQUENCE}_{band}": number
+        for band, number in zip(LISTS.values(), NUM_PAIRS[SEQUENCES.index(TIMING_SEQUENCE)], strict=True)
+    }
+    is_paper_pair = len(lists) == 1 and lists[0].pairs.tolist() == [[0, 10]]
+    timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and whole == all_lists
+    reduced = experiment == "deterioration" and sequence.zfill(2) == "05" and is_paper_pair
     return {
         method: own
         | ({"paper": TIMING[method]} if timed and method in TIMING else {})
@@ -116,12 +87,3 @@ def _paper_of(method: str, one: dict[str, Any], whole: dict[str, int], *, reduce
         return {}
     value = success_percent(method, one["list"], whole[one["list"]])
     return {} if value is None else {"paper": {"success_percent": value}}
-
-
-def _are_all(whole: dict[str, int], sequence: str) -> bool:
-    theirs = {f"kitti{sequence}_{band}": NUM_PAIRS[sequence][place] for place, band in enumerate(LISTS.values())}
-    return whole == theirs
-
-
-def _is_paper_pair(lists: Sequence[PairList]) -> bool:
-    return len(lists) == 1 and lists[0].pairs.tolist() == [[0, 10]]

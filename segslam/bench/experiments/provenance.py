@@ -13,17 +13,7 @@ from segslam.bench.experiments.job import Job
 from segslam.bench.experiments.pairs import PairList
 from segslam.bench.simulation.files import SETTINGS_FILE
 
-PACKAGES = (
-    "segslam",
-    "numpy",
-    "scipy",
-    "numba",
-    "open3d",
-    "small-gicp",
-    "kiss-matcher",
-    "dask",
-    "distributed",
-)
+PACKAGES = ("segslam", "numpy", "scipy", "numba", "open3d", "small-gicp", "kiss-matcher", "dask", "distributed")
 CPU_INFO = Path("/proc/cpuinfo")
 
 

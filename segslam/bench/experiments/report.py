@@ -28,8 +28,13 @@ def write_bench_report(folder: Path, report: dict[str, Any], *, pictures: Mappin
 
     Raises SegslamError if the folder cannot be written.
     """
+    results = report["results"]
     with matplotlib.rc_context(figures.STYLE):
-        plots = _plots(report["results"])
+        if (by := varied(results)) == "list":
+            plots = {"Success": report_figures.draw_success(results)}
+        else:
+            plots = {"Success and errors": report_figures.draw_along(results, by)}
+        plots["Times"] = report_figures.draw_times(results)
     files = {
         "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
         "report.md": _markdown(report),
@@ -37,12 +42,6 @@ def write_bench_report(folder: Path, report: dict[str, Any], *, pictures: Mappin
     }
     for name, text in files.items():
         write_whole(folder / name, text)
-
-
-def _plots(results: dict[str, Any]) -> dict[str, str]:
-    by = varied(results)
-    first = report_figures.draw_success(results) if by == "list" else report_figures.draw_along(results, by)
-    return {"Success" if by == "list" else "Success and errors": first, "Times": report_figures.draw_times(results)}
 
 
 def _title(report: dict[str, Any]) -> str:

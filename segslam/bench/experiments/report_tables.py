@@ -49,13 +49,19 @@ def tables(report: dict[str, Any]) -> list[Table]:
     """All tables of a report, the most important first."""
     results = report["results"]
     by = varied(results)
-    made = [_by_value(results, by)] if by != "list" else [_success(results)]
+    if by == "list":
+        made = [_success(results)]
+    else:
+        caption = f"Success (%) by {TITLES[by]}"
+        made = [_table_by(results, by, caption, lambda one: percent(one["success_percent"]))]
     if by == "lost_percent":
-        made.append(_errors(results, by))
+        caption = f"Mean error of successes (m / deg; paper's in brackets) by {TITLES[by]}"
+        made.append(_table_by(results, by, caption, _error_pair))
     made.append(overall(results))
     if any("paper" in own for own in results.values()):
         made.append(_paper_comparison(results))
-    return [*made, _stages(results)]
+    stages = {method: own["stage_ms"] for method, own in results.items()}
+    return [*made, _figures_table("Median time of each stage, ms", STAGES, stages)]
 
 
 def varied(results: dict[str, Any]) -> str:
@@ -112,16 +118,6 @@ def _compared(one: dict[str, Any]) -> str:
     return f"{measured} ({theirs:g}, {one['success_percent'] - theirs:+.1f})"
 
 
-def _by_value(results: dict[str, Any], by: str) -> Table:
-    return _table_by(results, by, f"Success (%) by {TITLES[by]}", lambda one: percent(one["success_percent"]))
-
-
-def _errors(results: dict[str, Any], by: str) -> Table:
-    return _table_by(
-        results, by, f"Mean error of successes (m / deg; paper's in brackets) by {TITLES[by]}", _error_pair
-    )
-
-
 def _table_by(results: dict[str, Any], by: str, caption: str, cell: Callable[[dict[str, Any]], str]) -> Table:
     """A row for each value of the varied quantity, a column for each method."""
     values = [one[by] for one in next(iter(results.values()))["by"]]
@@ -139,10 +135,6 @@ def _error_pair(one: dict[str, Any]) -> str:
 def overall(results: dict[str, Any]) -> Table:
     """The figures of each method over all pairs."""
     return _figures_table("All pairs", FIGURES, results)
-
-
-def _stages(results: dict[str, Any]) -> Table:
-    return _figures_table("Median time of each stage, ms", STAGES, {m: own["stage_ms"] for m, own in results.items()})
 
 
 def _figures_table(caption: str, titles: dict[str, str], results: dict[str, Any]) -> Table:

@@ -1,8 +1,7 @@
 """One row per registration, written to a CSV file at once, and read to resume a benchmark."""
 
 import csv
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -10,18 +9,13 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from segslam.bench.experiments.trials import ScanVariant
-from segslam.core.errors import reason
 from segslam.core.evaluation import PoseError
-from segslam.core.types import SegslamError, Transform, WorkFailed
-from segslam.core.whole_files import whole_file
+from segslam.core.types import SegslamError, Transform
+from segslam.core.whole_files import cannot_write, whole_file
 
-
-def _none_if_empty(value: object) -> object:
-    return None if value == "" else value
-
-
-Number = Annotated[float | None, BeforeValidator(_none_if_empty)]
-Count = Annotated[int | None, BeforeValidator(_none_if_empty)]
+NONE_IF_EMPTY = BeforeValidator(lambda value: None if value == "" else value)
+Number = Annotated[float | None, NONE_IF_EMPTY]
+Count = Annotated[int | None, NONE_IF_EMPTY]
 
 
 class Row(BaseModel):
@@ -96,19 +90,8 @@ class RowFile:
     """
 
     def __init__(self, file: Path, rows: Sequence[Row]) -> None:
-        self._file = file
-        part = file.with_suffix(".part")
-        try:
-            with self._room():
-                self._stream = part.open("w", newline="", encoding="utf-8")
-                self._csv = csv.DictWriter(self._stream, COLUMNS)
-                self._csv.writeheader()
-            self.write(rows)
-            with self._room():
-                part.replace(file)
-        except WorkFailed:
-            part.unlink(missing_ok=True)
-            raise
+        write_rows(file, rows)
+        self._file, self._stream = file, file.open("a", newline="", encoding="utf-8")
 
     def __enter__(self) -> "RowFile":
         return self
@@ -118,16 +101,11 @@ class RowFile:
 
     def write(self, rows: Sequence[Row]) -> None:
         """Append rows."""
-        with self._room():
-            self._csv.writerows(_cells(row) for row in rows)
-            self._stream.flush()
-
-    @contextmanager
-    def _room(self) -> Iterator[None]:
         try:
-            yield
+            csv.DictWriter(self._stream, COLUMNS).writerows(_cells(row) for row in rows)
+            self._stream.flush()
         except OSError as error:
-            raise WorkFailed(f"{self._file}: cannot be written ({reason(error)}); free space there") from error
+            raise cannot_write(self._file, error) from error
 
 
 def write_rows(file: Path, rows: Sequence[Row]) -> None:

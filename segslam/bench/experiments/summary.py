@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from segslam.bench.experiments.job import LOST_WORKER
 from segslam.bench.experiments.rows import Row
-from segslam.bench.experiments.workers import LOST_WORKER
 
 STAGES = ("label_ms", "prepare_ms", "match_ms", "refine_ms", "verify_ms")
 
@@ -70,15 +70,11 @@ def worst_failures(rows: Sequence[Row], count: int) -> list[Row]:
     return sorted(failures, key=lambda row: -(row.error_m or 0.0))[:count]
 
 
-def _known(values: Sequence[float | None]) -> list[float]:
-    return [value for value in values if value is not None]
-
-
 def _mean(values: Sequence[float | None]) -> float | None:
-    known = _known(values)
+    known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 
 def _percentile(values: Sequence[float | None], percent: float) -> float | None:
-    known = _known(values)
+    known = [value for value in values if value is not None]
     return float(np.percentile(known, percent)) if known else None

@@ -1,12 +1,18 @@
-"""A trial: two scans, each possibly rotated or with labels removed, and their true relative pose."""
+"""Trials: two scans, each possibly rotated or with labels removed, and their true relative pose."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
+from segslam.bench.experiments.pairs import PairList, true_poses
 from segslam.core import geometry
-from segslam.core.types import Label, Labels, Points, Transform
+from segslam.core.types import Label, Labels, Points, Trajectory, Transform
+
+PAPER_PAIR = PairList("0 and 10", np.array([[0, 10]]), 1)
+"""The scans of 05 with which the paper tests rotation and removal of labels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,3 +64,42 @@ def trial(pairs: str, source: ScanVariant, target: ScanVariant, T_target_source:
     """The trial of two variants, from the true pose of the unchanged scans."""
     T_true = target.T_variant_scan @ T_target_source @ geometry.inverse(source.T_variant_scan)
     return Trial(pairs, source, target, T_true)
+
+
+def pair_trials(pairs: PairList, reference: Trajectory | None) -> list[Trial]:
+    """One trial per pair of unchanged scans. Raises SegslamError for a pair without known true pose."""
+    return [
+        trial(pairs.name, ScanVariant(source), ScanVariant(target), T_target_source)
+        for (source, target), T_target_source in true_poses(pairs, reference).items()
+    ]
+
+
+def turned_trials(pairs: PairList, reference: Trajectory | None, *, step_deg: float) -> list[Trial]:
+    """Each pair with the source rotated about z in steps. Raises SegslamError as `pair_trials`."""
+    return [
+        trial(pairs.name, ScanVariant(source, yaw_deg=float(yaw_deg)), ScanVariant(target), T_target_source)
+        for (source, target), T_target_source in true_poses(pairs, reference).items()
+        for yaw_deg in np.arange(0.0, 360.0, step_deg)
+    ]
+
+
+def unlabelled_trials(
+    pairs: PairList,
+    reference: Trajectory | None,
+    *,
+    lost_percent: Sequence[float],
+    num_draws: int,
+    seed: int,
+    both: bool,
+) -> list[Trial]:
+    """Each pair with a random share of its labels removed, from both scans or from the source; a new draw per trial.
+
+    Raises SegslamError as `pair_trials`.
+    """
+    trials = []
+    for ((source, target), T_target_source), percent in product(true_poses(pairs, reference).items(), lost_percent):
+        for draw in range(seed * num_draws, (seed + 1) * num_draws):
+            reduced = [ScanVariant(index, lost=percent / 100, draw=draw) for index in (source, target)]
+            kept = reduced[1] if both else ScanVariant(target)
+            trials.append(trial(pairs.name, reduced[0], kept, T_target_source))
+    return trials

@@ -1,14 +1,11 @@
 """Simulated labelled street scenes and LiDAR sensors; writes sequences in KITTI format with exact ground truth."""
 
 from segslam.bench.simulation.drift import SweepError, sweep_errors
-from segslam.bench.simulation.drive import drive_sweeps, simulate_drive
 from segslam.bench.simulation.files import prepare_folder, write_drive, write_sequence
-from segslam.bench.simulation.label_errors import LabelErrorConfig, network_like
 from segslam.bench.simulation.levelling import level_revisits, level_world
-from segslam.bench.simulation.routes import example_loop
-from segslam.bench.simulation.sensor import Sensor, Sweep, make_sensor, sweep
-from segslam.bench.simulation.tracks import Drive, example_drive, in_lane, read_drive
-from segslam.bench.simulation.world import Hits, World, build_world
+from segslam.bench.simulation.sensor import drive_sweeps, make_sensor, sweep
+from segslam.bench.simulation.tracks import Drive, example_drive, example_loop, in_lane, read_drive
+from segslam.bench.simulation.world import build_world
 from segslam.bench.simulation.world_settings import (
     SensorConfig,
     SimulationConfig,
@@ -18,14 +15,9 @@ from segslam.bench.simulation.world_settings import (
 
 __all__ = [
     "Drive",
-    "Hits",
-    "LabelErrorConfig",
-    "Sensor",
     "SensorConfig",
     "SimulationConfig",
-    "Sweep",
     "SweepError",
-    "World",
     "WorldConfig",
     "build_world",
     "drive_sweeps",
@@ -35,10 +27,8 @@ __all__ = [
     "level_revisits",
     "level_world",
     "make_sensor",
-    "network_like",
     "prepare_folder",
     "read_drive",
-    "simulate_drive",
     "simulation_config",
     "sweep",
     "sweep_errors",

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.bench.simulation.drive import drive_sweeps
-from segslam.bench.simulation.sensor import Sweep
-from segslam.bench.simulation.tracks import Drive, parse_calib
+from segslam.bench.simulation.sensor import Sweep, drive_sweeps
+from segslam.bench.simulation.tracks import Drive
 from segslam.bench.simulation.world import build_world
 from segslam.bench.simulation.world_settings import SimulationConfig
 from segslam.core import geometry
@@ -20,9 +19,9 @@ from segslam.core.trajectory import camera_from_lidar
 from segslam.core.types import SegslamError, Transform, WorkFailed
 from segslam.core.whole_files import write_whole
 from segslam.labels.encodings import RAW_OF_LABEL
+from segslam.scans.kitti import VERTICAL_ANGLE_DEG, parse_calibration
 
 SETTINGS_FILE = "simulation.json"
-KITTI_VERTICAL_ANGLE_DEG = 0.205  # correction that readers of KITTI's scans apply to each vertical angle
 
 
 def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
@@ -96,7 +95,7 @@ def write_sequence(
     """
     folder = out / "sequences" / sequence
     write_whole(folder / "calib.txt", drive.calib)
-    T_camera_lidar = parse_calib(drive.calib, source="calib")
+    T_camera_lidar = parse_calibration(drive.calib, folder / "calib.txt")
     origin = drive.T_world_lidar[0] if T_world_origin is None else T_world_origin
     T_first_lidar = geometry.inverse(origin) @ drive.T_world_lidar
     T_first_camera = camera_from_lidar(T_first_lidar, T_camera_lidar)
@@ -132,4 +131,4 @@ def _write_scan(folder: Path, name: str, one: Sweep) -> None:
 
 def uncorrected(points: np.ndarray) -> np.ndarray:
     """Points with their vertical angles lowered by the correction that readers of KITTI's scans apply."""
-    return raise_beams(points, -KITTI_VERTICAL_ANGLE_DEG)
+    return raise_beams(points, -VERTICAL_ANGLE_DEG)

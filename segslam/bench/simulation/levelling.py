@@ -36,20 +36,16 @@ def level_world(T_world_lidar: Poses) -> Poses:
 def level_revisits(T_world_lidar: Poses) -> Poses:
     """The drive with one height for each place; x, y and yaw are unchanged. z must point up."""
     positions = T_world_lidar[:, :3, 3]
-    travel = _travel_m(positions)
-    climb = np.concatenate([[0.0], np.cumsum(_plausible_climbs(positions, travel))])
+    steps = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
+    travel = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-6))])  # ascends strictly, also where the car stands
+    bound = MAX_SLOPE * np.diff(travel)
+    climb = np.concatenate([[0.0], np.cumsum(np.clip(np.diff(positions[:, 2]), -bound, bound))])
     stations = np.arange(0.0, travel[-1] + STEP_M, STEP_M)
     path = np.column_stack([np.interp(stations, travel, values) for values in (*positions[:, :2].T, climb)])
     raise_m = _smoothest_raise(path)
     slope = np.gradient(raise_m, STEP_M) if len(stations) > 1 else np.zeros(1)
     heights = climb + np.interp(travel, stations, raise_m)
     return _raised(T_world_lidar, heights, np.interp(travel, stations, slope))
-
-
-def _plausible_climbs(positions: np.ndarray, travel_m: Vector) -> Vector:
-    """(n - 1,) height differences between consecutive poses, limited to MAX_SLOPE; zero where the car stands."""
-    bound = MAX_SLOPE * np.diff(travel_m)
-    return np.clip(np.diff(positions[:, 2]), -bound, bound)
 
 
 def _smoothest_raise(path: np.ndarray) -> Vector:
@@ -93,9 +89,3 @@ def _raised(T_world_lidar: Poses, heights: Vector, slope: Vector) -> Poses:
     poses[:, :3, :3] = turns @ T_world_lidar[:, :3, :3]
     poses[:, 2, 3] = heights
     return poses
-
-
-def _travel_m(positions: np.ndarray) -> Vector:
-    """Horizontal travel (m). A standing car advances by a tiny amount, so that the values ascend strictly."""
-    steps = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-6))])

@@ -1,13 +1,18 @@
-"""Model of a LiDAR: beam directions, returned points, and sensor errors."""
+"""Model of a LiDAR: beam directions, returned points, and sensor errors; its sweeps along a drive.
 
+A sweep depends only on the seed and its own number.
+"""
+
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from segslam.bench.simulation.drift import NO_ERROR, SweepError, distorted
+from segslam.bench.simulation.drift import NO_ERROR, SweepError, distorted, sweep_errors
 from segslam.bench.simulation.mesh import Instances
 from segslam.bench.simulation.world import Hits, World
 from segslam.bench.simulation.world_settings import SensorConfig, SensorName
+from segslam.core.trajectory import Poses
 from segslam.core.types import Label, Labels, Points, Scan, Transform, Vector
 
 
@@ -132,3 +137,26 @@ def _table(column: int) -> Vector:
 
 
 MEAN_INTENSITY, SPREAD_INTENSITY = _table(0), _table(1)
+
+
+def drive_sweeps(
+    world: World,
+    T_world_lidar: Poses,
+    time_s: Vector,
+    *,
+    config: SensorConfig,
+    seed: int,
+    only: Collection[int] | None = None,
+) -> Iterator[Sweep]:
+    """The sweeps of a drive through a world, in order; only the numbers in `only`, if given.
+
+    The sensor is the same on each simulated day; its noise differs.
+    """
+    sensor = make_sensor(config, seed=seed)
+    days = [world.day] if world.day else []
+    errors = sweep_errors(time_s, config=config, rng=np.random.default_rng([seed, 3, *days]))
+    for index, (T_world_now, now, error) in enumerate(zip(T_world_lidar, time_s, errors, strict=True)):
+        if only is not None and index not in only:
+            continue
+        rng = np.random.default_rng([seed, 4, index, *days])
+        yield sweep(world, sensor, T_world_now, rng=rng, time_s=float(now), error=error)

@@ -67,7 +67,9 @@ def ground_of(path: np.ndarray, rng: np.random.Generator) -> Terrain:
     coarse += _relief(rng, street_m[::COARSE, ::COARSE])
     kerb = np.clip((street_m - ROAD_M) / CELL_M, 0.0, 1.0) * KERB_M
     labels = np.select([street_m < ROAD_M, street_m < SIDEWALK_M], [Label.ROAD, Label.SIDEWALK], Label.TERRAIN)
-    return Terrain(origin, path_m, street_m, _refined(coarse) + kerb, labels.astype(np.uint8))
+    along = [np.linspace(0, size - 1, (size - 1) * COARSE + 1) for size in coarse.shape]
+    fine = map_coordinates(coarse, np.stack(np.meshgrid(*along, indexing="ij")), order=1)
+    return Terrain(origin, path_m, street_m, fine + kerb, labels.astype(np.uint8))
 
 
 def _distance_m(at: np.ndarray, shape: tuple[int, ...]) -> Raster:
@@ -98,12 +100,6 @@ def _relief(rng: np.random.Generator, distance: Raster) -> Raster:
     rough = gaussian_filter(rng.normal(size=distance.shape), 0.5) * 0.05
     rolling = gaussian_filter(rng.normal(size=distance.shape), 5.0) * 4.0
     return (rough + rolling) * np.clip((distance - SIDEWALK_M) / 10.0, 0.0, 1.0)
-
-
-def _refined(coarse: Raster) -> Raster:
-    """Bilinear interpolation between the coarse nodes."""
-    along = [np.linspace(0, size - 1, (size - 1) * COARSE + 1) for size in coarse.shape]
-    return map_coordinates(coarse, np.stack(np.meshgrid(*along, indexing="ij")), order=1)
 
 
 def ground_mesh(ground: Terrain) -> Mesh:

@@ -78,17 +78,13 @@ def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, se
     site = Site(ground)
     sides = frontages(street)
     today = np.random.default_rng([seed, 1, config.day]) if config.day else None
-    parked = _numbered_cars([car for side in sides for car in parked_cars(site, side, route, config, rng, today=today)])
+    parked = [car for side in sides for car in parked_cars(site, side, route, config, rng, today=today)]
+    parked = [replace(car, mesh=one) for car, one in zip(parked, _numbered([car.mesh for car in parked]), strict=True)]
     things = [thing for side in sides for thing in furnish(site, side, config, rng)]
     standing = [car.mesh for car in parked if not car.changes]
     static = join_meshes([ground_mesh(ground), *standing, *_numbered(things)])
     changing = [car for car in parked if car.changes]
     return World(ground, static, route, changing, moving_cars(route, config, today or rng), config.day)
-
-
-def _numbered_cars(cars: list[ParkedCar]) -> list[ParkedCar]:
-    meshes = _numbered([car.mesh for car in cars])
-    return [replace(car, mesh=mesh) for car, mesh in zip(cars, meshes, strict=True)]
 
 
 def _numbered(things: list[Mesh]) -> list[Mesh]:

@@ -1,14 +1,12 @@
 """Settings of the simulated street world and of its sensor."""
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from segslam.core.config import Section
-from segslam.core.config.yaml_text import parse_yaml, short
-from segslam.core.errors import brief
-from segslam.core.types import SegslamError
+from segslam.core.config.files import validated, with_overrides
 
 SensorName = Literal["hdl64", "os1-64", "vlp16"]
 
@@ -75,20 +73,5 @@ def simulation_config(sensor: str, overrides: Sequence[str] = ()) -> SimulationC
 
     Raises SegslamError, naming the key, for an unknown key or a value out of range.
     """
-    values: dict[str, dict[str, Any]] = {"world": {}, "sensor": {"name": sensor}}
-    for text in overrides:
-        key, _, value = text.partition("=")
-        section, _, name = key.strip().partition(".")
-        if section not in values or not name or not value:
-            raise SegslamError(
-                f"--set {brief(text)}: write world.key=value or sensor.key=value, for example world.cars=3"
-            )
-        values[section][name] = parse_yaml(value, f"--set {brief(text)}")
-    try:
-        return SimulationConfig.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        section, name = (str(part) for part in first["loc"])
-        known = ", ".join((WorldConfig if section == "world" else SensorConfig).model_fields)
-        remedy = f"known keys: {known}" if first["type"] == "extra_forbidden" else f"got {short(first['input'])}"
-        raise SegslamError(f"{section}.{name}: {first['msg']}; {remedy}") from error
+    values = with_overrides({"sensor": {"name": sensor}}, overrides, source="--set", example="world.cars=3")
+    return validated(SimulationConfig, values, "--set")

@@ -3,16 +3,17 @@
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from segslam.core.config.sections import Config, Section
+from segslam.core.config.sections import Config
 from segslam.core.config.yaml_text import parse_yaml, short
 from segslam.core.errors import SegslamError, brief
 
 logger = logging.getLogger(__name__)
+Model = TypeVar("Model", bound=BaseModel)
 
 REMOVED = {
     "adjustment": "every steps radius_m reach min_overlap",
@@ -57,18 +58,42 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base
     Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
     """
     values = _changed(base.model_dump(mode="json") if base else {}, _read_yaml(path) if path else {})
+    source = " and ".join([*([str(path)] if path else []), *(["--set"] if overrides or not path else [])])
+    overridden = with_overrides(values, overrides, source=source, example="keyframes.distance_m=1.5")
+    return validated(Config, _without_removed(overridden, source), source)
+
+
+def with_overrides(values: dict[str, Any], overrides: Sequence[str], *, source: str, example: str) -> dict[str, Any]:
+    """The values of sections, changed by `section.key=value` texts; `source` and `example` are for messages."""
+    changed = dict(values)
     for text in overrides:
         key, separator, value = text.partition("=")
-        section, dot, name = key.strip().partition(".")
-        if not separator or not dot or not name:
-            raise SegslamError(f"--set {brief(text)}: write section.key=value, for example keyframes.distance_m=1.5")
-        section_values = values.setdefault(section, {})
-        if not isinstance(section_values, dict):
-            raise SegslamError(f"{path}: {section}: expected a section with keys, found {short(section_values)}")
-        section_values[name] = parse_yaml(value, f"--set {brief(text)}")
-    source = str(path) if path is not None else "--set"
-    source = source if not (path and overrides) else f"{path} and --set"
-    return _validate(_without_removed(values, source), source)
+        section, _, name = key.strip().partition(".")
+        if not separator or not name:
+            raise SegslamError(f"--set {brief(text)}: write section.key=value, for example {example}")
+        known = changed.get(section, {})
+        if not isinstance(known, dict):
+            raise SegslamError(f"{source}: {section}: expected a section with keys, found {short(known)}")
+        changed[section] = known | {name: parse_yaml(value, f"--set {brief(text)}")}
+    return changed
+
+
+def validated(model: type[Model], values: Any, source: str) -> Model:
+    """The settings of a model from their values. Raises SegslamError, naming `source` and the key, for invalid ones."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = brief(".".join(str(part) for part in first["loc"]))
+        if first["type"] == "extra_forbidden":
+            fields = model.model_fields
+            if len(first["loc"]) > 1 and (section := fields.get(str(first["loc"][0]))) is not None:
+                fields = getattr(section.annotation, "model_fields", fields)
+            known = ", ".join(fields) or "none"
+            raise SegslamError(f"{source}: unknown key {key}; known keys: {known}") from error
+        message = brief(first["msg"].removeprefix("Value error, "), 300)
+        got = "" if isinstance(first["input"], dict) else f", got {short(first['input'])}"
+        raise SegslamError(f"{source}: {key + ': ' if key else ''}{message}{got}") from error
 
 
 def config_to_yaml(config: Config) -> str:
@@ -95,7 +120,7 @@ def config_from_yaml(text: str, source: str) -> Config:
         more = f" and {len(gone) - MOST_NAMED} more" if len(gone) > MOST_NAMED else ""
         named = ", ".join(gone[:MOST_NAMED])
         logger.warning("%s: ignored settings that this version does not have: %s%s", source, named, more)
-    return _validate(known, source)
+    return validated(Config, known, source)
 
 
 def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
@@ -155,25 +180,3 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise SegslamError(f"{source}: expected sections with keys, found {type(values).__name__}")
     return values
-
-
-def _validate(values: dict[str, Any], source: str) -> Config:
-    try:
-        return Config.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = brief(".".join(str(part) for part in first["loc"]))
-        if first["type"] == "extra_forbidden":
-            raise SegslamError(f"{source}: unknown key {key}; {_known_keys(first['loc'])}") from error
-        message = brief(first["msg"].removeprefix("Value error, "), 300)
-        got = "" if isinstance(first["input"], dict) else f", got {short(first['input'])}"
-        raise SegslamError(f"{source}: {key}: {message}{got}") from error
-
-
-def _known_keys(location: tuple[int | str, ...]) -> str:
-    fields = Config.model_fields
-    if len(location) > 1 and location[0] in fields:
-        section = fields[str(location[0])].annotation
-        if isinstance(section, type) and issubclass(section, Section):
-            fields = section.model_fields
-    return "known keys: " + (", ".join(fields) or "none")

@@ -155,15 +155,6 @@ class RetrievalConfig(Section):
     )
 
 
-def _check_rising(bounds: tuple[float, float]) -> tuple[float, float]:
-    if not 0 <= bounds[0] < bounds[1]:
-        raise ValueError("give the lower bound, at least 0, then the upper bound")
-    return bounds
-
-
-Bounds = Annotated[tuple[float, float], AfterValidator(_check_rising)]
-
-
 class SegregatorConfig(Section):
     """Global registration from semantic clusters and point features."""
 

@@ -47,9 +47,8 @@ def consistency_graph(
     )
     joined = pairs(adjacency)
     if config.gate != "lengths":
-        shape_gate = spectral_distances if config.gate == "invariant" else shape_distances
-        distances = shape_gate(joined, correspondences.source_covariances, correspondences.target_covariances)
-        kept = distances <= config.shape_bound_m2
+        covariances = correspondences.source_covariances, correspondences.target_covariances
+        kept = _distances(joined, *covariances, config.gate == "invariant") <= config.shape_bound_m2
         part(adjacency, joined[~kept])
         joined = joined[kept]
     return ConsistencyGraph(adjacency, joined)
@@ -149,21 +148,12 @@ def _shape_distance(a, b):
     return a[0] + a[1] + a[2] + b[0] + b[1] + b[2] - 2.0 * (roots[0] + roots[1] + roots[2])
 
 
-@kernel("float64[::1](int64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])")
-def spectral_distances(pairs, source_covariances, target_covariances):
-    """Invariant gate: distance of each pair's summed covariances in the two scans (m^2)."""
+@kernel("float64[::1](int64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], boolean)")
+def _distances(pairs, source_covariances, target_covariances, invariant):
+    """Distance of each pair's summed covariances in the two scans (m^2), invariant to rotation or as published."""
     distances = np.empty(len(pairs))
     for row in range(len(pairs)):
         i, j = pairs[row]
-        distances[row] = _spectral_distance(_sum(source_covariances, i, j), _sum(target_covariances, i, j))
-    return distances
-
-
-@kernel("float64[::1](int64[:, ::1], float64[:, :, ::1], float64[:, :, ::1])")
-def shape_distances(pairs, source_covariances, target_covariances):
-    """Published gate: the same without invariance to rotation, as if both covariances were in one frame (m^2)."""
-    distances = np.empty(len(pairs))
-    for row in range(len(pairs)):
-        i, j = pairs[row]
-        distances[row] = _shape_distance(_sum(source_covariances, i, j), _sum(target_covariances, i, j))
+        a, b = _sum(source_covariances, i, j), _sum(target_covariances, i, j)
+        distances[row] = _spectral_distance(a, b) if invariant else _shape_distance(a, b)
     return distances

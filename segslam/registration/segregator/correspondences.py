@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from segslam.core.kernels import kernel
-from segslam.core.types import Covariances, Description, IndexPairs, Indices, Label, Labels, Points
+from segslam.core.types import Covariances, Description, IndexPairs, Indices, Labels, Points
 
 Descriptors = Float[np.ndarray, "_ 33"]
 
@@ -87,7 +87,13 @@ def feature_correspondences(
     rng = np.random.default_rng(seed)
     kept = [np.empty((0, 2), np.int64)]
     for label in np.intersect1d(source.feature_classes, target.feature_classes):
-        pairs = _mutual_nearest_of_class(source, target, Label(label))
+        source_rows, target_rows = (
+            # the descriptors of key points without neighbours are zero
+            np.flatnonzero((one.feature_classes == label) & one.feature_descriptors.any(axis=1))
+            for one in (source, target)
+        )
+        pairs = mutual_nearest(source.feature_descriptors[source_rows], target.feature_descriptors[target_rows])
+        pairs = np.column_stack([source_rows[pairs[:, 0]], target_rows[pairs[:, 1]]])
         rows = tuple_test(
             source.feature_points[pairs[:, 0]],
             target.feature_points[pairs[:, 1]],
@@ -104,17 +110,6 @@ def concatenate(first: Correspondences, second: Correspondences) -> Corresponden
     return Correspondences(
         *(np.concatenate([getattr(first, name), getattr(second, name)]) for name in Correspondences.__slots__)
     )
-
-
-def _mutual_nearest_of_class(source: Description, target: Description, label: Label) -> IndexPairs:
-    source_rows, target_rows = _described_rows(source, label), _described_rows(target, label)
-    pairs = mutual_nearest(source.feature_descriptors[source_rows], target.feature_descriptors[target_rows])
-    return np.column_stack([source_rows[pairs[:, 0]], target_rows[pairs[:, 1]]])
-
-
-def _described_rows(description: Description, label: Label) -> Indices:
-    """Key points of a class that have neighbours; the descriptors of the others are zero."""
-    return np.flatnonzero((description.feature_classes == label) & description.feature_descriptors.any(axis=1))
 
 
 def _collect(source: Description, target: Description, pairs: IndexPairs) -> Correspondences:

@@ -48,9 +48,7 @@ def ground_cells(points: Points, labels: Labels, *, reach_m: float) -> Points:
 
     Sums in float64 of float32 values above 1e-5 m are exact, so they do not depend on the order of points.
     """
-    is_ground = np.zeros(256, np.bool_)
-    is_ground[list(GROUND_LABELS)] = True
-    sums = _cell_sums(points[is_ground[labels]].astype(np.float64), reach_m, CELL_M)
+    sums = _cell_sums(points[np.isin(labels, GROUND_LABELS)].astype(np.float64), reach_m, CELL_M)
     sums = sums[sums[:, 3] > 0]
     return sums[:, :3] / sums[:, 3:]
 

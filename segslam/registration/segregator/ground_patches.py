@@ -38,9 +38,7 @@ def ground_patches(points: Points, labels: Labels) -> GroundPatches:
 
     Normals point towards the sensor.
     """
-    is_ground = np.zeros(256, np.bool_)
-    is_ground[list(GROUND_LABELS)] = True
-    sums = _moments(points[is_ground[labels]].astype(np.float64), REACH_M, CELL_M, RESOLUTION_M)
+    sums = _moments(points[np.isin(labels, GROUND_LABELS)].astype(np.float64), REACH_M, CELL_M, RESOLUTION_M)
     sums = sums[sums[:, 0] >= MIN_POINTS]
     means = sums[:, 1:] / sums[:, :1]
     centres = means[:, :3] * RESOLUTION_M

@@ -8,7 +8,6 @@ then point features.
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -78,35 +77,19 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
             rejections.append(attempt)
             continue
         found.append(attempt)
-        if attempt.fit.inliers.sum() >= CERTAIN_INLIERS:
+        if attempt[1].num_inliers >= CERTAIN_INLIERS:
             break
     if not found:
         return rejections[0]
-    found.sort(key=lambda attempt: -attempt.fit.score)
-    poses = [attempt.fit.T_target_source for attempt in found]
-    return [attempt.registration() for k, attempt in enumerate(found) if not _is_among(poses[k], poses[:k])]
+    ranked = [registration for _, registration in sorted(found, key=lambda attempt: -attempt[0])]
+    poses = [registration.T_target_source for registration in ranked]
+    return [registration for k, registration in enumerate(ranked) if not _is_among(poses[k], poses[:k])]
 
 
-class _Attempt(NamedTuple):
-    """A pose, and the numbers of correspondences and edges of the graph from which it was computed."""
-
-    fit: PoseFit
-    num_correspondences: int
-    num_edges: int
-
-    def registration(self) -> Registration:
-        return Registration(
-            T_target_source=self.fit.T_target_source,
-            num_correspondences=self.num_correspondences,
-            num_inliers=int(self.fit.inliers.sum()),
-            rms_m=self.fit.rms_m,
-            information=self.fit.information,
-            num_edges=self.num_edges,
-        )
-
-
-def _attempts(source: Description, target: Description, config: SegregatorConfig) -> Iterator[_Attempt | Rejected]:
-    """Poses of the maximum cliques: first of clusters, then of clusters and features, for increasing bounds."""
+def _attempts(
+    source: Description, target: Description, config: SegregatorConfig
+) -> Iterator[tuple[float, Registration] | Rejected]:
+    """Scores and poses of the maximum cliques: of clusters, then of clusters and features, for increasing bounds."""
     for correspondences in putative(source, target, config=config):
         if len(correspondences) < config.min_clique:
             yield Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
@@ -120,7 +103,18 @@ def _attempts(source: Description, target: Description, config: SegregatorConfig
                 continue
             for clique in search.cliques:
                 fit = _solve(source, target, correspondences, clique, bound_m, config)
-                yield fit if isinstance(fit, Rejected) else _Attempt(fit, len(correspondences), len(graph.edges))
+                if isinstance(fit, Rejected):
+                    yield fit
+                    continue
+                registration = Registration(
+                    T_target_source=fit.T_target_source,
+                    num_correspondences=len(correspondences),
+                    num_inliers=int(fit.inliers.sum()),
+                    rms_m=fit.rms_m,
+                    information=fit.information,
+                    num_edges=len(graph.edges),
+                )
+                yield fit.score, registration
 
 
 def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Iterator[Correspondences]:

@@ -66,7 +66,8 @@ def plan_hypotheses(source: FloorPlan, target: FloorPlan, *, num_poses: int) -> 
     if min(len(source.points), len(target.points)) == 0:
         return
     volume, steps = _correlation(source, target)
-    filled = _filled(target.points)
+    filled = np.zeros((SIZE, SIZE, NUM_SLICES), bool)
+    filled[*_slots(target.points)] = True
     for yaw_index, i, j in _peaks(volume, num_poses):
         R_yaw = geometry.yaw(math.tau * yaw_index / NUM_YAWS)
         T_flat = geometry.transform(R_yaw, CELL_M * np.array([steps[i], steps[j], 0.0]))
@@ -139,12 +140,6 @@ def _count_filled(rows, columns, slices, filled, most_rise):
             height = min(max(slices[at] + k - most_rise, 0), filled.shape[2] - 1)
             num_filled[k] += filled[rows[at], columns[at], height]
     return num_filled
-
-
-def _filled(points: Points) -> Bool[np.ndarray, "size size slices"]:
-    filled = np.zeros((SIZE, SIZE, NUM_SLICES), bool)
-    filled[*_slots(points)] = True
-    return filled
 
 
 def _slots(points: Points) -> tuple[np.ndarray, ...]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
-from segslam.core.robust import first_control, tls_weights
+from segslam.core.robust import CONTROL_FACTOR, first_control, tls_weights
 from segslam.core.types import (
     Direction,
     Information,
@@ -32,8 +32,6 @@ from segslam.core.types import (
     Vector,
 )
 
-GNC_FACTOR = 1.4
-"""Authors: growth of GNC's control parameter."""
 GNC_MAX_ITERATIONS = 100
 """Authors: largest number of iterations of GNC."""
 GNC_COST_TOLERANCE = 1e-6
@@ -155,7 +153,7 @@ def graduated_non_convexity(fit: Callable[[Vector], tuple[Fitted, Vector]], num_
         if abs(cost - previous_cost) < GNC_COST_TOLERANCE:
             break
         previous_cost = cost
-        control *= GNC_FACTOR
+        control *= CONTROL_FACTOR
     return fitted
 
 

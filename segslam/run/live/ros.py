@@ -32,7 +32,7 @@ from segslam.gnss.messages import row_of
 from segslam.run.live.live_map import DrawnMap
 from segslam.run.live.waiting import Arrival, Waiting
 from segslam.scans.dataset import make_scan
-from segslam.scans.point_cloud2 import CloudReader
+from segslam.scans.point_cloud2 import read_message
 from segslam.scans.sweep_times import sweep_times
 
 try:
@@ -167,19 +167,18 @@ class TopicSource:
         waiting.put(sent_ns, lambda index, stamp_ns: self._read(message, index, stamp_ns))
 
     def _read(self, message: PointCloud2, index: int, stamp_ns: int) -> Scan:
-        reader = CloudReader()
         try:
-            points, times = reader(message)
+            cloud = read_message(message)
         except (KeyError, TypeError, ValueError) as error:
             raise BadScan(f"{self._topic}: cloud {index} cannot be read ({error!r})") from error
         return make_scan(
             FilePath(self._topic),
             index,
             stamp_ns,
-            points,
-            np.zeros(len(points), np.uint8),
-            sweep_times(times, len(points), reader.stamp_ns * 1e-9),
-            intensities=reader.intensities if self._has_intensities else None,
+            cloud.points,
+            np.zeros(len(cloud.points), np.uint8),
+            sweep_times(cloud.times, len(cloud.points), 1e-9 * (cloud.stamp_ns or 0)),
+            intensities=cloud.intensities if self._has_intensities else None,
             vertical_angle_deg=self._vertical_angle_deg,
         )
 

@@ -12,14 +12,13 @@ from segslam.core.config import Config
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
-from segslam.graph import Graph
+from segslam.graph import AnchoredGraph, Graph
 from segslam.odometry import Odometry
 from segslam.output.finished import FinishedRun
 from segslam.output.georeferenced import take_over
 from segslam.registration.prepared import Labeller
 from segslam.run.locator import Locator
 from segslam.run.map_folder import SlamOf, map_folder
-from segslam.run.sessions.anchored import AnchoredGraph
 from segslam.run.sessions.placer import Placer
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.slam import Slam, SlamResult

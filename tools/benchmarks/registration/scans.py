@@ -11,13 +11,11 @@ from segslam.bench.experiments.job import open_once
 from segslam.bench.experiments.trials import ScanVariant, Trial
 from segslam.bench.simulation import (
     Drive,
-    LabelErrorConfig,
     SimulationConfig,
     SweepError,
     WorldConfig,
     build_world,
     make_sensor,
-    network_like,
     read_drive,
     sweep,
     sweep_errors,
@@ -30,6 +28,7 @@ from segslam.core.types import Labels, Points, Scan, Transform
 from segslam.labels import geometric_labels
 from segslam.scans.kitti import read_returns
 from tools.benchmarks import real_pairs
+from tools.benchmarks.registration.label_errors import LabelErrorConfig, network_like
 
 Labelled = tuple[Points, Labels]
 

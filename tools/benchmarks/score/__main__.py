@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.bench.simulation.scenes import SCENES
 from segslam.core.config import Config, load_config
 from segslam.verification.patches import BINS
 from segslam.verification.score import Table
 from tools.benchmarks import common, score
+from tools.benchmarks.scene_models import SCENES
 from tools.benchmarks.score import ratio
 from tools.benchmarks.score.pairs import Task, described, of_drive, of_scene, of_towns
 from tools.benchmarks.score.ratio import Best, Pair

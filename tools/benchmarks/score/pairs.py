@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam.bench.simulation.scenes import SCENES
 from segslam.candidates.prior import far_from_prior
 from segslam.core import geometry
 from segslam.core.config import Config
@@ -26,6 +25,7 @@ from segslam.verification.patches import agreement
 from segslam.verification.trial import Trial
 from tools.benchmarks import common, scenes
 from tools.benchmarks.registration.scans import courtyard_points
+from tools.benchmarks.scene_models import SCENES
 from tools.benchmarks.score.ratio import Pair, Pose
 from tools.benchmarks.submaps import Submaps, poses_of
 

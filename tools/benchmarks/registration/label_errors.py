@@ -6,6 +6,7 @@ from pydantic import Field
 from segslam.core import geometry
 from segslam.core.config import Section
 from segslam.core.types import Label, Labels, Points
+from segslam.labels.scores import STILL
 
 # Classes that networks confuse with each class, most likely first.
 CONFUSED_WITH: dict[Label, tuple[Label, ...]] = {
@@ -21,14 +22,6 @@ CONFUSED_WITH: dict[Label, tuple[Label, ...]] = {
     Label.TRUNK: (Label.POLE, Label.VEGETATION),
     Label.POLE: (Label.TRUNK, Label.TRAFFIC_SIGN, Label.FENCE),
     Label.TRAFFIC_SIGN: (Label.POLE, Label.UNLABELLED),
-}
-STANDING = {
-    Label.MOVING_CAR: Label.CAR,
-    Label.MOVING_TRUCK: Label.TRUCK,
-    Label.MOVING_OTHER_VEHICLE: Label.OTHER_VEHICLE,
-    Label.MOVING_PERSON: Label.PERSON,
-    Label.MOVING_BICYCLIST: Label.BICYCLIST,
-    Label.MOVING_MOTORCYCLIST: Label.MOTORCYCLIST,
 }
 IMAGE = (64, 1024)  # rows over the elevations in the scan, columns over the full circle: the usual network resolution
 
@@ -48,19 +41,12 @@ class LabelErrorConfig(Section):
 
 def network_like(points: Points, labels: Labels, *, config: LabelErrorConfig, rng: np.random.Generator) -> Labels:
     """Simulated network labels (n,) for points (n, 3) of the LiDAR frame with known true labels."""
-    guessed = _static(labels)
+    guessed = STILL[labels]  # a single scan does not show motion
     for _ in range(config.regions if len(points) else 0):
         _confuse_region(guessed, points, config.region_radius_m, rng)
     guessed = _blurred(guessed, points, config.bleeding, rng)
     guessed[rng.random(len(guessed)) < config.lost] = Label.UNLABELLED
     return guessed
-
-
-def _static(labels: Labels) -> Labels:
-    """Labels with each moving class replaced by its static class: a single scan does not show motion."""
-    table = np.arange(len(Label), dtype=np.uint8)
-    table[list(STANDING)] = list(STANDING.values())
-    return table[labels]
 
 
 def _confuse_region(labels: Labels, points: Points, radius_m: float, rng: np.random.Generator) -> None:

@@ -11,15 +11,14 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, ChunkIndex, Message, MessageIndex, Schema
+from mcap.records import Channel, Chunk, Message, MessageIndex, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
 from segslam.core.extras import how_to_install
-from segslam.scans.in_order import InOrder
+from segslam.scans.bag_messages import CLOUD, InOrder, one_topic
 from segslam.scans.scan_files import MAX_SCAN_BYTES
 
-MESSAGE = "sensor_msgs/msg/PointCloud2"
 RECORD_HEADER_BYTES = 9
 DAMAGE = (McapError, ValueError, OverflowError, struct.error)
 """Exceptions of the library for damaged records."""
@@ -33,15 +32,16 @@ class _Place(NamedTuple):
     offset: int
 
 
-class McapClouds:
-    """Messages with clouds, by their order in time; replaces kiss_icp's reader, which fails with mcap-ros2-support 0.6.
+class McapMessages:
+    """Messages of one kind, by their order in time; replaces kiss_icp's reader, which fails with mcap-ros2-support 0.6.
 
     A message in a damaged chunk cannot be read; the others can. In a file without chunks, or without an index of their
     messages, none after the damage can. Raises ValueError if the file has no index or no such topic, ImportError if
     the decoding package is missing.
     """
 
-    def __init__(self, file: Path, topic: str) -> None:
+    def __init__(self, file: Path, topic: str, *, kind: str = CLOUD, option: str = "--topic") -> None:
+        """As `BagMessages`."""
         try:
             from mcap_ros2.decoder import DecoderFactory
         except ImportError as error:
@@ -50,17 +50,22 @@ class McapClouds:
         self._chunk: tuple[int, bytes] = (-1, b"")
         with file.open("rb") as stream:
             summary = _summary(stream)
-            self._topic, channels, num_clouds = _topic_and_count(summary, topic)
+            assert summary.statistics is not None
+            alike = [one for one in summary.channels.values() if one.schema_id and _schema(summary, one).name == kind]
+            self._topic = one_topic({one.topic for one in alike}, topic, kind=kind, option=option)
+            channels = {one.id: one for one in alike if one.topic == self._topic}
+            counts = summary.statistics.channel_message_counts
+            self._num_messages = sum(counts.get(id, 0) for id in channels)
             self._places = _places(stream, summary, channels)
         self._decode = {id: _decoder(DecoderFactory(), one, _schema(summary, one)) for id, one in channels.items()}
         self._in_order = None
-        if len(self._places) != num_clouds:
-            self._in_order = InOrder(self._messages, num_clouds, num_bytes=file.stat().st_size)
+        if len(self._places) != self._num_messages:
+            num_bytes = file.stat().st_size if kind == CLOUD else None
+            self._in_order = InOrder(self._messages, self._num_messages, num_bytes=num_bytes)
         self.is_sequential = self._in_order is not None
-        self._num_clouds = num_clouds
 
     def __len__(self) -> int:
-        return self._num_clouds
+        return self._num_messages
 
     def __getitem__(self, index: int) -> tuple[int, Any]:
         """Log time (ns) and decoded message. Raises what the decoders raise for a damaged one."""
@@ -104,24 +109,6 @@ def _summary(stream: IO[bytes]) -> Summary:
     return summary
 
 
-def _topic_and_count(summary: Summary, wanted: str) -> tuple[str, dict[int, Channel], int]:
-    """The topic, its channels by id, and its number of messages."""
-    assert summary.statistics is not None
-    clouds = [
-        channel
-        for channel in summary.channels.values()
-        if channel.schema_id and _schema(summary, channel).name == MESSAGE
-    ]
-    topics = {channel.topic for channel in clouds}
-    found = [topic for topic in topics if topic == wanted or not wanted]
-    if len(found) != 1:
-        known = ", ".join(f"--topic {topic}" for topic in sorted(topics)) or "none"
-        raise ValueError(f"give one topic of type {MESSAGE}; the file has: {known}")
-    channels = {channel.id: channel for channel in clouds if channel.topic == found[0]}
-    counts = summary.statistics.channel_message_counts
-    return found[0], channels, sum(counts.get(id, 0) for id in channels)
-
-
 def _schema(summary: Summary, channel: Channel) -> Schema:
     try:
         return summary.schemas[channel.schema_id]
@@ -135,16 +122,11 @@ def _places(stream: IO[bytes], summary: Summary, channels: dict[int, Channel]) -
     for chunk in summary.chunk_indexes:
         for channel in channels.keys() & chunk.message_index_offsets.keys():
             with suppress(*DAMAGE):
-                entries = _message_index(stream, chunk, channel)
+                stream.seek(chunk.message_index_offsets[channel] + RECORD_HEADER_BYTES)
+                index = MessageIndex.read(ReadDataStream(stream))
+                entries = index.records if index.channel_id == channel else []
                 places += [_Place(log_ns, chunk.chunk_start_offset, offset) for log_ns, offset in entries]
     return sorted(places)
-
-
-def _message_index(stream: IO[bytes], chunk: ChunkIndex, channel: int) -> list[tuple[int, int]]:
-    """Time and offset of each message of a channel in a chunk."""
-    stream.seek(chunk.message_index_offsets[channel] + RECORD_HEADER_BYTES)
-    index = MessageIndex.read(ReadDataStream(stream))
-    return index.records if index.channel_id == channel else []
 
 
 def _chunk_data(stream: IO[bytes], start: int) -> bytes:

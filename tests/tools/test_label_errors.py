@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from segslam.bench.simulation.label_errors import CONFUSED_WITH, LabelErrorConfig, network_like
 from segslam.core.types import Label
+from tools.benchmarks.registration.label_errors import CONFUSED_WITH, LabelErrorConfig, network_like
 
 NONE = LabelErrorConfig(regions=0, bleeding=0.0, lost=0.0)
 

@@ -5,7 +5,6 @@ that across a break of the odometry. Each keyframe that was placed in the map ha
 optimisation of loops and breaks therefore applies to placements without change.
 """
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,16 +13,8 @@ import numpy as np
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core.config import GraphConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import (
-    GraphEstimate,
-    Information,
-    LoopClosure,
-    Placement,
-    SegslamError,
-    Transform,
-    Vector,
-)
-from segslam.graph import PoseGraph
+from segslam.core.types import GraphEstimate, Information, LoopClosure, Placement, SegslamError, Transform, Vector
+from segslam.graph.graph import PoseGraph
 
 OPTIMIZE_EVERY = 25
 """Chosen: placements between two optimisations during the run; until then the pose of a keyframe is its placement."""
@@ -35,8 +26,7 @@ class AnchoredGraph:
     def __init__(self, config: GraphConfig) -> None:
         self._graph = PoseGraph(config)
         self._graph.add_keyframe(0, np.eye(4), 0.0)
-        self._placements: list[int] = []
-        self._num_waiting = 0
+        self._num_placements = self._num_waiting = 0
         self.weights: dict[int, float] = {}
         """Weight of each keyframe placed before the last optimisation: 0 (rejected) to 1 (full weight)."""
 
@@ -58,7 +48,7 @@ class AnchoredGraph:
     @property
     def is_due(self) -> bool:
         """True if enough placements wait for an optimisation: the first, or `OPTIMIZE_EVERY`."""
-        return self._num_waiting >= OPTIMIZE_EVERY or 0 < self._num_waiting == len(self._placements)
+        return self._num_waiting >= OPTIMIZE_EVERY or 0 < self._num_waiting == self._num_placements
 
     def add_keyframe(
         self,
@@ -72,21 +62,14 @@ class AnchoredGraph:
         """As `PoseGraph.add_keyframe`."""
         if keyframe_id == 0:
             information = np.zeros((6, 6))
-        self._graph.add_keyframe(
-            keyframe_id + 1,
-            T_odom_keyframe,
-            travel_m + BREAK_TRAVEL_M,
-            information=information,
-            stamp_ns=stamp_ns,
-        )
+        at_m = travel_m + BREAK_TRAVEL_M
+        self._graph.add_keyframe(keyframe_id + 1, T_odom_keyframe, at_m, information=information, stamp_ns=stamp_ns)
 
     def add_closure(self, closure: LoopClosure) -> None:
         """Raises SegslamError: a localised drive has no loops of its own."""
         raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 
-    def weigh_odometry_by(self, closure: LoopClosure) -> None:
-        """Raises SegslamError, as `add_closure` does."""
-        self.add_closure(closure)
+    weigh_odometry_by = add_closure
 
     def place(self, placement: Placement) -> None:
         """Place a keyframe in the map; takes effect in the next optimisation."""
@@ -94,7 +77,7 @@ class AnchoredGraph:
         self._graph.add_closure(
             LoopClosure(source_id, 0, placement.T_world_keyframe, placement.information, placement.alignment)
         )
-        self._placements.append(placement.keyframe_id)
+        self._num_placements += 1
         self._num_waiting += 1
 
     def optimize(self) -> GraphEstimate:
@@ -116,9 +99,5 @@ class AnchoredGraph:
             estimate,
             T_world_keyframe=dict(enumerate(self.T_world_keyframes)),
             closure_weights={},
-            motion_weights=_renumbered(estimate.motion_weights.items()),
+            motion_weights={(a - 1, b - 1): weight for (a, b), weight in estimate.motion_weights.items() if a > 0},
         )
-
-
-def _renumbered(weights: Iterable[tuple[tuple[int, int], float]]) -> dict[tuple[int, int], float]:
-    return {(before - 1, after - 1): weight for (before, after), weight in weights if before > 0}

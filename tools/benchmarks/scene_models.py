@@ -1,5 +1,9 @@
-"""Scenes other than streets, for registration tests: corridor, garage, tunnel, forest, parking lot, open square."""
+"""Scenes other than streets, for registration tests: corridor, garage, tunnel, forest, parking lot, open square.
 
+Sensors of several kinds scan them: 16 to 128 beams, high or narrow fields of view, a non-repetitive pattern.
+"""
+
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,6 +17,17 @@ from segslam.bench.simulation.vehicles import car
 from segslam.bench.simulation.world import Hits, cast_mesh, scene_of
 from segslam.core import geometry
 from segslam.core.types import Label, Points, Transform
+
+SENSORS = {
+    "16": (16, (-15.0, 15.0), 360.0), "32": (32, (-25.0, 15.0), 360.0), "64": (64, (-22.5, 22.5), 360.0),
+    "128": (128, (-22.5, 22.5), 360.0), "90 high": (64, (-45.0, 45.0), 360.0), "70 wide": (64, (-22.5, 22.5), 70.0),
+    "non-repeating": (0, (-7.0, 52.0), 360.0),
+}  # fmt: skip
+"""Number of beams (0: random directions in each scan), lowest and highest elevation, horizontal view (degrees)."""
+NUM_AZIMUTH = 720
+NUM_DRAWN = 30_000
+MIN_RANGE_M, MAX_RANGE_M = 0.5, 100.0
+DROPOUT = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,6 +199,31 @@ def pose(scene: Scene, row: int, rng: np.random.Generator, *, turned: bool = Fal
     side = rng.normal(scale=[0.15, 0.15, 0.03])
     tilt = geometry.exp(geometry.tangent(rotation_rad=np.radians(rng.normal(scale=[0.7, 0.7, 4.0])), translation_m=0.0))
     return geometry.transform(geometry.yaw(heading + np.pi * turned), np.array([x, y, z]) + side) @ tilt
+
+
+def scan_points(
+    scene: Scene, sensor: str, T_world_lidar: Transform, *, noise_m: float, rng: np.random.Generator
+) -> Points:
+    """One sweep (n, 3), float32, in the sensor's frame, with range noise and lost returns."""
+    rays = _rays(sensor, rng)
+    ranges = scene.cast(T_world_lidar, rays).range_m
+    seen = (ranges > MIN_RANGE_M) & (ranges < MAX_RANGE_M) & (rng.random(len(rays)) > DROPOUT)
+    ranges = ranges[seen] + rng.normal(scale=noise_m, size=int(seen.sum()))
+    return (rays[seen] * ranges[:, None]).astype(np.float32)
+
+
+def _rays(sensor: str, rng: np.random.Generator) -> Points:
+    beams, (low_deg, high_deg), width_deg = SENSORS[sensor]
+    half = math.radians(width_deg) / 2
+    if beams:
+        azimuths = np.linspace(-half, half, int(NUM_AZIMUTH * width_deg / 360.0), endpoint=False)
+        azimuth = np.repeat(azimuths, beams)
+        elevation = np.tile(np.radians(np.linspace(low_deg, high_deg, beams)), len(azimuths))
+    else:
+        azimuth = rng.uniform(-half, half, NUM_DRAWN)
+        elevation = np.radians(rng.uniform(low_deg, high_deg, NUM_DRAWN))
+    flat = np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
 def _path(x: np.ndarray, y: np.ndarray, z: float, heading: np.ndarray | float) -> np.ndarray:

@@ -30,6 +30,8 @@ MAX_ITERATIONS = 20
 """As small_gicp: largest number of iterations in each stage."""
 MAX_RANGE_M = 60.0
 """Chosen: points farther away are dropped (m)."""
+PRECISION_M = 0.001
+"""As small_gicp: a stage has converged if an iteration moves the pose by less."""
 MIN_POINTS = 100
 """Chosen on KITTI 00: smallest number of points, and of point pairs, for a registration."""
 INFORMATION_SCALE = 0.05
@@ -192,6 +194,7 @@ def refine(
     *,
     config: RefineConfig,
     must_converge: bool = True,
+    precision_m: float = PRECISION_M,
 ) -> Registration | Rejected:
     """The pose near `T_target_source` that aligns source and target by GICP (Segal et al. 2009).
 
@@ -204,7 +207,7 @@ def refine(
         sizes = f"{len(source)} and {len(target)} points, {MIN_POINTS} needed"
         return Rejected(RejectReason.TOO_FEW_POINTS, sizes)
     for correspondence_m in config.correspondence_m:
-        result = _aligned(source, target, T_target_source, correspondence_m, MAX_ITERATIONS)
+        result = _aligned(source, target, T_target_source, correspondence_m, MAX_ITERATIONS, precision_m)
         T_target_source = result.T_target_source
         if result.num_inliers < MIN_POINTS or not np.isfinite(T_target_source).all():
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"{result.num_inliers} pairs at {correspondence_m} m")
@@ -238,6 +241,7 @@ def _aligned(
     T_target_source: Transform,
     within_m: float,
     max_iterations: int,
+    precision_m: float = PRECISION_M,
 ) -> Any:
     return small_gicp.align(
         target.cloud,
@@ -246,6 +250,7 @@ def _aligned(
         T_target_source,
         max_correspondence_distance=within_m,
         max_iterations=max_iterations,
+        translation_epsilon=precision_m,
         num_threads=1,
     )
 

@@ -59,8 +59,8 @@ def register_prepared(
 ) -> Alignment | Rejected:
     """The refined and verified pose of the source in the target without an initial guess, or the reason of rejection.
 
-    Hypotheses are tried from best to worst until one is no chance fit. It is compared with all other poses
-    that were tried and with rivals; the best of them is returned if it is as probable as `verify.max_false_share`
+    Hypotheses are tried from best to worst until one that the prior allows is no chance fit. It is compared with all
+    other poses that were tried and with rivals; the best is returned if it is as probable as `verify.max_false_share`
     asks. `gate` may reject a pose before and after refinement. If no hypothesis leads anywhere, the rejection of the
     best one is returned.
     """

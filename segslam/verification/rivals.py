@@ -12,7 +12,7 @@ from segslam.core.types import Direction, Registration, Rejected, Transform
 from segslam.registration import refinement
 from segslam.registration.hypotheses import anywhere, plans_near
 from segslam.verification import score
-from segslam.verification.trial import Found, Trial, few_points, is_near
+from segslam.verification.trial import FEW_PRECISION_M, Found, Trial, few_points, is_near
 
 MAX_RIVALS = 6
 """Chosen: number of floor-plan poses tried as rivals, besides shifts along the weak direction."""
@@ -89,7 +89,9 @@ def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
     if _lead(found, T_begun, trial) > most + APPROACH_LEAD:
         return None
     with trial.watch("refine"):
-        fine = refinement.refine(*surfaces, T_begun, config=trial.config.refine, must_converge=False)
+        fine = refinement.refine(
+            *surfaces, T_begun, config=trial.config.refine, must_converge=False, precision_m=FEW_PRECISION_M
+        )
     if isinstance(fine, Rejected):
         return None
     lead = _lead(found, fine.T_target_source, trial)

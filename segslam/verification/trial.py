@@ -23,6 +23,8 @@ NUM_FEW = 4
 FEW_OFF_M = 0.5
 """Chosen: few points lead to a pose nearer than this to that of all points. Of 210 accepted poses (KITTI 00, NCLT, its
 submaps, simulated 06, scenes of even seeds) none was farther off than 0.33 m."""
+FEW_PRECISION_M = 0.02
+"""A refinement with few points ends once an iteration moves the pose by less: all points refine it further."""
 FEW_RATIO = 0.15
 """Chosen: a pose is not refined further if its mean log ratio, of the patches of one scan after a refinement with few
 points, is more than this below that of a pose that fits (nats)."""
@@ -88,6 +90,7 @@ class Trial(NamedTuple):
                 coarse.T_target_source,
                 config=config.refine,
                 must_converge=False,
+                precision_m=FEW_PRECISION_M,
             )
         if isinstance(led, Rejected):
             return led
@@ -123,8 +126,8 @@ class Trial(NamedTuple):
             return Found(coarse, fine, patches.agreement(*scans, fine.T_target_source))
 
     def fits(self, pose: Found) -> bool:
-        """False for a chance fit."""
-        return self.table.fits(pose.agreement.counts)
+        """False for a chance fit, and for a pose that the prior excludes."""
+        return self.gate(pose.T_target_source, slack_m=0.0) is None and self.table.fits(pose.agreement.counts)
 
     def mean_ratio(self, pose: Found) -> float:
         """Mean log ratio of the patches at a pose (nats)."""

@@ -15,39 +15,40 @@ from functools import cache, update_wrapper
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from queue import Queue
 from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).resolve().parents[1]
 MODULES = (
-    "core.points",
-    "graph.closure_pairs",
+    "registration.segregator.descent",
+    "registration.cliques.search",
+    "registration.cliques.bits",
+    "registration.segregator.fpfh",
+    "registration.segregator.consistency_graph",
     "labels.ground_surface",
     "labels.solids",
     "labels.uprights",
-    "labels.votes",
     "labels.walls",
-    "odometry.nudge",
-    "output.map.views",
-    "registration.cliques.bits",
-    "registration.cliques.search",
-    "registration.free_space",
+    "labels.votes",
     "registration.segregator.clusters",
-    "registration.segregator.consistency_graph",
+    "registration.segregator.plan",
     "registration.segregator.correspondences",
-    "registration.segregator.descent",
     "registration.segregator.feet",
-    "registration.segregator.fpfh",
     "registration.segregator.gaussians",
     "registration.segregator.ground_patches",
-    "registration.segregator.plan",
+    "graph.closure_pairs",
+    "output.map.views",
     "scans.pcd",
+    "registration.free_space",
     "slam.adjustment.alignment",
+    "odometry.nudge",
+    "core.points",
 )
-"""Modules of this package that define kernels."""
+"""Modules of this package that define kernels, the slowest to compile first."""
 DONE = "done "
-"""Start of the line that is printed for each compiled kernel."""
+"""Start of the line that a process prints for each compiled kernel."""
 
 _all: list["Kernel"] = []
 _lock = threading.RLock()
@@ -96,41 +97,24 @@ def are_built(modules: Sequence[str] = MODULES) -> bool:
 
 
 def build(modules: Sequence[str] = MODULES) -> Iterator[str]:
-    """Compile all kernels of these modules; yields the name of each when it is done.
+    """Compile all kernels of these modules in two processes; yields the name of each when it is done.
 
-    Another process does it, so that this one does not load all libraries of the modules. Raises RuntimeError, with the
-    last line that it wrote, if it fails.
+    Raises RuntimeError, with the last lines that a process wrote, if it fails.
     """
-    code = f"from segslam.core.kernels import _build; _build({list(modules)})"
-    path = os.pathsep.join([str(PACKAGE.parent), *filter(None, sys.path)])
-    environment = os.environ | {"PYTHONPATH": path}
-    last = ""
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
-    ) as process:
-        assert process.stdout is not None
-        try:
-            for line in map(str.strip, process.stdout):
-                last = line or last
-                if line.startswith(DONE):
-                    yield line.removeprefix(DONE)
-        except BaseException:
-            process.kill()
-            raise
-    if process.returncode:
-        raise RuntimeError(f"the kernels were not compiled: {last or 'the process was stopped'}")
+    lines: Queue[str] = Queue()
+    processes = [_start(modules, backwards=backwards) for backwards in (False, True)]
+    threads = [threading.Thread(target=_pass_on, args=(process, lines)) for process in processes]
+    for thread in threads:
+        thread.start()
+    try:
+        yield from _names_of_done(lines, num_kernels(modules))
+    finally:
+        for process, thread in zip(processes, threads, strict=True):
+            process.kill()  # no effect on a process that has ended
+            thread.join()
     stamp = _stamp(modules)
     stamp.parent.mkdir(parents=True, exist_ok=True)
     stamp.touch()
-
-
-def _build(modules: Sequence[str]) -> None:
-    """Compile the kernels one by one, and print a line for each."""
-    for name in modules:
-        module = import_module(f"segslam.{name}").__name__
-        for one in [one for one in _all if one.__module__ == module]:
-            one.compiled  # noqa: B018  (compiles on access)
-            print(f"{DONE}{module}.{one.py_func.__qualname__}", flush=True)
 
 
 def cache_folder() -> Path | None:
@@ -202,6 +186,57 @@ def _processor() -> str:
     except OSError:
         return platform.processor()
     return "".join(line for line in text.partition("\n\n")[0].splitlines() if line.startswith(("model name", "flags")))
+
+
+def _start(modules: Sequence[str], *, backwards: bool) -> subprocess.Popen[str]:
+    code = f"from segslam.core.kernels import _build; _build({list(modules)}, backwards={backwards})"
+    path = os.pathsep.join([str(PACKAGE.parent), *filter(None, sys.path)])
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
+    )
+
+
+def _names_of_done(lines: "Queue[str]", total: int) -> Iterator[str]:
+    """Name of each kernel on its first report, until there are `total`."""
+    done: set[str] = set()
+    others: list[str] = []
+    while len(done) < total:
+        line = lines.get()
+        name = line.removeprefix(DONE)
+        if not line:
+            raise RuntimeError(f"the kernels were not compiled: {' '.join(others[-3:]) or 'a process was stopped'}")
+        if name == line:
+            others.append(line)
+        elif name not in done:
+            done.add(name)
+            yield name
+
+
+def _pass_on(process: subprocess.Popen[str], lines: "Queue[str]") -> None:
+    """Pass on each line of the process, and an empty line if it fails."""
+    assert process.stdout is not None
+    with process.stdout as output:
+        for line in output:
+            lines.put(line.strip() or "-")
+    if process.wait():
+        lines.put("")
+
+
+def _build(modules: Sequence[str], *, backwards: bool) -> None:
+    """Compile the kernels one by one, and print a line for each.
+
+    Two processes start at opposite ends: each loads the kernels compiled by the other within milliseconds.
+    """
+    for name in reversed(modules) if backwards else modules:
+        module = import_module(f"segslam.{name}")
+        own = [kernel for kernel in _all if kernel.__module__ == module.__name__]
+        for kernel in reversed(own) if backwards else own:
+            kernel.compiled  # noqa: B018  (compiles on access)
+            print(f"{DONE}{kernel.__module__}.{kernel.py_func.__qualname__}", flush=True)
 
 
 def _file(module: str) -> Path:

@@ -100,19 +100,31 @@ def test_long_drives_are_thinned(made: MadeRun, monkeypatch: pytest.MonkeyPatch)
         assert 0 < len(interactive._thinned(np.zeros((num, 3)))) <= MOST_SCANS
 
 
+def _shown(page: str, folder: Path, *options: str) -> str:
+    """The page as the browser has built it."""
+    (folder / "page.html").write_text(page)
+    command = [str(BROWSER), "--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000", *options]
+    profile = f"--user-data-dir={folder / 'profile'}"
+    done = subprocess.run(
+        [*command, profile, "--dump-dom", f"file://{folder / 'page.html'}"], capture_output=True, text=True, check=True
+    )
+    return html.unescape(done.stdout)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+@pytest.mark.parametrize(("width", "has_buttons"), [(1400, True), (400, False)])
+def test_buttons_do_not_cover_the_legend_on_a_phone(
+    made: MadeRun, tmp_path: Path, width: int, has_buttons: bool
+) -> None:
+    shown = _shown((made.folder / "report.html").read_text(), tmp_path, f"--window-size={width},900")
+    assert 'data-ready="yes"' in shown
+    assert ('class="modebar-btn' in shown) == has_buttons
+
+
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
 def test_a_click_on_a_loop_shows_its_two_clouds_before_and_after(made: MadeRun, tmp_path: Path) -> None:
-    page = (made.folder / "report.html").read_text().replace("</body>", f"{CLICK}</body>")
-    (tmp_path / "page.html").write_text(page)
-    command = [str(BROWSER), "--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000"]
-    profile = f"--user-data-dir={tmp_path / 'profile'}"
-    done = subprocess.run(
-        [*command, profile, "--dump-dom", f"file://{tmp_path / 'page.html'}"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    shown = html.unescape(done.stdout)
+    page = (made.folder / "report.html").read_text()
+    shown = _shown(page.replace("</body>", f"{CLICK}</body>"), tmp_path)
     loops = [loop for loop in _data(page)["loops"] if loop["kind"] == "accepted"]
     assert f"<h3>keyframes {loops[1]['name']}: accepted, overlap" in shown
     assert shown.count('class="panel"') == 2

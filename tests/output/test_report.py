@@ -6,23 +6,27 @@ import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
+from itertools import cycle
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
+import matplotlib
 import numpy as np
 import pytest
 from helpers.finished_run import make_run
+from matplotlib.figure import Figure
 from PIL import Image
 
 from segslam import cli
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
-from segslam.core.types import SegslamError
+from segslam.core.types import MotionState, SegslamError
 from segslam.output.accuracy import accuracy
 from segslam.output.finished import FIGURES, read_run
 from segslam.output.folder import ALONE, write_metrics, write_poses
 from segslam.output.map.from_above import small_png
-from segslam.output.report import write_report
+from segslam.output.report import figures, gallery, write_report
 from segslam.output.report.figures import draw_loops, paths_of
 from segslam.output.report.gallery import choose, outcome_text
 from segslam.output.report.page import number, page, settings_not_default
@@ -240,3 +244,49 @@ def test_the_gallery_has_the_best_accepted_and_the_nearest_missed_loops(tmp_path
 )
 def test_numbers_have_three_digits(value: float, text: str) -> None:
     assert number(value) == text
+
+
+def test_plots_have_whole_legends_and_plain_numbers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made = make_run(tmp_path / "run")
+    run = read_run(made.folder)
+    states = cycle((MotionState.REPAIRED, MotionState.BROKEN, MotionState.CONFIRMED))
+    motions = tuple(replace(motion, state=state) for motion, state in zip(run.result.motions, states, strict=False))
+    run = replace(run, result=replace(run.result, motions=motions, alone=run.result.odometry))
+    poses = figures.compared(run)
+    assert poses is not None
+    with matplotlib.rc_context(figures.STYLE):
+        plots = [figures.draw_paths(run), figures.draw_loops(run), figures.draw_loops_over_time(run)]
+        plots.append(figures.draw_errors(poses))
+        for longest_ms in (2.0, 100.0, 1e5):
+            stages = {"a": {"median": 0.5, "p95": 1.0}, "b": {"median": 1.0, "p95": longest_ms}}
+            plots.append(figures.draw_stages(stages))
+    for plot in plots:
+        width = float(plot.split('viewBox="0 0 ')[1].split()[0])
+        words = re.findall(r'<text style="[^"]*" x="([\d.]+)"[^>]*>([^<]+)</text>', plot)
+        assert len(words) > 4
+        assert "$" not in "".join(word for _, word in words)
+        assert sum(word.strip().strip("0.").isdigit() for _, word in words) > 1
+        ends = {word: float(x) + 5 * len(word) for x, word in words if not word[0].isdigit()}
+        assert max(ends.values()) <= width, ends
+
+
+def test_the_title_of_a_pair_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+
+    def keep(*args: Any, **kwargs: Any) -> Figure:
+        drawn.append(Figure(*args, **kwargs))
+        return drawn[-1]
+
+    monkeypatch.setattr(gallery, "Figure", keep)
+    title = "keyframes 1200 to 300: accepted, probability 1.0000 (" + "other pose -14.9, " * 6 + ")"
+    gallery.draw_pair(np.zeros((1, 3)), np.zeros((1, 3)), poses={"a": np.eye(4), "b": np.eye(4)}, title=title)
+    (words,) = (text for text in drawn[0].texts if "keyframes" in text.get_text())
+    assert " ".join(words.get_text().split()) == " ".join(title.split())
+    extent = words.get_window_extent()
+    assert 0 <= extent.x0 < extent.x1 <= drawn[0].bbox.x1
+
+
+def test_a_phone_scrolls_wide_pictures_instead_of_shrinking_their_text(scored: Path) -> None:
+    html = scored.read_text()
+    assert re.search(r"@media \(max-width: 40rem\) \{[^@]*img\[src\*=\"image/png\"\] \{ width: 44rem; \}", html)
+    assert "<p>Left: before, by odometry. Right: after, as mapped.</p><img" in html

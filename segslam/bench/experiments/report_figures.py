@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from segslam.bench.experiments.report_tables import TITLES
-from segslam.output.report.figures import svg
+from segslam.output.report.figures import plain_powers, svg
 
 COLORS = (
     "#0072B2",
@@ -56,8 +56,7 @@ def draw_times(results: dict[str, Any]) -> str:
     axes.barh(methods, [results[name]["median_ms"] or 0.0 for name in methods], height=0.45, label="median")
     axes.set(xlabel="time of a registration (ms)", xscale="log")
     axes.set_xlim(left=10)
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("")
+    plain_powers(axes.xaxis)
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     _legend(axes)
@@ -77,6 +76,8 @@ def draw_along(results: dict[str, Any], by: str) -> str:
     success.set(ylabel="success (%)", ylim=(-3, 103))
     metres.set(ylabel="mean error (m)", yscale="log")
     degrees.set(ylabel="mean error (deg)", yscale="log", xlabel=TITLES[by])
+    for axes in (metres, degrees):
+        plain_powers(axes.yaxis)
     _legend(success)
     return svg(figure, by)
 

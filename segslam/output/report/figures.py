@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from segslam.core.evaluation import align_positions, false_loops, pose_errors
 from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
@@ -117,7 +119,7 @@ def draw_loops(run: FinishedRun) -> str:
         for pair in pairs:
             axes.plot(*ends[list(pair)].T, "o-", color=color, markersize=3, linewidth=1.5)
         axes.plot([], [], "o-", color=color, label=label)
-    _finish_map(axes, num_columns=2)
+    _finish_map(axes)
     return svg(figure, "loops")
 
 
@@ -172,7 +174,8 @@ def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
     axes.barh(stages, [stage_ms[stage]["median"] for stage in stages], color=CORRECTED, height=0.45, label="median")
     axes.grid(visible=False, axis="y")
     axes.set(xlabel="time (ms)", xscale="log")  # from a keyframe's fraction of a millisecond to minutes of adjustment
-    legend_on_top(axes)
+    plain_powers(axes.xaxis)
+    legend_on_top(axes, num_columns=2)
     return svg(figure, "stages")
 
 
@@ -181,7 +184,7 @@ def _plot_from_above(axes: Axes, paths: Iterable[Line]) -> None:
         xy = line.poses[:, :2, 3]
         axes.plot(*xy.T, line.style, color=line.color, label=line.name, linewidth=line.width)
         axes.plot(*xy[0], "o", color=line.color, markersize=5)
-    _finish_map(axes, num_columns=3)
+    _finish_map(axes)
 
 
 def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:
@@ -201,9 +204,9 @@ def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:
             axes.plot(*T_corrected[rows, :2, 3].T, marker, color=color, markersize=7, zorder=4, label=label)
 
 
-def _finish_map(axes: Axes, *, num_columns: int) -> None:
+def _finish_map(axes: Axes) -> None:
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", adjustable="datalim")
-    legend_on_top(axes, num_columns=num_columns)
+    legend_on_top(axes, num_columns=2)
 
 
 class _Outcome(NamedTuple):
@@ -252,7 +255,20 @@ def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:
     return {(c.source_id, c.target_id) for c, is_false in zip(closures, false, strict=True) if is_false}
 
 
-def legend_on_top(axes: Axes, *, num_columns: int = 3) -> None:
+class _PlainPowers(LogFormatter):
+    """Labels the ticks that the library would label, without a formula."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:g}" if super().__call__(x, pos) else ""
+
+
+def plain_powers(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers: `STYLE` draws no formulas."""
+    axis.set_major_formatter(_PlainPowers())
+    axis.set_minor_formatter(_PlainPowers(minor_thresholds=(1.0, 0.4)))
+
+
+def legend_on_top(axes: Axes, *, num_columns: int) -> None:
     """Draw the legend above the axes, on the left."""
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=num_columns, borderaxespad=0.2, fontsize=10)
 
@@ -299,7 +315,7 @@ def draw_fixes(folder: Path) -> str | None:
     above.set_aspect("equal", adjustable="datalim")
     figure.legend(loc="outside upper center", ncols=3)
     over_time.set(xlabel="time (minutes)", ylabel="residual (m)", yscale="log")
-    over_time.yaxis.set_major_formatter("{x:g}")
+    plain_powers(over_time.yaxis)
     return svg(figure, "fixes")
 
 

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable, Mapping
+from textwrap import fill
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,6 +26,8 @@ APART = 10
 """Chosen: keyframes between two pictures of one kind, so that they show different places."""
 SOURCE, TARGET = "#D55E00", "#4D4D4D"
 VIEW_M = 50.0
+LETTERS = 31
+"""Letters of a title that fit above a panel."""
 
 
 def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
@@ -83,7 +86,7 @@ def _standing(keyframe: Keyframe) -> Points:
 def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform], title: str) -> bytes:
     """The two scans as a PNG, a panel for each of `poses`: a name and T_target_source."""
     figure = Figure(figsize=(3.6 * len(poses), 4.4), layout="compressed")
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(fill(title, LETTERS * len(poses)), fontsize=11)
     panels = figure.subplots(1, len(poses), squeeze=False)[0]
     for axes, (name, T_target_source) in zip(panels, poses.items(), strict=True):
         for points, color, label in (

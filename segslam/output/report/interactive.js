@@ -21,7 +21,8 @@
     xaxis: { ...axis, title: { text: "x (m)" } },
     yaxis: { ...axis, title: { text: "y (m)" }, scaleanchor: "x" }, ...more,
   });
-  const config = { scrollZoom: true, responsive: true, displaylogo: false };
+  const narrow = window.innerWidth < 640;  // there the buttons would cover the legend, and fingers do what they do
+  const config = { scrollZoom: true, responsive: true, displaylogo: false, displayModeBar: narrow ? false : "hover" };
 
   const lines = data.paths.map((path) => ({
     type: "scatter", mode: "lines", name: path.name, x: path.x, y: path.y, hoverinfo: "skip",

@@ -59,8 +59,8 @@ def top_view(run: FinishedRun, keyframes: Mapping[int, Keyframe]) -> str:
     script = resources.files("segslam.output.report").joinpath("interactive.js").read_text(encoding="utf-8")
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("</", "<\\/")
     return (
-        "<p>Scroll or pinch to zoom, drag to move. Point at a dot to see its figures; click on a loop to see its two "
-        "scans before and after.</p>"
+        "<p>Scroll or pinch to zoom, drag to move, double-click to see all. Point at a dot to see its figures; click "
+        "on a loop to see its two scans before and after.</p>"
         f'<label>colour of the trajectory: <select id="colour"></select></label>'
         '<div id="topview"></div><div id="pair"></div><noscript>This view needs JavaScript.</noscript>'
         f'<script type="application/json" id="topview-data">{text}</script>'

@@ -57,14 +57,15 @@ table { border-collapse: collapse; width: 100%; font-size: .92rem; }
 td, th { text-align: left; padding: .2rem .6rem .2rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 #pair { display: flex; flex-wrap: wrap; gap: 1rem; } #pair h3 { flex-basis: 100%; margin: .5rem 0 0; font-size: 1rem; }
 #pair h4 { margin: 0; text-align: center; }
-.panel { flex: 1 1 18rem; min-width: 0; } figure { margin: 0; min-width: 0; } .gallery { display: grid; gap: 1rem;
+.panel { flex: 1 1 18rem; min-width: 0; } figure { margin: 0; min-width: 0; overflow-x: auto; }
+.gallery { display: grid; gap: 1rem;
   grid-template-columns: repeat(auto-fit, minmax(min(34rem, 100%), 1fr)); } p { margin: .2rem 0 .6rem; }
 td.number, th + th { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 th + th { white-space: normal; width: 5.5rem; }
 tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: anywhere; }
 details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child { white-space: nowrap; }
 @media (max-width: 40rem) { body, section { padding: .5rem; } td code { display: block; }
-  th + th { white-space: normal; } }
+  th + th { white-space: normal; } img[src*="image/png"] { width: 44rem; } }
 @media print { body { max-width: none; padding: 0; font-size: 11px; } .plots { columns: 2 7cm; }
   .tiles div, tr, img { break-inside: avoid; } h2, summary { break-after: avoid; }
   section:has(details) { break-inside: auto; }
@@ -97,9 +98,12 @@ def page(
     pictures = pictures or Pictures()
     name = run.folder.resolve().name
     title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
-    maps = {"Map by odometry, and corrected": pictures.before_after, "Map in top view": pictures.map}
     top = section("Top view", pictures.top_view) if pictures.top_view else ""
-    top += "".join(png_section(caption, png) for caption, png in maps.items() if png is not None)
+    if pictures.before_after is not None:
+        note = "Left: before, by odometry. Right: after, as mapped."
+        top += png_section("Map by odometry, and corrected", pictures.before_after, note=note)
+    if pictures.map is not None:
+        top += png_section("Map in top view", pictures.map)
     sections = [plot_section(caption, svg) for caption, svg in plots.items()]
     sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
     sections += [section("Files", _files(run)), section("Conditions", _conditions(run, about))]
@@ -169,9 +173,9 @@ def plot_section(caption: str, svg: str) -> str:
     return section(caption, _picture(caption, svg.encode(), "svg+xml"))
 
 
-def png_section(caption: str, png: bytes) -> str:
-    """A picture and its caption."""
-    return section(caption, _picture(caption, png, "png"))
+def png_section(caption: str, png: bytes, *, note: str = "") -> str:
+    """A picture and its caption; between them a note."""
+    return section(caption, f"<p>{note}</p>{_picture(caption, png, 'png')}" if note else _picture(caption, png, "png"))
 
 
 def _picture(caption: str, picture: bytes, kind: str) -> str:

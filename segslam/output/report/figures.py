@@ -259,7 +259,8 @@ class _PlainPowers(LogFormatter):
     """Labels the ticks that the library would label, without a formula."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
-        return f"{x:g}" if super().__call__(x, pos) else ""
+        label = super().__call__(x, pos)
+        return f"{x:g}" if label else ""
 
 
 def plain_powers(axis: Axis) -> None:

@@ -1,6 +1,7 @@
 """`segslam compare` and `sweep`: the figures of several runs in one table."""
 
 import shutil
+import textwrap
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -64,16 +65,20 @@ def _names(runs: list[Path]) -> list[str]:
 
 
 def _table(figures: dict[str, dict[str, Any]]) -> str:
-    """A line for each figure of any run, and a column for each run; `-` for missing figures."""
+    """A row for each figure of any run, and a column for each run; `-` for missing figures. Meanings are wrapped."""
     from segslam.output.finished import FIGURES
 
     width = max(COLUMN, *(len(name) + 2 for name in figures))
+    indent = len(figures) * width + 2
+    left = max(shutil.get_terminal_size().columns - indent, COLUMN)
     lines = ["".join(f"{name:>{width}}" for name in figures)]
     for key, meaning in FIGURES.items():
         values = [run.get(key) for run in figures.values()]
         if any(value is not None for value in values):
             cells = ("-" if value is None else figure(value) for value in values)
-            lines.append("".join(f"{cell:>{width}}" for cell in cells) + f"  {meaning}")
+            first, *others = textwrap.wrap(meaning, left)
+            lines.append("".join(f"{cell:>{width}}" for cell in cells) + f"  {first}")
+            lines += [" " * indent + other for other in others]
     return "\n".join(lines)
 
 

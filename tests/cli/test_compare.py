@@ -22,7 +22,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     root = tmp_path_factory.mktemp("runs")
     folders = [make_run(root / "one").folder, make_run(root / "two", with_truth=False).folder]
     write_metrics(folders[0], {"ate_m": 0.25, "num_scans": 120, "num_loops_accepted": 4})
-    write_metrics(folders[1], {"num_scans": 120, "num_loops_accepted": 7})
+    write_metrics(folders[1], {"num_scans": 120, "num_loops_accepted": 7, "num_motions_rejected": 3})
     return folders
 
 
@@ -32,6 +32,16 @@ def test_runs_stand_side_by_side(runs: list[Path], capsys: pytest.CaptureFixture
     assert lines[0].split() == ["one", "two"]
     assert next(line.split()[:2] for line in lines if "loops accepted" in line) == ["4", "7"]
     assert next(line.split()[:2] for line in lines if "trajectory error" in line) == ["0.25", "-"]
+
+
+def test_long_meanings_are_wrapped_to_the_terminal(
+    runs: list[Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run("compare", *runs) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert any(line.startswith(" " * 30) for line in lines), "a second line of a meaning"
 
 
 def test_figures_and_picture_of_several_runs(

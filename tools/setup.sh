@@ -27,10 +27,11 @@ find_python() {
 }
 
 system_packages() {
-    local missing=()
+    local missing=() libraries
+    libraries=$(PATH=$PATH:/sbin ldconfig -p)  # no pipe: `grep -q` ends it early, which pipefail takes for a failure
     # What Open3D's wheel loads, by the library that it asks for.
     for pair in libusb-1.0.so.0=libusb-1.0-0 libGL.so.1=libgl1 libEGL.so.1=libegl1 libgomp.so.1=libgomp1; do
-        ldconfig -p | grep -q "${pair%%=*}" || missing+=("${pair##*=}")
+        [[ $libraries == *"${pair%%=*}"* ]] || missing+=("${pair##*=}")
     done
     find_python || python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3 python3-venv)
     if [ ${#missing[@]} -gt 0 ]; then

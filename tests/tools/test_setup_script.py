@@ -38,3 +38,12 @@ def test_without_an_interpreter_the_message_has_the_package_to_install(tmp_path:
     assert "Python 3.14.0 is what there is" in ended.stderr
     assert "Install python3.13" in ended.stderr
     assert not (tmp_path / "venv").exists()
+
+
+def test_installed_libraries_are_found_in_a_long_list(tmp_path: Path) -> None:
+    names = [f"{name}.so.{number}" for name, number in (("libusb-1.0", 0), ("libGL", 1), ("libEGL", 1), ("libgomp", 1))]
+    listed = "\\n".join([*names, *("libother.so => /lib/libother.so" for _ in range(5000))])
+    _write(tmp_path / "ldconfig", f"#!/bin/bash\nfor part in 1 2 3 4 5 6 7 8; do printf '{listed}\\n'; done\n")
+    _write(tmp_path / "python3", f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    ended = _sourced(tmp_path, "set -o pipefail; install_packages() { echo installing $*; }; system_packages")
+    assert (ended.returncode, ended.stdout) == (0, ""), ended.stderr

@@ -82,7 +82,7 @@ class Tracker:
         """Continue after scans with these poses and stamps; `scan_of` reads the scan of a row.
 
         The odometry starts from the last scans within its range, a keyframe's distance apart. Its poses
-        therefore differ from those of an uninterrupted run, by centimetres.
+        therefore differ from those of an uninterrupted run, by centimetres to decimetres.
         """
         config = self._config
         intervals = Intervals()

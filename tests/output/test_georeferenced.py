@@ -83,13 +83,19 @@ def test_the_files_say_where_every_scan_is(made: MadeRun) -> None:
     assert {row["reason"] for row in fixes if row["kept"] == "1"} == {""}
 
 
+def _num_messages(folder: Path) -> int:
+    with (folder / "log.mcap").open("rb") as stream:
+        return sum(1 for _ in make_reader(stream).iter_messages())
+
+
 def test_the_log_shows_fixes_and_positions_on_a_map(made: MadeRun, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(made.folder, tmp_path / "run"))
     before = [(step.scan_index, step.stamp_ns) for step in read_log(folder / "log.mcap").steps()]
-    size = (folder / "log.mcap").stat().st_size
+    size, num_messages = (folder / "log.mcap").stat().st_size, _num_messages(folder)
     assert run("georeference", folder, "--gnss", made.folder.parent / "fixes.csv", "--quiet") == 0
     new_size = (folder / "log.mcap").stat().st_size
     assert new_size == pytest.approx(size, rel=1e-3), "the positions of before are replaced"  # digits may differ
+    assert _num_messages(folder) == num_messages
     trajectory = made.result.trajectory
     with (folder / "log.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])

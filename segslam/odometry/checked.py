@@ -10,13 +10,13 @@ smaller corrections leave it undisturbed, and are added to its poses.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.types import Information, Motion, MotionState, Points, Scan, Transform
+from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan, displacement_m
@@ -41,7 +41,7 @@ BREAK_M = 1.0
 
 
 class CheckedOdometry:
-    """Another odometry with its motions checked and replaced by more likely ones; itself an `Odometry`."""
+    """Another odometry with its motions checked and replaced by more likely ones."""
 
     def __init__(self, inner: Odometry, config: Config, *, recover: Recover) -> None:
         """`recover` registers two clouds without initial guess."""
@@ -63,11 +63,6 @@ class CheckedOdometry:
         self._num_unchecked = self._num_repaired = 0
         self._num_to_watch = WINDOW if inner.is_from_scans else 0
 
-    @property
-    def is_from_scans(self) -> bool:
-        """As that of the inner odometry."""
-        return self._inner.is_from_scans
-
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
         """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry."""
         gap = max(gap, self._intervals.gap(scan.stamp_ns))
@@ -83,24 +78,16 @@ class CheckedOdometry:
             self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(proposed.T_odom_lidar))
         return OdometryResult(T_odom_lidar, proposed.points, proposed.labels, proposed.intensities, motion)
 
-    def follow(
-        self,
-        scans: Sequence[tuple[Transform, Points]],
-        T_odom_lidar: Transform,
-        T_before_lidar: Transform,
-        *,
-        last: Scan | None = None,
-    ) -> None:
-        """As `Odometry.follow`; the scans have all their cropped points. What is usual on the drive is learnt again."""
-        seen = [(T_odom_scan, SeenScan(points, self._refine)) for T_odom_scan, points in scans]
-        for T_odom_scan, scan in seen:
-            if len(scan.thinned) >= MIN_POINTS:
-                self._map.add(T_odom_scan, scan)
-        self._motion.restart(T_before_lidar)
-        self._T_odom_last = T_odom_lidar
-        downsampled = [(T_odom_scan, scan.thinned) for T_odom_scan, scan in seen]
-        self._inner.follow(downsampled, T_odom_lidar, T_before_lidar, last=last)
-        self._T_odom_inner = np.eye(4)
+    def watch_after(self, states: Iterable[MotionState]) -> None:
+        """Watch the next scans for as long as after motions with these results, those of a drive so far."""
+        self._num_repaired, self._num_to_watch = 0, WINDOW if self._inner.is_from_scans else 0
+        for state in states:
+            self._note(is_repaired=state in (MotionState.REPAIRED, MotionState.BROKEN))
+
+    def _note(self, *, is_repaired: bool) -> None:
+        """Watch the next scans after a repair; a watched one passed if it was not repaired."""
+        self._num_repaired += is_repaired
+        self._num_to_watch = WINDOW * self._num_repaired if is_repaired else max(self._num_to_watch - 1, 0)
 
     def _checked(self, T_odom_proposed: Transform, scan: SeenScan, gap: float) -> tuple[Transform, Motion]:
         """The pose of a scan and the result of its check, if one is due."""
@@ -217,7 +204,7 @@ class CheckedOdometry:
         """The pose of an odometry of other sensors, which the scans do not contradict."""
         self._map.add(T_odom_proposed, scan)
         self._motion.restart(geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_proposed, 1.0 / gap))
-        self._num_to_watch = max(self._num_to_watch - 1, 0)
+        self._note(is_repaired=False)
         state = MotionState.UNCHECKED if is_unsure else MotionState.CONFIRMED
         return T_odom_proposed, self._result(state, T_map_proposed, best, None)
 
@@ -244,14 +231,13 @@ class CheckedOdometry:
     ) -> MotionState:
         """Name of the result; the next scans are watched after a repair."""
         is_break = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > BREAK_M**2
-        if displacement_m(scan.few, T_odom_lidar, T_odom_proposed) > self._tolerance_m:
-            self._num_repaired += 1
-            self._num_to_watch = WINDOW * self._num_repaired
-            return MotionState.BROKEN if is_break else MotionState.REPAIRED
         is_watched = self._num_to_watch > 0
-        self._num_to_watch = max(self._num_to_watch - 1, 0)
+        is_repaired = displacement_m(scan.few, T_odom_lidar, T_odom_proposed) > self._tolerance_m
+        self._note(is_repaired=is_repaired)
         if is_break:
             return MotionState.BROKEN
+        if is_repaired:
+            return MotionState.REPAIRED
         return MotionState.REFINED if is_watched and self._inner.is_from_scans else MotionState.CONFIRMED
 
     def _covariance(self, fit: Fit) -> Information:

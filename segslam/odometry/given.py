@@ -44,16 +44,9 @@ class GivenOdometry:
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
     def follow(
-        self,
-        scans: Sequence[tuple[Transform, Points]],
-        T_odom_lidar: Transform,
-        T_before_lidar: Transform,
-        *,
-        last: Scan | None = None,
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
-        """Continue from another pose of the last scan. Raises BadScan if `last` has no pose."""
-        if last is not None:
-            self._T_given_last = self._trajectory.T_world_lidar[self._row(last)]
+        """Continue from another pose of the last scan."""
         self._T_odom_given = T_odom_lidar @ geometry.inverse(self._T_given_last)
         self._T_odom_last = T_odom_lidar
 

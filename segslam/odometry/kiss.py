@@ -108,12 +108,7 @@ class KissOdometry:
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
     def follow(
-        self,
-        scans: Sequence[tuple[Transform, Points]],
-        T_odom_lidar: Transform,
-        T_before_lidar: Transform,
-        *,
-        last: Scan | None = None,
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
         """Continue from another pose of the last scan, with a local map of these scans alone."""
         self._has_followed = True

@@ -46,17 +46,11 @@ class Odometry(Protocol):
         ...
 
     def follow(
-        self,
-        scans: Sequence[tuple[Transform, Points]],
-        T_odom_lidar: Transform,
-        T_before_lidar: Transform,
-        *,
-        last: Scan | None = None,
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
         """Continue from another pose of the last scan, with a local map of these scans (poses and downsampled points).
 
-        `T_before_lidar`: the motion between the last two scans, per interval of the sensor. `last`: the last scan, if
-        it was registered by another instance, as before an interruption.
+        `T_before_lidar`: the motion between the last two scans, per interval of the sensor.
         """
         ...
 

@@ -15,9 +15,13 @@ from segslam.core.types import BadScan, Indices, Motion, MotionState, Scan, Step
 from segslam.keyframes.keyframes import KeyframeSelector
 from segslam.odometry.checked import CheckedOdometry
 from segslam.odometry.kiss import KissOdometry
-from segslam.odometry.motion_model import Intervals
-from segslam.odometry.sweep import Odometry, OdometryResult, deskew_scan
+from segslam.odometry.local_map import MAP_SCANS
+from segslam.odometry.motion_model import WINDOW
+from segslam.odometry.sweep import Odometry, OdometryResult
 from segslam.verification import register
+
+RESUMED_SCANS = WINDOW + MAP_SCANS
+"""Scans after which the local map is full and what is usual on a drive is known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,8 +45,11 @@ class Tracker:
         """`odometry` replaces KISS-ICP."""
         self._config = config
         self._inner = odometry or KissOdometry(config.odometry)
+        self._noted: list[MotionState] = []
         self._odometry = CheckedOdometry(self._inner, config, recover=partial(register, config=config))
         self._selector = KeyframeSelector(config.keyframes)
+        self._T_odom_own = np.eye(4)
+        """Pose of the frame of the odometry, which starts anew after `resume`."""
         self._num_tracked = 0
         self._last_stamp_ns: int | None = None
 
@@ -59,6 +66,7 @@ class Tracker:
         watch = Stopwatch()
         with watch("odometry"):
             registered = self._odometry.register(scan, gap=gap)
+        registered = replace(registered, T_odom_lidar=self._T_odom_own @ registered.T_odom_lidar)
         self._last_stamp_ns = scan.stamp_ns
         self._num_tracked += 1
         T_odom_lidar = registered.T_odom_lidar
@@ -75,37 +83,21 @@ class Tracker:
         """Note a recorded step; after `resume`, `track` continues from it."""
         motion = recorded.motion or Motion(MotionState.UNCHECKED)
         self._selector.update(recorded.T_odom_lidar, break_m=BREAK_TRAVEL_M * motion.is_break)
+        self._noted.append(motion.state)
         self._last_stamp_ns = recorded.stamp_ns
         self._num_tracked = recorded.scan_index + 1
 
     def resume(self, T_odom_lidar: Poses, stamps_ns: Indices, scan_of: Callable[[int], Scan]) -> None:
-        """Continue after scans with these poses and stamps; `scan_of` reads the scan of a row.
+        """Continue after noted scans, with these poses and stamps; `scan_of` reads the scan of a row.
 
-        The odometry starts from the last scans within its range, a keyframe's distance apart. Its poses
-        therefore differ from those of an uninterrupted run, by centimetres to decimetres.
+        The odometry starts anew: it registers the last `RESUMED_SCANS` again, and its frame is placed so that the last
+        pose stays. Poses of a drive with more scans differ from those of an uninterrupted run, usually by centimetres.
         """
-        config = self._config
-        intervals = Intervals()
-        for stamp_ns in stamps_ns[:-1]:
-            intervals.note(int(stamp_ns))
-        gap = intervals.gap(int(stamps_ns[-1]))
-
-        def motion_to(row: int) -> Transform:
-            return geometry.inverse(T_odom_lidar[row - 1]) @ T_odom_lidar[row] if row > 0 else np.eye(4)
-
-        rows = [len(T_odom_lidar) - 1]
-        for row in reversed(range(len(T_odom_lidar) - 1)):
-            if geometry.distance(geometry.inverse(T_odom_lidar[row]) @ T_odom_lidar[-1]) > config.odometry.max_range_m:
-                break
-            T_row_kept = geometry.inverse(T_odom_lidar[row]) @ T_odom_lidar[rows[-1]]
-            if geometry.distance(T_row_kept) >= config.keyframes.distance_m:
-                rows.append(row)
-        read = {row: scan_of(row) for row in reversed(rows)}
-        scans = [
-            (T_odom_lidar[row], deskew_scan(scan, motion_to(row - 1), config.odometry)[0]) for row, scan in read.items()
-        ]
-        T_before_lidar = geometry.scaled(motion_to(rows[0]), 1.0 / gap)
-        self._odometry.follow(scans, T_odom_lidar[-1], T_before_lidar, last=read[rows[0]])
+        for row in range(max(len(T_odom_lidar) - RESUMED_SCANS, 0), len(T_odom_lidar)):
+            scan = replace(scan_of(row), stamp_ns=int(stamps_ns[row]))
+            T_own_lidar = self._odometry.register(scan).T_odom_lidar
+        self._odometry.watch_after(self._noted)
+        self._T_odom_own = geometry.nearest_transform(T_odom_lidar[-1] @ geometry.inverse(T_own_lidar))
 
     def _check_later(self, scan: Scan) -> None:
         if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:

@@ -260,18 +260,6 @@ def _street(num_scans: int) -> list[Scan]:
     return scans
 
 
-def test_a_given_odometry_continues_from_the_last_scan_of_another_instance() -> None:
-    poses = np.array([_forward(7.0 + i) for i in range(5)])
-    scans = [_scan(_room(np.random.default_rng(i)), index=i, times=np.linspace(0, 1, 4000)) for i in range(5)]
-    uninterrupted, resumed = (GivenOdometry(_trajectory(poses), CONFIG) for _ in range(2))
-    last = [uninterrupted.register(scan).T_odom_lidar for scan in scans[:3]][-1]
-    resumed.follow([], last, _forward(1.0), last=scans[2])
-    for scan in scans[3:]:
-        expected, found = uninterrupted.register(scan), resumed.register(scan)
-        np.testing.assert_allclose(found.T_odom_lidar, expected.T_odom_lidar, atol=1e-12)
-        np.testing.assert_allclose(found.points, expected.points, atol=1e-5)
-
-
 def test_a_sweep_whose_seam_has_no_returns_is_not_stretched() -> None:
     """Returns from an eighth to seven eighths of the sweep move by their own share of the motion."""
     times = np.linspace(0.125, 0.875, 400)

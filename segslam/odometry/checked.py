@@ -144,13 +144,13 @@ class CheckedOdometry:
         self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float
     ) -> tuple[Transform, Motion]:
         """The most likely pose of the scan in the local map."""
-        fits = self._rejoined(T_odom_proposed, T_odom_predicted, scan)
-        is_rejoined = bool(fits)
+        T_map_odom = geometry.inverse(self._map.T_odom_map)
+        fits = self._search.near(self._map, scan, [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted])
+        rejoined = self._rejoined(T_odom_proposed, T_odom_predicted, scan, fits)
+        fits, is_rejoined = rejoined or fits, bool(rejoined)
         T_odom_map = self._map.T_odom_map
         T_map_odom = geometry.inverse(T_odom_map)
         T_map_proposed, T_map_last = T_map_odom @ T_odom_proposed, T_map_odom @ self._T_odom_last
-        starts = [T_map_proposed, T_map_odom @ T_odom_predicted]
-        fits = fits or self._search.near(self._map, scan, starts)
         if not (fits and self._is_usual(fits[0])):
             fits = self._search.near(self._map, scan, [T_map_last], fits)
         unsure, elsewhere = np.zeros((6, 6)), float(is_rejoined)  # the scan before is not in the map before a break
@@ -208,8 +208,13 @@ class CheckedOdometry:
         state = MotionState.UNCHECKED if is_unsure else MotionState.CONFIRMED
         return T_odom_proposed, self._result(state, T_map_proposed, best, None)
 
-    def _rejoined(self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan) -> Sequence[Fit]:
-        """Poses in the map before a break, if it explains the scan as usual; it is then the local map again."""
+    def _rejoined(
+        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, here: Sequence[Fit]
+    ) -> list[Fit]:
+        """Poses in the map before a break, if it explains the scan as usual and better than the local map does `here`.
+
+        It is then the local map again.
+        """
         if self._lost is None:
             return []
         local, num_scans = self._lost
@@ -217,7 +222,7 @@ class CheckedOdometry:
         starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4)]
         near = self._search.near(local, scan, starts)
         fits = self._search.around(local, scan, np.eye(4), self._motion.T_step, near)
-        is_found = bool(fits) and self._is_usual(fits[0])
+        is_found = bool(fits) and self._is_usual(fits[0]) and (not here or fits[0].mean_log > here[0].mean_log)
         if is_found:
             self._map = local
         self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, num_scans + 1)

@@ -153,6 +153,24 @@ def _elsewhere(scan: Scan) -> Scan:
     return replace(scan, points=points.astype(np.float32), labels=np.zeros(20_000, np.uint8))
 
 
+def test_a_map_before_a_break_is_left_for_one_that_explains_the_scans_better() -> None:
+    """Scans with every tenth point, six metres apart, the first of which shows another place."""
+    scans, truth = round_drive()
+    rows = range(1, 30, 3)
+    thinned = [replace(scans[row], points=scans[row].points[::10], labels=scans[row].labels[::10]) for row in rows]
+    first = replace(_elsewhere(scans[0]), points=_elsewhere(scans[0]).points[::10], labels=np.zeros(2000, np.uint8))
+    odometry = CheckedOdometry(
+        KissOdometry(CONFIG.odometry), CONFIG, recover=lambda *_: Rejected(RejectReason.SMALL_CLIQUE)
+    )
+    found = _registered(odometry, [first, *(replace(scan, stamp_ns=k * 10**8) for k, scan in enumerate(thinned, 1))])[
+        1:
+    ]
+    for (a, b), (one, other) in zip(pairwise(rows), pairwise(found), strict=True):
+        T_true = geometry.inverse(truth.T_world_lidar[a]) @ truth.T_world_lidar[b]
+        T_found = geometry.inverse(one.T_odom_lidar) @ other.T_odom_lidar
+        assert a == 1 or geometry.distance(geometry.inverse(T_true) @ T_found) < 0.1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("interval_s", [0.3, 6.0])
 def test_a_scan_from_another_town_is_a_break_though_the_odometry_is_steady(interval_s: float) -> None:

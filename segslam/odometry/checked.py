@@ -33,7 +33,8 @@ ELSEWHERE_M = 30.0
 ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
 SIGNIFICANT = 0.001
-"""Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans."""
+"""Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans; and the
+map before a break is not used again."""
 MOST_UNCHECKED = 9
 """Chosen: number of scans after which a sensor that seems to stand still is checked."""
 BREAK_M = 1.0
@@ -211,9 +212,9 @@ class CheckedOdometry:
     def _rejoined(
         self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, here: Sequence[Fit]
     ) -> list[Fit]:
-        """Poses in the map before a break, if it explains the scan as usual and better than the local map does `here`.
+        """Poses in the map before a break, if it explains the scan as usual and not significantly worse than `here`.
 
-        It is then the local map again.
+        It is then the local map again. `here`: the poses in the present local map.
         """
         if self._lost is None:
             return []
@@ -222,7 +223,7 @@ class CheckedOdometry:
         starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4)]
         near = self._search.near(local, scan, starts)
         fits = self._search.around(local, scan, np.eye(4), self._motion.T_step, near)
-        is_found = bool(fits) and self._is_usual(fits[0]) and (not here or fits[0].mean_log > here[0].mean_log)
+        is_found = bool(fits) and self._is_usual(fits[0]) and (not here or as_likely(fits[0], here[0]) >= SIGNIFICANT)
         if is_found:
             self._map = local
         self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, num_scans + 1)

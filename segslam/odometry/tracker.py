@@ -49,7 +49,7 @@ class Tracker:
         self._odometry = CheckedOdometry(self._inner, config, recover=partial(register, config=config))
         self._selector = KeyframeSelector(config.keyframes)
         self._T_odom_own = np.eye(4)
-        """Pose of the frame of the odometry, which starts anew after `resume`."""
+        """Pose of the frame of the odometry, which starts again after `resume`."""
         self._num_tracked = 0
         self._last_stamp_ns: int | None = None
 
@@ -90,7 +90,7 @@ class Tracker:
     def resume(self, T_odom_lidar: Poses, stamps_ns: Indices, scan_of: Callable[[int], Scan]) -> None:
         """Continue after noted scans, with these poses and stamps; `scan_of` reads the scan of a row.
 
-        The odometry starts anew: it registers the last `RESUMED_SCANS` again, and its frame is placed so that the last
+        The odometry starts again: it registers the last `RESUMED_SCANS` again, and its frame is placed so that the last
         pose stays. Poses of a drive with more scans differ from those of an uninterrupted run, usually by centimetres.
         """
         for row in range(max(len(T_odom_lidar) - RESUMED_SCANS, 0), len(T_odom_lidar)):

@@ -25,6 +25,7 @@ from segslam.output.log import read_log
 from segslam.run.live import FolderSource, Front, Placed
 from segslam.run.live.serve import OdometryEnded, Past, _place_all
 from segslam.run.live.waiting import Arrival, Waiting
+from segslam.scans.presets import SETTINGS as PRESETS
 
 SETTINGS = ("--set", "odometry.min_range_m=1")
 INTERVAL_NS = 300_000_000
@@ -218,7 +219,7 @@ def _spawned(pid: int) -> list[int]:
 
 
 def test_a_front_process_that_is_killed_while_it_stops_ends_the_run() -> None:
-    with Front(HangingSource(), Config(), tell=lambda text: None) as front:
+    with Front(HangingSource(), dict.fromkeys(PRESETS, Config()), tell=lambda text: None) as front:
         front.wait_until_ready()
         front.stop()
         front._process.kill()
@@ -231,7 +232,7 @@ def test_an_exception_in_the_main_process_ends_the_front_process_at_once() -> No
     errors: list[threading.ExceptHookArgs] = []
     before, threading.excepthook = threading.excepthook, errors.append
     try:
-        front = Front(HangingSource(), Config(), tell=lambda _: None)
+        front = Front(HangingSource(), dict.fromkeys(PRESETS, Config()), tell=lambda _: None)
         with pytest.raises(SegslamError, match="disk"):
             _fails_within(front)
     finally:

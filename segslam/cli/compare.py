@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from segslam.cli import completion
-from segslam.cli.checks import check_exists, check_free, check_run
+from segslam.cli.checks import check_exists, check_free, check_own, check_run
 from segslam.cli.console import Terminal, print_json, print_out
 from segslam.cli.options import OverwriteOption
 from segslam.cli.tables import TableFiles, as_text, figure
@@ -110,6 +110,7 @@ def sweep(
     check_run(run)
     grid = grid_of(settings)
     check_free([tables.csv, tables.latex], overwrite=overwrite)
+    check_own(out, "*=*")
     terminal.announce(f"sweep: reading {run}")
     from segslam.output.folder import log_of
     from segslam.output.log import read_log

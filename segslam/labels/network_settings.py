@@ -121,6 +121,6 @@ def _read_yaml(file: Path) -> Any:
         return parse_yaml(file.read_text(encoding="utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(
-            f"{unreadable(file, 'settings', error)}; a network needs this file beside its model, or the {ARCH} and {DATA} "
-            "that were published with it"
+            f"{unreadable(file, 'settings', error)}; a network needs this file beside its model, or the {ARCH} and "
+            f"{DATA} that were published with it"
         ) from error

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from segslam.core.config import Config
-from segslam.core.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.errors import unreadable
+from segslam.core.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log

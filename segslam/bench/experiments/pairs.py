@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.trajectory import rows_of_same_scan
 from segslam.core.errors import unreadable
+from segslam.core.trajectory import rows_of_same_scan
 from segslam.core.types import IndexPairs, SegslamError, Trajectory, Transform
 
 MIN_GAP = 50

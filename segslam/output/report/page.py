@@ -66,7 +66,7 @@ th + th { white-space: normal; width: 5.5rem; }
 tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: break-word; }
 details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child { white-space: nowrap; }
 @media (max-width: 40rem) { body, section { padding: .5rem; } td code { display: block; }
-  th + th { white-space: normal; } img[src*="image/png"] { width: 44rem; } }
+  th + th { width: 1px; } img[src*="image/png"] { width: 44rem; } }
 @media print { body { max-width: none; padding: 0; font-size: 11px; } .plots { columns: 2 7cm; }
   .tiles div, tr, img { break-inside: avoid; } h2, summary { break-after: avoid; }
   section:has(details) { break-inside: auto; }

@@ -131,7 +131,7 @@ def demo(
     scans = open_dataset(data, sequence=SEQUENCE, labels="geometric")
     map_scans(scans, out / "run", terminal, settings=Config(), go_on=begin_again)
     picture = write_before_after(out / "run", out / "run" / BEFORE_AFTER)
-    terminal.say(f"map before and after loop closing: {picture}\nreport: {out / 'run' / 'report.html'}")
+    terminal.say(f"map before and after loop closing: {picture}")
 
 
 def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]:

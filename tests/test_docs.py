@@ -227,7 +227,14 @@ def test_commands_are_added_once_however_many_are_run() -> None:
 
 def test_every_command_has_an_example_and_every_option_is_explained() -> None:
     commands.add(cli.app)
-    for name, command in all_commands(get_command(cli.app)):
+    whole = get_command(cli.app)
+    groups = [whole, *(command for command in whole.commands.values() if hasattr(command, "commands"))]
+    assert len(groups) == 2  # the bench
+    for group in groups:
+        assert "Example: segslam" in group.help, group.name
+        lines = [command.get_short_help_str(62) for command in group.commands.values()]
+        assert not [line for line in lines if line.endswith("...")]
+    for name, command in all_commands(whole):
         assert "Example" in (command.help or ""), f"segslam {name}"
         for parameter in command.params:
             assert getattr(parameter, "help", None), f"segslam {name}: {parameter.name}"

@@ -23,7 +23,8 @@ BAD_INPUT = 2
 app = typer.Typer(
     name="segslam",
     cls=GroupedCommands,
-    help="LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs.",
+    help="LiDAR pose-graph SLAM: KISS-ICP odometry, Segregator loop closing, GTSAM, MCAP logs.\n\n"
+    "Example: segslam map kitti --sequence 00 --out runs/00",
     no_args_is_help=True,
     rich_markup_mode=None,  # rich doubles the time until help is shown
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
@@ -100,6 +101,8 @@ def _of_file(error: OSError) -> str:
     """Message with the file and the reason; standard output has no file name."""
     if error.filename is None and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO):
         return f"standard output: cannot be written ({reason(error)}); redirect it elsewhere"
+    if isinstance(error, FileNotFoundError) and error.filename:
+        return f"{error.filename}: no such file or folder; give a path that exists"
     return f"{error.filename or 'output'}: cannot be read or written ({reason(error)})"
 
 

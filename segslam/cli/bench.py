@@ -10,9 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from segslam.bench.experiments.method_settings import METHOD_NAMES
+from segslam.cli.checks import check_free, check_own
 from segslam.cli.completion import methods
 from segslam.cli.console import Terminal
-from segslam.cli.options import DatasetOption, EncodingOption, LabelsOption, SequenceOption, Settings, with_options
+from segslam.cli.options import (
+    DatasetOption,
+    EncodingOption,
+    LabelsOption,
+    OverwriteOption,
+    SequenceOption,
+    Settings,
+    with_options,
+)
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
 from segslam.core.whole_files import check_target
@@ -25,7 +34,9 @@ if TYPE_CHECKING:
     from segslam.core.types import Trajectory
 
 app = typer.Typer(
-    help="Repeat the experiments of the Segregator paper; every method gets the same scans.", no_args_is_help=True
+    help="Repeat the experiments of the Segregator paper; every method gets the same scans.\n\n"
+    "Example: segslam bench pairs kitti --sequence 06 --pairs kitti06_3to5.txt --sample 100 --out bench06",
+    no_args_is_help=True,
 )
 
 LOST_PERCENT = [10.0, 30.0, 50.0, 70.0, 90.0]
@@ -85,6 +96,7 @@ class Options:
         None
     )
     draw: Annotated[int, typer.Option("--draw", min=0, help="Draw the N worst failures; needs --out.")] = 0
+    overwrite: OverwriteOption = False
 
 
 @app.command()
@@ -97,7 +109,7 @@ def pairs(data: DataArgument, options: Options, changes: Settings, terminal: Ter
     _experiment("pairs", data, options, changes, terminal, lambda variations: variations.pair_trials, by="list")
 
 
-@app.command()
+@app.command(short_help="Measure times, errors and graph sizes.")
 @with_options
 def timing(data: DataArgument, options: Options, changes: Settings, terminal: Terminal) -> None:
     """Measure the time of each stage, the errors and the graph size, all lists together (paper: sequence 06).
@@ -107,7 +119,7 @@ def timing(data: DataArgument, options: Options, changes: Settings, terminal: Te
     _experiment("timing", data, options, changes, terminal, lambda variations: variations.pair_trials, by="list")
 
 
-@app.command()
+@app.command(short_help="Measure the error against the yaw of the source.")
 @with_options
 def yaw(
     data: DataArgument,
@@ -130,7 +142,7 @@ def yaw(
     _experiment("yaw", data, options, changes, terminal, vary, by="yaw_deg", of_paper=True, step_deg=step_deg)
 
 
-@app.command()
+@app.command(short_help="Measure the success while labels are removed.")
 @with_options
 def deterioration(
     data: DataArgument,
@@ -199,6 +211,9 @@ def places(
 
 def _make_job(data: Path, options: Options, changes: Settings, terminal: Terminal) -> "Job":
     """The job that the options describe. By default, methods that are not installed are skipped with a message."""
+    check_free([options.details], overwrite=options.overwrite)
+    if options.out is not None:
+        check_own(options.out, "asked.json")
     terminal.announce(f"bench: opening {data}")
     for variable in THREAD_VARIABLES:  # before Open3D and others are loaded, because times are per core
         os.environ.setdefault(variable, "1")

@@ -35,6 +35,12 @@ def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
             raise SegslamError(f"{file}: exists; give another name, or replace it with --overwrite")
 
 
+def check_own(folder: Path, *made_by: str) -> None:
+    """Raises SegslamError for a folder with other content than that of this command: no name matches `made_by`."""
+    if folder.is_dir() and any(folder.iterdir()) and not any(any(folder.glob(name)) for name in made_by):
+        raise SegslamError(f"{folder}: not empty, and not made by this command; give another folder")
+
+
 def make_room(
     folder: Path, *, overwrite: bool, inputs: Iterable[Path | None] = (), made_by: tuple[str, ...] = RUN_LOGS
 ) -> None:

@@ -1,7 +1,6 @@
 """`segslam compare` and `sweep`: the figures of several runs in one table."""
 
 import shutil
-import textwrap
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -10,10 +9,10 @@ from typing import Annotated, Any
 import typer
 
 from segslam.cli import completion
-from segslam.cli.checks import check_exists, check_free, check_run
+from segslam.cli.checks import check_exists, check_free, check_own, check_run
 from segslam.cli.console import Terminal, print_json, print_out
 from segslam.cli.options import OverwriteOption
-from segslam.cli.tables import TableFiles, as_text, figure
+from segslam.cli.tables import TableFiles, as_text, figure, with_meaning
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.interrupts import when_stopped
 
@@ -69,16 +68,12 @@ def _table(figures: dict[str, dict[str, Any]]) -> str:
     from segslam.output.finished import FIGURES
 
     width = max(COLUMN, *(len(name) + 2 for name in figures))
-    indent = len(figures) * width + 2
-    left = max(shutil.get_terminal_size().columns - indent, COLUMN)
     lines = ["".join(f"{name:>{width}}" for name in figures)]
     for key, meaning in FIGURES.items():
         values = [run.get(key) for run in figures.values()]
         if any(value is not None for value in values):
             cells = ("-" if value is None else figure(value) for value in values)
-            first, *others = textwrap.wrap(meaning, left)
-            lines.append("".join(f"{cell:>{width}}" for cell in cells) + f"  {first}")
-            lines += [" " * indent + other for other in others]
+            lines.append(with_meaning("".join(f"{cell:>{width}}" for cell in cells), meaning))
     return "\n".join(lines)
 
 
@@ -110,6 +105,7 @@ def sweep(
     check_run(run)
     grid = grid_of(settings)
     check_free([tables.csv, tables.latex], overwrite=overwrite)
+    check_own(out, "*=*")
     terminal.announce(f"sweep: reading {run}")
     from segslam.output.folder import log_of
     from segslam.output.log import read_log

@@ -10,7 +10,7 @@ import typer
 from segslam.cli.checks import check_free, check_links
 from segslam.cli.console import Terminal
 from segslam.cli.options import OverwriteOption
-from segslam.cli.tables import TableFiles, as_text, figure
+from segslam.cli.tables import TableFiles, as_text, figure, with_meaning
 from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
@@ -102,7 +102,9 @@ def _table(figures: dict[str, Any]) -> str:
     from segslam.output.finished import FIGURES
 
     meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
-    return "\n".join(f"{figure(figures[key]):>10}  {meaning}" for key, meaning in meanings.items() if key in figures)
+    return "\n".join(
+        with_meaning(f"{figure(figures[key]):>10}", meaning) for key, meaning in meanings.items() if key in figures
+    )
 
 
 class _How(NamedTuple):

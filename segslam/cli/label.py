@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from segslam.cli.checks import check_own
 from segslam.cli.console import Terminal
 from segslam.cli.options import EncodingOption, LabelsOption, OverwriteOption, ScanOptions, Settings
 from segslam.core.errors import SegslamError
@@ -43,6 +44,7 @@ def label(
 
     Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
     """
+    check_own(out, "*.label")
     terminal.announce(f"label: opening {data}")
     from segslam.output.folder import new_folder
 

@@ -4,7 +4,7 @@ import json as json_text
 import shlex
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
@@ -18,7 +18,7 @@ from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.ending import counted, finish
 from segslam.cli.georeference import GnssOptions
 from segslam.cli.options import PresetOption, RunOutput
-from segslam.cli.preset import live_config
+from segslam.cli.preset import live_configs, show_preset
 from segslam.cli.viewers import check_display, close_scene, open_scene, serve_foxglove
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.extras import how_to_install
@@ -77,11 +77,10 @@ def live(
     _check_source(folder, topic, out)
     if gnss.gnss is not None:
         _check_ros("--gnss")
-    output.load()  # reports a wrong setting before the scans are looked at
     if labels not in ("auto", "geometric", "none"):
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
+    configs = live_configs(preset, output)
     terminal.announce("live: starting")
-    settings = output.load(base=live_config(preset, folder, topic, terminal))
     from segslam.labels.label_files import unlabelled
     from segslam.output.folder import new_folder
     from segslam.run.live import Front, LiveMap
@@ -90,9 +89,8 @@ def live(
 
     map_names, map_files = output.maps(out)
     check_free([file for file in map_files if out not in file.parents], overwrite=output.overwrite)
+    settings = configs["driving"]  # the presets differ in none of the values used here
     angle_deg = settings.sensor.vertical_angle_deg or 0.0
-    sensor = settings.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
-    settings = settings.model_copy(update={"sensor": sensor})
     source = _source(folder, topic, intensities=settings.map.color == "intensity", vertical_angle_deg=angle_deg)
     recorded = {"labels": labels, "live": source.name, "map_files": json_text.dumps([str(name) for name in map_names])}
     scene = open_scene(None, view_every=settings.log.view_every) if output.view else None
@@ -100,16 +98,13 @@ def live(
         server = serve_foxglove(output.foxglove, stack, terminal)
         make_room(out, overwrite=output.overwrite, inputs=[folder])
         out = new_folder(out)
+        stack.callback(_remove_if_empty, out)
         terminal.compile_kernels()
-        slam = Slam(settings, labeller=(lambda points: unlabelled(len(points))) if labels == "none" else None)
         go_on = f"make the results from the log: segslam replay {shlex.quote(str(out))} --out NEW"
         when_stopped(f"the log in {out} is kept; {go_on}")
         stack.enter_context(how_to_go_on(go_on))
-        mirror = server.send if server else None
-        run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
-        publisher = _publisher(source, run, stack)
         place = gnss.placing_live(stack)
-        front = stack.enter_context(Front(source, settings, tell=terminal.say, idle_s=idle))
+        front = stack.enter_context(Front(source, configs, tell=terminal.say, idle_s=idle))
         stops: list[bool] = []
 
         def stop() -> None:
@@ -119,6 +114,16 @@ def live(
         stack.enter_context(stopped_by_signals(stop))
         front.wait_until_ready()
         terminal.say(f"{source.name}: waiting for scans; Ctrl-C ends the run")
+        if (chosen := front.wait_until_chosen()) is not None:
+            settings = configs[chosen.preset]
+            if preset == "auto":
+                show_preset(chosen.preset, chosen.extent_m, terminal)
+        sensor = settings.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
+        settings = settings.model_copy(update={"sensor": sensor})
+        slam = Slam(settings, labeller=(lambda points: unlabelled(len(points))) if labels == "none" else None)
+        mirror = server.send if server else None
+        run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
+        publisher = _publisher(source, run, stack)
         with LiveMap(_shows(server, publisher), view_every=settings.log.view_every) as live_map:
             figures = _follow(front, run, _watch(run, scene, live_map, publisher), terminal)
         ended = front.ended
@@ -144,6 +149,12 @@ def live(
         close_scene(scene, None)
     if ended.failed:
         raise WorkFailed(f"{ended.why}; the scans until then are mapped, results in {out}")
+
+
+def _remove_if_empty(folder: Path) -> None:
+    """Remove the folder of a run that did not begin."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]", terminal: Terminal) -> "LiveFigures":

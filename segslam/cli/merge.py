@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.checks import check_exists, make_room
+from segslam.cli.checks import check_exists, check_own, make_room
 from segslam.cli.console import Terminal, print_out
 from segslam.cli.ending import finish, is_interrupted
 from segslam.cli.options import WITH_MAP, OverwriteOption, RunSettings, Settings, WithMapOption
@@ -94,6 +94,7 @@ def fleet(
         raise SegslamError("--workers: the scheduler has workers of its own; omit one of the options")
     for path in drives:
         check_exists(path, "give a list of drives in YAML, or recordings")
+    check_own(out, "runs")
     terminal.announce("fleet: reading the list")
     from segslam.run.fleets import drives_of, read_drives
     from segslam.run.fleets import fleet as run_fleet

@@ -1,9 +1,9 @@
 """Choice of the settings for an environment."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from segslam.cli.console import Terminal
+from segslam.cli.options import Settings
 from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
@@ -26,30 +26,24 @@ def check_preset(name: str, *, resumes: bool) -> None:
 
 def preset_config(name: str, scans: "Dataset", terminal: Terminal) -> "Config":
     """The settings of a preset; with `auto`, of the preset that fits the scans, with a message."""
-    from segslam.scans.presets import extent_m, preset
-
-    return preset(cast("Preset", name)) if name != "auto" else _fitting(extent_m(scans), terminal)
-
-
-def live_config(name: str, folder: Path | None, topic: str | None, terminal: Terminal) -> "Config":
-    """As `preset_config`; `auto` looks at the scans already in the folder, or at the first cloud of the topic."""
-    check_preset(name, resumes=False)
-    from segslam.scans.presets import preset
+    from segslam.scans.presets import extent_m, preset, preset_for
 
     if name != "auto":
         return preset(cast("Preset", name))
-    from segslam.run.live.waiting import extent_in_folder, extent_of_topic
-
-    extent = extent_in_folder(folder) if folder is not None else extent_of_topic(topic or "")
-    if extent is None:
-        terminal.say("no scan yet: using --preset driving; others: campus, indoor")
-    return _fitting(extent, terminal)
+    extent = extent_m(scans)
+    show_preset(preset_for(extent), extent, terminal)
+    return preset(preset_for(extent))
 
 
-def _fitting(extent_m: float | None, terminal: Terminal) -> "Config":
-    from segslam.scans.presets import preset, preset_for
+def live_configs(name: str, output: Settings) -> "dict[Preset, Config]":
+    """The settings for each preset that may fit the first scan: all the same unless `name` is `auto`."""
+    check_preset(name, resumes=False)
+    from segslam.scans.presets import SETTINGS, preset
 
-    chosen = preset_for(extent_m)
+    return {one: output.load(base=preset(one if name == "auto" else cast("Preset", name))) for one in SETTINGS}
+
+
+def show_preset(chosen: "Preset", extent_m: float | None, terminal: Terminal) -> None:
+    """Print the preset that fits the scans, unless it is the default."""
     if chosen != "driving":
         terminal.say(f"surfaces are near (median range {extent_m:.0f} m): using --preset {chosen}")
-    return preset(chosen)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.checks import make_room
+from segslam.cli.checks import check_own, make_room
 from segslam.cli.completion import SENSORS, one_of, simulation_settings
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.map import map_scans
@@ -58,9 +58,7 @@ def simulate(
     sample: Annotated[
         int | None, typer.Option(min=1, help="Use only N pairs of each list, those of `bench --sample N --seed 0`.")
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier simulated sequence in this folder.")
-    ] = False,
+    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Simulate a labelled drive in KITTI's format, with exact poses.
@@ -69,6 +67,7 @@ def simulate(
 
     Example: segslam simulate streets --sequence 06 --poses kitti/poses/06.txt --frames 300 --seed 1
     """
+    check_own(out, "sequences", "poses")
     terminal.announce(f"simulate: making a drive in {out}")
     from segslam.bench import simulation
 
@@ -132,7 +131,7 @@ def demo(
     scans = open_dataset(data, sequence=SEQUENCE, labels="geometric")
     map_scans(scans, out / "run", terminal, settings=Config(), go_on=begin_again)
     picture = write_before_after(out / "run", out / "run" / BEFORE_AFTER)
-    terminal.say(f"map before and after loop closing: {picture}\nreport: {out / 'run' / 'report.html'}")
+    terminal.say(f"map before and after loop closing: {picture}")
 
 
 def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]:

@@ -3,6 +3,7 @@
 import csv
 import io
 import shutil
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ SHORT = {
     "num_poses": "poses",
 }
 """Columns of a table for people: figures that at least one row has."""
+LEAST_WIDTH = 16
+"""Width of a wrapped text on a terminal that is too narrow for it."""
 Rows = Mapping[str, Mapping[str, Any]]
 """Name -> figures."""
 
@@ -33,6 +36,13 @@ Rows = Mapping[str, Mapping[str, Any]]
 def figure(value: float) -> str:
     """Whole numbers in full, others with four digits."""
     return str(value) if isinstance(value, int) else f"{value:.4g}"
+
+
+def with_meaning(cells: str, meaning: str) -> str:
+    """Figures and, beside them, their meaning, wrapped to the width of the terminal."""
+    indent = " " * (len(cells) + 2)
+    width = max(shutil.get_terminal_size().columns, len(indent) + LEAST_WIDTH)
+    return textwrap.fill(meaning, width, initial_indent=f"{cells}  ", subsequent_indent=indent)
 
 
 @dataclass(frozen=True)

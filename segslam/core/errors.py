@@ -23,6 +23,13 @@ def brief(text: str, num_characters: int = 80) -> str:
     return text if len(text) <= num_characters else f"{text[:num_characters]}..."
 
 
+def unreadable(path: object, content: str, error: Exception) -> str:
+    """Start of the message about a file that is missing, or whose content cannot be read; a remedy follows."""
+    if isinstance(error, FileNotFoundError):
+        return f"{path}: no such file"
+    return f"{path}: cannot read the {content} ({reason(error) if isinstance(error, OSError) else error})"
+
+
 def reason(error: OSError) -> str:
     """Short reason of an error; NumPy's errors have no `strerror`, and give item counts if the disk is full."""
     if error.strerror is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
-from segslam.core.errors import brief
+from segslam.core.errors import brief, unreadable
 from segslam.core.types import IndexPairs, Indices, Mask, SegslamError, Transform, Vector
 
 Poses = Float[np.ndarray, "_ 4 4"]
@@ -189,7 +189,7 @@ def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{path}: cannot read the poses ({error}); give a KITTI or TUM trajectory") from error
+        raise SegslamError(f"{unreadable(path, 'poses', error)}; give a KITTI or TUM trajectory") from error
     split = (
         (number, re.split(r"[\s,]+", line.partition("#")[0].strip())) for number, line in enumerate(text.split("\n"), 1)
     )

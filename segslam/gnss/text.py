@@ -5,7 +5,7 @@ from bisect import bisect_right
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from segslam.core.errors import brief
+from segslam.core.errors import brief, unreadable
 from segslam.core.types import SegslamError
 
 MOST_BYTES = 2**30
@@ -27,7 +27,7 @@ def text_lines(file: Path) -> list[str]:
             raise SegslamError(f"{file}: larger than 1 GB; is it a file of position fixes?")
         content = file.read_bytes()
     except OSError as error:
-        raise SegslamError(f"{file}: cannot be read ({error.strerror}); give another file with --gnss") from error
+        raise SegslamError(f"{unreadable(file, 'fixes', error)}; give another file with --gnss") from error
     if b"\0" in content[:4096]:
         raise SegslamError(f"{file}: a binary file; give CSV, NMEA or RTKLIB .pos, a KITTI oxts folder, or a recording")
     return content.decode("utf-8", errors="replace").lstrip("\ufeff").splitlines()

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.core.errors import brief
+from segslam.core.errors import brief, unreadable
 from segslam.core.types import Indices, SegslamError, Transform
 from segslam.graph.edges import Edge, Transforms
 
@@ -106,7 +106,7 @@ def _read_fields(path: Path) -> tuple[dict[str, list[list[str]]], dict[str, list
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{path}: cannot read the pose graph ({error}); give a g2o file") from error
+        raise SegslamError(f"{unreadable(path, 'pose graph', error)}; give a g2o file") from error
     fields: dict[str, list[list[str]]] = {tag: [] for tag in NUM_FIELDS}
     line_numbers: dict[str, list[int]] = {tag: [] for tag in NUM_FIELDS}
     for number, line in enumerate(text.split("\n"), start=1):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from segslam.core.errors import unreadable
 from segslam.core.types import BadScan, Label, Labels, Mask, Points, ScanLabels, SegslamError, Vector
 from segslam.core.whole_files import expanded, whole_file
 from segslam.labels.encodings import Encoding, Histogram, Ids, detect_encoding, to_ids, to_labels
@@ -90,7 +91,7 @@ def read_ids(file: Path) -> Ids:
     try:
         content = file.read_bytes()
     except OSError as error:
-        raise BadScan(f"{file}: cannot read the labels ({error})") from error
+        raise BadScan(unreadable(file, "labels", error)) from error
     if len(content) % 4:
         raise BadScan(f"{file}: {len(content)} bytes are not a multiple of 4 (uint32): truncated; copy the file again")
     return np.frombuffer(content, dtype="<u4") & 0xFFFF

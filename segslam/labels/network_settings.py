@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 from segslam.core.config import LabelName, Section
 from segslam.core.config.files import validated
 from segslam.core.config.yaml_text import parse_yaml
-from segslam.core.errors import brief
+from segslam.core.errors import brief, unreadable
 from segslam.core.types import SegslamError
 from segslam.labels.network_import import ARCH, DATA, Architecture, ClassMap, is_architecture
 
@@ -121,6 +121,6 @@ def _read_yaml(file: Path) -> Any:
         return parse_yaml(file.read_text(encoding="utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(
-            f"{file}: cannot be read ({error}); a network needs this file beside its model, or the {ARCH} and {DATA} "
-            "that were published with it"
+            f"{unreadable(file, 'settings', error)}; a network needs this file beside its model, or the {ARCH} and "
+            f"{DATA} that were published with it"
         ) from error

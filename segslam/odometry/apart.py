@@ -32,6 +32,11 @@ class OdometryApart(KissOdometry):
         self._apart = _AlignerApart(config)
         super().__init__(config, self._apart, keeps_alone=keeps_alone)
 
+    def begin(self, config: OdometryConfig) -> None:
+        """Start again with other settings, in the same process."""
+        self._apart.begin(config)
+        super().__init__(config, self._apart, keeps_alone=self._keeps_alone)
+
     def __enter__(self) -> "OdometryApart":
         return self
 
@@ -57,6 +62,11 @@ class _AlignerApart:
         self._process = context.Process(target=_serve, args=(theirs, shared, config), name="odometry", daemon=True)
         self._process.start()
         theirs.close()
+
+    def begin(self, config: OdometryConfig) -> None:
+        """Replace the aligner by a new one."""
+        with self._reported():
+            self._pipe.send((config,))
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
         """T_odom_lidar of the next sweep, `gap` intervals after the previous one."""
@@ -138,8 +148,9 @@ def _as_points(shared: Any) -> Points:
 def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
     """Answer requests with a pose until the other side closes the pipe.
 
-    Two values are the points and the gap of a sweep to align, four those of one to `align_alone`, three the arguments
-    of `follow`. Points are sent themselves or, if they are in the shared memory, as their number.
+    One value is the argument of `begin`, which gets no answer; two values are the points and the gap of a sweep to
+    align, four those of one to `align_alone`, three the arguments of `follow`. Points are sent themselves or, if they
+    are in the shared memory, as their number.
     """
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and then closes the pipe
@@ -148,6 +159,9 @@ def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
     try:
         while True:
             request = pipe.recv()
+            if len(request) == 1:
+                aligner = KissAligner(*request)
+                continue
             if len(request) == 3:
                 aligner.follow(*request)
                 pipe.send(request[1])

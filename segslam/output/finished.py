@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.config import Config
+from segslam.core.errors import unreadable
 from segslam.core.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
@@ -107,7 +108,7 @@ def read_run(folder: str | Path) -> FinishedRun:
     """The run of a folder, or of its log. Raises SegslamError if there is none, or it did not finish."""
     folder = folder_of(Path(folder))
     if not folder.is_dir():
-        raise SegslamError(f"{folder}: no such folder; give a folder made by `segslam map --out`")
+        raise SegslamError(f"{folder}: no such file or folder; give a folder made by `segslam map --out`")
     log = read_log(folder)
     result = _result(log)
     return FinishedRun(
@@ -132,7 +133,7 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     try:
         return _checked_metrics(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError) as error:
-        raise SegslamError(f"{file}: cannot read the figures of the run ({error}); replay its log.mcap") from error
+        raise SegslamError(f"{unreadable(file, 'figures of the run', error)}; replay its log.mcap") from error
 
 
 def plain_name(key: str) -> str:

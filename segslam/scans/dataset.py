@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.core.errors import brief
+from segslam.core.errors import brief, unreadable
 from segslam.core.geometry import raise_beams
 from segslam.core.points import squared_ranges
 from segslam.core.trajectory import nanoseconds
@@ -209,9 +209,7 @@ def read_stamps(file: Path) -> Indices:
     try:
         lines = file.read_text(encoding="ascii").split()
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(
-            f"{file}: cannot read the scan times ({error}); expected one time in seconds per line"
-        ) from error
+        raise SegslamError(f"{unreadable(file, 'scan times', error)}; expected one time in seconds per line") from error
     stamps: list[int] = []
     for number, line in enumerate(lines, start=1):
         try:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from segslam.core import geometry
-from segslam.core.errors import brief
+from segslam.core.errors import brief, unreadable
 from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera, read_poses
 from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory, Transform
 from segslam.labels.label_files import open_labels
@@ -110,7 +110,7 @@ def read_calibration(file: Path) -> Transform:
     try:
         text = file.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{file}: cannot read the calibration ({error}); put KITTI's calib.txt there") from error
+        raise SegslamError(f"{unreadable(file, 'calibration', error)}; put KITTI's calib.txt there") from error
     return parse_calibration(text, file)
 
 

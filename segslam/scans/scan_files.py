@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam.core.errors import brief
+from segslam.core.errors import brief, unreadable
 from segslam.core.types import BadScan
 
 MAX_SCAN_BYTES = 2**30
@@ -39,7 +39,7 @@ def read_bytes(file: Path) -> bytes:
                 raise BadScan(f"{file}: {status.st_size} bytes are too many for one scan (at most {MAX_SCAN_BYTES})")
             return stream.read()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise BadScan(f"{file}: cannot read the scan ({error})") from error
+        raise BadScan(unreadable(file, "scan", error)) from error
 
 
 def read_header(content: bytes, last: str) -> tuple[list[list[str]], int]:

@@ -34,14 +34,19 @@ def test_runs_stand_side_by_side(runs: list[Path], capsys: pytest.CaptureFixture
     assert next(line.split()[:2] for line in lines if "trajectory error" in line) == ["0.25", "-"]
 
 
+@pytest.mark.parametrize(("command", "indent"), [("compare", 30), ("eval", 12), ("info", 12)])
 def test_long_meanings_are_wrapped_to_the_terminal(
-    runs: list[Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str, indent: int
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    assert run("compare", *runs) == 0
+    monkeypatch.chdir(tmp_path)
+    make_run(Path("one"))
+    make_run(Path("two"))
+    write_metrics(Path("one"), {"map_thickness_m": 0.25, "num_motions_rejected": 3})
+    assert run(command, *(["one", "two"] if command == "compare" else ["one"])) == 0
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
-    assert any(line.startswith(" " * 30) for line in lines), "a second line of a meaning"
+    assert any(line.startswith(" " * indent) for line in lines), "a second line of a meaning"
 
 
 def test_figures_and_picture_of_several_runs(

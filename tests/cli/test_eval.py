@@ -136,8 +136,8 @@ def test_run_is_scored_against_a_file(tmp_path: Path, capsys: pytest.CaptureFixt
     [
         ([], "give either a run folder, or two files"),
         (["--estimate", "estimate.txt"], "give either a run folder, or two files"),
-        (["nowhere"], "nowhere: no such folder"),
-        (["--estimate", "nowhere.txt", "--reference", "truth.txt"], "nowhere.txt: cannot read the poses"),
+        (["nowhere"], "nowhere: no such file or folder"),
+        (["--estimate", "nowhere.txt", "--reference", "truth.txt"], "nowhere.txt: no such file; give a KITTI or TUM"),
         (["--estimate", "estimate.txt", "--reference", "truth_tum.txt"], "another format than"),
         (["--estimate", "estimate.txt", "--reference", "truth.txt", "--format", "tum"], "found 12 numbers; TUM"),
     ],

@@ -252,7 +252,7 @@ def test_the_command_writes_the_optimum_and_prints_one_json_object(run: Optimize
     [
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0\n", [], "in.g2o:1: "),
         ("", [], "in.g2o: holds no vertex"),
-        (None, [], "in.g2o: cannot read"),
+        (None, [], "in.g2o: no such file; give a g2o file"),
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", ["--robust", "magic"], "magic"),
     ],
 )

@@ -83,3 +83,24 @@ def test_only_a_finished_run_that_is_no_input_is_removed(made: Path, tmp_path: P
         make_room(run_folder, overwrite=True)
     assert (other / "me.jpg").exists()
     assert (made / "log.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "OUT", "--frames", "1"],
+        ["label", "DATA", "--labels", "geometric", "--out", "OUT", "--overwrite"],
+        ["bench", "pairs", "DATA", "--out", "OUT"],
+        ["fleet", "DATA", "--out", "OUT"],
+        ["sweep", "RUN", "--set", "verify.max_false_share=0.1", "--out", "OUT"],
+    ],
+)
+def test_a_folder_with_other_content_is_not_written_into(
+    command: list[str], made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "report.html").write_text("mine")
+    paths = {"OUT": tmp_path / "photos", "RUN": made, "DATA": made}
+    assert run(*(paths.get(word, word) for word in command), "--quiet") == 2
+    assert "photos: not empty, and not made by this command; give another folder" in capsys.readouterr().err
+    assert [file.name for file in (tmp_path / "photos").iterdir()] == ["report.html"]

@@ -123,7 +123,7 @@ def test_a_file_without_vertices_is_refused(tmp_path: Path, lines: list[str]) ->
 
 
 def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match=r"nowhere\.g2o: cannot read"):
+    with pytest.raises(SegslamError, match=r"nowhere\.g2o: no such file; give a g2o file"):
         read_g2o(tmp_path / "nowhere.g2o")
     (tmp_path / "binary.g2o").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(SegslamError, match=r"binary\.g2o: cannot read"):

@@ -94,7 +94,7 @@ def _made(**options: Any) -> Callable[[Path], Path]:
     ("make", "expected"),
     [
         (lambda folder: folder / "none.onnx", r"none\.onnx: no such file"),
-        (_without_settings, r"net\.yaml: cannot be read"),
+        (_without_settings, r"net\.yaml: no such file"),
         (_truncated, r"net\.onnx: onnxruntime cannot load it"),
         (_weights_elsewhere, r"in a separate file, net\.onnx\.data: put it beside.*external_data=False"),
         (_two_inputs, r"takes the inputs a: tensor\(float\), b: tensor\(float\); expected a single input"),

@@ -140,7 +140,7 @@ def _with(architecture: dict[str, Any], classes: Any = None) -> Callable[[Path],
     ("make", "expected"),
     [
         (_without_classes, r"data_cfg\.yaml: no such file; .*semantic-kitti\.yaml"),
-        (_imports_nothing, r"elsewhere/arch_cfg\.yaml: cannot be read"),
+        (_imports_nothing, r"elsewhere/arch_cfg\.yaml: no such file"),
         (_with(_architecture(fov_left=-45, fov_right=45)), r"azimuth_deg: -45 to 45; .*full circle"),
         (_with(_architecture(img_means=[0] * 8, img_stds=[1] * 8)), r"img_means: .*8 numbers; expected 5.*normals"),
         (_with(_architecture(type="cylindrical")), r"arch_cfg\.yaml: dataset\.sensor\.type: .*'spherical'"),

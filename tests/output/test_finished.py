@@ -88,7 +88,7 @@ def test_truth_of_another_drive_is_refused(tmp_path: Path) -> None:
 
 
 def test_folder_without_a_whole_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match="nowhere: no such folder"):
+    with pytest.raises(SegslamError, match="nowhere: no such file or folder"):
         read_run(tmp_path / "nowhere")
     with pytest.raises(SegslamError, match=r"log\.mcap"):
         read_run(tmp_path)

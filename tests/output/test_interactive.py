@@ -21,6 +21,18 @@ from segslam.output.report import interactive, write_report
 from segslam.output.report.interactive import MOST_SCANS, with_clouds
 
 BROWSER = next((name for name in ("chromium", "chromium-browser", "google-chrome") if shutil.which(name)), None)
+BROKEN = """<script>
+document.body.style.cssText = "width: 400px; box-sizing: border-box";
+for (const details of document.querySelectorAll("details")) details.open = true;
+const words = [...document.querySelectorAll("td code")].flatMap(code => [...code.childNodes]).filter(node => {
+  const range = document.createRange();
+  range.selectNode(node);
+  return node.data && !node.data.includes(" ") && new Set([...range.getClientRects()].map(box => box.top)).size > 1;
+});
+const found = words.map(node => node.data).join(" ") || "none";
+document.body.dataset.broken = `${found}, width ${document.body.offsetWidth}`;
+</script>"""
+"""Notes words of keys that are on more than one line, at 400 pixels: the browser has no window below 500."""
 CLICK = """<script>
 const look = setInterval(() => {
   const view = document.getElementById("topview");
@@ -119,6 +131,13 @@ def test_buttons_do_not_cover_the_legend_on_a_phone(
     shown = _shown((made.folder / "report.html").read_text(), tmp_path, f"--window-size={width},900")
     assert 'data-ready="yes"' in shown
     assert ('class="modebar-btn' in shown) == has_buttons
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_keys_are_broken_between_their_words_on_a_phone(made: MadeRun, tmp_path: Path) -> None:
+    page = (made.folder / "report.html").read_text()
+    shown = _shown(page.replace("</body>", f"{BROKEN}</body>"), tmp_path, "--window-size=400,900")
+    assert 'data-broken="none, width 400"' in shown
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")

@@ -24,6 +24,7 @@ from segslam.output.log import LogWriter, read_log
 from segslam.run.live import FolderSource, Front
 from segslam.run.live.folder import stamp_of_name
 from segslam.run.live.waiting import Rhythm, Waiting
+from segslam.scans.presets import SETTINGS as PRESETS
 
 INTERVAL_NS = 100_000_000
 SETTINGS = ("--set", "odometry.min_range_m=1")
@@ -328,7 +329,7 @@ def test_a_faster_odometry_is_recommended_where_many_scans_were_dropped() -> Non
 
 @pytest.mark.slow
 def test_a_source_that_hangs_does_not_keep_a_run_from_ending() -> None:
-    with Front(HangingSource(), Config(), tell=lambda text: None) as front:
+    with Front(HangingSource(), dict.fromkeys(PRESETS, Config()), tell=lambda text: None) as front:
         front.wait_until_ready()
         front.stop()
         assert list(front) == []

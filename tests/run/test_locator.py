@@ -148,4 +148,4 @@ def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path, capsys: pyte
     scan = tmp_path / "a.npy"
     np.save(scan, round_drive()[0][55].points)
     assert commands.run("locate", tmp_path / "nothing", scan) == 2
-    assert "nothing: no such folder" in capsys.readouterr().err
+    assert "nothing: no such file or folder" in capsys.readouterr().err

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam.core import geometry
+from segslam.core.errors import unreadable
 from segslam.core.trajectory import rows_of_same_scan
 from segslam.core.types import IndexPairs, SegslamError, Trajectory, Transform
 
@@ -37,7 +38,7 @@ def read_pairs(file: Path) -> PairList:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(
-            f"{file}: cannot read the pairs ({error}); give a file with `source target` on each line"
+            f"{unreadable(file, 'pairs', error)}; give a file with `source target` on each line"
         ) from error
     return _from_json(file, text) if file.suffix == ".json" else _from_text(file, text)
 

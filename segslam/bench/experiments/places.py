@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 
 from segslam.candidates import Places, signature_of_standing
 from segslam.core import geometry
+from segslam.core.errors import unreadable
 from segslam.core.types import Points, SegslamError
 
 CELL_M = 0.4
@@ -49,7 +50,7 @@ def read_places(file: Path) -> SeenPlaces:
         with np.load(file) as stored:
             columns, poses = stored["columns"], stored["poses"].astype(np.float64)
     except (OSError, ValueError, KeyError, BadZipFile, EOFError) as error:
-        raise SegslamError(f"{file}: cannot read places ({error}); {remedy}") from error
+        raise SegslamError(f"{unreadable(file, 'places', error)}; {remedy}") from error
     is_square = columns.ndim == 3 and columns.shape[1] == columns.shape[2]
     if not is_square or columns.dtype != np.uint8 or poses.shape != (len(columns), 3, 4):
         raise SegslamError(f"{file}: columns {columns.shape} {columns.dtype}, poses {poses.shape}; {remedy}")

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from segslam.core.config.sections import Config
 from segslam.core.config.yaml_text import parse_yaml, short
-from segslam.core.errors import SegslamError, brief
+from segslam.core.errors import SegslamError, brief, unreadable
 
 logger = logging.getLogger(__name__)
 Model = TypeVar("Model", bound=BaseModel)
@@ -169,7 +169,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
+        raise SegslamError(f"{unreadable(path, 'configuration', error)}; give a YAML file") from error
     return _parse_yaml(text, str(path))
 
 

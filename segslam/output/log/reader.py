@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from google.protobuf.message import DecodeError
 
 from segslam.core.config import Config, config_from_yaml
-from segslam.core.errors import brief
+from segslam.core.errors import brief, unreadable
 from segslam.core.types import (
     GraphEstimate,
     Keyframe,
@@ -231,7 +231,7 @@ def read_log(run: Path) -> RunLog:
     try:
         metadata, cut = container.metadata(path)
     except OSError as error:
-        raise SegslamError(f"{path}: cannot read the log ({error.strerror}); {remedy}") from error
+        raise SegslamError(f"{unreadable(path, 'log', error)}; {remedy}") from error
     check = metadata.get(schema.CHECK_METADATA)
     if cut is not None and check is None:
         raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}") from cut

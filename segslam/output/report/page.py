@@ -29,6 +29,7 @@ FILES = {
     "poses_geodetic.csv": "latitude, longitude, height and heading of every scan",
     "loops.csv": 'all loop candidates and their outcomes (<a href="#words">words</a>)',
     "graph.g2o": "the pose graph",
+    "adjusted.g2o": "all edges of the last estimate, as <code>segslam georeference</code> reads them",
     "metrics.json": "the figures of this page",
     "config.yaml": "the settings",
     "log.mcap": "complete log, for Foxglove and segslam replay",
@@ -62,10 +63,10 @@ td, th { text-align: left; padding: .2rem .6rem .2rem 0; border-bottom: 1px soli
   grid-template-columns: repeat(auto-fit, minmax(min(34rem, 100%), 1fr)); } p { margin: .2rem 0 .6rem; }
 td.number, th + th { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 th + th { white-space: normal; width: 5.5rem; }
-tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: anywhere; }
+tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: break-word; }
 details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child { white-space: nowrap; }
 @media (max-width: 40rem) { body, section { padding: .5rem; } td code { display: block; }
-  th + th { white-space: normal; } img[src*="image/png"] { width: 44rem; } }
+  th + th { width: 1px; } img[src*="image/png"] { width: 44rem; } }
 @media print { body { max-width: none; padding: 0; font-size: 11px; } .plots { columns: 2 7cm; }
   .tiles div, tr, img { break-inside: avoid; } h2, summary { break-after: avoid; }
   section:has(details) { break-inside: auto; }
@@ -191,13 +192,18 @@ def _figures(metrics: dict[str, Any]) -> str:
     titles = {prefix: title for prefix, title in zip(COMPARED, ODOMETRIES, strict=True) if prefix + "ate_m" in metrics}
     rows = [
         (
-            f"{FIGURES.get(key, '')} <code>{escape(key)}</code>",
+            f"{FIGURES.get(key, '')} {_key(key)}",
             metrics[key],
             *(metrics.get(prefix + key) for prefix in titles),
         )
         for key in of_run
     ]
     return table(rows, head=("", "run", *titles.values()))
+
+
+def _key(name: str) -> str:
+    """A key as code, which may be broken after underscores and dots."""
+    return f"<code>{escape(name).replace('_', '_<wbr>').replace('.', '.<wbr>')}</code>"
 
 
 def _outcomes(run: FinishedRun) -> str:
@@ -227,7 +233,7 @@ def _setting_section(name: str, section: Section, default: Section) -> str:
     rows = ""
     for key, setting in type(section).model_fields.items():
         kind = ' class="changed"' if values[key] != usual[key] else ""
-        cells = f"<code>{key}</code>", escape(str(values[key])), escape(setting.description or "")
+        cells = _key(key), escape(str(values[key])), escape(setting.description or "")
         rows += f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
     return f"<details{' open' if values != usual else ''}><summary>{name}</summary><table>{rows}</table></details>"
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from segslam.core.config.yaml_text import parse_yaml, short
+from segslam.core.errors import unreadable
 from segslam.core.types import SegslamError
 
 KEY_DIGITS = 16
@@ -65,7 +66,7 @@ def _state(path: Path) -> list[tuple[str, int, int]]:
             files = sorted(Path(folder) / name for folder, _, names in os.walk(path, onerror=_raise) for name in names)
         states = [(file, file.stat()) for file in files]
     except OSError as error:
-        raise SegslamError(f"{path}: cannot be read ({error.strerror}); correct the list of drives") from error
+        raise SegslamError(f"{unreadable(path, 'recording', error)}; correct the list of drives") from error
     return [(os.path.relpath(file, path), state.st_size, state.st_mtime_ns) for file, state in states]
 
 
@@ -81,7 +82,7 @@ def read_drives(file: Path) -> list[Drive]:
     try:
         values = parse_yaml(file.read_text(encoding="utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{file}: cannot be read ({error}); give a list of drives in YAML") from error
+        raise SegslamError(f"{unreadable(file, 'list of drives', error)}; give a list of drives in YAML") from error
     if isinstance(values, dict) and set(values) == {"drives"}:
         values = values["drives"]
     if not isinstance(values, list) or not values:

@@ -15,6 +15,7 @@ from time import time_ns
 
 import numpy as np
 
+from segslam.core.errors import unreadable
 from segslam.core.types import BadScan, Scan, SegslamError, Transform
 from segslam.run.live.waiting import Arrival, Waiting
 from segslam.scans.clouds import read_cloud, read_intensities
@@ -101,7 +102,7 @@ class FolderSource:
         try:
             found = file.stat()
         except OSError as error:  # removed already
-            waiting.put_unusable(f"{file}: cannot be read ({error.strerror}); leave files until they are mapped")
+            waiting.put_unusable(f"{unreadable(file, 'scan', error)}; leave files until they are mapped")
             return
         content = found.st_mtime_ns, found.st_size
         if self._seen.get(file.name) == content:

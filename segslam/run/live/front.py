@@ -8,7 +8,7 @@ dies, for example for lack of memory, another one continues from its last poses.
 import multiprocessing
 import signal
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.sharedctypes import RawValue
@@ -20,8 +20,9 @@ from segslam.core.config import Config
 from segslam.core.memory import note_peak_of
 from segslam.core.types import SegslamError, Step
 from segslam.odometry import Tracked
-from segslam.run.live.serve import END_S, READY, Ended, Past, Placed, serve
+from segslam.run.live.serve import END_S, READY, Chosen, Ended, Past, Placed, serve
 from segslam.run.live.waiting import Source, Tally
+from segslam.scans.presets import Preset
 
 CLOUDS_KEPT = 20
 """Chosen: number of keyframes whose points are kept for a new front process, about 1.5 MB each."""
@@ -31,19 +32,27 @@ class Front:
     """The front process as seen from the main process: an iterator of `Placed`; a context manager."""
 
     def __init__(
-        self, source: Source, config: Config, *, tell: Callable[[str], None], idle_s: float | None = None
+        self,
+        source: Source,
+        configs: Mapping[Preset, Config],
+        *,
+        tell: Callable[[str], None],
+        idle_s: float | None = None,
     ) -> None:
-        """Start the process. `tell` prints messages of the source.
+        """Start the process, which uses the settings of the preset that fits the first scan with a pose.
 
-        The stream ends after `idle_s` without a scan, unless it is None.
+        `tell` prints messages of the source. Iterate after `wait_until_chosen`. The stream ends after `idle_s` without
+        a scan, unless it is None.
         """
         self._tell = tell
-        self._serving = source, config, idle_s
+        self._serving = source, configs, idle_s
         self._is_ready = self._is_stopping = False
         self._tally = RawValue(Tally)
         self._past = Past([], deque(maxlen=CLOUDS_KEPT))
         self._num_placed = 0
         self._received: SimpleQueue[Any] = SimpleQueue()
+        self._before_chosen: deque[Any] = deque()
+        """Unusable scans before the first scan with a pose, and the end if there is none."""
         self.num_keyframes_waiting = 0
         self.num_restarts = 0
         self.ended = Ended()
@@ -57,12 +66,23 @@ class Front:
         if isinstance(first, Ended):
             raise SegslamError(first.why)
 
+    def wait_until_chosen(self) -> Chosen | None:
+        """Wait for the first scan with a pose; the preset that fits it, or None if the stream ends without one."""
+        while not isinstance(item := self._received.get(), Chosen):
+            self._before_chosen.append(item)
+            if isinstance(item, Ended):
+                return None
+        return item
+
     def __iter__(self) -> Iterator[Placed]:
-        while not isinstance(item := self._received.get(), Ended):
+        while not isinstance(item := self._next(), Ended):
             if _is_keyframe(item):
                 self.num_keyframes_waiting -= 1
             yield item
         self.ended = item
+
+    def _next(self) -> Any:
+        return self._before_chosen.popleft() if self._before_chosen else self._received.get()
 
     def stop(self) -> None:
         """Accept no more scans; waiting scans are still processed."""
@@ -145,6 +165,8 @@ class Front:
             if self.num_restarts:
                 self._tell("the odometry runs again")
                 return
+        if isinstance(item, Chosen):
+            self._past.preset = item.preset
         if isinstance(item, Placed):
             self._num_placed += 1
             self._note(item)

@@ -2,6 +2,7 @@
 
 import signal
 from collections import deque
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -18,6 +19,7 @@ from segslam.core.memory import keep_freed_memory
 from segslam.core.types import BadScan, Points, Scan, SegslamError, Step
 from segslam.odometry import KissOdometry, OdometryApart, Tracked, Tracker
 from segslam.run.live.waiting import Arrival, Gaps, Source, Tally, Waiting
+from segslam.scans.presets import Preset, extent_of, preset_for
 
 READY = b"ready"
 END_S = 5.0
@@ -43,6 +45,15 @@ class Placed:
 
 
 @dataclass(frozen=True, slots=True)
+class Chosen:
+    """The preset that fits the first scan with a pose."""
+
+    preset: Preset
+    extent_m: float | None
+    """As `segslam.scans.presets.extent_of`."""
+
+
+@dataclass(frozen=True, slots=True)
 class Ended:
     """End of the stream: reason and final counts."""
 
@@ -65,16 +76,26 @@ class Past:
     clouds: deque[tuple[int, Points]]
     """Row and points of the last keyframes."""
     gaps: Gaps = field(default_factory=Gaps)
+    preset: Preset | None = None
+    """None before the first scan with a pose."""
 
 
 class OdometryEnded(Exception):
     """The process of the odometry has ended, so this process cannot place further scans."""
 
 
-def serve(pipe: Connection, source: Source, config: Config, idle_s: float | None, past: Past, tally: Tally) -> None:
+def serve(
+    pipe: Connection,
+    source: Source,
+    configs: Mapping[Preset, Config],
+    idle_s: float | None,
+    past: Past,
+    tally: Tally,
+) -> None:
     """Process scans until the source ends, `idle_s` pass without a scan, or the main process sends or closes.
 
-    The first scan follows those of `past`; `tally` counts the scans, in memory shared with the main process.
+    The first scan chooses one of `configs`, or follows those of `past`; `tally` counts the scans, in memory shared with
+    the main process.
     """
     keep_freed_memory()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -85,10 +106,13 @@ def serve(pipe: Connection, source: Source, config: Config, idle_s: float | None
     waiting, stopped = Waiting(tally=tally), Event()
     why, failed, died = "", False, False
     feeder: _Feeder | None = None
+    config = configs[past.preset or "driving"]
     try:
         with OdometryApart(config.odometry) as odometry:
             _warm_up(config, odometry)
-            tracker = _continued(Tracker(config, odometry=odometry), past, waiting)
+            tracker: Tracker | _Choosing = _Choosing(configs, odometry, to_send.put)
+            if past.preset:
+                tracker = _continued(Tracker(config, odometry=odometry), past, waiting)
             source.open(to_send.put)
             to_send.put(READY)
             feeder = _Feeder(source, waiting, stopped)
@@ -122,6 +146,30 @@ def _warm_up(config: Config, odometry: OdometryApart) -> None:
         throwaway.track(Scan(points, stamp_ns))
 
 
+class _Choosing:
+    """A tracker with the settings that fit its first scan with a pose, which is passed to `tell`."""
+
+    def __init__(
+        self, configs: Mapping[Preset, Config], odometry: OdometryApart, tell: Callable[[Chosen], None]
+    ) -> None:
+        self._configs, self._odometry, self._tell = configs, odometry, tell
+        self._tracker: Tracker | None = None
+
+    def track(self, scan: Scan, *, gap: float) -> Tracked:
+        """As `Tracker.track`; a BadScan chooses nothing."""
+        if self._tracker:
+            return self._tracker.track(scan, gap=gap)
+        extent_m = extent_of(scan.points)
+        chosen = Chosen(preset_for(extent_m), extent_m)
+        config = self._configs[chosen.preset]
+        self._odometry.begin(config.odometry)
+        tracker = Tracker(config, odometry=self._odometry)
+        tracked = tracker.track(scan, gap=gap)
+        self._tracker = tracker
+        self._tell(chosen)
+        return tracked
+
+
 def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
     """The tracker after the scans of earlier processes: its maps contain the last keyframes."""
     if not past.steps:
@@ -149,7 +197,12 @@ def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
 
 
 def _place_all(
-    tracker: Tracker, source: Source, waiting: Waiting, to_send: "SimpleQueue[Any]", idle_s: float | None, past: Past
+    tracker: Tracker | _Choosing,
+    source: Source,
+    waiting: Waiting,
+    to_send: "SimpleQueue[Any]",
+    idle_s: float | None,
+    past: Past,
 ) -> bool:
     """Process each scan. Returns True if it ended because no scan came for `idle_s`."""
     last_ns = past.steps[-1].stamp_ns if past.steps else None
@@ -164,7 +217,7 @@ def _place_all(
     return not waiting.is_closed
 
 
-def _tracked(tracker: Tracker, arrival: Arrival, gap: float) -> Tracked | BadScan:
+def _tracked(tracker: Tracker | _Choosing, arrival: Arrival, gap: float) -> Tracked | BadScan:
     """The pose of a scan; BadScan for any exception of a single scan, because the run continues.
 
     Raises OdometryEnded if no further scan can be placed.

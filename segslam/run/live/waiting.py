@@ -3,17 +3,13 @@
 import ctypes
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
-from threading import Condition, Event, Thread
+from threading import Condition, Event
 from time import monotonic
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from segslam.core.types import BadScan, Scan, SegslamError, Transform
-from segslam.scans import open_dataset
-from segslam.scans.presets import extent_m, extent_of
+from segslam.core.types import BadScan, Scan, Transform
 
 MOST_WAITING = 4
 """Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
@@ -27,8 +23,6 @@ SET_BACK_NS = 1_000_000_000
 """Chosen: the sender's clock was set back if a stamp is this much earlier than the last, as in a replay."""
 SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
 """Chosen: the sender's clock was set forward if a stamp is this much later than the last: no drive has such a gap."""
-PATIENCE_S = 2.0
-"""Chosen: time to wait for the first cloud of a topic; a sensor that runs sends ten a second."""
 
 
 class Tally(ctypes.Structure):
@@ -199,37 +193,3 @@ class Source(Protocol):
     def close(self) -> None:
         """Release the resources of `open`."""
         ...
-
-
-def extent_in_folder(folder: Path) -> float | None:
-    """The extent (m), as `segslam.presets.extent_m`, of the scans already in a folder; None if there are none."""
-    with suppress(SegslamError):
-        return extent_m(open_dataset(folder, labels="none"))
-    return None
-
-
-def extent_of_topic(topic: str) -> float | None:
-    """The extent (m) of the first cloud of a ROS 2 topic; None if none arrives within two seconds.
-
-    Raises SegslamError if the topic cannot be opened.
-    """
-    from segslam.run.live.ros import TopicSource
-
-    return extent_of_first(TopicSource(topic))
-
-
-def extent_of_first(source: Source) -> float | None:
-    """The extent (m) of the first readable scan of a source, which is closed; None if none arrives in time."""
-    waiting, stopped = Waiting(), Event()
-    source.open(lambda text: None)
-    feeder = Thread(target=source.feed, args=(waiting, stopped), daemon=True)
-    feeder.start()
-    try:
-        while (arrival := waiting.take(PATIENCE_S)) is not None:
-            with suppress(BadScan):
-                return extent_of(arrival.read(arrival.index, arrival.stamp_ns).points)
-    finally:
-        stopped.set()
-        feeder.join(timeout=PATIENCE_S)
-        source.close()
-    return None

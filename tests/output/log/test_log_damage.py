@@ -137,7 +137,7 @@ def test_a_log_that_ends_before_its_first_step_has_its_settings_and_no_step(tmp_
 
 def test_a_missing_log_and_a_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "absent.mcap", tmp_path):
-        with pytest.raises(SegslamError, match="cannot read the log"):
+        with pytest.raises(SegslamError, match=r"\.mcap: no such file; give the log\.mcap of a run"):
             read_log(path)
 
 

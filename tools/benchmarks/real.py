@@ -3,16 +3,19 @@
     python -m tools.benchmarks.real NAME=RUN[,RUN,...] ... --out docs/real_drives.json [--picture NAME=FILE.png]
 
 Runs of `segslam map` with default settings, several of one drive separated by commas: medians over them. KISS-ICP alone
-is computed again from the data of the first run.
+is computed again from the data of the first run. The covariances of its motions are compared with their errors: the
+share within the ellipsoid of 99 %, and the median of chi-square divided by the expected one.
 """
 
 import argparse
 import json
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from segslam.core import geometry
 from segslam.core.evaluation import align_positions, trajectory_metrics
@@ -56,9 +59,31 @@ def row(name: str, runs: list[FinishedRun], alone: Poses | None) -> common.Row:
         values = [run.metrics[key] for run in runs if key in run.metrics]
         if values:
             found[key] = round(median(values), 4 if key in METRES else 3)
+    found |= within_covariance(first)
     for key in ("odometry_ate_m", "ate_m"):
         found[f"{key}_all"] = sorted(round(run.metrics[key], 3) for run in runs)
     return found
+
+
+def within_covariance(run: FinishedRun) -> common.Row:
+    """How true the covariances of the motions are: compared with their errors by the true poses."""
+    assert run.reference is not None
+    rows = rows_of_same_scan(run.result.trajectory.scan_index, run.reference.scan_index)
+    true_row = dict(rows.tolist())
+    squares = []
+    for row, (last, step) in enumerate(pairwise(read_log(run.folder / LOG).steps()), start=1):
+        covariance = None if step.motion is None else step.motion.covariance
+        if covariance is not None and row in true_row and row - 1 in true_row:
+            T_a, T_b = (run.reference.T_world_lidar[true_row[k]] for k in (row - 1, row))
+            T_true, T_found = (geometry.inverse(a) @ b for a, b in ((T_a, T_b), (last.T_odom_lidar, step.T_odom_lidar)))
+            error = geometry.log(geometry.inverse(T_true) @ T_found)
+            squares.append(error @ np.linalg.solve(covariance, error))
+    if not squares:
+        return {}
+    return {
+        "motions_within_99_percent": round(float(np.mean(np.array(squares) < chi2.ppf(0.99, 6))), 3),
+        "chi_square_of_motions": round(float(np.median(squares) / chi2.median(6)), 2),
+    }
 
 
 def draw(run: FinishedRun, alone: Poses, file: Path) -> None:

@@ -18,6 +18,8 @@ from segslam.core.interrupts import when_stopped
 
 COLUMN = 14
 """Smallest width of a column of the table, in characters."""
+SOURCE = "replayed.txt"
+"""File in the folder of a sweep: the log that its runs replay."""
 
 
 def compare(
@@ -105,7 +107,7 @@ def sweep(
     check_run(run)
     grid = grid_of(settings)
     check_free([tables.csv, tables.latex], overwrite=overwrite)
-    check_own(out, "*=*")
+    check_own(out, SOURCE, "*=*")
     terminal.announce(f"sweep: reading {run}")
     from segslam.output.folder import log_of
     from segslam.output.log import read_log
@@ -116,6 +118,7 @@ def sweep(
     for changes in grid.values():  # reports a wrong setting before anything is replayed
         changed_config(recorded, settings=changes)
     out.mkdir(parents=True, exist_ok=True)
+    _check_same(log_of(run), out / SOURCE)
     when_stopped(f"what is done is kept in {out}; call the same command again to go on")
     tasks = [(str(log_of(run).resolve()), str((out / name).resolve()), changes) for name, changes in grid.items()]
     rows: dict[str, dict[str, Any]] = {name: {} for name in grid}
@@ -130,6 +133,14 @@ def sweep(
     terminal.say(f"runs in {out}")
     if failures:
         raise WorkFailed("; ".join(failures))
+
+
+def _check_same(log: Path, note: Path) -> None:
+    """Note the log in a file. Raises SegslamError if another one, or another state of it, is noted there."""
+    text = f"{log.resolve()} of {log.stat().st_mtime_ns} ns\n"
+    if note.is_file() and note.read_text(encoding="utf-8") != text:
+        raise SegslamError(f"{note.parent}: has replays of another log; give another folder")
+    note.write_text(text, encoding="utf-8")
 
 
 def grid_of(settings: Sequence[str]) -> dict[str, list[str]]:

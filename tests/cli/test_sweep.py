@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,9 @@ def test_a_sweep_replays_each_value_once_and_tables_it(
     assert run(*given, "--overwrite") == 0
     assert (out / "verify.max_false_share=0.2" / "log.mcap").stat().st_mtime_ns == before
     assert "verify.max_false_share=1e-300" in capsys.readouterr().out
+    other = shutil.copy(log, tmp_path / "other.mcap")
+    assert run("sweep", other, *given[2:], "--overwrite") == 2
+    assert "replays of another log" in capsys.readouterr().err
 
 
 def test_a_wrong_setting_is_reported_before_anything_is_replayed(

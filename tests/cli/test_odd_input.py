@@ -175,6 +175,7 @@ def test_a_log_with_a_damaged_option_is_refused_by_name(
     assert "log.mcap" in line
 
 
+@pytest.mark.slow
 def test_a_run_from_python_is_resumed_by_the_command(scans: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     map_folder(scans, folder, frames="0:3")

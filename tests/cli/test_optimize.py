@@ -188,7 +188,12 @@ def test_without_a_chain_of_odometry_gnc_is_refused_and_consistent_becomes_cauch
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("name", "optimum"), [("parking-garage", 0.634192), ("sphere2500", 675.701), ("smallGrid3D", 517.925)]
+    ("name", "optimum"),
+    [
+        ("parking-garage", 0.634192),
+        pytest.param("sphere2500", 675.701, marks=pytest.mark.slow),
+        ("smallGrid3D", 517.925),
+    ],
 )
 @pytest.mark.parametrize("robust", ["none", "consistent"])
 def test_published_graphs_reach_their_known_optimum(data_dir: Path, name: str, optimum: float, robust: str) -> None:

@@ -251,6 +251,7 @@ print(found.graph.T_world_vertex[11_999][0, 3])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="ulimit")
 def test_a_long_drive_does_not_exhaust_the_stack() -> None:
     """GTSAM calls itself along the drive: on a small stack 12,000 poses crash it as 100,000 do on the usual one."""

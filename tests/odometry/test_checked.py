@@ -241,6 +241,7 @@ def test_a_sudden_turn_is_found_by_the_search_around_the_last_pose(degrees: floa
     assert np.degrees(geometry.angle(T_true_found)) < 0.3
 
 
+@pytest.mark.slow
 def test_a_keyframe_follows_a_break_and_its_motion_has_nearly_no_information() -> None:
     scans, _ = round_drive()
     slam = Slam(CONFIG)
@@ -291,7 +292,7 @@ def test_the_quick_check_measures_a_small_slip(moved_m: float) -> None:
     assert geometry.distance(geometry.inverse(T_slipped) @ found) == pytest.approx(moved_m, abs=0.06)
 
 
-@pytest.mark.parametrize("num_again", [10, 70])
+@pytest.mark.parametrize("num_again", [10, pytest.param(70, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("last", [SLIP_AT + 1, pytest.param(SLIP_AT + 12, marks=pytest.mark.slow)])
 def test_an_interrupted_drive_continues_from_its_last_scans(
     last: int, num_again: int, monkeypatch: pytest.MonkeyPatch
@@ -384,6 +385,7 @@ def test_a_scan_of_a_smooth_tunnel_does_not_constrain_the_position_along_it() ->
     assert sigmas_m[1][2] < 0.1
 
 
+@pytest.mark.slow
 def test_in_a_smooth_tunnel_the_motion_along_it_is_reported_as_uncertain() -> None:
     odometry = CheckedOdometry(KissOdometry(CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
     results = _registered(odometry, _into_a_tunnel(20))

@@ -107,6 +107,7 @@ def test_late_subscribers_receive_the_last_map() -> None:
     assert (stamp_ns, cloud.frame_id, len(cloud.data) // cloud.point_stride) == (2, "world", 3)
 
 
+@pytest.mark.slow
 def test_a_replay_is_served_while_it_runs(tmp_path: Path) -> None:
     """The port is known only to the server: whoever opens one is followed."""
     folder = make_run(tmp_path / "run").folder

@@ -47,6 +47,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> MadeRun:
     return found
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing_and_json_one_value(made: MadeRun, capfd: pytest.CaptureFixture[str]) -> None:
     fixes = made.folder.parent / "fixes.csv"
     assert run("georeference", made.folder, "--gnss", fixes, "--quiet") == 0
@@ -88,6 +89,7 @@ def _num_messages(folder: Path) -> int:
         return sum(1 for _ in make_reader(stream).iter_messages())
 
 
+@pytest.mark.slow
 def test_the_log_shows_fixes_and_positions_on_a_map(made: MadeRun, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(made.folder, tmp_path / "run"))
     before = [(step.scan_index, step.stamp_ns) for step in read_log(folder / "log.mcap").steps()]

@@ -214,6 +214,7 @@ def test_degenerate_clouds_have_their_clusters_or_none(points: np.ndarray, sizes
     assert clusters.classes.dtype == np.uint8
 
 
+@pytest.mark.slow
 def test_two_million_points_are_clustered() -> None:
     points = np.random.default_rng(3).uniform(-60, 60, (2_000_000, 3)).astype(np.float32)
     clusters = semantic_clusters(points, np.full(len(points), Label.CAR, np.uint8), config=CONFIG)

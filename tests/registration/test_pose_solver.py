@@ -96,6 +96,7 @@ def test_joint_pose_has_no_greater_truncated_cost_than_nearby_poses() -> None:
         assert cost(fit.T_target_source) <= cost(fit.T_target_source @ geometry.exp(step))
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32))
 def test_swapping_the_two_sides_inverts_the_joint_pose(seed: int) -> None:
     rng = np.random.default_rng(seed)

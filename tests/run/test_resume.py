@@ -182,6 +182,7 @@ def test_a_full_disk_ends_with_status_2_and_the_run_is_resumed_when_there_is_spa
     _resumed_as_whole(kitti, whole, out)
 
 
+@pytest.mark.slow
 def test_results_without_disk_space_end_with_status_2_and_the_run_is_resumed(
     kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -193,7 +193,7 @@ class Slam:
         )
 
     def _alone(self, odometry: Trajectory) -> Trajectory | None:
-        """The poses by KISS-ICP alone; None if they were not kept, as after `resume`."""
+        """The poses by KISS-ICP alone; None if they were not all kept, as after `resume`."""
         poses = self._tracker.alone()[: len(odometry)]  # tracking may be ahead when a run is stopped
         return replace(odometry, T_world_lidar=np.stack(poses)) if len(poses) == len(odometry) else None
 

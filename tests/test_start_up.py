@@ -84,7 +84,7 @@ def test_every_long_command_prints_a_message_before_it_imports_large_libraries(t
         ["view", folder, "--save", f"{folder}/run.rrd"],
         ["export", folder, f"{folder}/map.ply"],
         ["register", file, file],
-        ["simulate", folder],
+        ["simulate", f"{folder}/drive"],
         ["demo", "--out", folder],
         ["optimize", file, "--out", f"{folder}/out.g2o"],
         ["label", folder, "--labels", "geometric", "--out", file],

@@ -160,7 +160,7 @@ def test_a_benchmark_on_a_full_disk_leaves_no_half_file(
         assert status == 2
         assert "File too large" in one_line(capsys)
         assert not [file for file in tmp_path.rglob("*") if file.is_file()]
-    assert run(*bench) == 0
+    assert run(*bench, "--overwrite") == 0
 
 
 def test_labels_on_a_full_disk_are_whole_or_not_there(

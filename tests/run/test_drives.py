@@ -68,5 +68,5 @@ def test_the_key_changes_with_recording_options_and_version_but_not_with_the_nam
 
 
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match="nothing: cannot be read"):
+    with pytest.raises(SegslamError, match="nothing: no such file"):
         drives_of([tmp_path / "nothing"])[0].key("1")

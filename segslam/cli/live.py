@@ -77,10 +77,11 @@ def live(
     _check_source(folder, topic, out)
     if gnss.gnss is not None:
         _check_ros("--gnss")
+    output.load()  # reports a wrong setting before large libraries are loaded
     if labels not in ("auto", "geometric", "none"):
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
-    configs = live_configs(preset, output)
     terminal.announce("live: starting")
+    configs = live_configs(preset, output)
     from segslam.labels.label_files import unlabelled
     from segslam.output.folder import new_folder
     from segslam.run.live import Front, LiveMap

@@ -293,7 +293,9 @@ def test_the_quick_check_measures_a_small_slip(moved_m: float) -> None:
 
 
 @pytest.mark.parametrize("num_again", [10, pytest.param(70, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("last", [SLIP_AT + 1, pytest.param(SLIP_AT + 12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "last", [pytest.param(15, marks=pytest.mark.slow), SLIP_AT + 1, pytest.param(SLIP_AT + 12, marks=pytest.mark.slow)]
+)
 def test_an_interrupted_drive_continues_from_its_last_scans(
     last: int, num_again: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

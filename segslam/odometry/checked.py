@@ -2,11 +2,11 @@
 
 As long as the odometry is sound, a scan every `keyframes.distance_m` is compared with the previous one in a few
 milliseconds. If this contradicts the motion, the scan is registered with the last scans from several proposals: the
-odometry's motion and the last motion; and, if neither explains the scan as scans of this drive usually are explained,
-no motion, poses all around, and place recognition. The most likely pose is kept. Each following scan is registered as
-well, until the odometry agrees with a window of registrations, after the n-th repair with n windows. So are the first
-scans of a drive, where KISS-ICP has few points in its map. After a repair the odometry continues from the local map;
-smaller corrections leave it undisturbed, and are added to its poses.
+odometry's motion and the last motion; and, if no pose near a proposal explains the scan as scans of this drive usually
+are explained, no motion, poses all around, and place recognition. The most likely pose is kept. Each following scan is
+registered as well, until the odometry agrees with a window of registrations, after the n-th repair with n windows. So
+are the first scans of a drive, where KISS-ICP has few points in its map. After a repair the odometry continues from
+the local map; smaller corrections leave it undisturbed, and are added to its poses.
 """
 
 import math
@@ -152,11 +152,11 @@ class CheckedOdometry:
         T_odom_map = self._map.T_odom_map
         T_map_odom = geometry.inverse(T_odom_map)
         T_map_proposed, T_map_last = T_map_odom @ T_odom_proposed, T_map_odom @ self._T_odom_last
-        if not (fits and self._is_usual(fits[0])):
-            fits = self._search.near(self._map, scan, [T_map_last], fits)
         unsure, elsewhere = np.zeros((6, 6)), float(is_rejoined)  # the scan before is not in the map before a break
-
-        if not is_rejoined and not (fits and self._is_usual(fits[0])):
+        starts = [T_map_proposed, T_map_odom @ T_odom_predicted]
+        if not is_rejoined and not self._is_found(fits, starts, scan):
+            fits = self._search.near(self._map, scan, [T_map_last], fits)
+        if not is_rejoined and not self._is_found(fits, [*starts, T_map_last], scan):
             T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
             fits = self._search.around(self._map, scan, T_map_last, T_step, fits)
             elsewhere = self._search.elsewhere(scan, fits)
@@ -228,6 +228,15 @@ class CheckedOdometry:
             self._map = local
         self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, num_scans + 1)
         return fits if is_found else []
+
+    def _is_found(self, fits: Sequence[Fit], T_map_starts: Sequence[Transform], scan: SeenScan) -> bool:
+        """True if the most likely pose is near one of the starts and explains the scan as usual.
+
+        A registration that leads away from where it started may have ended at the first of several local optima.
+        """
+        if not fits or not self._is_usual(fits[0]):
+            return False
+        return any(self._search.is_same(scan, fits[0].T_map_lidar, T_map_start) for T_map_start in T_map_starts)
 
     def _is_usual(self, fit: Fit) -> bool:
         return self._usual_fit.includes(fit.mean_log, least_spread=fit.num_patches**-0.5)

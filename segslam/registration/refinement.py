@@ -93,9 +93,9 @@ class Surface:
     def __len__(self) -> int:
         return self.cloud.size()
 
-    def nearest(self, points: Points, *, num_threads: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """(n,) each: row of the nearest point of the surface, and the distance to it (m)."""
-        rows, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=num_threads)
+        rows, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
         return np.asarray(rows, dtype=np.int64), np.sqrt(squared)
 
     def normals_at(self, rows: Indices) -> Points:
@@ -151,13 +151,13 @@ def merge_clouds(clouds: Sequence[Points], *, config: RefineConfig) -> Points:
     return voxel_means(np.vstack(clouds), config.voxel_m).astype(np.float32)
 
 
-def make_surface(downsampled: Points, *, config: RefineConfig, num_threads: int = 1) -> Surface:
+def make_surface(downsampled: Points, *, config: RefineConfig) -> Surface:
     """The surface through downsampled points. It may be empty; `refine` then rejects."""
     cloud = small_gicp.PointCloud(downsampled.astype(np.float64))
     tree = small_gicp.KdTree(cloud)
     if len(downsampled) < MIN_POINTS:
         return Surface(cloud, tree, LEAST_ROUGHNESS * config.voxel_m)
-    small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, num_threads)
+    small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, 1)
     return Surface(cloud, tree, _roughness(cloud, tree, config.voxel_m))
 
 

@@ -7,13 +7,14 @@ from helpers.yards import seen
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
+from segslam.registration.refinement import LightSurface
 from segslam.slam.adjustment.alignment import _normal_equations, align
-from segslam.slam.adjustment.submaps import Submap, Submaps, members
+from segslam.slam.adjustment.submaps import Submaps, members
 
 WAY_M = 12.0
 
 
-def submap(x_m: float, *, low_deg: float = 0.0, pitch_deg: float = 0.0, seed: int = 0) -> Submap:
+def submap(x_m: float, *, low_deg: float = 0.0, pitch_deg: float = 0.0, seed: int = 0) -> LightSurface:
     """One scan."""
     points = seen(x_m, low_deg=low_deg, pitch_deg=pitch_deg, seed=seed).astype(np.float32)
     made = Submaps(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())
@@ -55,12 +56,11 @@ def test_the_gradient_is_the_derivative_of_the_cost() -> None:
     source, target = rng.normal(scale=5.0, size=(2, 40, 3))
     normals = rng.normal(size=(40, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    nearest, near = np.arange(40), np.ones(40, dtype=bool)
     width = 1e3  # nearly least squares
 
     def system(xi: np.ndarray) -> tuple:
         T = np.ascontiguousarray(geometry.exp(xi))
-        return _normal_equations(source, normals @ T[:3, :3], target, normals, nearest, near, T, width)
+        return _normal_equations(source, normals @ T[:3, :3], target, normals, T, width)
 
     _, gradient, *_ = system(np.zeros(6))
     steps = 1e-6 * np.eye(6)

@@ -11,7 +11,7 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.kernels import kernel
 from segslam.core.types import Information, Transform, Vector
-from segslam.slam.adjustment.submaps import NUM_THREADS, Submap
+from segslam.registration.refinement import LightSurface
 
 SEARCH_M = (1.0, 0.8, 0.7)
 """Chosen: search distance of each iteration, the last one for all others; odometry errs by less over 30 m."""
@@ -41,8 +41,10 @@ class Alignment:
     """Share of the source's points that are paired."""
 
 
-def align(source: Submap, target: Submap, T_target_source: Transform) -> Alignment | None:
+def align(source: LightSurface, target: LightSurface, T_target_source: Transform) -> Alignment | None:
     """The pose that aligns source and target near an initial guess; None if it does not converge."""
+    if min(len(source), len(target)) < MIN_PAIRED:
+        return None
     fit = _Fit(source, target)
     length = np.inf
     for iteration in range(MOST_ITERATIONS):
@@ -61,24 +63,22 @@ def align(source: Submap, target: Submap, T_target_source: Transform) -> Alignme
 class _Fit:
     """Steps of Gauss and Newton for one pair, and the system of the last of them."""
 
-    def __init__(self, source: Submap, target: Submap) -> None:
-        rows = slice(None, None, max(1, -(-len(source.points) // MOST_POINTS)))
-        self.points, self._normals = source.points[rows], source.normals[rows]
+    def __init__(self, source: LightSurface, target: LightSurface) -> None:
+        rows = np.arange(0, len(source), max(1, -(-len(source) // MOST_POINTS)))
+        self.points, self._normals = source.points[rows], source.normals_at(rows)
         self._target = target
 
     def step(self, T_target_source: Transform, iteration: int) -> Vector | None:
         """The next step of the pose (right perturbation); None with few pairs."""
         target = self._target
-        nearest, distance_m = target.surface.nearest(
-            geometry.apply(T_target_source, self.points), num_threads=NUM_THREADS
-        )
+        nearest, distance_m = target.nearest(geometry.apply(T_target_source, self.points))
+        paired = distance_m < SEARCH_M[min(iteration, len(SEARCH_M) - 1)]
+        rows = nearest[paired]
         self.hessian, gradient, squares, weights, self.num = _normal_equations(
-            self.points,
-            self._normals,
-            target.points,
-            target.normals,
-            nearest,
-            distance_m < SEARCH_M[min(iteration, len(SEARCH_M) - 1)],
+            self.points[paired],
+            self._normals[paired],
+            target.points[rows],
+            target.normals_at(rows),
             np.ascontiguousarray(T_target_source),
             KERNEL_M[min(iteration, len(KERNEL_M) - 1)],
         )
@@ -90,18 +90,15 @@ class _Fit:
 
 @kernel(
     "Tuple((float64[:, ::1], float64[::1], float64, float64, int64))(float64[:, :], float64[:, :], "
-    "float64[:, :], float64[:, :], int64[:], boolean[:], float64[:, ::1], float64)"
+    "float64[:, :], float64[:, :], float64[:, ::1], float64)"
 )
-def _normal_equations(source, normals, target, target_normals, nearest, near, T, width):
-    """Hessian and gradient of half the weighted squares by the pose; weighted squares, weights, paired points."""
+def _normal_equations(source, normals, target, target_normals, T, width):
+    """Hessian and gradient of half the weighted squares of pairs by the pose; weighted squares, weights, pairs used."""
     hessian, gradient, row = np.zeros((6, 6)), np.zeros(6), np.empty(6)
     squares = weights = 0.0
     num = 0
     for k in range(len(source)):
-        if not near[k]:
-            continue
-        j = nearest[k]
-        n, m, p = target_normals[j], normals[k], source[k]
+        n, m, p = target_normals[k], normals[k], source[k]
         a = T[0, 0] * n[0] + T[1, 0] * n[1] + T[2, 0] * n[2]  # the normal in the source's frame
         b = T[0, 1] * n[0] + T[1, 1] * n[1] + T[2, 1] * n[2]
         c = T[0, 2] * n[0] + T[1, 2] * n[1] + T[2, 2] * n[2]
@@ -109,7 +106,7 @@ def _normal_equations(source, normals, target, target_normals, nearest, near, T,
             continue
         e = a * p[0] + b * p[1] + c * p[2]
         for i in range(3):
-            e += n[i] * (T[i, 3] - target[j, i])
+            e += n[i] * (T[i, 3] - target[k, i])
         row[0], row[1], row[2] = p[1] * c - p[2] * b, p[2] * a - p[0] * c, p[0] * b - p[1] * a
         row[3], row[4], row[5] = a, b, c
         w = (1.0 + (e / width) ** 2) ** -2.0

@@ -1,7 +1,6 @@
 """Submaps: the cloud of a keyframe merged with those of its neighbours along the drive, as a surface."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -9,17 +8,14 @@ import numpy as np
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
-from segslam.core.points import cell_keys, group_means, hash_keys
+from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Vector
-from segslam.registration.refinement import Surface, downsample, make_surface
+from segslam.registration.refinement import LightSurface, downsample
 from segslam.slam.adjustment.pairs import EVERY
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
-
-NUM_THREADS = 2
-"""Threads of searches in submaps: nothing else runs at the end of a drive. Results do not depend on it."""
 
 PointsOf = Callable[[int], Points]
 """Returns the points of a keyframe, by id, in its own frame."""
@@ -28,17 +24,8 @@ MOST_SUBMAPS = 16
 """Chosen: submaps in memory, about 1.5 MB each; a drive needs 6, and 2 more for each other pass beside it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Submap:
-    """The surface around a keyframe, in its frame."""
-
-    surface: Surface
-    points: Points
-    normals: Points
-
-
 class Submaps:
-    """Submaps by the id of their keyframe, made when they are needed."""
+    """Submaps by the id of their keyframe, in its frame, made when they are needed."""
 
     def __init__(
         self,
@@ -56,15 +43,11 @@ class Submaps:
     def _scan_of(self, keyframe_id: int) -> Points:
         return downsample(self._points_of(keyframe_id), config=self._refine).astype(np.float64)
 
-    def _submap(self, keyframe_id: int) -> Submap:
+    def _submap(self, keyframe_id: int) -> LightSurface:
         T_keyframe_world = geometry.inverse(self._T_world[keyframe_id])
         near = members(keyframe_id, self._travel_m, reach=REACH)
         points = np.vstack([geometry.apply(T_keyframe_world @ self._T_world[one], self._scan(one)) for one in near])
-        keys, _ = cell_keys(points, self._refine.voxel_m)
-        voxels, group = np.unique(hash_keys(keys)[1], return_inverse=True)
-        merged = group_means(points, group, len(voxels)) if len(points) else points
-        surface = make_surface(merged, config=self._refine, num_threads=NUM_THREADS)
-        return Submap(surface, surface.points.copy(), surface.normals.copy())
+        return LightSurface(voxel_means(points, self._refine.voxel_m))
 
 
 def members(keyframe_id: int, travel_m: Vector, *, reach: int) -> list[int]:

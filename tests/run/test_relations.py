@@ -64,16 +64,17 @@ def test_the_inverse_has_the_same_cost_for_the_same_motion() -> None:
     )
 
 
-def test_components_are_related_by_their_most_similar_pair_once() -> None:
+def test_each_drive_is_related_to_the_most_similar_earlier_one_first() -> None:
     components = Components(5)
-    similarity = {(1, 0): 4.0, (2, 0): 9.0, (2, 1): 7.0, (3, 1): 3.0, (4, 3): 5.0}
-    assert components.next_pairs(similarity) == [(2, 0), (2, 1), (4, 3)]
+    similarity = {(2, 0): 9.0, (2, 1): 7.0, (3, 1): 3.0, (4, 3): 5.0}
+    assert components.next_pairs(similarity) == [(2, 0), (3, 1), (4, 3)]
     T_0_2, T_1_2 = _pose(), _pose()
     components.add(2, 0, Relation(T_0_2, ((1, 1, _alignment(_pose())),)))
     components.add(2, 1, Relation(T_1_2, ((2, 3, _alignment(_pose())),)))
     components.add(4, 3, Relation(None, (), "not found"))
     assert components.members() == [[0, 1, 2], [3], [4]]
     assert components.next_pairs(similarity) == [(3, 1)]
+    assert components.next_pairs({**similarity, (4, 0): 1.0}) == [(3, 1), (4, 0)]
     order, poses = components.arranged([0, 1, 2])
     assert order == [0, 2, 1]
     assert poses[0] is None
@@ -85,7 +86,7 @@ def test_components_are_related_by_their_most_similar_pair_once() -> None:
     assert poses[2].found[0][:2] == (3, 2), "keyframe of the drive, and of the one before it"
 
 
-def test_drives_that_several_others_do_not_fit_are_not_tried_with_all() -> None:
+def test_a_drive_that_several_earlier_ones_do_not_fit_is_not_tried_with_all() -> None:
     num_drives = 40
     components = Components(num_drives)
     similarity = {(later, earlier): 1.0 for later in range(num_drives) for earlier in range(later)}
@@ -94,5 +95,4 @@ def test_drives_that_several_others_do_not_fit_are_not_tried_with_all() -> None:
         for pair in pairs:
             components.add(*pair, Relation(None, (), "not found"))
             num_tried += 1
-    assert num_tried <= (MOST_FAILED + 1) * num_drives < 0.3 * len(similarity)
-    assert all(components._num_failed[drive] >= MOST_FAILED for drive in range(num_drives))
+    assert num_tried == sum(min(drive, MOST_FAILED) for drive in range(num_drives))

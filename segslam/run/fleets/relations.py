@@ -95,7 +95,6 @@ class Components:
         one, other = sorted((self.of(later), self.of(earlier)))
         if relation.T_earlier_later is None:
             self._num_failed[later] += 1
-            self._num_failed[earlier] += 1
         if relation.T_earlier_later is None or one == other:
             return
         self._relations[later, earlier] = relation
@@ -124,16 +123,14 @@ class Components:
         return None
 
     def next_pairs(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
-        """For each component the most similar pair with another one, of those not tried yet.
+        """For each drive the most similar earlier one of another component, of those not tried yet.
 
-        Two drives that `MOST_FAILED` others each could not be joined to are not tried with each other.
+        A drive that could not be joined to `MOST_FAILED` earlier ones is not tried with the others. A drive that is
+        added to a fleet thus needs its own pairs only.
         """
-        best: dict[int, tuple[float, tuple[int, int]]] = {}
-        for pair, value in similarity.items():
-            ends = {self.of(drive) for drive in pair}
-            is_open = min(self._num_failed[drive] for drive in pair) < MOST_FAILED
-            if pair in self._tried or len(ends) < 2 or not is_open:
-                continue
-            for component in ends:
-                best[component] = max(best.get(component, (0.0, (0, 0))), (value, (-pair[0], -pair[1])))
-        return sorted({(-negated[0], -negated[1]) for _, negated in best.values()})
+        best: dict[int, tuple[float, int]] = {}
+        for (later, earlier), value in similarity.items():
+            is_open = self._num_failed[later] < MOST_FAILED and self.of(later) != self.of(earlier)
+            if is_open and (later, earlier) not in self._tried:
+                best[later] = max(best.get(later, (-np.inf, 0)), (value, -earlier))
+        return sorted((later, -negated) for later, (_, negated) in best.items())

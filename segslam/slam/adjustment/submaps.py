@@ -12,7 +12,6 @@ from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Vector
 from segslam.registration.refinement import LightSurface, downsample
-from segslam.slam.adjustment.pairs import EVERY
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
@@ -37,7 +36,7 @@ class Submaps:
     ) -> None:
         self._points_of, self._T_world, self._travel_m = points_of, T_world, travel_m
         self._refine = config
-        self._scan = lru_cache(4 * REACH + EVERY + 2)(self._scan_of)
+        self._scan = lru_cache(MOST_SUBMAPS * (2 * REACH + 1))(self._scan_of)  # those of the submaps in memory
         self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
 
     def _scan_of(self, keyframe_id: int) -> Points:

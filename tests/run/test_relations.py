@@ -96,3 +96,16 @@ def test_a_drive_that_several_earlier_ones_do_not_fit_is_not_tried_with_all() ->
             components.add(*pair, Relation(None, (), "not found"))
             num_tried += 1
     assert num_tried == sum(min(drive, MOST_FAILED) for drive in range(num_drives))
+
+
+def test_a_component_that_others_do_not_fit_waits_until_a_drive_joins_it() -> None:
+    first, second = 1, MOST_FAILED + 2
+    components = Components(second + 1)
+    similarity = {(MOST_FAILED + 1, earlier): 9.0 - earlier for earlier in range(MOST_FAILED + 1)}
+    for _ in range(MOST_FAILED):
+        (pair,) = components.next_pairs(similarity)
+        components.add(*pair, Relation(None, (), "not found"))
+    assert components.next_pairs(similarity) == []
+    components.add(second, MOST_FAILED + 1, Relation(_pose(), ()))
+    assert components.next_pairs(similarity) == [(MOST_FAILED + 1, MOST_FAILED)]
+    assert components.next_pairs({**similarity, (second, first): 7.0}) == [(second, first)]

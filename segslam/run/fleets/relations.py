@@ -77,6 +77,7 @@ class Components:
         self._relations: dict[tuple[int, int], Relation] = {}
         self._tried = set[tuple[int, int]]()
         self._num_failed = [0] * num_drives
+        """By component: pairs that could not be joined since its last drive was."""
 
     def of(self, drive: int) -> int:
         """The component of a drive: the number of its first drive."""
@@ -94,11 +95,12 @@ class Components:
         self._tried.add((later, earlier))
         one, other = sorted((self.of(later), self.of(earlier)))
         if relation.T_earlier_later is None:
-            self._num_failed[later] += 1
+            self._num_failed[self.of(later)] += 1
         if relation.T_earlier_later is None or one == other:
             return
         self._relations[later, earlier] = relation
         self._component = [one if own == other else own for own in self._component]
+        self._num_failed[one] = 0
 
     def arranged(self, members: Sequence[int]) -> tuple[list[int], list[SessionPose | None]]:
         """The drives of a component, each after one in which its pose is known, and these poses."""
@@ -123,14 +125,14 @@ class Components:
         return None
 
     def next_pairs(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
-        """For each drive the most similar earlier one of another component, of those not tried yet.
+        """For each component its most similar pair with an earlier drive of another one, of those not tried yet.
 
-        A drive that could not be joined to `MOST_FAILED` earlier ones is not tried with the others. A drive that is
-        added to a fleet thus needs its own pairs only.
+        After `MOST_FAILED` pairs of a component that could not be joined, it waits until a drive joins it. The first
+        pairs are those of each drive, and a drive that is added to a fleet needs its own pairs only.
         """
-        best: dict[int, tuple[float, int]] = {}
-        for (later, earlier), value in similarity.items():
-            is_open = self._num_failed[later] < MOST_FAILED and self.of(later) != self.of(earlier)
-            if is_open and (later, earlier) not in self._tried:
-                best[later] = max(best.get(later, (-np.inf, 0)), (value, -earlier))
-        return sorted((later, -negated) for later, (_, negated) in best.items())
+        best: dict[int, tuple[float, tuple[int, int]]] = {}
+        for pair, value in similarity.items():
+            own, other = map(self.of, pair)
+            if own != other and pair not in self._tried and self._num_failed[own] < MOST_FAILED:
+                best[own] = max(best.get(own, (0.0, (0, 0))), (value, (-pair[0], -pair[1])))
+        return sorted((-negated[0], -negated[1]) for _, negated in best.values())

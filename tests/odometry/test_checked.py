@@ -13,11 +13,14 @@ from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Step, Trajectory
+from segslam.graph.noise import odometry_information
 from segslam.odometry import CheckedOdometry, GivenOdometry, KissOdometry, OdometryResult, Tracker, information_of
-from segslam.odometry.likelihood import fit
+from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import Intervals
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
+from segslam.odometry.search import PoseSearch
+from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
 from segslam.registration.refinement import refine as refined
 from segslam.slam.slam import Slam
 from segslam.verification import register
@@ -251,6 +254,45 @@ def test_a_keyframe_follows_a_break_and_its_motion_has_nearly_no_information() -
     assert before is not None
     assert keyframe.travel_m - before.travel_m > 1e4
     assert [step.motion.state for step in steps if step.motion][20] is MotionState.BROKEN
+
+
+def test_a_registration_that_leads_away_from_its_start_is_compared_with_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends two metres beside the true pose, which explains the scan better, though both are as usual."""
+    scans, truth = round_drive()
+    odometry = _checked(_slipped(metres=3.0))
+    last = _registered(odometry, scans[:SLIP_AT])[-1]
+    usual = float(np.median(odometry._usual_fit._values))
+
+    before, now = truth.T_world_lidar[SLIP_AT - 1 : SLIP_AT + 1]
+
+    def slides(search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = ()) -> list[Fit]:
+        beside = geometry.inverse(before) @ now @ geometry.transform(np.eye(3), [0.0, 2.0, 0.0])
+        fit = local.fit(scan, beside)
+        return [replace(fit, mean_log=usual - 2.0 * fit.num_patches**-0.5)]
+
+    monkeypatch.setattr(PoseSearch, "near", slides)
+    found = odometry.register(scans[SLIP_AT])
+    T_before_found = geometry.inverse(last.T_odom_lidar) @ found.T_odom_lidar
+    assert geometry.distance(geometry.inverse(now) @ before @ T_before_found) < 0.1
+
+
+def test_a_motion_has_information_of_its_own_if_it_is_less_certain_than_the_model() -> None:
+    step = geometry.transform(np.eye(3), np.array([CONFIG.keyframes.distance_m, 0.0, 0.0]))
+    shared = geometry.tangent(rotation_rad=np.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
+    model = np.linalg.inv(odometry_information(0.0, step, CONFIG.graph)) + np.diag(shared**2)
+    odometry = _checked(round_drive()[1].T_world_lidar)
+    assert odometry._own_information(0.5 * model) is None
+    own = odometry._own_information(4.0 * model)
+    assert own is not None
+    np.testing.assert_allclose(own @ (4.0 * model), np.eye(6), atol=1e-6)
+
+
+def test_a_given_motion_predicts_the_next_one() -> None:
+    scans, truth = round_drive()
+    odometry = _checked(truth.T_world_lidar)
+    _registered(odometry, scans[:5])
+    T_step = geometry.inverse(truth.T_world_lidar[3]) @ truth.T_world_lidar[4]
+    np.testing.assert_allclose(odometry._motion.T_step, T_step, atol=1e-6)
 
 
 def test_the_uncertainties_of_several_motions_add_up() -> None:

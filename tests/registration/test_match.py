@@ -251,6 +251,11 @@ def test_ground_keeps_a_level_scene_from_being_turned_over(monkeypatch: pytest.M
         assert (registration.T_target_source @ geometry.inverse(T_TRUE))[2, 2] > 0.9
 
 
+def test_ground_in_one_scan_alone_does_not_align_the_verticals() -> None:
+    scan = street(13)
+    assert error(match(grounded(scan, slope=0.0), moved(T_TRUE, scan), config=SegregatorConfig()), T_TRUE)[0] < 0.1
+
+
 def test_repeated_structure_gives_several_different_hypotheses_with_the_truth_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -15,6 +15,7 @@ from segslam.registration.refinement import (
     make_surface,
     observability,
     refine,
+    weakest_level,
 )
 
 CONFIG = RefineConfig()
@@ -127,6 +128,11 @@ def test_a_corner_is_held_in_all_directions() -> None:
     assert isinstance(found, Registration)
     assert observability(found.information)[0] > UNOBSERVED
     assert np.sqrt(np.diag(np.linalg.inv(found.information))[3:]).max() < 0.1
+
+
+def test_without_information_some_level_direction_is_the_weakest() -> None:
+    assert np.linalg.norm(weakest_level(np.zeros((6, 6)))) == 1.0
+    assert weakest_level(np.zeros((6, 6)))[2] == 0.0
 
 
 @pytest.mark.data

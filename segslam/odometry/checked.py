@@ -159,6 +159,7 @@ class CheckedOdometry:
         if not is_rejoined and not self._is_found(fits, [*starts, T_map_last], scan):
             T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
             fits = self._search.around(self._map, scan, T_map_last, T_step, fits)
+        if not is_rejoined and not (fits and self._is_usual(fits[0])):
             elsewhere = self._search.elsewhere(scan, fits)
             if elsewhere * ELSEWHERE_M**2 > BREAK_M**2 or not self._motion.is_known:
                 recognised = self._search.without_guess(self._map, scan)

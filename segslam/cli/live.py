@@ -94,7 +94,7 @@ def live(
     angle_deg = settings.sensor.vertical_angle_deg or 0.0
     source = _source(folder, topic, intensities=settings.map.color == "intensity", vertical_angle_deg=angle_deg)
     recorded = {"labels": labels, "live": source.name, "map_files": json_text.dumps([str(name) for name in map_names])}
-    scene = open_scene(None, view_every=settings.log.view_every) if output.view else None
+    scene = open_scene(None) if output.view else None
     with ExitStack() as stack:
         server = serve_foxglove(output.foxglove, stack, terminal)
         make_room(out, overwrite=output.overwrite, inputs=[folder])
@@ -125,7 +125,7 @@ def live(
         mirror = server.send if server else None
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
         publisher = _publisher(source, run, stack)
-        with LiveMap(_shows(server, publisher), view_every=settings.log.view_every) as live_map:
+        with LiveMap(_shows(server, publisher)) as live_map:
             figures = _follow(front, run, _watch(run, scene, live_map, publisher), terminal)
         ended = front.ended
         if run.num_steps == 0:

@@ -58,7 +58,7 @@ def view(
 
     log = read_log(run)
     with nullcontext() if save is None else whole_file(save) as part:
-        scene = open_scene(part, view_every=log.config.log.view_every, named=save)
+        scene = open_scene(part, named=save)
         num_steps = 0
         for step in terminal.progress(log.steps(), log.num_steps(), "view"):
             scene.add(step)

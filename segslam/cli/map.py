@@ -200,7 +200,7 @@ def map_data(
             raise typer.Exit(0)
     else:
         make_room(folder, overwrite=output.overwrite, inputs=(data, in_map, options.odometry))
-    scene = open_scene(None, view_every=settings.log.view_every) if output.view else None
+    scene = open_scene(None) if output.view else None
     with ExitStack() as stack:
         server = serve_foxglove(output.foxglove, stack, terminal)
         map_scans(

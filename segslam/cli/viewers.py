@@ -43,7 +43,7 @@ def check_display() -> None:
         )
 
 
-def open_scene(file: Path | None, *, view_every: int, named: Path | None = None) -> "Scene":
+def open_scene(file: Path | None, *, named: Path | None = None) -> "Scene":
     """An empty scene in a new viewer, or in a file, called `named` in messages. Raises SegslamError if it fails."""
     os.environ.setdefault("RUST_LOG", "off")  # otherwise Rerun prints every action
     try:
@@ -61,7 +61,7 @@ def open_scene(file: Path | None, *, view_every: int, named: Path | None = None)
             viewer.spawn()
         else:
             viewer.save(file)
-        return Scene(viewer, view_every=view_every)
+        return Scene(viewer)
     except (OSError, RuntimeError) as error:
         raise _no_viewer(named, error) from error
 

@@ -11,6 +11,9 @@ from segslam.core.config import KeyframeConfig
 from segslam.core.points import voxel_first
 from segslam.core.types import Indices, Keyframe, Label, Labels, Points, Transform
 
+ANGLE_DEG = 20.0
+"""Chosen: rotation after which a keyframe is made before `keyframes.distance_m` is reached (degrees)."""
+
 
 class KeyframeSelector:
     """Selects a scan as keyframe if distance or rotation from the last keyframe are large enough."""
@@ -36,7 +39,7 @@ class KeyframeSelector:
         if self._T_odom_keyframe is not None:
             moved = geometry.inverse(self._T_odom_keyframe) @ T_odom_lidar
             is_keyframe |= geometry.distance(moved) >= self._config.distance_m
-            is_keyframe |= geometry.angle(moved) >= math.radians(self._config.angle_deg)
+            is_keyframe |= geometry.angle(moved) >= math.radians(ANGLE_DEG)
         if is_keyframe:
             self._T_odom_keyframe = T_odom_lidar
         return is_keyframe

@@ -18,7 +18,7 @@ from segslam.core.types import (
     Transform,
 )
 from segslam.labels.class_colors import COLORS
-from segslam.output.log.drawing import ACCEPTED_COLOR, PATH_GROWTH, REJECTED_COLORS
+from segslam.output.log.drawing import ACCEPTED_COLOR, PATH_GROWTH, REJECTED_COLORS, VIEW_EVERY
 
 WORLD, LIDAR, TIMES = "world", "world/lidar", "stage_ms"
 CORRECTED_COLOR, ODOMETRY_COLOR, MOVING_COLOR = "#00a0ff", "#ff9000", "#ff2a2a"
@@ -51,10 +51,8 @@ FLUSH_S = 60.0
 class Scene:
     """Displays a run step by step in the viewer."""
 
-    def __init__(self, viewer: rr.RecordingStream, *, view_every: int) -> None:
-        """`view_every`: every n-th point of a keyframe is shown."""
+    def __init__(self, viewer: rr.RecordingStream) -> None:
         self._viewer = viewer
-        self._view_every = view_every
         self._T_odom_keyframe: list[Transform] = []
         self._T_world_keyframe: list[Transform] = []
         self._T_world_odom = np.eye(4)
@@ -106,7 +104,7 @@ class Scene:
         entity = f"{WORLD}/keyframes/{keyframe.id}"
         self._T_odom_keyframe.append(keyframe.T_odom_keyframe)
         self._T_world_keyframe.append(self._T_world_odom @ keyframe.T_odom_keyframe)
-        some = slice(None, None, self._view_every)
+        some = slice(None, None, VIEW_EVERY)
         self._viewer.log(entity, rr.Points3D(keyframe.points[some], class_ids=keyframe.labels[some], radii=0.05))
         self._viewer.log(entity, _pose(self._T_world_keyframe[-1]))
         if len(self._T_odom_keyframe) >= PATH_GROWTH * self._num_on_paths:

@@ -38,9 +38,9 @@ def test_a_setting_that_was_removed_is_dropped_with_a_warning(tmp_path: Path, ca
 
 def test_a_file_holds_differences_and_set_wins_over_it(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
-    file.write_text("keyframes: {distance_m: 4.0, angle_deg: 30}\n")
+    file.write_text("keyframes: {distance_m: 4.0, voxel_m: 0.3}\n")
     config = load_config(file, ["keyframes.distance_m=5"])
-    assert (config.keyframes.distance_m, config.keyframes.angle_deg) == (5.0, 30.0)
+    assert (config.keyframes.distance_m, config.keyframes.voxel_m) == (5.0, 0.3)
     assert config.refine == Config().refine
 
 

@@ -6,7 +6,7 @@ from segslam.core.config import KeyframeConfig
 from segslam.core.types import Keyframe, Label
 from segslam.keyframes.keyframes import CloudStore, KeyframeSelector, downsample_keyframe
 
-CONFIG = KeyframeConfig(distance_m=2.0, angle_deg=20.0)
+CONFIG = KeyframeConfig(distance_m=2.0)
 
 
 def _at(x: float, yaw_deg: float = 0.0) -> np.ndarray:

@@ -27,7 +27,8 @@ REMOVED = {
         "tolerance_m tolerance_deg watch_scans map_scans map_spacing_m map_spacing_deg correspondence_m "
         "inlier_m min_overlap max_rms"
     ),
-    "keyframes": "dense_voxels max_gathered",
+    "keyframes": "dense_voxels max_gathered angle_deg",
+    "log": "view_every compression",
     "map": "view_margin_m view_margin_ratio min_views moved_radius_m cell_m min_obstacle_voxels obstacle_m",
     "odometry": "stamp_tolerance_s",
     "proximity": (

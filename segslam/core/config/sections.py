@@ -120,12 +120,6 @@ class KeyframeConfig(Section):
         description="voxel size to which keyframes are downsampled, except for the classes that form clusters (m) "
         "[chosen]",
     )
-    angle_deg: float = Field(
-        20.0,
-        gt=0,
-        le=180,
-        description="rotation after which a keyframe is made before that distance is reached (degrees) [chosen]",
-    )
     resolution_m: float = Field(
         0.004, gt=0, description="grid to which the coordinates of keyframes are rounded (m) [chosen]"
     )
@@ -294,15 +288,6 @@ class AdjustmentConfig(Section):
     )
 
 
-class LogConfig(Section):
-    """Format of the log."""
-
-    view_every: int = Field(
-        8, ge=1, description="viewers get every n-th point of a keyframe; replay uses all points [chosen]"
-    )
-    compression: Literal["none", "lz4", "zstd"] = Field("zstd", description="compression of the log [chosen]")
-
-
 class MapConfig(Section):
     """The map that `--map` and `segslam export` make of a run."""
 
@@ -347,5 +332,4 @@ class Config(Section):
     verify: VerifyConfig = VerifyConfig()
     graph: GraphConfig = GraphConfig()
     adjustment: AdjustmentConfig = AdjustmentConfig()
-    log: LogConfig = LogConfig()
     map: MapConfig = MapConfig()

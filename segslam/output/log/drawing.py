@@ -8,7 +8,6 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 from segslam.core import geometry
-from segslam.core.config import LogConfig
 from segslam.core.points import voxel_first, within_range
 from segslam.core.types import (
     GraphEstimate,
@@ -54,6 +53,8 @@ PATH_GROWTH = 1.05
 """Chosen: a path is written again when it has grown by this factor. The size of all versions together is then
 linear in its length (about 20 times the last), and a viewer that jumps in time shows at least 95 % of the path."""
 
+VIEW_EVERY = 8
+"""Chosen: viewers get every eighth point of a keyframe; replay uses all points."""
 VIEW_GRID_M = 2.0**-5
 """Chosen: displayed points are rounded to 3 cm (a binary fraction), which halves their compressed size."""
 
@@ -74,8 +75,7 @@ REPAIRS = (MotionState.REPAIRED, MotionState.REJOINED)
 class Drawing:
     """Converts the steps of a run to messages by topic."""
 
-    def __init__(self, config: LogConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._T_odom_keyframe: dict[int, Transform] = {}
         self._T_world_keyframe: Mapping[int, Transform] = {}
         self._T_world_odom = np.eye(4)
@@ -121,7 +121,7 @@ class Drawing:
 
         `cloud` returns the points of a keyframe, in its frame, and their labels.
         """
-        points, labels = map_points(estimate.T_world_keyframe, cloud, view_every=self._config.view_every)
+        points, labels = map_points(estimate.T_world_keyframe, cloud)
         if len(points):
             yield map_message(points, labels, stamp_ns=stamp_ns)
 
@@ -134,7 +134,7 @@ class Drawing:
     def _keyframe(self, keyframe: Keyframe, *, corrected: bool) -> Iterator[Topical]:
         """Its points, and now and then the paths: by odometry and, with `corrected`, in world as far as it is known."""
         self._T_odom_keyframe[keyframe.id] = keyframe.T_odom_keyframe
-        stamp_ns, some = keyframe.stamp_ns, slice(None, None, self._config.view_every)
+        stamp_ns, some = keyframe.stamp_ns, slice(None, None, VIEW_EVERY)
         points = np.round(keyframe.points[some] / VIEW_GRID_M) * VIEW_GRID_M
         yield (
             schema.POINTS,
@@ -190,13 +190,13 @@ class Drawing:
         return self._T_world_odom @ self._T_odom_keyframe[keyframe_id]
 
 
-def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, *, view_every: int) -> tuple[Points, Labels]:
+def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf) -> tuple[Points, Labels]:
     """Some points (n, 3), in world, of between `MAP_KEYFRAMES` and twice as many keyframes, and their labels.
 
     Moving classes are omitted.
     """
     every = 1 + len(T_world_keyframe) // MAP_KEYFRAMES
-    some = slice(None, None, view_every)
+    some = slice(None, None, VIEW_EVERY)
     ids = list(T_world_keyframe)[::every]
     drawn = np.empty((0, 3)), np.empty(0, np.uint8)
     for start in range(0, len(ids), MAP_BATCH):

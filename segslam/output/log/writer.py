@@ -144,7 +144,7 @@ class LogWriter:
         """
         self._mirror = mirror
         self._path = path
-        self._drawing = Drawing(config.log)
+        self._drawing = Drawing()
         self._resolution_m = config.keyframes.resolution_m
         self._stamp_ns = 0
         self._num_poses = 0
@@ -155,8 +155,7 @@ class LogWriter:
             self._output = Output(path)
         except OSError as error:
             raise SegslamError(f"{path}: cannot write the log ({error.strerror}); give another folder") from error
-        compression = CompressionType[config.log.compression.upper()]
-        self._mcap = Writer(cast(IO[bytes], self._output), chunk_size=CHUNK_BYTES, compression=compression)
+        self._mcap = Writer(cast(IO[bytes], self._output), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         with self._whole():
             self._mcap.start(library=f"segslam {version('segslam')}")
             for name, data in metadata(config, dataset, T_camera_lidar, options).items():

@@ -44,9 +44,8 @@ class _Wanted(NamedTuple):
 class LiveMap:
     """Draws the newest requested map and skips older requests; a context manager."""
 
-    def __init__(self, shows: Sequence[Show], *, view_every: int) -> None:
+    def __init__(self, shows: Sequence[Show]) -> None:
         self._shows = shows
-        self._view_every = view_every
         self._changed = Condition()
         self._wanted: _Wanted | None = None
         self._num_drawn = 0
@@ -84,7 +83,7 @@ class LiveMap:
                 self._num_drawn = len(wanted.T_world_keyframe)
             started = monotonic()
             try:
-                points, labels = map_points(wanted.T_world_keyframe, wanted.cloud, view_every=self._view_every)
+                points, labels = map_points(wanted.T_world_keyframe, wanted.cloud)
                 for show in self._shows:
                     show(DrawnMap(points, labels, wanted.T_world_keyframe, wanted.stamp_ns))
             except (SegslamError, OSError) as error:

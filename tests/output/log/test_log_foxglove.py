@@ -92,7 +92,7 @@ def test_one_cloud_of_the_whole_drive_lies_in_world_where_the_last_estimate_has_
         log.write_result(estimate, trajectory)
     [cloud] = decoded(tmp_path / "log.mcap", schema.MAP)
     assert cloud.frame_id == schema.WORLD
-    every, expected = CONFIG.log.view_every, []
+    every, expected = drawing.VIEW_EVERY, []
     for keyframe in (step.keyframe for step in steps if step.keyframe is not None):
         some = keyframe.points[::every]
         near = np.linalg.norm(some, axis=1) < MAP_RANGE_M
@@ -111,7 +111,7 @@ def test_the_cloud_to_look_at_is_a_share_of_the_keyframe_within_its_rounding(ste
     assert {field.name: field.offset for field in cloud.fields} == of_label
     np.testing.assert_array_equal(rows["rgba"][:, :3], of_classes(rows["label"]))
     assert (rows["rgba"][:, 3] == 255).all()
-    every = CONFIG.log.view_every
+    every = drawing.VIEW_EVERY
     np.testing.assert_array_equal(rows["label"], keyframe.labels[::every])
     assert np.abs(rows["xyz"] - keyframe.points[::every]).max() <= 2.0**-6
 
@@ -139,7 +139,7 @@ def test_a_rejected_line_disappears_when_its_loop_is_accepted(steps: list[Step])
     step = next(step for step in steps if step.estimate is not None)
     (accepted,) = step.attempts
     waiting = replace(accepted, outcome=Rejected(RejectReason.UNCONFIRMED, "0 of 2"))
-    drawing = Drawing(CONFIG.log)
+    drawing = Drawing()
     for one in steps[: steps.index(step)]:
         list(drawing.draw(one))
     assert not _deleted(drawing, replace(step, attempts=()))
@@ -237,9 +237,9 @@ def test_the_displayed_map_does_not_depend_on_the_number_of_keyframes_in_a_batch
         for number in range(7)
     }
     poses = {number: geometry.transform(np.eye(3), [float(number), 0.0, 0.0]) for number in clouds}
-    points, labels = drawing.map_points(poses, clouds.__getitem__, view_every=2)
+    points, labels = drawing.map_points(poses, clouds.__getitem__)
     monkeypatch.setattr(drawing, "MAP_BATCH", 3)
-    points_in_batches, labels_in_batches = drawing.map_points(poses, clouds.__getitem__, view_every=2)
+    points_in_batches, labels_in_batches = drawing.map_points(poses, clouds.__getitem__)
     assert 100 < len(points) < 7 * 200
     np.testing.assert_array_equal(points_in_batches, points)
     np.testing.assert_array_equal(labels_in_batches, labels)

@@ -163,7 +163,7 @@ def _propose_seconds(num_keyframes: int) -> float:
 
 
 def _draw_seconds(num_keyframes: int) -> float:
-    drawing = Drawing(Config().log)
+    drawing = Drawing()
     poses = dict(enumerate(_rounds(num_keyframes)))
     drawing._T_odom_keyframe = poses
     estimate = GraphEstimate(poses, 0.0, {})

@@ -13,7 +13,7 @@ from segslam.core.errors import SegslamError
 from segslam.core.whole_files import check_target, whole_file
 
 if TYPE_CHECKING:
-    from segslam.graph import Optimized
+    from segslam.graph.batch import Optimized
 
 
 def optimize(
@@ -41,7 +41,9 @@ def optimize(
     check_target(out)
     check_free([out], overwrite=overwrite or force)
     terminal.announce(f"optimize: reading {graph}")
-    from segslam.graph import Unsolvable, optimize_graph, read_g2o, write_g2o
+    from segslam.graph.batch import optimize_graph
+    from segslam.graph.g2o import read_g2o, write_g2o
+    from segslam.graph.levenberg_marquardt import Unsolvable
 
     try:
         result = optimize_graph(read_g2o(graph), robust=robust)

@@ -19,7 +19,8 @@ from segslam.gnss.alignment import PRIOR, Placement, linearised, moved, refined
 from segslam.gnss.evidence import DriveCovariance, Estimate, Noise, estimated
 from segslam.gnss.matching import Drive, Matched, Prepared
 from segslam.gnss.statistics import KEPT_WEIGHT, Weights, axis_sigma, fix_noise, horizontal_sigma, robust_weights
-from segslam.graph import Edge, PositionedGraph
+from segslam.graph import Edge
+from segslam.graph.position_fixes import PositionedGraph
 
 NUM_WINDOWS = 6
 """Chosen: windows of fixes in a row that are held out, one at a time; a sixth of the fixes is longer than the errors of

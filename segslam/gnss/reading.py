@@ -1,17 +1,23 @@
-"""Position fixes of any source: the kind is found from the content."""
+"""Position fixes of any source: the kind is found from the content. Messages and KITTI's oxts folder are read here."""
 
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
+from segslam.core.errors import brief
 from segslam.core.types import SegslamError
 from segslam.gnss.csv_fixes import read_csv
-from segslam.gnss.fixes import Fixes, make_fixes
-from segslam.gnss.messages import read_messages
+from segslam.gnss.fixes import Fixes, Row, make_fixes
 from segslam.gnss.nmea import is_nmea, read_nmea
-from segslam.gnss.oxts import read_oxts
 from segslam.gnss.rtklib import is_rtklib, read_rtklib
-from segslam.gnss.text import text_lines
+from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, text_lines
 
 RECORDINGS = (".bag", ".mcap", ".db3")
+FIX_MESSAGE = "sensor_msgs/msg/NavSatFix"
+UNKNOWN = 0
+"""`position_covariance_type` of a covariance that is not known."""
+OXTS_ACCURACY = 23
+"""Column of the accuracy of the position (m), counted from 0, as the devkit's dataformat.txt lists them."""
 
 
 def read_fixes(source: str | Path, *, recording: Path | None = None) -> Fixes:
@@ -22,17 +28,17 @@ def read_fixes(source: str | Path, *, recording: Path | None = None) -> Fixes:
     path = Path(source).expanduser()
     if not path.exists():
         if str(source).startswith("/") and recording is not None and _is_recording(recording):
-            return make_fixes(str(source), read_messages(recording, str(source)))
+            return make_fixes(str(source), _read_messages(recording, str(source)))
         raise SegslamError(
             f"{source}: no such file, nor a topic of a recording; give CSV, NMEA, RTKLIB .pos, a KITTI oxts folder, or "
             "the topic of a recording that is mapped"
         )
     if _is_recording(path):
-        return make_fixes(path, read_messages(path, ""))
+        return make_fixes(path, _read_messages(path, ""))
     if path.is_dir():
         if not (path / "timestamps.txt").exists():
             raise SegslamError(f"{path}: no timestamps.txt; give the oxts folder of KITTI's raw data, or a file")
-        return make_fixes(path, read_oxts(path))
+        return make_fixes(path, _read_oxts(path))
     lines = text_lines(path)
     if is_nmea(lines):
         rows, note = read_nmea(path, lines)
@@ -45,3 +51,73 @@ def _is_recording(path: Path) -> bool:
     if path.is_dir():
         return (path / "metadata.yaml").exists() or any(path.glob("*.bag"))
     return path.suffix.lower() in RECORDINGS
+
+
+def _read_messages(recording: Path, topic: str) -> list[Row]:
+    """The fixes of a topic; of the only one if it is empty.
+
+    Raises SegslamError, naming the recording and its topics, if there is no such topic, if the recording cannot be
+    read, or if a package is missing.
+    """
+    from segslam.scans.bag_messages import BagMessages
+    from segslam.scans.mcap_messages import McapMessages
+
+    read = McapMessages if recording.suffix == ".mcap" else BagMessages
+    try:
+        messages = read(recording, topic, kind=FIX_MESSAGE, option="--gnss")
+        return [row_of(messages[number][1]) for number in range(len(messages))]
+    except ImportError as error:
+        raise SegslamError(f"{recording}: {error}") from error
+    except Exception as error:  # the readers raise anything for damaged data
+        what = str(error) if isinstance(error, ValueError) else repr(error)
+        raise SegslamError(f"{recording}: its messages cannot be read ({brief(what, 300)})") from error
+
+
+def row_of(message: Any) -> Row:
+    """The fix of a message. REP 145: the covariance is that of east, north, up; status -1 is no fix."""
+    stamp = message.header.stamp
+    nanosec = stamp.nanosec if hasattr(stamp, "nanosec") else stamp.nsec
+    sigma_m = (float("nan"), float("nan"), float("nan"))
+    if message.position_covariance_type != UNKNOWN:
+        east, north, up = (float(value) for value in list(message.position_covariance)[::4])
+        sigma_m = _root(east), _root(north), _root(up)
+    has_fix = int(message.status.status) >= 0
+    place = float(message.latitude), float(message.longitude), float(message.altitude)
+    return Row(int(stamp.sec) * 10**9 + int(nanosec), *place, sigma_m, has_fix)
+
+
+def _root(variance: float) -> float:
+    return variance**0.5 if variance > 0.0 else float("nan")
+
+
+def _read_oxts(folder: Path) -> list[Row]:
+    """The fixes of a folder with `timestamps.txt` and `data/`. Raises SegslamError, naming the file."""
+    times = [line.strip() for line in text_lines(folder / "timestamps.txt") if line.strip()]
+    files = sorted(file for file in (folder / "data").glob("*.txt") if not file.name.startswith("."))
+    if len(times) != len(files):
+        raise SegslamError(
+            f"{folder}: {len(times)} lines in timestamps.txt, but {len(files)} files in data; copy it again"
+        )
+    return [
+        _oxts_row(file, _oxts_stamp(folder, number, text))
+        for number, (file, text) in enumerate(zip(files, times, strict=True), 1)
+    ]
+
+
+def _oxts_row(file: Path, stamp_ns: int) -> Row:
+    words = " ".join(text_lines(file)).split()
+    if len(words) < 3:
+        raise SegslamError(f"{file}: {len(words)} values; latitude, longitude and altitude are needed")
+    latitude, longitude, height_m = (number_in(file, 1, word, "coordinate") for word in words[:3])
+    check_degrees(file, 1, latitude, longitude)
+    sigma_m = number_in(file, 1, words[OXTS_ACCURACY], "accuracy") if len(words) > OXTS_ACCURACY else float("nan")
+    return Row(stamp_ns, latitude, longitude, height_m, (sigma_m, sigma_m, sigma_m))
+
+
+def _oxts_stamp(folder: Path, number: int, text: str) -> int:
+    """Nanoseconds of a date with up to nine decimals."""
+    try:
+        whole, _, fraction = text.partition(".")
+        return stamp_of(datetime.fromisoformat(whole)) + int(fraction.ljust(9, "0")[:9] or 0)
+    except ValueError as error:
+        raise bad_line(folder / "timestamps.txt", number, f"{text[:40]} is no date and time") from error

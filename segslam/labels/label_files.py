@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from segslam.core.errors import unreadable
 from segslam.core.types import BadScan, Label, Labels, Mask, Points, ScanLabels, SegslamError, Vector
 from segslam.core.whole_files import expanded, whole_file
 from segslam.labels.encodings import Encoding, Histogram, Ids, detect_encoding, to_ids, to_labels
-from segslam.labels.network import Network, open_network
+
+if TYPE_CHECKING:
+    from segslam.labels.network import Network
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +46,7 @@ class LabelSource:
     files: LabelFiles | None
     geometric: bool
     """True if scans without a label file are labelled by geometry when they become keyframes."""
-    network: Network | None = None
+    network: "Network | None" = None
 
     def read(self, name: str, points: Points, intensities: Vector | None = None) -> ScanLabels:
         """The labels of the scan `name`; all UNLABELLED if there is no source for it.
@@ -71,6 +74,8 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
     if source in ("none", "geometric"):
         return LabelSource(None, geometric=source == "geometric")
     if source.startswith(NETWORK):
+        from segslam.labels.network import open_network
+
         return LabelSource(None, geometric=False, network=open_network(expanded(source.removeprefix(NETWORK))))
     if source == "auto":
         if not _labelled(beside / "labels", scan_names):

@@ -15,8 +15,7 @@ from segslam.core.extras import how_to_install
 from segslam.core.points import within_range
 from segslam.core.types import Label, Labels, Points, SegslamError, Vector
 from segslam.labels.network_settings import NetworkSettings, read_settings, settings_file
-from segslam.labels.range_image import network_input, project
-from segslam.labels.votes import point_labels
+from segslam.labels.range_image import network_input, point_labels, project
 
 LabelImage = UInt8[np.ndarray, "_ _"]
 

@@ -20,7 +20,7 @@ from segslam.gnss import georeference as georeference_drive
 from segslam.gnss.fixes import DUPLICATE, NO_FIX, NOT_FINITE, Row, make_fixes
 from segslam.gnss.geodesy import Geodetic
 from segslam.gnss.reading import read_fixes
-from segslam.graph import read_g2o
+from segslam.graph.g2o import read_g2o
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import ADJUSTED_GRAPH, PLACE_ON_GLOBE, folder_of, log_of, room_for, write_csv, write_metrics
 from segslam.output.log import schema

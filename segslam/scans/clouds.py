@@ -1,5 +1,9 @@
 """Single scans from files: .bin, .npy, .ply, .pcd. All commands read them here."""
 
+import ast
+import math
+import re
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +11,6 @@ import numpy as np
 from segslam.core.types import BadScan, Points, SegslamError, Vector
 from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
-from segslam.scans.npy import parse_npy
 from segslam.scans.pcd import parse_pcd
 from segslam.scans.ply import parse_ply
 from segslam.scans.point_cloud2 import INTENSITY_FIELDS, TIME_FIELDS
@@ -16,6 +19,10 @@ from segslam.scans.scan_files import Columns, read_bytes
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 TIMES = (*TIME_FIELDS, "timestamps", "stamps")
 """Names of the field with the time of a point; the first that exists is used."""
+NPY_MAGIC = b"\x93NUMPY"
+NPY_NUMBER = re.compile(r"[<>|=]?[fiu][1248]")
+MAX_NPY_HEADER_BYTES = 10_000
+"""As in NumPy: a longer header can make Python's parser fail."""
 
 
 def read_file(file: Path) -> Cloud:
@@ -29,7 +36,7 @@ def read_file(file: Path) -> Cloud:
             case ".bin":
                 return _from_rows(read_returns(file))
             case ".npy":
-                return _from_rows(parse_npy(read_bytes(file)))
+                return _from_rows(_parse_npy(read_bytes(file)))
             case ".ply":
                 return _from_columns(parse_ply(read_bytes(file)))
             case ".pcd":
@@ -50,6 +57,37 @@ def read_cloud(file: Path) -> Points:
 def read_intensities(file: Path) -> Vector | None:
     """Intensities (n,) of a file; None if it has none. Raises SegslamError as `read_file` does."""
     return read_file(file).intensities
+
+
+def _parse_npy(content: bytes) -> np.ndarray:
+    """The array (n, k) of a .npy file, of at least three columns of plain numbers, as stored.
+
+    Raises ValueError for another content, and for a file whose size is not that of the array.
+    """
+    if not content.startswith(NPY_MAGIC) or len(content) < 12:
+        raise ValueError("it is not a .npy file; save an array by numpy.save")
+    size, start = ("<H", 10) if content[6] == 1 else ("<I", 12)
+    (num_header,) = struct.unpack_from(size, content, 8)
+    if num_header > MAX_NPY_HEADER_BYTES or start + num_header > len(content):
+        raise ValueError("its header is damaged or truncated")
+    try:
+        header = ast.literal_eval(content[start : start + num_header].decode("latin-1").strip())
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
+        raise ValueError(f"its header is damaged ({type(error).__name__})") from error
+    match header:
+        case {"descr": str(kind), "fortran_order": bool(by_columns), "shape": (int(rows), int(columns))}:
+            pass
+        case _:
+            raise ValueError("its array is not of the shape (n, 3) or more, or not of plain numbers, x y z")
+    if not NPY_NUMBER.fullmatch(kind) or kind[-2:] == "f1" or columns < 3 or rows < 0:
+        raise ValueError(f"it contains {kind[:20]} of shape ({rows}, {columns}); expected (n, 3) numbers, x y z")
+    start += num_header
+    num_bytes = len(content) - start
+    if num_bytes != math.prod((rows, columns, np.dtype(kind).itemsize)):
+        raise ValueError(f"its header claims {rows} x {columns} {kind}, but {num_bytes} bytes follow: truncated")
+    if rows == 0:
+        raise ValueError("it has no points")
+    return np.frombuffer(content, kind, offset=start).reshape((rows, columns), order="F" if by_columns else "C")
 
 
 def _from_rows(rows: np.ndarray) -> Cloud:

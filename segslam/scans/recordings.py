@@ -5,6 +5,7 @@ The number of a scan is its position in the recording.
 
 import contextlib
 import io
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.scans.bag_messages import BagMessages
-from segslam.scans.clouds import read_file
+from segslam.scans.clouds import SUFFIXES, read_file
 from segslam.scans.dataset import (
     ASSUMED_PERIOD_NS,
     Cloud,
@@ -32,7 +33,6 @@ from segslam.scans.dataset import (
 from segslam.scans.mcap_messages import McapMessages
 from segslam.scans.ouster import OusterFrames
 from segslam.scans.point_cloud2 import MessageClouds
-from segslam.scans.scan_folder import ScanFolder, scan_files
 from segslam.scans.sweep_times import sweep_times
 
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
@@ -131,6 +131,43 @@ class Recording(Dataset):
         return Trajectory(posed, np.array([self._stamp_ns(int(index)) for index in posed]), poses[posed])
 
 
+class ScanFolder:
+    """The scans of a folder: all files of one format, without hidden ones. Numbers in names are sorted by value."""
+
+    is_sequential = False
+
+    def __init__(self, folder: Path) -> None:
+        self.scan_files = scan_files(folder)
+
+    def __len__(self) -> int:
+        return len(self.scan_files)
+
+    def __getitem__(self, index: int) -> Cloud:
+        """Raises BadScan, naming the file."""
+        return read_file(self.scan_files[index])
+
+
+def scan_files(folder: Path) -> list[Path]:
+    """The files with scans in a folder; .npy files are scans only if no file has another format.
+
+    Raises SegslamError for scans of several formats.
+    """
+    found = [file for file in folder.iterdir() if file.suffix in SUFFIXES and not file.name.startswith(".")]
+    files = [file for file in found if file.is_file()]
+    files = [file for file in files if file.suffix != ".npy"] or files
+    counts = {suffix: sum(file.suffix == suffix for file in files) for suffix in sorted({f.suffix for f in files})}
+    if len(counts) > 1:
+        listed = ", ".join(f"{suffix} {count}" for suffix, count in counts.items())
+        raise SegslamError(f"{folder}: {len(counts)} kinds of scans ({listed}); put each kind into its own folder")
+    return sorted(files, key=_by_numbers)
+
+
+def _by_numbers(file: Path) -> tuple[list[str | int], str]:
+    """Texts and numbers of a name in turn: 10 comes after 9."""
+    parts = re.split(r"(\d+)", file.name)
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)], file.name
+
+
 def _opened(source: DataSource) -> tuple[str, Path, Any]:
     """Kind of the data, file or folder with the scans, and their reader."""
     kinds = known_kinds()
@@ -180,7 +217,7 @@ def _kind_of(data: Path) -> str:
         return KIND_OF_SUFFIX[data.suffix]
     if (data / "metadata.yaml").exists() or any(data.glob("*.bag")):
         return "rosbag"
-    if data.is_dir() and _has_clouds(_scans_folder(data)):
+    if data.is_dir() and scan_files(_scans_folder(data)):
         return "generic"
     raise SegslamError(
         f"{data}: found neither sequences/ nor velodyne/ (KITTI), nor clouds (.bin .ply .pcd ...), nor a rosbag, .mcap "
@@ -189,11 +226,7 @@ def _kind_of(data: Path) -> str:
 
 
 def _scans_folder(data: Path) -> Path:
-    return data / "velodyne" if not _has_clouds(data) and (data / "velodyne").is_dir() else data
-
-
-def _has_clouds(folder: Path) -> bool:
-    return bool(scan_files(folder))
+    return data / "velodyne" if not scan_files(data) and (data / "velodyne").is_dir() else data
 
 
 def _beside(source: Path) -> Path:

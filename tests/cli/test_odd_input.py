@@ -218,7 +218,7 @@ def test_a_scan_that_is_needed_and_gone_is_reported_with_the_log(
 SLOW_EXPORT = """
 import sys, time
 from segslam import cli
-from segslam.output.map.store import MapStore
+from segslam.output.map.write import MapStore
 MapStore.add = lambda *_: time.sleep(60)
 cli.main(["export", *sys.argv[1:]])
 """

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from segslam.core import geometry
 from segslam.core.types import SegslamError
-from segslam.graph import G2oGraph, optimize_graph, read_g2o, write_g2o
+from segslam.graph.batch import optimize_graph
 from segslam.graph.edges import Edge, factor_graph
+from segslam.graph.g2o import G2oGraph, read_g2o, write_g2o
 
 TIGHT = np.diag(geometry.tangent(rotation_rad=0.01, translation_m=0.05) ** -2.0)
 

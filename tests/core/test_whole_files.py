@@ -13,8 +13,8 @@ from helpers.made_logs import largest_file
 from segslam.core.geometry import transform, yaw
 from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import whole_file, write_whole
-from segslam.graph import G2oGraph, write_g2o
 from segslam.graph.edges import Edge
+from segslam.graph.g2o import G2oGraph, write_g2o
 
 
 @pytest.fixture

@@ -18,7 +18,8 @@ from segslam.core.config import load_config
 from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError
 from segslam.gnss.reading import read_fixes
-from segslam.graph import Robust, optimize_graph, read_g2o
+from segslam.graph.batch import Robust, optimize_graph
+from segslam.graph.g2o import read_g2o
 from segslam.labels.label_files import encoding_of, read_labels
 from segslam.labels.network import open_network
 from segslam.labels.network_settings import read_settings

@@ -15,7 +15,7 @@ from segslam.gnss.alignment import place
 from segslam.gnss.fixes import Row, make_fixes
 from segslam.gnss.fusion import _Problem, _windows
 from segslam.gnss.matching import prepare
-from segslam.graph import PositionedGraph
+from segslam.graph.position_fixes import PositionedGraph
 
 NUM, STEP_M, PERIOD_S = 240, 2.0, 1.0
 

@@ -16,8 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import make_fixes
 from segslam.gnss.geodesy import Origin, ecef_from_geodetic, enu_from_geodetic
-from segslam.gnss.messages import row_of
-from segslam.gnss.reading import read_fixes
+from segslam.gnss.reading import read_fixes, row_of
 from segslam.gnss.text import stamp_of
 
 MOMENT = datetime(2021, 5, 17, 2, 33, 17, 500000, tzinfo=UTC)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from segslam.core import geometry
-from segslam.graph import G2oGraph, optimize_graph
+from segslam.graph.batch import optimize_graph
 from segslam.graph.batch_search import contradicting
 from segslam.graph.edges import Edge
+from segslam.graph.g2o import G2oGraph
 
 TIGHT = np.diag(geometry.tangent(rotation_rad=0.01, translation_m=0.05) ** -2.0)
 NUM = 24

@@ -6,8 +6,8 @@ import pytest
 
 from segslam.core import geometry
 from segslam.core.types import SegslamError
-from segslam.graph import G2oGraph, read_g2o, write_g2o
 from segslam.graph.edges import Edge
+from segslam.graph.g2o import G2oGraph, read_g2o, write_g2o
 
 INFORMATION = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
 VERTICES = ["VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1", "VERTEX_SE3:QUAT 1 1 0 0 0 0 0 1", "VERTEX_SE3:QUAT 2 2 0 0 0 0 0 1"]

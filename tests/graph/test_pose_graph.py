@@ -13,8 +13,9 @@ from scipy.stats import chi2, kstest
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
 from segslam.core.types import Alignment, GraphEstimate, LoopClosure, Registration, SegslamError
-from segslam.graph import PoseGraph, noise, read_g2o
+from segslam.graph import PoseGraph, noise
 from segslam.graph.edges import Edge, factor_graph, squared_errors
+from segslam.graph.g2o import read_g2o
 from segslam.graph.levenberg_marquardt import Unsolvable
 from segslam.graph.noise import closure_information, inlier_bound, odometry_information
 
@@ -239,7 +240,8 @@ def test_the_more_closures_there_are_the_more_wait_for_an_optimisation(monkeypat
 
 LONG_DRIVE = """
 import numpy as np
-from segslam.graph import G2oGraph, optimize_graph
+from segslam.graph.batch import optimize_graph
+from segslam.graph.g2o import G2oGraph
 from segslam.graph.edges import Edge
 ahead = np.eye(4)
 ahead[0, 3] = 1.0

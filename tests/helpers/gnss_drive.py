@@ -8,7 +8,8 @@ from segslam.core import geometry
 from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Transform
 from segslam.gnss import Origin, geodetic_from_enu
-from segslam.graph import Edge, G2oGraph, write_g2o
+from segslam.graph import Edge
+from segslam.graph.g2o import G2oGraph, write_g2o
 from segslam.output.finished import read_run
 from segslam.output.folder import ADJUSTED_GRAPH
 

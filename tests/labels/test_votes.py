@@ -6,8 +6,7 @@ from helpers.made_networks import SETTINGS
 
 from segslam.core.types import Label
 from segslam.labels.network_settings import NetworkSettings, VoteSettings
-from segslam.labels.range_image import Projection, project
-from segslam.labels.votes import point_labels, window_weights
+from segslam.labels.range_image import Projection, point_labels, project, window_weights
 
 NETWORK = NetworkSettings.model_validate(SETTINGS)
 

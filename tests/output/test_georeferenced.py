@@ -23,12 +23,12 @@ from pyproj import Transformer
 from segslam.core import geometry
 from segslam.core.types import Points, SegslamError
 from segslam.gnss import Origin, enu_from_geodetic, geodetic_from_enu
+from segslam.output.export import track
 from segslam.output.georeferenced import Globe, read_globe
 from segslam.output.log import read_log, schema
 from segslam.output.log.locations import write_locations
 from segslam.output.map.projected import Utm, _affine
 from segslam.output.report.figures import STYLE, draw_fixes
-from segslam.output.tracks import track
 from segslam.scans import open_dataset
 
 KML = "{http://www.opengis.net/kml/2.2}"

@@ -7,7 +7,7 @@ from helpers.real_scans import PREDICTED, raw_scan
 from segslam.core.config import SegregatorConfig
 from segslam.core.points import voxel_means
 from segslam.core.types import Label
-from segslam.registration.segregator.features import MAX_CLOUD_POINTS, point_features
+from segslam.registration.segregator.describe import MAX_CLOUD_POINTS, point_features
 
 CONFIG = SegregatorConfig(max_features_per_class=200)
 WALL = np.stack(np.meshgrid([8.0], np.arange(-5, 5, 0.11), np.arange(-1, 3, 0.13)), axis=-1).reshape(-1, 3)

@@ -18,7 +18,7 @@ from helpers.made_logs import boundaries, largest_file
 from mcap.reader import make_reader
 
 from segslam.core.types import LoopClosure
-from segslam.graph import read_g2o
+from segslam.graph.g2o import read_g2o
 from segslam.output.finished import read_run
 from segslam.output.folder import POSE_COLUMNS
 from segslam.output.log import LogWriter, RunLog, read_log

@@ -1,18 +1,55 @@
-"""The description of a scan for matching, computed once per scan."""
+"""The description of a scan for matching, computed once per scan: clusters, ground, and FPFH key points.
+
+Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator: Global Point Cloud Registration with Semantic and Geometric Cues", ICRA
+2023, section III: FPFH on the voxelised cloud of each class.
+
+Differs from the paper: only the points with the most neighbours are key points, each with the Gaussian of the patch
+around it. A descriptor is the square root of its FPFH, scaled to unit length, so that Euclidean distances are Hellinger
+distances of histograms (Arandjelovic, Zisserman, "Three things everyone should know to improve object retrieval", CVPR
+2012).
+"""
+
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from segslam.core.config import SegregatorConfig
-from segslam.core.types import Description, Labels, Points
-from segslam.registration.segregator.clusters import MAX_RANGE_M, Clusters, semantic_clusters
-from segslam.registration.segregator.features import NO_FEATURES, point_features
-from segslam.registration.segregator.feet import ground_cells, stand_on_ground
-from segslam.registration.segregator.ground_patches import ground_patches
+from segslam.core.points import normals, patch_covariances, radius_neighbours, voxel_means, within_range
+from segslam.core.types import Covariances, Description, Label, Labels, Points
+from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, Clusters, semantic_clusters
+from segslam.registration.segregator.fpfh import fpfh
+from segslam.registration.segregator.ground import ground_cells, ground_patches, stand_on_ground
 
 FOOT_MAX_DISTANCE_M = 10.0
 """Chosen: largest distance to the ground patch below such a cluster (m)."""
 FEW_CLUSTERS = 24
 """Chosen on simulated 00 and 08: number of clusters below which a scan has few clusters."""
+FEATURE_CLASSES = (Label.BUILDING, Label.VEGETATION)
+"""Classes that give FPFH key points (paper: L_F)."""
+
+MIN_PATCH_POINTS = 4
+"""Chosen: three points always lie on a plane, so a normal needs at least four."""
+MAX_CLOUD_POINTS = 20_000
+"""Chosen: largest number of points of a class after voxelising, about four times that of real scans; the nearest
+points are used if there are more."""
+
+
+class Features(NamedTuple):
+    """Key points, a row each: position (m), covariance of the patch (m^2), class, descriptor of unit length.
+
+    float32, the descriptors float16.
+    """
+
+    points: Points
+    covariances: Covariances
+    classes: Labels
+    descriptors: Float[np.ndarray, "_ 33"]
+
+
+NO_FEATURES = Features(
+    np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty(0, np.uint8), np.empty((0, 33), np.float16)
+)
 
 
 def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
@@ -51,3 +88,41 @@ def _grounded(clusters: Clusters, points: Points, labels: Labels, config: Segreg
         return clusters
     ground = ground_cells(points, labels, reach_m=MAX_RANGE_M)
     return stand_on_ground(clusters, upright, ground, max_distance_m=FOOT_MAX_DISTANCE_M)
+
+
+def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) -> Features:
+    """The key points of each class in `FEATURE_CLASSES`, in the frame of `points`; the sensor is at its origin.
+
+    Points that are NaN or out of range are ignored. The result does not depend on the order of the points.
+    """
+    parts = []
+    for label in FEATURE_CLASSES:
+        cloud = points[labels == label]
+        cloud = cloud[within_range(cloud, MIN_RANGE_M, MAX_RANGE_M)].astype(np.float32)
+        parts.append(_class_features(_voxelised(cloud, config.feature_voxel_m), int(label), config))
+    return Features(*(np.concatenate(columns) for columns in zip(NO_FEATURES, *parts, strict=True)))
+
+
+def _voxelised(cloud: Points, voxel_m: float) -> Points:
+    means = voxel_means(cloud, voxel_m)
+    if len(means) <= MAX_CLOUD_POINTS:
+        return means
+    nearest = np.argsort(np.linalg.norm(means, axis=1), kind="stable")[:MAX_CLOUD_POINTS]
+    return means[np.sort(nearest)]
+
+
+def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Features:
+    """The key points of one class from its voxelised cloud; none if no point has enough neighbours."""
+    patches = radius_neighbours(cloud, config.normal_radius_m)
+    kept = patches.ends - patches.starts >= MIN_PATCH_POINTS
+    covariances = patch_covariances(cloud, patches)[kept]
+    cloud = cloud[kept]
+    around = radius_neighbours(cloud, config.feature_radius_m)
+    chosen = np.sort(np.argsort(around.starts - around.ends, kind="stable")[: config.max_features_per_class])
+    histograms = fpfh(cloud, normals(cloud, covariances), around, chosen)
+    return Features(
+        points=cloud[chosen].astype(np.float32),
+        covariances=covariances[chosen].astype(np.float32),
+        classes=np.full(len(chosen), label, np.uint8),
+        descriptors=np.sqrt(histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1.0)).astype(np.float16),
+    )

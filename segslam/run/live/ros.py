@@ -28,7 +28,7 @@ from sensor_msgs.msg import NavSatFix, PointCloud2, PointField
 from segslam.core import geometry
 from segslam.core.types import BadScan, GraphEstimate, Labels, Points, Scan, SegslamError, Transform
 from segslam.gnss.fixes import Row
-from segslam.gnss.messages import row_of
+from segslam.gnss.reading import row_of
 from segslam.run.live.live_map import DrawnMap
 from segslam.run.live.waiting import Arrival, Waiting
 from segslam.scans.dataset import make_scan

@@ -25,8 +25,9 @@ from segslam.core.types import (
     Step,
     Trajectory,
 )
-from segslam.graph import G2oGraph, optimize_graph
+from segslam.graph.batch import optimize_graph
 from segslam.graph.edges import Edge
+from segslam.graph.g2o import G2oGraph
 from segslam.odometry import GivenOdometry
 from segslam.output.log import LogWriter
 from segslam.output.log.drawing import Drawing

@@ -40,7 +40,6 @@ app = typer.Typer(
 )
 
 LOST_PERCENT = [10.0, 30.0, 50.0, 70.0, 90.0]
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 DataArgument = Annotated[Path, typer.Argument(help="KITTI folder, with real or simulated scans.")]
 
@@ -215,7 +214,8 @@ def _make_job(data: Path, options: Options, changes: Settings, terminal: Termina
     if options.out is not None:
         check_own(options.out, "asked.json")
     terminal.announce(f"bench: opening {data}")
-    for variable in THREAD_VARIABLES:  # before Open3D and others are loaded, because times are per core
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        # before Open3D and others are loaded, because times are per core
         os.environ.setdefault(variable, "1")
     from segslam.bench.experiments.job import Job
     from segslam.bench.experiments.methods import find_method

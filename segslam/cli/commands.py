@@ -54,7 +54,6 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
 }
 """Group -> command -> module and function, and line of the list of commands, which must fit 80 columns."""
 CLASSES = {"register": "locate.LabelsCommand"}
-BENCH = "Repeat the experiments of the Segregator paper."
 ALIASES = MappingProxyType({"localize": "localise", "optimise": "optimize"})
 """Other spellings of commands; the help does not list them."""
 VALUE_NAMES: Mapping[type, str] = MappingProxyType({Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"})
@@ -72,7 +71,12 @@ def add(app: typer.Typer, words: Sequence[str] = ()) -> None:
             app.command(name, short_help=about, rich_help_panel=title, cls=kind)(with_options(_imported(place)))
     app.registered_commands.sort(key=lambda command: list(known).index(command.name or ""))
     if called not in known and not app.registered_groups:
-        app.add_typer(_imported("bench.app"), name="bench", short_help=BENCH, rich_help_panel="Paper")
+        app.add_typer(
+            _imported("bench.app"),
+            name="bench",
+            short_help="Repeat the experiments of the Segregator paper.",
+            rich_help_panel="Paper",
+        )
 
 
 def _imported(place: str) -> Any:

@@ -15,7 +15,6 @@ from segslam.cli.viewers import check_display, close_scene, open_scene
 if TYPE_CHECKING:
     from segslam.output.log import RunLog
 
-METRICS = "metrics.json"
 SHOWN = (
     *("num_scans", "num_keyframes", "length_m", "duration_s", "num_candidates", "num_loops_accepted"),
     *("num_motions_repaired", "ate_m", "odometry_ate_m", "kiss_icp_ate_m", "map_thickness_m"),
@@ -92,7 +91,7 @@ def _found_in(log: "RunLog") -> dict[str, Any]:
 
     folder = log.path.parent
     state = "in progress" if is_being_written(log.path) else "finished" if log.result() else "interrupted"
-    metrics = read_metrics(folder) if (folder / METRICS).is_file() else {}
+    metrics = read_metrics(folder) if (folder / "metrics.json").is_file() else {}
     return {
         "run": str(folder),
         "data": log.run.get("dataset", ""),

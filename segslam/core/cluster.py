@@ -8,8 +8,6 @@ from typing import Any
 from segslam.core.errors import SegslamError
 from segslam.core.extras import how_to_install
 
-CONNECT_S = 5
-
 
 @contextmanager
 def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
@@ -24,7 +22,7 @@ def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
     logging.getLogger("distributed").setLevel(logging.WARNING)  # its info level reports each connection
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout=CONNECT_S)
+            client = Client(scheduler, timeout=5)
         except (OSError, ValueError) as error:
             raise SegslamError(f"--scheduler {scheduler}: no answer ({error}); start `dask scheduler`") from error
         with client:

@@ -80,20 +80,6 @@ def angle(T_a_b: Transform) -> float:
     return math.atan2(math.hypot(h - f, c - g, d - b), a + e + i - 1.0)
 
 
-def quaternion(R_a_b: Rotation) -> tuple[float, float, float, float]:
-    """x, y, z, w of a rotation, from the largest of the four; of either sign."""
-    (a, b, c), (d, e, f), (g, h, i) = R_a_b.tolist()
-    rows = (
-        (1.0 + a - e - i, b + d, c + g, h - f),
-        (b + d, 1.0 - a + e - i, f + h, c - g),
-        (c + g, f + h, 1.0 - a - e + i, d - b),
-        (h - f, c - g, d - b, 1.0 + a + e + i),
-    )
-    x, y, z, w = max(rows, key=lambda row: math.hypot(*row))
-    length = math.hypot(x, y, z, w)
-    return x / length, y / length, z / length, w / length
-
-
 def distance(T_a_b: Transform) -> float:
     """Length of the translation (m)."""
     return float(np.linalg.norm(T_a_b[:3, 3]))

@@ -23,8 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 PACKAGE = Path(__file__).resolve().parents[1]
 MODULES = (
     "registration.segregator.descent",
-    "registration.cliques.search",
-    "registration.cliques.bits",
+    "registration.cliques",
     "registration.segregator.fpfh",
     "registration.segregator.consistency_graph",
     "labels.ground_surface",

@@ -13,7 +13,6 @@ NOTE = (
 )
 NO_DATE = date(1970, 1, 1)
 """Without RMC or ZDA the times are those of the day."""
-HALF_DAY = timedelta(hours=12)
 
 
 def is_nmea(lines: Sequence[str]) -> bool:
@@ -44,7 +43,7 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
         if kind not in found or len(words) < 10 or not words[1]:
             continue
         at = _time(file, number, words[1])
-        if last is not None and datetime.combine(day, last) - datetime.combine(day, at) > HALF_DAY:
+        if last is not None and datetime.combine(day, last) - datetime.combine(day, at) > timedelta(hours=12):
             day += timedelta(days=kind == "GGA")  # midnight, before the next RMC
         last = at
         found[kind].append(_row(file, number, kind, words, datetime.combine(day, at, tzinfo=UTC)))

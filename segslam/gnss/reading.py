@@ -12,8 +12,6 @@ from segslam.gnss.nmea import is_nmea, read_nmea
 from segslam.gnss.rtklib import is_rtklib, read_rtklib
 from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, text_lines
 
-RECORDINGS = (".bag", ".mcap", ".db3")
-FIX_MESSAGE = "sensor_msgs/msg/NavSatFix"
 UNKNOWN = 0
 """`position_covariance_type` of a covariance that is not known."""
 OXTS_ACCURACY = 23
@@ -50,7 +48,7 @@ def _is_recording(path: Path) -> bool:
     """True for a bag or MCAP file, and for a folder of ROS 2 or with bags."""
     if path.is_dir():
         return (path / "metadata.yaml").exists() or any(path.glob("*.bag"))
-    return path.suffix.lower() in RECORDINGS
+    return path.suffix.lower() in (".bag", ".mcap", ".db3")
 
 
 def _read_messages(recording: Path, topic: str) -> list[Row]:
@@ -64,7 +62,7 @@ def _read_messages(recording: Path, topic: str) -> list[Row]:
 
     read = McapMessages if recording.suffix == ".mcap" else BagMessages
     try:
-        messages = read(recording, topic, kind=FIX_MESSAGE, option="--gnss")
+        messages = read(recording, topic, kind="sensor_msgs/msg/NavSatFix", option="--gnss")
         return [row_of(messages[number][1]) for number in range(len(messages))]
     except ImportError as error:
         raise SegslamError(f"{recording}: {error}") from error

@@ -13,12 +13,12 @@ import gtsam
 import numpy as np
 
 from segslam.core import geometry
-from segslam.graph.breaks import is_break
 from segslam.graph.edges import (
     Edge,
     Kernel,
     Transforms,
     factor_graph,
+    is_break,
     joined,
     poses_by_id,
     squared_errors,

@@ -1,6 +1,11 @@
-"""An edge of the graph as numbers, and as a factor of GTSAM."""
+"""An edge of the graph as numbers, and as a factor of GTSAM; breaks.
 
-from collections.abc import Iterable
+Breaks are motions of the odometry that are almost unknown. They divide a drive into segments, which closures locate. An
+optimisation that starts far from the solution may end in a local optimum, so each segment is first moved as a rigid
+body to satisfy one closure.
+"""
+
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,11 +13,14 @@ import gtsam
 import numpy as np
 from jaxtyping import Float
 
-from segslam.core.types import Information, Transform, Vector
+from segslam.core import geometry
+from segslam.core.types import Indices, Information, Mask, Transform, Vector
 
 Kernel = Any
 """One of gtsam.noiseModel.mEstimator; their common base is not in GTSAM's stubs."""
 Transforms = Float[np.ndarray, "_ 4 4"]
+BREAK_M, BREAK_DEG = 1.0, 5.0
+"""A motion with a larger standard deviation is a break. Chosen: 100 m of healthy odometry have a tenth of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,3 +76,56 @@ def poses_by_id(values: gtsam.Values) -> Transforms:
     poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
     poses[:, :3, 3] = rows[:, 9:]
     return poses
+
+
+def segments(odometry: Sequence[Edge]) -> Indices:
+    """(n,) the segment of each keyframe, counted from 0; a break separates two segments."""
+    return np.cumsum([False, *(is_break(edge) for edge in odometry)])
+
+
+def is_break(edge: Edge) -> bool:
+    """True if the standard deviation of a motion is above that of a break in any direction."""
+    weakest = (np.linalg.eigvalsh(edge.information[half, half])[0] for half in (slice(0, 3), slice(3, 6)))
+    rotation, translation = weakest
+    return bool(rotation < np.radians(BREAK_DEG) ** -2.0 or translation < BREAK_M**-2.0)
+
+
+def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Transforms, likely: Mask) -> Transforms:
+    """(n, 4, 4) poses in which `likely` closures (k,) join the segments of a drive.
+
+    Segments that already fit the closure that joins them are not moved; segments without one follow the segment before.
+    """
+    segment = segments(odometry)
+    joining = [
+        closure
+        for closure, use in zip(closures, likely, strict=True)
+        if use and segment[closure.a] != segment[closure.b]
+    ]
+    if not joining:
+        return T_world
+    moved = T_world.copy()
+    placed = {0}
+    while len(placed) <= segment[-1]:
+        step = next((edge for edge in joining if (segment[edge.a] in placed) != (segment[edge.b] in placed)), None)
+        if step is None:
+            first = next(number for number in range(1, segment[-1] + 1) if number not in placed)
+            row = int(np.argmax(segment == first))
+            step = Edge(row - 1, row, geometry.inverse(T_world[row - 1]) @ T_world[row], odometry[row - 1].information)
+        _join(moved, segment, step, placed)
+    return moved
+
+
+def _join(T_world: Transforms, segment: Indices, edge: Edge, placed: set[int]) -> None:
+    """Move the segment at one end of an edge to fit the edge, if it does not yet, and mark it as placed."""
+    if segment[edge.a] in placed:
+        end, T_world_end = edge.b, T_world[edge.a] @ edge.T_a_b
+    else:
+        end, T_world_end = edge.a, T_world[edge.b] @ geometry.inverse(edge.T_a_b)
+    T_new_old = T_world_end @ geometry.inverse(T_world[end])
+    if (
+        geometry.angle(T_new_old) > np.radians(BREAK_DEG)
+        or geometry.distance(geometry.inverse(T_world[end]) @ T_world_end) > BREAK_M
+    ):
+        rows = segment == segment[end]
+        T_world[rows] = T_new_old @ T_world[rows]
+    placed.add(int(segment[end]))

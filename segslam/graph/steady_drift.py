@@ -22,9 +22,8 @@ from scipy.sparse.linalg import splu
 from segslam.core import geometry
 from segslam.core.types import Vector
 from segslam.graph import noise
-from segslam.graph.breaks import is_break
 from segslam.graph.closure_pairs import pairwise_chi2
-from segslam.graph.edges import Edge, factor_graph, joined
+from segslam.graph.edges import Edge, factor_graph, is_break, joined
 from segslam.graph.levenberg_marquardt import search
 
 MUCH_LESS = 0.5

@@ -11,7 +11,6 @@ from segslam.core.types import IndexPairs, Indices, Mask, Points, Vector
 CELL_M = 0.3
 """Chosen: objects nearer to each other than this form one segment."""
 NO_PIECE = -1
-EIGHT_NEIGHBOURS = np.ones((3, 3), bool)
 RECTANGLE_STEP_DEG = 5.0
 """Chosen: angle steps for which the short side of a car is overestimated by at most 20 cm."""
 _ANGLES = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
@@ -37,7 +36,7 @@ def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
     cells, _, shape = grid_cells(points, CELL_M, border=1)
     occupied = np.zeros(shape, bool)
     occupied[cells[chosen, 0], cells[chosen, 1]] = True
-    grid, num_pieces = label(occupied, structure=EIGHT_NEIGHBOURS)
+    grid, num_pieces = label(occupied, structure=np.ones((3, 3), bool))
     of_point = grid[cells[:, 0], cells[:, 1]].astype(np.int64) + NO_PIECE  # labels start at 1; 0 is the background
     num_points = np.bincount(of_point[chosen], minlength=num_pieces)
     top_m = np.full(num_pieces, -np.inf)

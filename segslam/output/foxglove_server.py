@@ -14,7 +14,6 @@ from segslam.output.origin_check import OriginCheck, hidden_address
 
 LASTING = (schema.MAP, schema.ODOMETRY, schema.TRAJECTORY, schema.GROUND_TRUTH, schema.GRAPH, schema.RESULT)
 """Channels that are written rarely; their last message is sent to late subscribers."""
-LOOPBACK = "127.0.0.1"
 MOST_MESSAGES = 128
 """Chosen: number of messages kept for a slow viewer, the newest ones; about 40 MB for clouds."""
 
@@ -89,4 +88,4 @@ def parse_address(address: str) -> tuple[str, int]:
     host, _, port = address.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
         raise SegslamError(f"--foxglove {address}: give a port, like 8765, or address and port, like 0.0.0.0:8765")
-    return host.strip("[]") or LOOPBACK, int(port)
+    return host.strip("[]") or "127.0.0.1", int(port)

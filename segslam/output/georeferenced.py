@@ -29,7 +29,6 @@ from segslam.output.log.locations import Locations, write_locations
 logger = logging.getLogger(__name__)
 
 FILE, FIXES, GEODETIC, ENU = PLACE_ON_GLOBE, "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
-DATUM = "WGS84 (EPSG:4979)"
 PLACE = ("datum", "latitude_deg", "longitude_deg", "height_m", "epsg", "T_enu_map", "sigma")
 """What a run localised in the map takes over from `FILE`."""
 SIGMAS = ("east_m", "north_m", "up_m")
@@ -185,7 +184,7 @@ def figures(placed: Georeference) -> dict[str, Any]:
     """The content of `georeference.json`; unknown figures are null."""
     origin = placed.origin
     return {
-        "datum": DATUM,
+        "datum": "WGS84 (EPSG:4979)",
         "latitude_deg": origin.latitude_deg,
         "longitude_deg": origin.longitude_deg,
         "height_m": origin.height_m,

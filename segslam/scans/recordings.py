@@ -36,7 +36,6 @@ from segslam.scans.point_cloud2 import MessageClouds
 from segslam.scans.sweep_times import sweep_times
 
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
-WITH_TOPICS = ("mcap", "rosbag")
 REMEDIES = {
     "mcap": "; `mcap recover IN -o OUT` copies what can be read",
     "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",
@@ -174,7 +173,7 @@ def _opened(source: DataSource) -> tuple[str, Path, Any]:
     if source.dataset is not None and source.dataset not in kinds:
         raise SegslamError(f"--dataset {source.dataset}: no such kind of data; known: {', '.join(kinds)}")
     kind = source.dataset or _kind_of(source.data)
-    if source.topic and kind not in WITH_TOPICS:
+    if source.topic and kind not in ("mcap", "rosbag"):
         raise no_topics(source.topic)
     place = _scans_folder(source.data) if kind == "generic" else source.data
     printed = io.StringIO()

@@ -85,11 +85,10 @@ def test_what_was_unknown_stays_unknown_under_noise() -> None:
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1e-5, 0.3, 2.0, np.pi - 1e-9, np.pi])
-def test_angle_and_quaternion_are_those_of_scipy(angle_rad: float) -> None:
+def test_the_angle_is_that_of_scipy(angle_rad: float) -> None:
     rng = np.random.default_rng(0)
     for axis in [*np.eye(3), *rng.normal(size=(20, 3))]:
         rotation = Rotation.from_rotvec(angle_rad * axis / np.linalg.norm(axis))
         T = geometry.transform(rotation.as_matrix(), 0.0)
         assert geometry.angle(T) == pytest.approx(angle_rad, abs=1e-14)
-        assert abs(np.dot(geometry.quaternion(T[:3, :3]), rotation.as_quat())) == pytest.approx(1.0, abs=1e-14)
         np.testing.assert_allclose(geometry.exp(np.r_[angle_rad * axis / np.linalg.norm(axis), 0, 0, 0]), T, atol=1e-14)

@@ -23,7 +23,7 @@ def test_every_module_with_kernels_is_built() -> None:
 
 def test_a_build_compiles_all_kernels_once_and_is_remembered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    modules = ["registration.cliques.bits"]
+    modules = ["registration.cliques"]
     assert not kernels.are_built(modules)
     names = list(kernels.build(modules))
     assert len(names) == len(set(names)) == kernels.num_kernels(modules) >= 5
@@ -46,7 +46,7 @@ def test_compiled_code_is_kept_where_it_can_be_written(monkeypatch: pytest.Monke
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
     assert kernels.cache_folder() == tmp_path / "given"
 
-    closed = {str(PACKAGE / "registration" / "cliques"), str(tmp_path / "given")}
+    closed = {str(PACKAGE / "registration" / "segregator"), str(tmp_path / "given")}
     monkeypatch.setattr(os, "access", lambda folder, _: str(folder) not in closed)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     assert kernels.cache_folder() == tmp_path / "home" / "segslam"

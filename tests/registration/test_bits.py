@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from segslam.registration.cliques.bits import (
+from segslam.registration.cliques import (
     count_bits,
     lowest_bit,
     members,

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from segslam.registration.cliques import maximum_cliques, pack_rows
-from segslam.registration.cliques.search import degeneracy_order
+from segslam.registration.cliques import degeneracy_order, maximum_cliques, pack_rows
 
 ENOUGH = 10_000_000
 

@@ -69,7 +69,6 @@ CloudOf = Callable[[int], tuple[Points, Labels]]
 """Function from the id of a keyframe to its points, in its frame, and their labels."""
 INFO, WARNING = Log.Level.Value("INFO"), Log.Level.Value("WARNING")
 NAME = "segslam"
-REPAIRS = (MotionState.REPAIRED, MotionState.REJOINED)
 
 
 class Drawing:
@@ -252,7 +251,7 @@ def warning(text: str, *, stamp_ns: int) -> Log:
 def messages_of(step: Step) -> Iterator[Log]:
     """Repairs and breaks of the odometry as warnings, accepted loops as information."""
     motion = step.motion
-    if motion is not None and motion.state in REPAIRS:
+    if motion is not None and motion.state in (MotionState.REPAIRED, MotionState.REJOINED):
         by = "" if motion.moved_m is None else f", by {motion.moved_m:.2f} m"
         yield warning(f"scan {step.scan_index}: motion of the odometry repaired{by}", stamp_ns=step.stamp_ns)
     elif motion is not None and motion.state is MotionState.BROKEN:

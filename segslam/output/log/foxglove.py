@@ -121,7 +121,7 @@ def _poses(T_frame_each: np.ndarray) -> list[Pose]:
 
 def _pose(T_frame_body: Transform) -> Pose:
     tx, ty, tz = T_frame_body[:3, 3].tolist()
-    x, y, z, w = geometry.quaternion(T_frame_body[:3, :3])
+    x, y, z, w = ScipyRotation.from_matrix(T_frame_body[:3, :3]).as_quat().tolist()
     return Pose(position=Vector3(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 

@@ -3,7 +3,6 @@
 import fcntl
 import json
 import os
-import resource
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -15,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from segslam.core.config import Config
 from segslam.core.interrupts import interrupts_wait
+from segslam.core.memory import status_mb
 from segslam.core.types import (
     GraphEstimate,
     Keyframe,
@@ -41,7 +41,6 @@ POSES_PER_KEYFRAME = 50
 only. All estimates are logged until the limit is reached; then every second estimate, and so on."""
 CHUNK_BYTES = 4 * 2**20
 """Larger than any step: a chunk ends with its step, so that a step is complete or missing."""
-_STATM = Path("/proc/self/statm")
 Encoded = tuple[str, bytes]
 """Topic and data of a message."""
 Mirror = Callable[[str, bytes, int], None]
@@ -242,8 +241,8 @@ class LogWriter:
         """The messages of a step. The step itself is last: it marks the others as complete."""
         logs_estimate = step.estimate is not None and self._affords(len(step.estimate.T_world_keyframe))
         yield from _serialised(self._drawing.draw(step, path=logs_estimate))
-        if (rss_mb := _rss_mb()) is not None:
-            yield schema.MEMORY, json.dumps({"rss_mb": rss_mb}).encode()
+        if (rss_mb := status_mb("VmRSS")) is not None:
+            yield schema.MEMORY, json.dumps({"rss_mb": round(rss_mb, 1)}).encode()
         if step.keyframe is not None:
             yield schema.KEYFRAME, keyframe_points(step.keyframe, resolution_m=self._resolution_m).SerializeToString()
         if step.estimate is not None and logs_estimate:
@@ -307,15 +306,6 @@ def _serialised(drawn: Iterable[Topical]) -> Iterator[Encoded]:
 
 def _estimate_message(estimate: GraphEstimate) -> Encoded:
     return schema.ESTIMATE, _json(GraphEstimate, estimate, keyframe_ids=list(estimate.T_world_keyframe))
-
-
-def _rss_mb() -> float | None:
-    """Memory of the process; None without /proc."""
-    try:
-        pages = int(_STATM.read_text().split()[1])
-    except OSError:
-        return None
-    return round(pages * resource.getpagesize() / 2**20, 1)
 
 
 def _json(record: type, value: Any, **more: Any) -> bytes:

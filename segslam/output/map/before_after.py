@@ -13,7 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from segslam.core import geometry
 from segslam.core.points import within_range
-from segslam.core.types import GROUND_LABELS, GraphEstimate, Keyframe, Label, Mask, Points, Transform
+from segslam.core.types import GROUND_LABELS, REJECTED_WEIGHT, GraphEstimate, Keyframe, Label, Mask, Points, Transform
 from segslam.output.map.from_above import draw_path, png, scale_bar
 from segslam.output.map.overhead import Window, cut_heights, visible
 
@@ -25,8 +25,6 @@ REACH_M = 40.0
 """Chosen: points farther from their keyframe are not drawn; they are sparse and blur both maps."""
 DETAIL_M = 30.0
 """Chosen: smallest half width of the detail."""
-TRUSTED = 0.5
-"""Closures with at least this weight are kept by the optimiser."""
 NO_LOOP = "after: adjusted as a whole; no loop was found"
 BEFORE, AFTER, BACKGROUND = "#E69F00", "#56B4E9", "#10141a"
 
@@ -49,7 +47,7 @@ class BeforeAfter:
         self._cut_m = cut_heights(self._path_m, (self._placed(keyframe) for keyframe in keyframes))
         whole = _around(np.array([T[:2, 3] for poses in self._maps for T in poses.values()]), REACH_M / 2)
         self._whole = [_Density(whole) for _ in self._maps]
-        self._loops = [pair for pair, weight in estimate.closure_weights.items() if weight >= TRUSTED]
+        self._loops = [pair for pair, weight in estimate.closure_weights.items() if weight >= REJECTED_WEIGHT]
         detail = most_changed(*self._maps, self._loops)
         self._detail = [] if detail is None else [_Density(window) for window in _details(self._maps, detail)]
 

@@ -15,13 +15,10 @@ from segslam.output.map.part import Extent, Part
 if TYPE_CHECKING:
     from segslam.gnss.geodesy import Origin
 
-PLY_ROW = [("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1")]
-PCD_ROW = [("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4")]
 INTENSITY = [("intensity", "<f4")]
 """Last column, if intensities are known."""
 HEADER_BYTES = 512
 """Bytes reserved for the header, which is written last because it contains the number of points."""
-LAS_SCALE_M = 0.001
 ASPRS_OF_LABEL = {
     Label.ROAD: 11,
     Label.PARKING: 11,
@@ -38,7 +35,7 @@ ASPRS_OF_LABEL = {
 class _BinaryCloud:
     """A header, then a row of a fixed layout for each point; the header is written last."""
 
-    row: ClassVar[list[Any]]
+    row: ClassVar[tuple[Any, ...]]
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._stream = file.open("wb")
@@ -72,7 +69,7 @@ class _BinaryCloud:
 class PlyCloud(_BinaryCloud):
     """Binary PLY: x y z (float32, m), red green blue, label (SemanticKITTI learning id), intensity if known."""
 
-    row = PLY_ROW
+    row = (("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1"))
 
     def _color(self, rows: np.ndarray, part: Part) -> None:
         rows["rgb"] = part.colors
@@ -93,7 +90,7 @@ class PlyCloud(_BinaryCloud):
 class PcdCloud(_BinaryCloud):
     """Binary PCD 0.7: x y z (float32, m), rgb packed as in PCL, label, intensity if known."""
 
-    row = PCD_ROW
+    row = (("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4"))
 
     def _color(self, rows: np.ndarray, part: Part) -> None:
         rows["bgra"][:, :3] = part.colors[:, ::-1]
@@ -127,7 +124,7 @@ class LasCloud:
 
         self._laspy = laspy
         header = laspy.LasHeader(version="1.4", point_format=7)
-        header.scales = np.full(3, LAS_SCALE_M)
+        header.scales = np.full(3, 0.001)
         self._intensity_step = None if extent.brightest is None else (extent.brightest or 1.0) / 65535
         self._projected: Callable[[Points], Points] = np.asarray
         if extent.origin is not None:

@@ -34,7 +34,6 @@ FILES = {
     "config.yaml": "the settings",
     "log.mcap": "complete log, for Foxglove and segslam replay",
 }
-ODOMETRIES = ("odometry, after repairs", "KISS-ICP alone")
 CONDITIONS = {
     "started": "started (UTC)",
     "command": "command",
@@ -189,7 +188,11 @@ def _figures(metrics: dict[str, Any]) -> str:
     known = [key for key in FIGURES if key in metrics]
     rest = [key for key, value in metrics.items() if key not in FIGURES and isinstance(value, int | float)]
     of_run = [key for key in known + rest if not key.startswith(COMPARED)]
-    titles = {prefix: title for prefix, title in zip(COMPARED, ODOMETRIES, strict=True) if prefix + "ate_m" in metrics}
+    titles = {
+        prefix: title
+        for prefix, title in zip(COMPARED, ("odometry, after repairs", "KISS-ICP alone"), strict=True)
+        if prefix + "ate_m" in metrics
+    }
     rows = [
         (
             f"{FIGURES.get(key, '')} {_key(key)}",

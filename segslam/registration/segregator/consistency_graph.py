@@ -21,7 +21,7 @@ import numpy as np
 from segslam.core.config import SegregatorConfig
 from segslam.core.kernels import kernel
 from segslam.core.types import IndexPairs
-from segslam.registration.cliques.bits import Bits, lowest_bit, pack_flags, pairs, part
+from segslam.registration.cliques import Bits, lowest_bit, pack_flags, pairs, part
 from segslam.registration.segregator.correspondences import Correspondences
 
 

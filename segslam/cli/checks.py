@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,13 +76,10 @@ def check_links(folder: Path) -> None:
 
 def check_intensities(scans: "Dataset") -> None:
     """Raises SegslamError if the first readable scan has no intensities."""
-    from segslam.core.errors import BadScan
+    from segslam.cli.dry_run import first_usable
 
-    for row in range(len(scans)):
-        with suppress(BadScan):
-            if scans[row].intensities is None:
-                raise SegslamError(f"map.color=intensity: {scans.name} has no intensities; use class or height")
-            return
+    if first_usable(scans)[1].intensities is None:
+        raise SegslamError(f"map.color=intensity: {scans.name} has no intensities; use class or height")
 
 
 def log_to_resume(folder: Path) -> "RunLog":

@@ -61,7 +61,7 @@ def examine() -> dict[str, Any]:
     packages: dict[str, dict[str, str | None]] = defaultdict(dict)
     for package, _, _, extra in extras.requirements():
         if extra != "dev":
-            packages[extra or "core"][package] = _version(package)
+            packages[extra or "core"][package] = extras.installed_version(package)
     libraries = {name: _loads(name) for name in LIBRARIES}
     missing = [name for name, found in packages["core"].items() if found is None]
     problems = [f"{name} is not installed: pip install {name}" for name in missing]
@@ -107,15 +107,6 @@ def _lines(report: dict[str, Any]) -> list[str]:
         shown = ", ".join(f"{name} {found or '-'}" for name, found in versions.items())
         lines.append(f"{'packages' if extra == 'core' else f'extra {extra}'}: {shown}")
     return [*lines, *(f"PROBLEM {problem}" for problem in report["problems"])]
-
-
-def _version(package: str) -> str | None:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _loads(library: str) -> bool:

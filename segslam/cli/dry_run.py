@@ -18,7 +18,7 @@ def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
     from segslam.core import geometry
     from segslam.core.config import Config, changed_settings
 
-    (first_row, first), (last_row, last) = _first_usable(scans), _first_usable(scans, backwards=True)
+    (first_row, first), (last_row, last) = first_usable(scans), first_usable(scans, backwards=True)
     seconds = (last.stamp_ns - first.stamp_ns) / 1e9
     ranges_m, elevations, _ = geometry.spherical(first.points)
     elevation_deg = np.degrees(elevations)
@@ -73,7 +73,7 @@ def lines(found: dict[str, Any]) -> str:
     )
 
 
-def _first_usable(scans: "Dataset", *, backwards: bool = False) -> "tuple[int, Scan]":
+def first_usable(scans: "Dataset", *, backwards: bool = False) -> "tuple[int, Scan]":
     """Row and scan of the first usable scan, or of the last with `backwards`."""
     for row in reversed(range(len(scans))) if backwards else range(len(scans)):
         with suppress(BadScan):

@@ -15,8 +15,7 @@ from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.core.evaluation import Up
-    from segslam.core.trajectory import PoseFile, Poses
-    from segslam.core.types import IndexPairs
+    from segslam.core.trajectory import Poses
     from segslam.output.accuracy import Align
 
 
@@ -190,6 +189,7 @@ def _score_files(
     from segslam.core.evaluation import UP
     from segslam.core.trajectory import read_poses
     from segslam.output.accuracy import scores
+    from segslam.run.evaluate import matching_rows
 
     estimate, reference = (read_poses(file, format=format) for file in (estimate_file, reference_file))
     if (estimate.stamp_ns is None) != (reference.stamp_ns is None):
@@ -201,7 +201,7 @@ def _score_files(
             f"{estimate_file}: {len(estimate)} poses, but {reference_file} has {len(reference)}; in KITTI format "
             "line n + 1 is scan n in both. Score the run folder instead, or use TUM format, which is matched by stamp"
         )
-    rows = _matching_rows(estimate, reference, round(max_difference_s * 1e9))
+    rows = matching_rows(estimate, reference, max_difference_ns=round(max_difference_s * 1e9))
     matched, truth = estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]]
     direction, why = (up, "") if up or not len(rows) else _up(truth, camera=estimate.stamp_ns is None)
     figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance_m, up=UP[direction or "z"])
@@ -227,15 +227,3 @@ def _up(reference: "Poses", *, camera: bool) -> tuple["Up", str]:
     if found is not None:
         return found, "the path is flattest along it"
     return ("-y", "as in KITTI's files; the path does not show it") if camera else ("z", "the path does not show it")
-
-
-def _matching_rows(estimate: "PoseFile", reference: "PoseFile", max_difference_ns: int) -> "IndexPairs":
-    """Matching rows: by row in KITTI format, where rows are scans; by stamp in TUM format."""
-    import numpy as np
-
-    from segslam.core.trajectory import rows_of_same_stamp
-
-    if estimate.stamp_ns is None or reference.stamp_ns is None:
-        common = np.arange(min(len(estimate), len(reference)))
-        return np.column_stack([common, common])
-    return rows_of_same_stamp(estimate.stamp_ns, reference.stamp_ns, max_difference_ns=max_difference_ns)

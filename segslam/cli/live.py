@@ -247,8 +247,9 @@ def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublis
 
     def save() -> str:
         file = run.folder / MAP_SO_FAR
-        made = save_map(*run.map_so_far(), file, config=run.config.map)
-        return f"{file}: {made.num_points} points of {counted(made.num_keyframes, 'keyframe')}"
+        T_world_keyframe, cloud = run.map_so_far()
+        num_points = save_map(T_world_keyframe, cloud, file, config=run.config.map)
+        return f"{file}: {num_points} points of {counted(len(T_world_keyframe), 'keyframe')}"
 
     return stack.enter_context(MappingPublisher(save))
 

@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from importlib.metadata import requires
+from importlib.metadata import PackageNotFoundError, requires, version
 from typing import NamedTuple
 
 
@@ -33,3 +33,11 @@ def how_to_install(extra: str) -> str:
     """The command that installs the packages of an extra, wherever segslam was installed from."""
     packages = [f"{need.package}{need.options}{need.versions}" for need in requirements() if need.extra == extra]
     return f"pip install {shlex.join(packages)}"
+
+
+def installed_version(package: str) -> str | None:
+    """The version of a package; None if it is not installed under this name."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

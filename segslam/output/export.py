@@ -80,12 +80,7 @@ def write_maps(
             made = write_map(_placed(log, globe, show), of_map, config=config, origin=origin, show=show)
         except OSError as error:
             raise cannot_write(of_map[0], error) from error
-    return {
-        "num_map_points": made.num_points,
-        "num_map_moving_points": made.num_moving_points,
-        "num_map_voxels_seen_through": made.num_voxels_seen_through,
-        "map_seconds": perf_counter() - started,
-    }
+    return {**made, "map_seconds": perf_counter() - started}
 
 
 def _finished(log: RunLog) -> tuple[GraphEstimate, Trajectory]:

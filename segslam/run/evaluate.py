@@ -8,9 +8,8 @@ from segslam.core.evaluation import Z_UP
 from segslam.core.trajectory import PoseFile, Poses, read_poses, rows_of_same_scan, rows_of_same_stamp
 from segslam.core.types import IndexPairs, SegslamError, Trajectory
 from segslam.output.accuracy import Align, scores
-from segslam.output.finished import FinishedRun
+from segslam.output.finished import STAMP_TOLERANCE_NS, FinishedRun
 
-STAMP_TOLERANCE_NS = 10_000_000
 Given = FinishedRun | Trajectory | Poses | str | Path
 """A run, a trajectory, poses (n, 4, 4), or a pose file in KITTI or TUM format."""
 
@@ -34,7 +33,7 @@ def evaluate(
         if reference is None:
             raise SegslamError("evaluate: no ground truth; give `reference`")
     made, true = _known(estimate), _known(reference)
-    rows = _rows(made, true)
+    rows = matching_rows(made, true)
     figures = scores(
         _poses(made)[rows[:, 0]], _poses(true)[rows[:, 1]], align=align, rpe_distance_m=rpe_distance_m, up=up
     )
@@ -57,11 +56,14 @@ def _poses(known: Trajectory | PoseFile) -> Poses:
     return known.T_world_lidar if isinstance(known, Trajectory) else known.T_a_b
 
 
-def _rows(made: Trajectory | PoseFile, true: Trajectory | PoseFile) -> IndexPairs:
+def matching_rows(
+    made: Trajectory | PoseFile, true: Trajectory | PoseFile, *, max_difference_ns: int = STAMP_TOLERANCE_NS
+) -> IndexPairs:
+    """(k, 2) rows of the same scan or time, else all rows. Raises SegslamError for unequal numbers of rows."""
     if isinstance(made, Trajectory) and isinstance(true, Trajectory):
         return rows_of_same_scan(made.scan_index, true.scan_index)
     if made.stamp_ns is not None and true.stamp_ns is not None:
-        return rows_of_same_stamp(made.stamp_ns, true.stamp_ns, max_difference_ns=STAMP_TOLERANCE_NS)
+        return rows_of_same_stamp(made.stamp_ns, true.stamp_ns, max_difference_ns=max_difference_ns)
     if len(made) != len(true):
         raise SegslamError(f"evaluate: {len(made)} poses for {len(true)} true ones; without stamps give one for each")
     return np.column_stack([np.arange(len(made)), np.arange(len(made))])

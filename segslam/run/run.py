@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -56,15 +56,6 @@ logger = logging.getLogger(__name__)
 
 MOST_WAITING = 8
 """Chosen: scans by which odometry may lead loop closing, about 2 MB each: the time of a keyframe with two loops."""
-
-
-class Completed(NamedTuple):
-    """What a run ended with."""
-
-    metrics: dict[str, Any]
-    """The content of `metrics.json`."""
-    placed: str
-    """What was found when the run was placed on the globe; empty if it was not."""
 
 
 def _nothing_more(_: SlamResult) -> Mapping[str, Any]:
@@ -281,8 +272,10 @@ class Run:
         map_files: Sequence[Path] = (),
         search_s: float = math.inf,
         progress: Progress = no_progress,
-    ) -> Completed:
+    ) -> tuple[dict[str, Any], str]:
         """Finish the run, and write the rest of its folder: figures, place on the globe, maps, and the report.
+
+        Returns the content of `metrics.json`, and what was found when the run was placed on the globe.
 
         `more` adds figures computed from the result. `place` georeferences the folder before the maps are written, and
         returns what it found. `search_s` and `progress` as in `finish`. A failure of place or maps leaves a report.
@@ -309,7 +302,7 @@ class Run:
         finally:
             with room_for(self.folder):
                 write_report(self.folder)
-        return Completed(metrics, placed)
+        return metrics, placed
 
     def _vertical_angle(self, result: SlamResult) -> dict[str, float]:
         """The remaining vertical angle of the scans as figures; empty if too few scans show it."""

@@ -10,6 +10,7 @@ from helpers.finished_run import make_run
 from matplotlib.image import imread
 
 from segslam.cli import doctor
+from segslam.core import extras
 from segslam.core.trajectory import write_kitti
 from segslam.output.finished import read_run
 from segslam.output.folder import write_metrics
@@ -122,8 +123,8 @@ def test_the_doctor_names_versions_libraries_and_caches(capsys: pytest.CaptureFi
 def test_the_doctor_names_the_remedy_of_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    version = doctor._version
-    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "kiss-icp" else version(name))
+    version = extras.installed_version
+    monkeypatch.setattr(extras, "installed_version", lambda name: None if name == "kiss-icp" else version(name))
     monkeypatch.setattr(doctor, "_loads", lambda name: name != "libGL.so.1")
     assert run("doctor") == 1
     output = capsys.readouterr().out

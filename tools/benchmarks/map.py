@@ -85,8 +85,8 @@ def main() -> None:
         counts.update(standing=int((~moves).sum()), standing_lost=int((~moves & ~in_map).sum()))
     figures = {
         "settings": config.map.model_dump(mode="json"),
-        "num_keyframes": summary.num_keyframes,
-        "num_map_points": summary.num_points,
+        "num_keyframes": len(T_world_keyframe),
+        "num_map_points": summary["num_map_points"],
         **counts,
         "moving_removed_percent": 100 * (1 - counts["moving_left"] / max(counts["moving"], 1)),
         "standing_lost_percent": 100 * counts["standing_lost"] / counts["standing"],

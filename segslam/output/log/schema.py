@@ -9,7 +9,6 @@ import sys
 import zlib
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +20,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from segslam.core.config import Config, config_to_yaml
+from segslam.core.extras import installed_version
 from segslam.core.types import GraphEstimate, LateLoops, Step, Trajectory, Transform
 from segslam.output.log.cloud import KeyframePoints
 from segslam.output.log.records import codec
@@ -194,7 +194,7 @@ def metadata(
         },
         CONFIG_METADATA: {"yaml": config_to_yaml(config)},
         OPTIONS_METADATA: dict(options),
-        PACKAGES_METADATA: {name: _version(name) for name in PACKAGES},
+        PACKAGES_METADATA: {name: installed_version(name) or "not installed" for name in PACKAGES},
     }
     records = {name: {key: _printable(text) for key, text in values.items()} for name, values in written.items()}
     return {**records, CHECK_METADATA: {"crc32": str(checksum(records))}}
@@ -225,10 +225,3 @@ def _processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:  # open3d is also distributed under other names
-        return "not installed"

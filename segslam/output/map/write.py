@@ -8,7 +8,7 @@ and one tile, whatever the length of the drive.
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -50,19 +50,6 @@ KINDS: dict[str, type[MapFile]] = {
 """Writers by file extension."""
 
 
-@dataclass(frozen=True, slots=True)
-class MapSummary:
-    """Contents of a map."""
-
-    num_keyframes: int
-    num_points: int
-    """Voxels in the map."""
-    num_moving_points: int
-    """Number of points of moving classes that were removed."""
-    num_voxels_seen_through: int
-    """Number of voxels removed because other keyframes saw through them."""
-
-
 def check_names(files: Sequence[Path], *, origin: "Origin | None" = None) -> None:
     """Raises SegslamError for a file with an unknown extension, or one that needs a missing package or the origin."""
     for file in files:
@@ -90,8 +77,8 @@ def write_map(
     config: MapConfig,
     origin: "Origin | None" = None,
     show: Progress = no_progress,
-) -> MapSummary:
-    """Make the map of the keyframes, each with its T_world_keyframe, and write it to one or more files.
+) -> dict[str, int]:
+    """Make the map of the keyframes, each with its T_world_keyframe, and write it to files; returns its figures.
 
     The extension selects the format: .ply, .pcd, .las, .laz: point cloud; .png: top view; .yaml, with a .pgm beside it:
     occupancy grid; .tif: the top view as GeoTIFF. With the `origin` of the world frame (east, north, up) on the globe,
@@ -111,12 +98,11 @@ def write_map(
             raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
         parts = show(store.parts(), store.num_tiles, "clean")
         num_points = _write(parts, replace(extent, origin=origin), files, scratch=scratch / "files", config=config)
-    return MapSummary(
-        num_keyframes=store.num_keyframes,
-        num_points=num_points,
-        num_moving_points=store.num_moving_points,
-        num_voxels_seen_through=store.num_voxels_seen_through,
-    )
+    return {
+        "num_map_points": num_points,
+        "num_map_moving_points": store.num_moving_points,
+        "num_map_voxels_seen_through": store.num_voxels_seen_through,
+    }
 
 
 def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scratch: Path, config: MapConfig) -> int:
@@ -156,11 +142,6 @@ class MapStore:
         self._has_intensities = True
         self.num_moving_points = 0
         self.num_voxels_seen_through = 0
-
-    @property
-    def num_keyframes(self) -> int:
-        """Number of keyframes added."""
-        return len(self._places)
 
     @property
     def num_tiles(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from segslam.core.config import MapConfig
 from segslam.core.types import Keyframe, Labels, Points, SegslamError, Transform
 from segslam.output.log.drawing import CloudOf, map_points
-from segslam.output.map.write import MapSummary, write_map
+from segslam.output.map.write import write_map
 
 logger = logging.getLogger(__name__)
 
@@ -35,19 +35,13 @@ class DrawnMap(NamedTuple):
 Show = Callable[[DrawnMap], None]
 
 
-class _Wanted(NamedTuple):
-    T_world_keyframe: dict[int, Transform]
-    cloud: CloudOf
-    stamp_ns: int
-
-
 class LiveMap:
     """Draws the newest requested map and skips older requests; a context manager."""
 
     def __init__(self, shows: Sequence[Show]) -> None:
         self._shows = shows
         self._changed = Condition()
-        self._wanted: _Wanted | None = None
+        self._wanted: tuple[dict[int, Transform], CloudOf, int] | None = None
         self._num_drawn = 0
         self._is_closed = False
         self._thread = Thread(target=self._draw_all, name="map", daemon=True)
@@ -68,7 +62,7 @@ class LiveMap:
         """Note a new keyframe. Does not wait for a map that is being drawn."""
         with self._changed:
             if self._shows and (is_corrected or self._wanted or len(T_world_keyframe) >= GROWTH * self._num_drawn):
-                self._wanted = _Wanted(T_world_keyframe, cloud, stamp_ns)
+                self._wanted = T_world_keyframe, cloud, stamp_ns
                 self._changed.notify()
 
     def _draw_all(self) -> None:
@@ -80,20 +74,21 @@ class LiveMap:
                 wanted, self._wanted = self._wanted, None
                 if self._is_closed or wanted is None:
                     return
-                self._num_drawn = len(wanted.T_world_keyframe)
+                T_world_keyframe, cloud, stamp_ns = wanted
+                self._num_drawn = len(T_world_keyframe)
             started = monotonic()
             try:
-                points, labels = map_points(wanted.T_world_keyframe, wanted.cloud)
+                points, labels = map_points(T_world_keyframe, cloud)
                 for show in self._shows:
-                    show(DrawnMap(points, labels, wanted.T_world_keyframe, wanted.stamp_ns))
+                    show(DrawnMap(points, labels, T_world_keyframe, stamp_ns))
             except (SegslamError, OSError) as error:
                 logger.warning("the map is not shown: %s", error)
                 return
             rest_s = max(LEAST_S, (monotonic() - started) * (1 / SHARE - 1))
 
 
-def save_map(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, file: Path, *, config: MapConfig) -> MapSummary:
-    """Write the map of these keyframes, as `segslam export` does at the end of a run.
+def save_map(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, file: Path, *, config: MapConfig) -> int:
+    """Write the map of these keyframes, as `segslam export` does at the end of a run; returns its number of points.
 
     The log keeps intensities for the end of the run only, so `map.color=intensity` gives way to classes here.
     Raises SegslamError if there is no keyframe, and OSError where the disk is full.
@@ -102,7 +97,7 @@ def save_map(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, file: Pa
         raise SegslamError("there is no keyframe yet")
     if config.color == "intensity":
         config = config.model_copy(update={"color": "class"})
-    return write_map(_keyframes(T_world_keyframe, cloud), [file], config=config)
+    return write_map(_keyframes(T_world_keyframe, cloud), [file], config=config)["num_map_points"]
 
 
 def _keyframes(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf) -> Iterator[tuple[Keyframe, Transform]]:

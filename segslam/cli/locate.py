@@ -187,9 +187,9 @@ def _read_one(
 
     from segslam.labels.label_files import encoding_of, read_labels
     from segslam.labels.late import computed
-    from segslam.scans.clouds import read_cloud
+    from segslam.scans.clouds import read_file
 
-    points = read_cloud(scan)
+    points = read_file(scan).points
     ids = np.zeros(len(points), np.uint8)
     if labels not in LABEL_WORDS:
         named = [Path(labels) / f"{one.stem}.label" for one in scans]
@@ -213,27 +213,27 @@ def _read_two(
     from segslam.labels import geometric_labels
     from segslam.labels.label_files import encoding_of, open_labels, read_labels
     from segslam.labels.late import computed
-    from segslam.scans.clouds import read_cloud, read_intensities
+    from segslam.scans.clouds import read_file
 
     files.check()
     both = (source, target)
-    stored = [read_cloud(file) for file in both]
+    stored = [read_file(file) for file in both]
     words = labels or ["geometric"]
     classes: list[ScanLabels]
     if len(words) == 2:
         named = [Path(word) for word in words]
         numbering = files.encoding or encoding_of(named)
-        classes = [read_labels(file, len(points), numbering) for file, points in zip(named, stored, strict=True)]
+        classes = [read_labels(file, len(cloud.points), numbering) for file, cloud in zip(named, stored, strict=True)]
     elif _is_word(words[0]):
         labeller = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None)
         classes = [
-            labeller.read(file.stem, points, read_intensities(file)) for file, points in zip(both, stored, strict=True)
+            labeller.read(file.stem, cloud.points, cloud.intensities) for file, cloud in zip(both, stored, strict=True)
         ]
     else:
         raise SegslamError(
             f"--labels {words[0]}: give two .label files, source and target, or geometric, or network:MODEL"
         )
-    scans = [files.ready(file, points, ids, config) for file, points, ids in zip(both, stored, classes, strict=True)]
+    scans = [files.ready(file, one.points, ids, config) for file, one, ids in zip(both, stored, classes, strict=True)]
     with watch("label"):
         return [
             (scan.points, geometric_labels(scan.points) if words[0] == "geometric" else computed(scan.labels))

@@ -41,9 +41,6 @@ CONSTANT_ROUNDS = 3
 """Chosen: repetitions of placement and constants; the third changes the lever arm by less than its noise."""
 
 
-Costs = tuple[float, float, float]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Constants:
     """Placement of the drive with the clock and the lever arm of the receiver."""
@@ -68,17 +65,10 @@ class Fused:
     T_enu_keyframe: Poses
     weights: Weights
     """(n, 2) robust weight of each fix, horizontally and vertically; 0 for an unknown height."""
-    precisions: Points
-    """(n, 3) inverse variances with which the fixes acted (1 / m^2)."""
     sigma_m: Vector
     """(3,) standard deviation of single fixes about the drive: east, north, up."""
     acting_sigma_m: Vector
     """(3,) standard deviations with which fixes of full weight acted: the slow errors are included."""
-    noise: tuple[Noise, Noise | None]
-    """Horizontal and vertical noise of largest likelihood."""
-    costs: tuple[Costs, Costs]
-    """Cost of the held-out fixes for the rigid drive, with this noise, and followed closely; horizontally and
-    vertically."""
 
 
 def calibrate(
@@ -138,10 +128,10 @@ def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> Fused:
         [*2 * [level.effective_sigma_m(interval_s)], np.inf if up is None else up.effective_sigma_m(interval_s)]
     )
     close = np.array([level.white_m, level.white_m, np.inf if up is None else up.white_m])
-    sigma, costs = _chosen(problem, soft, close)
-    T, weights, precisions = _solved(problem, sigma)
+    sigma = _chosen(problem, soft, close)
+    T, weights, _ = _solved(problem, sigma)
     scales = _scales(matched.enu_m - problem.positions(T), weights)
-    return Fused(T, weights, precisions, scales, sigma, (level, up), costs)
+    return Fused(T, weights, scales, sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,21 +149,18 @@ class _Problem:
         return self.graph.solve(start, self.matched.keyframe, points, self.matched.enu_m, precisions)
 
 
-def _chosen(problem: _Problem, soft: Vector, close: Vector) -> tuple[Vector, tuple[Costs, Costs]]:
-    """(3,) standard deviations with which the fixes act, and the costs that decide, horizontally and vertically."""
+def _chosen(problem: _Problem, soft: Vector, close: Vector) -> Vector:
+    """(3,) standard deviations with which the fixes act."""
     sigma = np.full(3, RIGID_M)
-    nothing = (0.0, 0.0, 0.0)
     if len(problem.matched) < LEAST_FUSED:
-        return sigma, (nothing, nothing)
-    level, costs_level = _best(problem, [np.array([*one[:2], RIGID_M]) for one in (sigma, soft, close)], 0)
+        return sigma
+    level = _best(problem, [np.array([*one[:2], RIGID_M]) for one in (sigma, soft, close)], 0)
     if not np.isfinite(close[2]):
-        return level, (costs_level, nothing)
-    with_up = [np.array([*level[:2], one]) for one in (RIGID_M, soft[2], close[2])]
-    both, costs_up = _best(problem, with_up, 1)
-    return both, (costs_level, costs_up)
+        return level
+    return _best(problem, [np.array([*level[:2], one]) for one in (RIGID_M, soft[2], close[2])], 1)
 
 
-def _best(problem: _Problem, candidates: Sequence[Vector], axis: int) -> tuple[Vector, Costs]:
+def _best(problem: _Problem, candidates: Sequence[Vector], axis: int) -> Vector:
     """The stiffest of three candidates, rigid, soft and close, whose cost is not significantly above the least one.
 
     `axis`: 0 horizontally, 1 vertically.
@@ -188,8 +175,7 @@ def _best(problem: _Problem, candidates: Sequence[Vector], axis: int) -> tuple[V
     means = costs.mean(axis=1)
     more = costs - costs[means.argmin()]
     is_as_good = more.mean(axis=1) <= SIGNIFICANT_T * more.std(axis=1, ddof=1) / np.sqrt(NUM_WINDOWS)
-    rigid, soft, close = means.tolist()
-    return candidates[int(is_as_good.argmax())], (rigid, soft, close)
+    return candidates[int(is_as_good.argmax())]
 
 
 def _windows(problem: _Problem, used: Mask) -> list[slice]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.core.types import BadScan, Points, SegslamError, Vector
+from segslam.core.types import BadScan, SegslamError
 from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
 from segslam.scans.pcd import parse_pcd
@@ -47,16 +47,6 @@ def read_file(file: Path) -> Cloud:
         raise BadScan(
             f"{file}: {str(error) or 'not enough memory'}; copy the file again, convert it, or remove it"
         ) from error
-
-
-def read_cloud(file: Path) -> Points:
-    """The points (n, 3) of a file. Raises SegslamError as `read_file` does."""
-    return read_file(file).points
-
-
-def read_intensities(file: Path) -> Vector | None:
-    """Intensities (n,) of a file; None if it has none. Raises SegslamError as `read_file` does."""
-    return read_file(file).intensities
 
 
 def _parse_npy(content: bytes) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 
 from segslam.core.types import BadScan
 from segslam.scans import open_dataset
-from segslam.scans.clouds import read_cloud, read_file, read_intensities
+from segslam.scans.clouds import read_file
 from segslam.scans.pcd import _decompress
 from segslam.scans.scan_files import Columns, Field, text_columns
 
@@ -101,7 +101,7 @@ def test_every_form_gives_map_and_live_the_same_points(tmp_path: Path, name: str
     file = tmp_path / name
     file.write_bytes(FILES[name])
     scan = open_dataset(tmp_path, intensities=True)[0]
-    for points, intensities in ((read_cloud(file), read_intensities(file)), (scan.points, scan.intensities)):
+    for points, intensities in ((read_file(file).points, read_file(file).intensities), (scan.points, scan.intensities)):
         np.testing.assert_array_equal(points, POINTS)
         if b"intensity" not in FILES[name]:
             assert intensities is None
@@ -127,7 +127,7 @@ def test_decompression_is_that_of_plain_python(tmp_path: Path) -> None:
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.repeat(POINTS, 30, axis=0)))
     file = tmp_path / "0.pcd"
     assert o3d.t.io.write_point_cloud(str(file), cloud, compressed=True)
-    np.testing.assert_array_equal(read_cloud(file), np.repeat(POINTS, 30, axis=0))
+    np.testing.assert_array_equal(read_file(file).points, np.repeat(POINTS, 30, axis=0))
     content = file.read_bytes()
     data = np.frombuffer(bytearray(content[content.index(b"compressed\n") + 19 :]), np.uint8)
     targets = np.zeros((2, 30 * NUM * 12), np.uint8)

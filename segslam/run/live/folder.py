@@ -18,7 +18,7 @@ import numpy as np
 from segslam.core.errors import unreadable
 from segslam.core.types import BadScan, Scan, SegslamError, Transform
 from segslam.run.live.waiting import Arrival, Waiting
-from segslam.scans.clouds import read_cloud, read_intensities
+from segslam.scans.clouds import read_file
 from segslam.scans.dataset import make_scan
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
@@ -144,20 +144,18 @@ class FolderSource:
 
     def _read_now(self, file: Path, index: int, stamp_ns: int) -> Scan:
         try:
-            points = read_cloud(file)
-            intensities = read_intensities(file) if self._has_intensities else None
+            cloud = read_file(file)
         except BadScan:
             raise
         except SegslamError as error:
             raise BadScan(str(error)) from error
-        labels = np.zeros(len(points), np.uint8)
         return make_scan(
             file,
             index,
             stamp_ns,
-            points,
-            labels,
-            intensities=intensities,
+            cloud.points,
+            np.zeros(len(cloud.points), np.uint8),
+            intensities=cloud.intensities if self._has_intensities else None,
             vertical_angle_deg=self._vertical_angle_deg,
         )
 

@@ -38,7 +38,7 @@ map before a break is not used again."""
 MOST_UNCHECKED = 9
 """Chosen: number of scans after which a sensor that seems to stand still is checked."""
 BREAK_M = 1.0
-"""A motion with a larger standard deviation is called a break; as in `pose_graph.breaks`."""
+"""A motion with a larger standard deviation is called a break, as in `graph/edges.py`."""
 
 
 class CheckedOdometry:

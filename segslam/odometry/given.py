@@ -65,7 +65,7 @@ class GivenOdometry:
             raise BadScan(
                 f"scan {scan.index}: the given odometry has no pose within {STAMP_TOLERANCE_S} s of its "
                 f"stamp {scan.stamp_ns} ns (it has {_span(self._trajectory.stamp_ns)}); "
-                "omit the scan, correct the stamps or raise odometry.stamp_tolerance_s"
+                "omit the scan, or correct the stamps"
             )
         return row
 

@@ -34,6 +34,7 @@ from segslam.graph.g2o import G2oGraph, write_g2o
 from segslam.graph.levenberg_marquardt import Search, Unsolvable, search
 from segslam.graph.motions import Drive, MotionSolution, solve_consistent, solve_gnc, without
 from segslam.graph.noise import INLIER_PROBABILITY
+from segslam.graph.rows import Rows
 from segslam.graph.steady_drift import noise_factor, steady_drift, turned
 
 logger = logging.getLogger(__name__)
@@ -355,29 +356,3 @@ class PoseGraph:
             dict(zip(pairs, self._weights, strict=True)),
             {(int(row), int(row) + 1): 0.0 for row in np.flatnonzero(self._rejected)},
         )
-
-
-class Rows:
-    """An array that grows by rows of one shape. Arrays returned by `all` do not change: rows are only appended."""
-
-    def __init__(self, rows: np.ndarray) -> None:
-        self._rows = rows
-        self._num = len(rows)
-
-    def __len__(self) -> int:
-        return self._num
-
-    def append(self, row: np.ndarray | float) -> None:
-        """Add a row; amortised constant time."""
-        if self._num == len(self._rows):
-            longer = np.empty((max(16, 2 * self._num), *self._rows.shape[1:]))
-            longer[: self._num] = self._rows
-            self._rows = longer
-        self._rows[self._num] = row
-        self._num += 1
-
-    def all(self) -> np.ndarray:
-        """A read-only view of the rows so far."""
-        view = self._rows[: self._num]
-        view.flags.writeable = False
-        return view

@@ -17,6 +17,7 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Information, Motion, MotionState, Scan, Transform
+from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan, displacement_m
@@ -37,8 +38,6 @@ SIGNIFICANT = 0.001
 map before a break is not used again."""
 MOST_UNCHECKED = 9
 """Chosen: number of scans after which a sensor that seems to stand still is checked."""
-BREAK_M = 1.0
-"""A motion with a larger standard deviation is called a break, as in `graph/edges.py`."""
 
 
 class CheckedOdometry:
@@ -155,11 +154,12 @@ class CheckedOdometry:
         unsure, elsewhere = np.zeros((6, 6)), float(is_rejoined)  # the scan before is not in the map before a break
         starts = [T_map_proposed, T_map_odom @ T_odom_predicted]
         if not is_rejoined and not self._is_found(fits, starts, scan):
+            starts.append(T_map_last)
             fits = self._search.near(self._map, scan, [T_map_last], fits)
-        if not is_rejoined and not self._is_found(fits, [*starts, T_map_last], scan):
+        if not is_rejoined and not self._is_found(fits, starts, scan):
             T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
             fits = self._search.around(self._map, scan, T_map_last, T_step, fits)
-        if not is_rejoined and not (fits and self._is_usual(fits[0])):
+        if not is_rejoined and not self._is_usual(fits):
             elsewhere = self._search.elsewhere(scan, fits)
             if elsewhere * ELSEWHERE_M**2 > BREAK_M**2 or not self._motion.is_known:
                 recognised = self._search.without_guess(self._map, scan)
@@ -224,7 +224,7 @@ class CheckedOdometry:
         starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4)]
         near = self._search.near(local, scan, starts)
         fits = self._search.around(local, scan, np.eye(4), self._motion.T_step, near)
-        is_found = bool(fits) and self._is_usual(fits[0]) and (not here or as_likely(fits[0], here[0]) >= SIGNIFICANT)
+        is_found = self._is_usual(fits) and (not here or as_likely(fits[0], here[0]) >= SIGNIFICANT)
         if is_found:
             self._map = local
         self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, num_scans + 1)
@@ -235,12 +235,13 @@ class CheckedOdometry:
 
         A registration that leads away from where it started may have ended at the first of several local optima.
         """
-        if not fits or not self._is_usual(fits[0]):
-            return False
-        return any(self._search.is_same(scan, fits[0].T_map_lidar, T_map_start) for T_map_start in T_map_starts)
+        return self._is_usual(fits) and any(
+            self._search.is_same(scan, fits[0].T_map_lidar, T_map_start) for T_map_start in T_map_starts
+        )
 
-    def _is_usual(self, fit: Fit) -> bool:
-        return self._usual_fit.includes(fit.mean_log, least_spread=fit.num_patches**-0.5)
+    def _is_usual(self, fits: Sequence[Fit]) -> bool:
+        """True if the most likely pose explains the scan as usual; False if there is none."""
+        return bool(fits) and self._usual_fit.includes(fits[0].mean_log, least_spread=fits[0].num_patches ** -0.5)
 
     def _state(
         self, T_odom_proposed: Transform, T_odom_lidar: Transform, covariance: Information, scan: SeenScan

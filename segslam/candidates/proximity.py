@@ -1,24 +1,26 @@
-"""Loop candidates by distance: older keyframes near the newest one by the graph's estimate, but far in travel.
+"""Loop candidates by distance: older keyframes that are probably near the newest one, but far in travel.
 
-Odometry drifts with the distance travelled, so the error between two keyframes is bounded by the length of the shortest
-chain of odometry and loops between them. The search radius of each target grows with that chain. This approximates the
-bound by a covariance, and costs one run of Dijkstra's algorithm over the keyframes with loops.
+How probable that is follows from the poses of the graph and their covariance. Where it says little, after much drift or
+across a break of the odometry, similar places are searched instead (`places`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.special import ndtr, ndtri
 
-from segslam.candidates.prior import height_bounds_m
 from segslam.core import geometry
 from segslam.core.config import ProximityConfig
 from segslam.core.types import REJECTED_WEIGHT, IndexPairs, Indices, LoopCandidate, LoopClosure, Vector
 
-BREAK_RADIUS_M = 60.0
-"""Chosen: search radius across a break of the odometry (m)."""
+LEAST_PROBABILITY = 0.01
+"""Chosen: two keyframes that are near each other with a smaller probability are no candidate."""
+FARTHEST = float(-ndtri(LEAST_PROBABILITY / 2.0))
+"""An error of more standard deviations has a smaller probability than that."""
+HEIGHT_M = 1.0
+"""Chosen: storeys are 3 m apart: largest height difference of two visits of a place (m)."""
 MAX_CANDIDATES = 2
 """Chosen: number of candidates per keyframe."""
 SPREAD_M = 8.0
@@ -31,6 +33,10 @@ BREAK_TRAVEL_M = 1e5
 NO_CLOSURES: IndexPairs = np.empty((0, 2), dtype=np.int64)
 
 
+Covariances = Callable[[int, Indices], Float[np.ndarray, "_ 6 6"]]
+"""Covariance of the pose of a keyframe in each of others, as a tangent of the keyframe (`graph.covariances`)."""
+
+
 class ProximityDetector:
     """Proposes loop candidates, and stores the accepted loops.
 
@@ -41,7 +47,6 @@ class ProximityDetector:
         self._config = config
         self._closures = NO_CLOSURES
         self._kept = np.empty(0, dtype=bool)
-        self._chains = Chains(NO_CLOSURES)
 
     def note_closure(self, closure: LoopClosure) -> None:
         """Exclude the surroundings of this loop from the following searches."""
@@ -49,125 +54,98 @@ class ProximityDetector:
         self._kept = np.append(self._kept, True)
 
     def note_estimate(self, closure_weights: Mapping[tuple[int, int], float]) -> None:
-        """Use the closures noted so far in the chains, with the weights of a `GraphEstimate`.
-
-        A closure that the optimiser rejected shortens no chain, and its surroundings are searched again.
-        """
+        """Note the weights of a `GraphEstimate`: the surroundings of a closure that it rejected are searched again."""
         weights = [closure_weights.get((source, target), 1.0) for source, target in self._closures.tolist()]
         self._kept = np.array(weights) >= REJECTED_WEIGHT
-        self._chains = Chains(self._closures[self._kept])
 
     def candidates(
         self,
         source_id: int,
         T_world_keyframes: Float[np.ndarray, "n 4 4"],
         travel_m: Float[np.ndarray, " n"],
+        covariances: Covariances,
         *,
         below: int | None = None,
     ) -> tuple[LoopCandidate, ...]:
-        """At most `max_candidates` older keyframes near one, sorted by distance, `spread_m` of travel apart.
+        """At most `MAX_CANDIDATES` older keyframes near one, sorted by distance, `SPREAD_M` of travel apart.
 
         Row i of the arrays is keyframe i, by the current estimate. Distances are horizontal, because the height of
-        LiDAR odometry drifts most. Heights may differ by `prior.height_bounds_m`, which separates the storeys of a
-        building. If `below` is given, only smaller ids are proposed.
+        LiDAR odometry drifts most; heights separate the storeys of a building. If `below` is given, only smaller ids
+        are proposed.
         """
-        config = self._config
-        within_reach = self._within_reach(source_id, T_world_keyframes, travel_m)
-        within_reach = within_reach if below is None else within_reach[within_reach < below]
-        chain_m = self._chains.lengths_m(source_id, within_reach, travel_m)
-        radius_m = search_radius_m(chain_m, config=config)
-        offset = T_world_keyframes[within_reach, :3, 3] - T_world_keyframes[source_id, :3, 3]
-        distance_m = np.hypot(offset[:, 0], offset[:, 1])
-        eligible = (
-            (distance_m <= radius_m)
-            & (np.abs(offset[:, 2]) <= height_bounds_m(chain_m))
-            & ~self._is_closed(source_id, within_reach, travel_m, radius_m)
-        )
-        nearest_first = np.flatnonzero(eligible)[np.argsort(distance_m[eligible], kind="stable")]
-        rows = _spread_out(nearest_first, travel_m[within_reach], SPREAD_M, MAX_CANDIDATES)
-        T_source_world = geometry.inverse(T_world_keyframes[source_id])
-        return tuple(
-            LoopCandidate(
-                source_id=source_id,
-                target_id=int(within_reach[row]),
-                T_target_source_prior=geometry.inverse(T_source_world @ T_world_keyframes[within_reach[row]]),
-                distance_m=float(np.linalg.norm(offset[row])),
-                search_radius_m=float(radius_m[row]),
-                chain_m=float(chain_m[row]),
-            )
-            for row in rows
-        )
+        num_far = int(np.searchsorted(travel_m, travel_m[source_id] - self._config.min_travel_m, side="right"))
+        older = np.arange(min(num_far, source_id, source_id if below is None else below))
+        near = nearness(source_id, older, T_world_keyframes, covariances, radius_m=self._config.base_radius_m)
+        is_open = near.probability >= LEAST_PROBABILITY
+        is_open[is_open] &= ~self._is_closed(source_id, older[is_open], travel_m, near.reach_m[is_open])
+        nearest_first = np.flatnonzero(is_open)[np.argsort(near.distance_m[is_open], kind="stable")]
+        rows = _spread_out(nearest_first, travel_m, SPREAD_M, MAX_CANDIDATES)
+        return tuple(near.candidate(row) for row in rows)
 
-    def _within_reach(self, source_id: int, T_world_keyframes: np.ndarray, travel_m: Vector) -> Indices:
-        """Older keyframes far enough in travel and within the largest radius."""
-        config = self._config
-        num_far = np.searchsorted(travel_m, travel_m[source_id] - config.min_travel_m, side="right")
-        x, y = T_world_keyframes[: min(num_far, source_id), :2, 3].T - T_world_keyframes[source_id, :2, 3, None]
-        largest_m = max(config.max_radius_m, BREAK_RADIUS_M) if _has_break(travel_m) else config.max_radius_m
-        return np.flatnonzero(np.hypot(x, y) <= largest_m)
-
-    def _is_closed(self, source_id: int, ids: Indices, travel_m: Vector, radius_m: Vector) -> Bool[np.ndarray, " k"]:
-        """True for targets near a loop closed within the last `min_gap_m`: closer to its target, in travel, than
-        `min_gap_m` plus the search radius."""
+    def _is_closed(self, source_id: int, ids: Indices, travel_m: Vector, reach_m: Vector) -> Bool[np.ndarray, " k"]:
+        """True for targets near a loop closed within the last `MIN_GAP_M`: closer to its target, in travel, than
+        `MIN_GAP_M` plus the reach of the search."""
         sources, targets = self._closures[self._kept].T
         recent = targets[np.abs(travel_m[sources] - travel_m[source_id]) < MIN_GAP_M]
         apart_m = np.abs(travel_m[ids, None] - travel_m[recent])
-        return (apart_m < MIN_GAP_M + radius_m[:, None]).any(axis=1)
+        return (apart_m < MIN_GAP_M + reach_m[:, None]).any(axis=1)
 
 
-class Chains:
-    """Shortest chains between keyframes along odometry, with its length, and closures, with length 0.
+@dataclass(frozen=True, slots=True, eq=False)
+class Nearness:
+    """How near one keyframe is to others (k), by the current estimate."""
 
-    Chains branch at the ends of closures only, so the searched graph has no other vertices.
-    """
+    source_id: int
+    ids: Indices
+    T_world_keyframes: Float[np.ndarray, "n 4 4"]
+    covariances: Float[np.ndarray, "k 6 6"]
+    distance_m: Vector
+    """Horizontal."""
+    probability: Vector
+    """That the two are within the radius; 0 on another storey."""
+    reach_m: Vector
+    """Largest distance that is probably within the radius."""
 
-    def __init__(self, closures: IndexPairs) -> None:
-        """`closures` (k, 2): the two keyframes of each."""
-        self._pairs = np.unique(closures, axis=0)  # the sparse format would add up duplicates
-        self._ends = np.unique(self._pairs)
-        self._found: dict[int, Vector] = {}
-
-    def lengths_m(self, source_id: int, ids: Indices, travel_m: Vector) -> Vector:
-        """(k,) lengths of the chains from one keyframe to others."""
-        straight_m = np.abs(travel_m[ids] - travel_m[source_id])
-        if not len(self._ends):
-            return straight_m
-        ends_m = travel_m[self._ends]
-        source_ends = [int(end[0]) for end in self._beside(np.array([source_id]))]
-        turning_m = np.min(
-            [self._from(end, ends_m) + abs(ends_m[end] - travel_m[source_id]) for end in source_ends], axis=0
+    def candidate(self, row: int) -> LoopCandidate:
+        """The loop with one of the others."""
+        target_id = int(self.ids[row])
+        T_target_source = geometry.inverse(self.T_world_keyframes[target_id]) @ self.T_world_keyframes[self.source_id]
+        return LoopCandidate(
+            self.source_id,
+            target_id,
+            T_target_source,
+            geometry.distance(T_target_source),
+            self.covariances[row],
+            float(self.probability[row]),
         )
-        by_ends_m = [turning_m[end] + np.abs(ends_m[end] - travel_m[ids]) for end in self._beside(ids)]
-        return np.minimum(straight_m, np.min(by_ends_m, axis=0))
-
-    def _beside(self, ids: Indices) -> tuple[Indices, Indices]:
-        """Rows of the closure ends before and after each keyframe in travel; the same row twice at the margins."""
-        after = np.searchsorted(self._ends, ids)
-        return np.maximum(after - 1, 0), np.minimum(after, len(self._ends) - 1)
-
-    def _from(self, end: int, ends_m: Vector) -> Vector:
-        """Lengths from one end to all ends, cached: successive keyframes mostly start at the same end."""
-        if end not in self._found:
-            rows = np.arange(len(self._ends) - 1)
-            sources, targets = np.searchsorted(self._ends, self._pairs).T
-            lengths = np.concatenate([np.diff(ends_m), np.zeros(len(self._pairs))])
-            places = np.concatenate([rows, sources]), np.concatenate([rows + 1, targets])
-            graph = coo_array((lengths, places), shape=(len(self._ends), len(self._ends)))
-            self._found[end] = dijkstra(graph, directed=False, indices=np.array(end))
-        return self._found[end]
 
 
-def search_radius_m(chain_m: Vector, *, config: ProximityConfig) -> Vector:
-    """Largest error of each keyframe's position relative to another, from the length of the chain between them (m).
-
-    A chain across a break of the odometry is longer than any drive (`BREAK_TRAVEL_M`).
-    """
-    radius_m = np.minimum(config.base_radius_m + config.drift_ratio * chain_m, config.max_radius_m)
-    return np.where(chain_m >= BREAK_TRAVEL_M, max(BREAK_RADIUS_M, config.max_radius_m), radius_m)
-
-
-def _has_break(travel_m: Vector) -> bool:
-    return len(travel_m) > 0 and bool(travel_m[-1] - travel_m[0] >= BREAK_TRAVEL_M)
+def nearness(
+    source_id: int,
+    ids: Indices,
+    T_world_keyframes: Float[np.ndarray, "n 4 4"],
+    covariances: Covariances,
+    *,
+    radius_m: float,
+) -> Nearness:
+    """How near a keyframe is to others, with `radius_m` as the distance from which two scans see the same place."""
+    found = covariances(source_id, ids)
+    R_world_source = T_world_keyframes[source_id, :3, :3]
+    spread = np.einsum("kij,lj->kil", np.einsum("ij,kjl->kil", R_world_source, found[:, 3:, 3:]), R_world_source)
+    offset = T_world_keyframes[source_id, :3, 3] - T_world_keyframes[ids, :3, 3]
+    distance_m = np.hypot(offset[:, 0], offset[:, 1])
+    ahead = offset[:, :2] / np.maximum(distance_m, 1e-9)[:, None]
+    ahead[distance_m < 1e-9] = (1.0, 0.0)
+    aside = ahead[:, ::-1] * (-1.0, 1.0)
+    along_m, across_m = (
+        np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", way, spread[:, :2, :2], way), 1e-12)) for way in (ahead, aside)
+    )
+    height_m = np.sqrt(np.maximum(spread[:, 2, 2], 0.0))
+    probability = ndtr((radius_m - distance_m) / along_m) - ndtr((-radius_m - distance_m) / along_m)
+    probability *= 2.0 * ndtr(radius_m / across_m) - 1.0
+    probability[np.abs(offset[:, 2]) > HEIGHT_M + FARTHEST * height_m] = 0.0
+    reach_m = radius_m + FARTHEST * np.maximum(along_m, across_m)
+    return Nearness(source_id, ids, T_world_keyframes, found, distance_m, probability, reach_m)
 
 
 def _spread_out(ranked: Indices, travel_m: Vector, spread_m: float, most: int) -> list[int]:

@@ -243,16 +243,17 @@ class Description(Record):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LoopCandidate(Record):
-    """A possible loop: the new keyframe `source_id` and the older `target_id`. The prior is used by gates only."""
+    """A possible loop: the new keyframe `source_id` and the older `target_id`."""
 
     source_id: int
     target_id: int
     T_target_source_prior: Transform
     distance_m: float
     """Distance between the two positions, by the current estimate."""
-    search_radius_m: float
-    chain_m: float = 0.0
-    """Length of the shortest chain of odometry and closures between the two."""
+    covariance: Information = field(default_factory=lambda: np.zeros((6, 6)))
+    """Of the prior, by the motions and loops between the two; zero if it is exact, or in logs of older versions."""
+    near_probability: float = 1.0
+    """That the two are so near each other, horizontally, that they see the same place."""
 
 
 class Found(Record):

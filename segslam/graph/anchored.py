@@ -5,6 +5,7 @@ that across a break of the odometry. Each keyframe that was placed in the map ha
 optimisation of loops and breaks therefore applies to placements without change.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,18 @@ import numpy as np
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core.config import GraphConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import GraphEstimate, Information, LoopClosure, Placement, SegslamError, Transform, Vector
+from segslam.core.types import (
+    GraphEstimate,
+    Indices,
+    Information,
+    LoopClosure,
+    Mask,
+    Placement,
+    SegslamError,
+    Transform,
+    Vector,
+)
+from segslam.graph.closure_pairs import Matrices
 from segslam.graph.graph import PoseGraph
 
 OPTIMIZE_EVERY = 25
@@ -70,6 +82,14 @@ class AnchoredGraph:
         raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 
     weigh_odometry_by = add_closure
+
+    def covariances(self, keyframe_id: int, others: Indices) -> Matrices:
+        """As `PoseGraph.covariances`."""
+        return self._graph.covariances(keyframe_id + 1, others + 1)
+
+    def agree(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
+        """As `add_closure`."""
+        raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 
     def place(self, placement: Placement) -> None:
         """Place a keyframe in the map; takes effect in the next optimisation."""

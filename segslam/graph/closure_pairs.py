@@ -67,8 +67,8 @@ def pairwise_chi2(
     targets, sources = np.array([(edge.a, edge.b) for edge in closures]).T.copy()
     T_world_moved = T_world[targets] @ np.array([edge.T_a_b for edge in closures])
     T_world_drifted = T_world_moved @ np.linalg.inv(T_world[sources])  # the drift that each closure measures
-    own = _carried(T_world_moved, closures)
-    summed = np.cumsum(np.concatenate([np.zeros((1, 6, 6)), _carried(T_world[1:], odometry)]), axis=0)
+    own = carried(T_world_moved, closures)
+    summed = np.cumsum(np.concatenate([np.zeros((1, 6, 6)), carried(T_world[1:], odometry)]), axis=0)
     chi2 = np.zeros((len(closures), len(closures)))
     inverses, turns = np.linalg.inv(T_world_drifted), adjoints(T_world_drifted)
     _fill(T_world_drifted, inverses, turns, own, summed, sources, targets, enough, chi2)
@@ -102,7 +102,7 @@ def adjoints(T_a_b: Transforms) -> Matrices:
     return whole
 
 
-def _carried(T_world_end: Transforms, edges: Sequence[Edge]) -> Matrices:
+def carried(T_world_end: Transforms, edges: Sequence[Edge]) -> Matrices:
     """Covariances of edges in the world frame, at their second vertices."""
     turns = adjoints(T_world_end)
     return turns @ np.linalg.inv(np.array([edge.information for edge in edges])) @ turns.transpose(0, 2, 1)

@@ -6,20 +6,15 @@ ruins the map. Such a loop is closed only if several keyframes, along some metre
 poses are consistent with the odometry between them.
 """
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
-from segslam.core import geometry
-from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
+from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason
 from segslam.graph import Graph
 
 MIN_CONSISTENT, MIN_SPREAD_M = 3, 5.0
 """Chosen: number of keyframes that must be consistent, and travel between the first and the last."""
 WAITING_M = 40.0
 """Chosen: travel after which an unconfirmed registration is dropped."""
-SAME_M, SAME_SHARE, SAME_RAD = 0.5, 0.05, math.radians(2.0)
-"""Chosen: largest difference of motions between consistent registrations; constant (m), and per metre between them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,9 +28,8 @@ class Unconfirmed:
 class Confirmation:
     """The registrations that are not yet confirmed, and their confirmation by later ones."""
 
-    def __init__(self, graph: Graph, T_odom_keyframe: Callable[[int], Transform]) -> None:
-        """`T_odom_keyframe`: pose of a keyframe by odometry."""
-        self._graph, self._T_odom = graph, T_odom_keyframe
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
         self._waiting: list[Unconfirmed] = []
 
     def is_waiting(self, keyframe_id: int) -> bool:
@@ -47,13 +41,14 @@ class Confirmation:
     def attempts(
         self, candidate: LoopCandidate, closure: LoopClosure, seconds: dict[str, float]
     ) -> tuple[LoopAttempt, ...]:
-        """The closures of a registration and of all that confirm it; one UNCONFIRMED attempt if these are too few."""
+        """The closures of a registration and of all that confirm it; one UNCONFIRMED attempt if these are too few.
+
+        If they confirm each other, the noise of an odometry that contradicts them is increased.
+        """
         newest = Unconfirmed(closure, candidate)
-        consistent = (
-            [one for one in self._waiting if self._are_consistent(one, newest)]
-            if self.is_waiting(closure.source_id)
-            else []
-        )
+        waiting = self._waiting if self.is_waiting(closure.source_id) else []
+        agree = self._graph.agree(closure, [one.closure for one in waiting])
+        consistent = [one for one, agrees in zip(waiting, agree, strict=True) if agrees]
         sources = {one.closure.source_id for one in consistent} - {closure.source_id}
         if (
             len(sources) + 1 < MIN_CONSISTENT
@@ -63,20 +58,11 @@ class Confirmation:
             shown = f"{len(sources)} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
             return (LoopAttempt(candidate, Rejected(RejectReason.UNCONFIRMED, shown), seconds),)
         self._waiting = []
+        self._graph.weigh_odometry_by(closure)
         return (
             *(LoopAttempt(one.candidate, one.closure, {}) for one in consistent),
             LoopAttempt(candidate, closure, seconds),
         )
-
-    def _are_consistent(self, earlier: Unconfirmed, later: Unconfirmed) -> bool:
-        """True if the motion between two keyframes is the same by their registrations and by odometry."""
-        T_world = self._graph.T_world_keyframes
-        a, b = earlier.closure, later.closure
-        T_a_b = geometry.inverse(T_world[a.target_id] @ a.T_target_source) @ T_world[b.target_id] @ b.T_target_source
-        T_odom = geometry.inverse(self._T_odom(a.source_id)) @ self._T_odom(b.source_id)
-        apart = geometry.inverse(T_odom) @ T_a_b
-        within_m = SAME_M + SAME_SHARE * abs(self._travel_m(later) - self._travel_m(earlier))
-        return geometry.distance(apart) <= within_m and geometry.angle(apart) <= SAME_RAD
 
     def _travel_m(self, one: Unconfirmed) -> float:
         return float(self._graph.travel_m[one.closure.source_id])

@@ -15,10 +15,21 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
-from segslam.core.types import GraphEstimate, Information, LoopClosure, Mask, SegslamError, Transform, Vector
+from segslam.core.types import (
+    REJECTED_WEIGHT,
+    GraphEstimate,
+    Indices,
+    Information,
+    LoopClosure,
+    Mask,
+    SegslamError,
+    Transform,
+    Vector,
+)
 from segslam.graph import noise
 from segslam.graph.adjusted import solve_adjusted, weighted_edges, without_shared_rotation
-from segslam.graph.closure_pairs import consistent_pairs, largest_consistent
+from segslam.graph.chains import Chains
+from segslam.graph.closure_pairs import Matrices, consistent_pairs, largest_consistent
 from segslam.graph.edges import (
     Edge,
     Transforms,
@@ -79,6 +90,8 @@ class PoseGraph:
         self._num_closures_in_estimate = 0
         self._weights: list[float] = []
         """Weights of the closures in the last estimate."""
+        self._chains: Chains | None = None
+        """Of the last estimate, continued by odometry; None until they are asked for."""
         self._adjusted_odometry: list[Edge] = []
         self._measured: list[Edge] = []
         """The motions and the relative poses of the last adjustment."""
@@ -157,6 +170,8 @@ class PoseGraph:
             pose = self._values.atPose3(keyframe_id - 1).compose(gtsam.Pose3(T_last_new))
         self._values.insert(keyframe_id, pose)
         self._T_world.append(pose.matrix())
+        if self._chains is not None:
+            self._chains.add(pose.matrix(), self._odometry[-1])
         self._T_odom_last = T_odom_keyframe
         self._travel_m.append(travel_m)
         self._time_s.append(np.nan if stamp_ns is None else 1e-9 * stamp_ns)
@@ -170,6 +185,28 @@ class PoseGraph:
         self._closures.append(edge)
         self._closure_factors.add(edge.factor())
         self._robust.add(edge.factor(kernel=self._kernel))
+
+    def covariances(self, keyframe_id: int, others: Indices) -> Matrices:
+        """(k, 6, 6) covariance of the pose of a keyframe in each of others, as a tangent of the keyframe.
+
+        By the shortest chain of odometry and of the loops that the last estimate kept (`Chains`).
+        """
+        if self._chains is None:
+            kept = [
+                closure
+                for closure, weight in zip(self._closures, self._weights, strict=False)  # newer ones have no weight yet
+                if weight >= REJECTED_WEIGHT
+            ]
+            self._chains = Chains(self.T_world_keyframes, self._kept_odometry(), kept)
+        return self._chains.covariances(keyframe_id, others)
+
+    def agree(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
+        """(k,) which other closures are consistent with one and the odometry between their ends.
+
+        None of them needs to be in the graph, but their keyframes must be.
+        """
+        edges = [self._edge(one) for one in (closure, *others)]
+        return consistent_pairs(self._kept_odometry(), edges, self._inlier_bound)[0, 1:]
 
     def consistent(self, closures: Sequence[LoopClosure]) -> Mask:
         """(k,) the largest subset in which every two closures are consistent with the odometry between their ends.
@@ -319,6 +356,7 @@ class PoseGraph:
 
     def _rebuild_backbone(self) -> None:
         self._backbone = joined(self._prior(), factor_graph(self._kept_odometry()))
+        self._chains = None
 
     def _optimize(self, tolerance: float) -> GraphEstimate:
         factors, start = joined(self._backbone, self._robust), self._linked()
@@ -345,6 +383,7 @@ class PoseGraph:
         """Store values that include all closures so far."""
         self._values = values
         self._T_world = Rows(poses_by_id(values))
+        self._chains = None
         self._num_closures_in_estimate = len(self._closures)
 
     def _estimate(self, error: float, weights: Iterable[float]) -> GraphEstimate:

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
-from segslam.core.types import Information, Transform
+from segslam.core.types import Information, Tangent, Transform
 from segslam.graph.edges import Kernel
 
 TURN_M = 5.0
@@ -77,10 +77,14 @@ def closure_information(information: Information) -> Information:
     """
     if not is_positive_semidefinite(information):
         raise ValueError("the information of a closure must be finite, symmetric and positive semidefinite")
-    sigmas = geometry.tangent(rotation_rad=math.radians(CLOSURE_SIGMA_DEG), translation_m=CLOSURE_SIGMA_M)
-    least = np.diag(sigmas**-2.0)
+    least = np.diag(closure_sigmas() ** -2.0)
     total = information @ np.linalg.solve(information + least, least)  # inverse(inverse(I) + inverse(L)), I may be flat
     return (total + total.T) / 2 + 1e-10 * least
+
+
+def closure_sigmas() -> Tangent:
+    """Smallest standard deviations of any closure."""
+    return geometry.tangent(rotation_rad=math.radians(CLOSURE_SIGMA_DEG), translation_m=CLOSURE_SIGMA_M)
 
 
 def is_positive_semidefinite(matrix: Information) -> bool:

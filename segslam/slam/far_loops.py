@@ -10,26 +10,23 @@ from functools import partial
 import numpy as np
 
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature
-from segslam.candidates.proximity import BREAK_TRAVEL_M, search_radius_m
-from segslam.core import geometry
+from segslam.candidates.proximity import Nearness, nearness
 from segslam.core.config import Config
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
 from segslam.graph import Graph
 from segslam.graph.confirmation import Confirmation
 from segslam.registration.prepared import PreparedScan
-from segslam.slam.recognition import recognise
+from segslam.slam.recognition import ELSEWHERE_M, recognise
 
 MIN_SCORE = 0.6
 """Chosen on the real places of KITTI 05: 97 % of the revisits are more similar, 99 % of other best places less."""
-MOST_DRIFT, LEAST_REACH_M = 0.25, 15.0
-"""Chosen: largest error of the odometry, as a share of the travel, and constant."""
+MOST_DRIFT = 0.25
+"""Chosen: largest error of the odometry, as a share of the travel."""
 NUM_LISTED = 5
 """Chosen: number of the most similar places whose distance is compared with the largest drift of the odometry."""
 RETRY_M = 4.0
 """Chosen: travel after a rejection until the next attempt, unless a registration waits for confirmation."""
-NEAR_M = 10.0
-"""Chosen: places nearer to the predicted position than this are left to the search by distance (`proximity`)."""
 
 
 class FarLoops:
@@ -71,7 +68,12 @@ class FarLoops:
             self._prepared,
             lambda number: self._graph.T_world_keyframes[number],
             config=self._config,
-            gate=lambda place_id: partial(_not_far, candidate=candidate, expected_m=self._expected_m(candidate)),
+            gate=lambda place_id: partial(
+                _not_far,
+                candidate=candidate,
+                reach_m=self._reach_m(candidate),
+                expected_m=float(self._nearness(keyframe_id, candidate.target_id).reach_m[0]),
+            ),
             watch=own,
         )
         for stage, seconds in own.seconds.items():
@@ -96,39 +98,31 @@ class FarLoops:
             for one in listed
             if one.score >= MIN_SCORE and (keyframe_id, one.place_id) not in self._forbidden
         ]
-        return next(
-            (one for one in candidates if NEAR_M <= one.distance_m <= one.search_radius_m + NEAR_M),
-            None,
-        )
+        elsewhere = (one for one in candidates if ELSEWHERE_M <= one.distance_m <= self._reach_m(one) + ELSEWHERE_M)
+        return next(elsewhere, None)
 
     def candidate(self, keyframe_id: int, target_id: int) -> LoopCandidate:
-        """A loop between these two, within the largest drift."""
-        T_world = self._graph.T_world_keyframes
-        T_target_source = geometry.inverse(T_world[target_id]) @ T_world[keyframe_id]
-        chain_m = float(self._graph.travel_m[keyframe_id] - self._graph.travel_m[target_id])
-        reach_m = BREAK_TRAVEL_M if chain_m >= BREAK_TRAVEL_M else max(MOST_DRIFT * chain_m, LEAST_REACH_M)
-        return LoopCandidate(
-            keyframe_id,
-            target_id,
-            T_target_source,
-            distance_m=geometry.distance(T_target_source),
-            search_radius_m=reach_m,
-            chain_m=chain_m,
-        )
+        """A loop between these two."""
+        return self._nearness(keyframe_id, target_id).candidate(0)
 
-    def _expected_m(self, candidate: LoopCandidate) -> float:
-        """Largest distance from the prior that the search by distance accepts (m)."""
-        return float(search_radius_m(np.array([candidate.chain_m]), config=self._config.proximity)[0])
+    def _nearness(self, keyframe_id: int, target_id: int) -> Nearness:
+        radius_m = self._config.proximity.base_radius_m
+        T_world = self._graph.T_world_keyframes
+        return nearness(keyframe_id, np.array([target_id]), T_world, self._graph.covariances, radius_m=radius_m)
+
+    def _reach_m(self, candidate: LoopCandidate) -> float:
+        """Largest drift between the two keyframes (m)."""
+        travel_m = self._graph.travel_m
+        return MOST_DRIFT * float(travel_m[candidate.source_id] - travel_m[candidate.target_id])
 
 
 def _not_far(
-    T_target_source: Transform, *, candidate: LoopCandidate, expected_m: float, slack_m: float
+    T_target_source: Transform, *, candidate: LoopCandidate, reach_m: float, expected_m: float, slack_m: float
 ) -> Rejected | None:
-    """Rejects poses beyond the largest drift, and poses near the prior, which the search by distance tries."""
+    """Rejects poses beyond the largest drift, and poses as predicted of places that are surely not near."""
     off_m = float(np.linalg.norm(T_target_source[:3, 3] - candidate.T_target_source_prior[:3, 3]))
-    if off_m > candidate.search_radius_m + slack_m:
-        return Rejected(RejectReason.FAR_FROM_PRIOR, f"distance {off_m:.1f} m > {candidate.search_radius_m:.1f} m")
-    is_expected = off_m + slack_m < expected_m < candidate.distance_m and candidate.chain_m < BREAK_TRAVEL_M
-    if is_expected:
+    if off_m > reach_m + slack_m:
+        return Rejected(RejectReason.FAR_FROM_PRIOR, f"distance {off_m:.1f} m > {reach_m:.1f} m")
+    if off_m + slack_m < expected_m < candidate.distance_m:
         return Rejected(RejectReason.FAR_FROM_PRIOR, f"near the predicted position, {candidate.distance_m:.1f} m away")
     return None

@@ -2,17 +2,17 @@
 
 import math
 from collections.abc import Callable, Iterator
-from functools import lru_cache, partial
+from functools import lru_cache
 from time import monotonic
 
 from segslam.candidates import PlaceSignature, signature_of
-from segslam.candidates.prior import far_from_prior
-from segslam.candidates.proximity import BREAK_TRAVEL_M, ProximityDetector
+from segslam.candidates.proximity import ProximityDetector
 from segslam.core.config import Config
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.threads import at_once
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import Graph
+from segslam.graph.chains import far_from_prior
 from segslam.graph.confirmation import Confirmation
 from segslam.keyframes.keyframes import Clouds
 from segslam.keyframes.submaps import Submaps
@@ -21,6 +21,7 @@ from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops
 from segslam.slam.loop_edits import LoopEdits
 from segslam.verification import register_near, register_prepared
+from segslam.verification.score import MOST_LOG_ODDS, shipped
 
 NO_EDITS = LoopEdits()
 NUM_PREPARED = 64
@@ -50,7 +51,7 @@ class LoopCloser:
         self._detector = ProximityDetector(config.proximity)
         self.submaps = Submaps(config, clouds, labeller, lambda: graph.travel_m)
         self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
-        self._confirmation = Confirmation(graph, lambda number: self.submaps.T_odom[number])
+        self._confirmation = Confirmation(graph)
         self._far = FarLoops(config, graph, self._prepared, self._confirmation, edits.forbidden)
         self._tried: set[tuple[int, int]] = set(edits.forbidden)
         self._unsearched: set[int] = set()
@@ -84,7 +85,11 @@ class LoopCloser:
         """
         with watch("propose"):
             candidates = self._detector.candidates(
-                keyframe_id, self._graph.T_world_keyframes, self._graph.travel_m, below=below
+                keyframe_id,
+                self._graph.T_world_keyframes,
+                self._graph.travel_m,
+                self._graph.covariances,
+                below=below,
             )
         by_hand = [self._far.candidate(keyframe_id, target_id) for target_id in self._edits.targets(keyframe_id)]
         new = [c for c in (*by_hand, *candidates) if (c.source_id, c.target_id) not in self._tried]
@@ -111,13 +116,10 @@ class LoopCloser:
                 return
 
     def _far_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        """Loops found by place recognition; the noise of contradicting odometry is increased."""
+        """Loops found by place recognition."""
         if not self._config.retrieval.enabled:
             return ()
         attempts = self._far.attempt(keyframe_id, watch)
-        closures = [attempt.outcome for attempt in attempts if isinstance(attempt.outcome, LoopClosure)]
-        if closures:
-            self._graph.weigh_odometry_by(closures[-1])
         self._take(attempts)
         return attempts
 
@@ -166,13 +168,28 @@ class LoopCloser:
         if isinstance(outcome, Rejected):
             return (LoopAttempt(candidate, outcome, own.seconds),)
         closure = LoopClosure.of(candidate.source_id, candidate.target_id, outcome)
-        if candidate.chain_m >= BREAK_TRAVEL_M and not is_known and not is_by_hand:
-            return self._confirmation.attempts(candidate, closure, own.seconds)
-        return (LoopAttempt(candidate, closure, own.seconds),)
+        if is_known or is_by_hand or self._is_certain(candidate, outcome):
+            return (LoopAttempt(candidate, closure, own.seconds),)
+        return self._confirmation.attempts(candidate, closure, own.seconds)
 
     def _near_prior(self, candidate: LoopCandidate) -> Gate:
-        R_world_target = self._graph.T_world_keyframes[candidate.target_id][:3, :3]
-        return partial(far_from_prior, candidate=candidate, R_world_target=R_world_target)
+        """Excludes poses that even a drift far beyond the noise of the odometry cannot explain."""
+        radius_m, allowance = self._config.proximity.base_radius_m, self._config.graph.error_allowance
+        return lambda T_target_source, *, slack_m: far_from_prior(
+            T_target_source, candidate, error_allowance=allowance, slack_m=radius_m + slack_m
+        )
+
+    def _is_certain(self, candidate: LoopCandidate, found: Alignment) -> bool:
+        """True for a pose that the motions and loops between two keyframes allow, and that is probable with them.
+
+        Where it is improbable that the two are near each other, the pose of a place that looks the same is likely.
+        """
+        allowance = self._config.graph.error_allowance
+        if far_from_prior(found.T_target_source, candidate, error_allowance=allowance, slack_m=0.0) is not None:
+            return False
+        own = min(sum(found.evidence.values()), MOST_LOG_ODDS)
+        prior = math.log(max(candidate.near_probability, 1e-300))
+        return own + prior >= shipped().least_odds(self._config.verify)
 
 
 def _once_each(candidates: list[LoopCandidate]) -> list[LoopCandidate]:

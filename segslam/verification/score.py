@@ -27,6 +27,13 @@ LEAST_SCATTER = 1.0
 """Least standard deviation of the sum over all patches (nats), of poses that show the same."""
 
 
+MISLED = 0.002
+"""Share of the poses that are right or wrong for a reason that no patch shows, such as a place that looks the same.
+Chosen: without it one pose at a wrong height decides all weights."""
+MOST_LOG_ODDS = math.log((1.0 - MISLED) / MISLED)
+"""Log odds of a pose of which scans alone cannot make more certain."""
+
+
 class Judged(NamedTuple):
     """How probable a pose is."""
 

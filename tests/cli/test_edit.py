@@ -36,7 +36,7 @@ def test_an_added_loop_is_registered_though_no_search_proposes_it(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     newer, older = max(_closures(log))
-    none = ["--set", "proximity.base_radius_m=0.001", "--set", "proximity.drift_ratio=0", *QUICK[:2]]
+    none = ["--set", "proximity.base_radius_m=0.001", *QUICK[:2]]
     assert run("edit", log, "--add", f"{newer}:{older}", "--out", tmp_path / "edited", *none) == 0
     assert f"added {newer}:{older}: accepted, probability" in capsys.readouterr().err
     assert _closures(tmp_path / "edited" / "log.mcap") == {(newer, older)}

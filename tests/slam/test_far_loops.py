@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.drives import drifting, round_drive
 
+from segslam.candidates.proximity import LEAST_PROBABILITY
 from segslam.core import geometry
 from segslam.core.config import OdometryConfig, load_config
 from segslam.core.types import (
@@ -86,7 +87,7 @@ def test_a_drive_whose_odometry_is_far_off_closes_by_place_recognition() -> None
 
 def test_one_keyframe_alone_closes_no_far_loop() -> None:
     _, tried = mapped_and_tried(FAR_DEG)
-    outcomes = [attempt.outcome for attempt in tried if attempt.candidate.search_radius_m > 20.0]
+    outcomes = [attempt.outcome for attempt in tried if attempt.candidate.near_probability < LEAST_PROBABILITY]
     first_closure = next(k for k, outcome in enumerate(outcomes) if isinstance(outcome, LoopClosure))
     unconfirmed = [
         outcome

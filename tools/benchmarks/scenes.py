@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.candidates.prior import far_from_prior
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
-from segslam.core.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
+from segslam.core.types import Alignment, LoopCandidate, Rejected, Transform
+from segslam.graph.chains import far_from_prior
 from segslam.keyframes.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
+from segslam.registration.hypotheses import Gate
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register_prepared
 from segslam.verification.patches import agreement
@@ -31,7 +32,6 @@ from tools.benchmarks.scene_models import SCENES, SENSORS, Scene, pose, scan_poi
 
 DRIFT_M, DRIFT_DEG, HEIGHT_M = 1.5, 3.0, 0.3
 """Standard deviations of the prior."""
-RADIUS_M, CHAIN_M = 8.0, 130.0
 ELSEWHERE = 100
 """Added to the seed of a scene: another one of its kind."""
 
@@ -78,12 +78,15 @@ class Judge:
     def __init__(self, config: Config) -> None:
         self._config = config
 
-    def __call__(
-        self, source: PreparedScan, target: PreparedScan, T_prior: Transform, R_world_target: Rotation
-    ) -> Alignment | Rejected:
-        candidate = LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), RADIUS_M, CHAIN_M)
-        gate = partial(far_from_prior, candidate=candidate, R_world_target=R_world_target)
-        return register_prepared(source, target, config=self._config, gate=gate)
+    def __call__(self, source: PreparedScan, target: PreparedScan, T_prior: Transform) -> Alignment | Rejected:
+        return register_prepared(source, target, config=self._config, gate=near(T_prior))
+
+
+def near(T_prior: Transform) -> Gate:
+    """The gate of a prior."""
+    sigmas = np.array([*np.radians([DRIFT_DEG] * 3), DRIFT_M, DRIFT_M, HEIGHT_M])
+    candidate = LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), np.diag(sigmas**2))
+    return partial(far_from_prior, candidate=candidate, error_allowance=1.0)
 
 
 def prior(T_target_source: Transform, rng: np.random.Generator) -> Transform:
@@ -121,7 +124,7 @@ def _true(place: Place, judge: Judge, count: int, rng: np.random.Generator, conf
         one, other = place.prepared(source, visits[0]), place.prepared(target, visits[1])
         T_true = geometry.inverse(T_target) @ T_source
         counts = agreement(one.observed, other.observed, T_true).overlap > 0.4
-        found = judge(one, other, prior(T_true, rng), T_target[:3, :3])
+        found = judge(one, other, prior(T_true, rng))
         right = isinstance(found, Alignment) and common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
         wrong += isinstance(found, Alignment) and not right
         overlapping += counts
@@ -141,9 +144,7 @@ def _false(here: Place, elsewhere: Place, judge: Judge, count: int, rng: np.rand
         visits = int(rng.integers(2)), int(rng.integers(2)) + 2
         T_source, T_target = place.pose(source, visits[0]), here.pose(target, visits[1])
         T_near = beside(here.scene, source, target, rng, is_same=place is here)
-        found = judge(
-            place.prepared(source, visits[0]), here.prepared(target, visits[1]), prior(T_near, rng), np.eye(3)
-        )
+        found = judge(place.prepared(source, visits[0]), here.prepared(target, visits[1]), prior(T_near, rng))
         if isinstance(found, Rejected):
             rejected[found.reason.value] += 1
         elif place is not here or not common.is_right(

@@ -32,7 +32,8 @@ REMOVED = {
     "map": "view_margin_m view_margin_ratio min_views moved_radius_m cell_m min_obstacle_voxels obstacle_m",
     "odometry": "stamp_tolerance_s",
     "proximity": (
-        "base_height_m height_ratio base_turn_deg turn_ratio_deg break_radius_m max_candidates spread_m min_gap_m"
+        "base_height_m height_ratio base_turn_deg turn_ratio_deg break_radius_m max_candidates "
+        "spread_m min_gap_m max_radius_m drift_ratio"
     ),
     "refine": "max_iterations max_range_m min_points information_scale shared_noise_m shared_noise_deg",
     "segregator": (

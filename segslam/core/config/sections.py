@@ -28,7 +28,7 @@ USER_SETTINGS = (
     "keyframes.distance_m",
     "keyframes.voxel_m",
     "proximity.min_travel_m",
-    "proximity.max_radius_m",
+    "proximity.base_radius_m",
     "verify.max_false_share",
     "graph.final",
     "graph.error_allowance",
@@ -131,13 +131,11 @@ class ProximityConfig(Section):
     min_travel_m: float = Field(
         50.0, ge=0, description="smallest distance travelled between the two keyframes of a loop (m) [chosen]"
     )
-    max_radius_m: float = Field(20.0, gt=0, description="largest search radius (m) [chosen on simulated drives]")
-    base_radius_m: float = Field(6.0, gt=0, description="search radius without drift (m) [chosen on simulated drives]")
-    drift_ratio: float = Field(
-        0.015,
-        ge=0,
-        description="increase of the search radius per metre travelled between the two keyframes "
-        "[chosen on KISS-ICP's drift in simulated drives]",
+    base_radius_m: float = Field(
+        6.0,
+        gt=0,
+        description="keyframes at most so far apart see the same place; drift is added to it (m) "
+        "[chosen on simulated drives]",
     )
 
 

@@ -131,7 +131,7 @@ def attempt(found: tuple[int, int, Alignment], first_id: int, target_shift: int)
     made = closure(found, first_id, target_shift)
     T_target_source = made.T_target_source
     distance_m = geometry.distance(T_target_source)
-    candidate = LoopCandidate(made.source_id, made.target_id, T_target_source, distance_m, distance_m, BREAK_TRAVEL_M)
+    candidate = LoopCandidate(made.source_id, made.target_id, T_target_source, distance_m)
     return LoopAttempt(candidate, made, {})
 
 

@@ -33,7 +33,10 @@ class Search:
     def look(self, keyframe_id: int) -> int:
         """Try new candidates of one keyframe; returns the number of closures found."""
         found = []
-        for candidate in self.detector.candidates(keyframe_id, self.graph.T_world_keyframes, self.graph.travel_m):
+        graph = self.graph
+        for candidate in self.detector.candidates(
+            keyframe_id, graph.T_world_keyframes, graph.travel_m, graph.covariances
+        ):
             pair = (keyframe_id, candidate.target_id)
             if pair in self.tried:
                 continue

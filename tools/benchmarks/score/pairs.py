@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from segslam.candidates.prior import far_from_prior
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import PoseError
 from segslam.core.stopwatch import Stopwatch
-from segslam.core.types import Alignment, LoopCandidate, Points, Rejected, Rotation, Transform
+from segslam.core.types import Alignment, Points, Rejected, Transform
 from segslam.keyframes.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.registration.hypotheses import Gate, anywhere
@@ -97,10 +96,6 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
         scenes.Place(SCENES[name](other), sensor, noise_m, other, config) for other in (seed, seed + scenes.ELSEWHERE)
     )
 
-    def gate(T_prior: Transform, R_world_target: Rotation) -> Gate:
-        candidate = LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), scenes.RADIUS_M, scenes.CHAIN_M)
-        return partial(far_from_prior, candidate=candidate, R_world_target=R_world_target)
-
     def visits() -> tuple[int, int]:
         return int(rng.integers(2)), int(rng.integers(2)) + 2
 
@@ -108,7 +103,7 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
         first, second = visits()
         T_source, T_target = here.pose(source, first), here.pose(target, second)
         T_true = geometry.inverse(T_target) @ T_source
-        prior = gate(scenes.prior(T_true, rng), T_target[:3, :3])
+        prior = scenes.near(scenes.prior(T_true, rng))
         scans = here.prepared(source, first), here.prepared(target, second)
         yield Task(name, sensor, *scans, T_true, True, prior, TRUTH)
     for number, (source, target) in enumerate(scenes.false_pairs(here.scene, count, rng)):
@@ -118,7 +113,7 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
         T_near = scenes.beside(here.scene, source, target, rng, is_same=place is here)
         T_true = geometry.inverse(here.pose(target, second)) @ place.pose(source, first)
         scans = place.prepared(source, first), here.prepared(target, second)
-        prior = gate(scenes.prior(T_near, rng), np.eye(3))
+        prior = scenes.near(scenes.prior(T_near, rng))
         yield Task(name, sensor, *scans, T_true if place is here else None, False, prior, TRUTH)
 
 

@@ -16,7 +16,7 @@ from scipy.special import expit
 from segslam.core.types import Transform, Vector
 from segslam.verification.patches import BINS, Counts, Shown, counted
 from segslam.verification.rivals import SAME_POSE_M, SAME_POSE_RAD
-from segslam.verification.score import NO_OTHER, Table, Weights, paired_lead, violating_root
+from segslam.verification.score import MISLED, NO_OTHER, Table, Weights, paired_lead, violating_root
 from segslam.verification.trial import is_near
 
 PRIOR_COUNT = 0.5
@@ -26,8 +26,6 @@ PART_WEIGHT = 100.0
 LOST = 0.03, 0.02
 """Chosen: shares of right poses that are given up as chance fits for their mean ratio, and for free space."""
 HUNDREDTHS = np.linspace(0.0, 1.0, 101)
-MISLED = 0.002
-"""Chosen: share of poses that are right or wrong for a reason that no patch shows, so that none of them decides."""
 SIGMA = 3.0
 """Normal prior of the weights, in standard deviations of what they multiply."""
 TAIL = 20

@@ -26,8 +26,10 @@ from segslam.core.types import (
     Trajectory,
 )
 from segslam.graph.batch import optimize_graph
+from segslam.graph.chains import Chains
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph
+from segslam.graph.noise import closure_information, odometry_information
 from segslam.odometry import GivenOdometry
 from segslam.output.log import LogWriter
 from segslam.output.log.drawing import Drawing
@@ -156,11 +158,18 @@ def exponent(sizes: tuple[int, ...], seconds: list[float]) -> float:
 def _propose_seconds(num_keyframes: int) -> float:
     """Of one search for candidates, with a closure on every fifth keyframe."""
     detector, poses = ProximityDetector(Config().proximity), _rounds(num_keyframes)
-    for source in range(LAP, num_keyframes, 5):
-        detector.note_closure(_closure(source, source - LAP))
+    pairs = [(source, source - LAP) for source in range(LAP, num_keyframes, 5)]
+    for pair in pairs:
+        detector.note_closure(_closure(*pair))
     detector.note_estimate({})
     travel_m = STEP_M * np.arange(num_keyframes)
-    return _timed(lambda: detector.candidates(num_keyframes - 1, poses, travel_m))
+    motions = [
+        Edge(i, i + 1, T_a_b, odometry_information(STEP_M, T_a_b, Config().graph))
+        for i, T_a_b in enumerate(np.linalg.inv(poses[:-1]) @ poses[1:])
+    ]
+    closures = [Edge(a, b, np.eye(4), closure_information(np.eye(6))) for b, a in pairs]
+    chains = Chains(poses, motions, closures)
+    return _timed(lambda: detector.candidates(num_keyframes - 1, poses, travel_m, chains.covariances))
 
 
 def _draw_seconds(num_keyframes: int) -> float:

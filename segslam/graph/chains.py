@@ -1,0 +1,133 @@
+"""How uncertain the pose of one keyframe in another is, by the motions and loops between the two.
+
+The covariance of the shortest chain of motions and loops bounds that of the whole graph from above, at the cost of one
+run of Dijkstra's algorithm over the keyframes with loops. Each link of a chain moves all that comes after it as a rigid
+body, so in the world frame the covariances of its links add up, and those of a stretch of odometry are a difference of
+two sums.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from segslam.core import geometry
+from segslam.core.types import Indices, Information, LoopCandidate, Rejected, RejectReason, Transform, Vector
+from segslam.graph import noise
+from segslam.graph.closure_pairs import Matrices, adjoints, carried
+from segslam.graph.edges import Edge, Transforms
+
+Link = tuple[float, Information]
+"""Length of a link, and its covariance in the world frame."""
+
+
+class Chains:
+    """Shortest chains between keyframes along motions and closures; a length is the variance of a link.
+
+    Chains branch at the ends of closures only, so the searched graph has no other vertices.
+    """
+
+    def __init__(self, T_world: Transforms, odometry: Sequence[Edge], closures: Sequence[Edge]) -> None:
+        """`odometry` leads from each vertex 0, 1, 2, ... to the next; `T_world` (n, 4, 4): their poses."""
+        self._T_world = T_world
+        self._summed = np.zeros((len(T_world), 6, 6))
+        self._length = np.zeros(len(T_world))
+        if odometry:
+            self._summed[1:] = np.cumsum(carried(T_world[1:], odometry), axis=0)
+            self._length[1:] = np.cumsum([_length(edge) for edge in odometry])
+        self._ends = np.unique(np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64))
+        self._links = self._linked(closures)
+        self._found: dict[int, tuple[Vector, Matrices]] = {}
+
+    def add(self, T_world: Transform, motion: Edge) -> None:
+        """Add the next vertex."""
+        own = carried(T_world[None], [motion])
+        self._T_world = np.concatenate([self._T_world, T_world[None]])
+        self._summed = np.concatenate([self._summed, self._summed[-1:] + own])
+        self._length = np.append(self._length, self._length[-1] + _length(motion))
+
+    def covariances(self, source_id: int, ids: Indices) -> Matrices:
+        """(k, 6, 6) covariance of the pose of one keyframe in each of others, as a tangent of `source_id`."""
+        length, summed = self._odometry(source_id, ids)
+        if len(self._ends):
+            starts = [self._ends[row] for row in sorted({int(row[0]) for row in self._beside(np.array([source_id]))})]
+            for row in self._beside(ids):
+                along, between = np.abs(self._length[self._ends[row]] - self._length[ids]), self._along(ids, row)
+                for start in starts:
+                    way, own = self._odometry(source_id, np.array([start]))
+                    lengths, covariances = self._from(int(start))
+                    total = way + lengths[row] + along
+                    shorter = total < length
+                    length = np.where(shorter, total, length)
+                    summed[shorter] = (own + covariances[row] + between)[shorter]
+        (turn,) = adjoints(geometry.inverse(self._T_world[source_id])[None])
+        return np.einsum("kij,lj->kil", np.einsum("ij,kjl->kil", turn, summed), turn)  # uses one thread
+
+    def _odometry(self, source_id: int, ids: Indices) -> tuple[Vector, Matrices]:
+        """Lengths and covariances along the odometry alone."""
+        later, earlier = np.maximum(source_id, ids), np.minimum(source_id, ids)
+        return self._length[later] - self._length[earlier], self._summed[later] - self._summed[earlier]
+
+    def _along(self, ids: Indices, row: Indices) -> Matrices:
+        ends = self._ends[row]
+        return self._summed[np.maximum(ends, ids)] - self._summed[np.minimum(ends, ids)]
+
+    def _beside(self, ids: Indices) -> tuple[Indices, Indices]:
+        """Rows of the closure ends before and after each keyframe; the same row twice at the margins."""
+        after = np.searchsorted(self._ends, ids)
+        return np.maximum(after - 1, 0), np.minimum(after, len(self._ends) - 1)
+
+    def _linked(self, closures: Sequence[Edge]) -> dict[tuple[int, int], Link]:
+        """The shortest link between each two neighbouring rows of ends."""
+        links: dict[tuple[int, int], Link] = {}
+        for row, (first, last) in enumerate(zip(self._ends[:-1], self._ends[1:], strict=True)):
+            links[row, row + 1] = self._length[last] - self._length[first], self._summed[last] - self._summed[first]
+        if closures:
+            own = carried(self._T_world[[edge.b for edge in closures]], closures)
+            for edge, covariance in zip(closures, own, strict=True):
+                first, last = np.searchsorted(self._ends, sorted((edge.a, edge.b))).tolist()
+                length = _length(edge)
+                if (first, last) not in links or length < links[first, last][0]:
+                    links[first, last] = length, covariance
+        return links
+
+    def _from(self, end: int) -> tuple[Vector, Matrices]:
+        """Lengths and covariances from one end to all ends, cached: successive keyframes mostly start at the same."""
+        if end not in self._found:
+            num = len(self._ends)
+            pairs = np.array(list(self._links), dtype=np.int64).reshape(-1, 2)
+            graph = coo_array(([length for length, _ in self._links.values()], tuple(pairs.T)), shape=(num, num))
+            start = int(np.searchsorted(self._ends, end))
+            lengths, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
+            covariances = np.zeros((num, 6, 6))
+            for row in np.argsort(lengths, kind="stable")[1:].tolist():
+                previous = int(before[row])
+                covariances[row] = covariances[previous] + self._links[min(row, previous), max(row, previous)][1]
+            self._found[end] = lengths, covariances
+        return self._found[end]
+
+
+def _length(edge: Edge) -> float:
+    """Variance of an edge; a radian counts as `noise.TURN_M` metres."""
+    variances = np.diag(np.linalg.inv(edge.information))
+    return float(noise.TURN_M**2 * variances[:3].sum() + variances[3:].sum())
+
+
+def far_from_prior(
+    T_target_source: Transform, candidate: LoopCandidate, *, error_allowance: float, slack_m: float
+) -> Rejected | None:
+    """Rejects with FAR_FROM_PRIOR a pose that contradicts the motions and loops between two keyframes; None otherwise.
+
+    It is the test that a loop has to pass in the graph (`noise.inlier_bound`). `slack_m`: distance by which refinement
+    may still move the pose; a radian counts as `noise.TURN_M` metres.
+    """
+    bound = noise.inlier_bound(noise.INLIER_PROBABILITY, error_allowance=error_allowance)
+    slack = geometry.tangent(rotation_rad=slack_m / noise.TURN_M, translation_m=slack_m) ** 2 / bound
+    off = geometry.log(geometry.inverse(candidate.T_target_source_prior) @ T_target_source)
+    covariance = candidate.covariance + np.diag(noise.closure_sigmas() ** 2 + slack)
+    chi2 = float(off @ np.linalg.solve(covariance, off))
+    if chi2 <= bound:
+        return None
+    away = f"{np.linalg.norm(off[3:]):.1f} m and {np.degrees(np.linalg.norm(off[:3])):.0f} degrees"
+    return Rejected(RejectReason.FAR_FROM_PRIOR, f"{away} from the predicted pose, chi-square {chi2:.0f} > {bound:.0f}")

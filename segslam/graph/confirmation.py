@@ -1,9 +1,9 @@
-"""Loops without a useful prior wait until others confirm them.
+"""Loops that the prior does not support wait until others confirm them.
 
-A single registration may be wrong, because places repeat. Where the odometry predicts the pose, the prior and the other
-closures exclude such errors; after much drift, and across a break of the odometry, nothing does, and one wrong loop
-ruins the map. Such a loop is closed only if several keyframes, along some metres of travel, are registered, and their
-poses are consistent with the odometry between them.
+A single registration may be wrong, because places repeat. Where the graph predicts the pose, the prior excludes such
+errors; after much drift, and across a break of the odometry, nothing does, and one wrong loop ruins the map. Such a
+loop, and one that contradicts its prior, is closed only if several keyframes, along some metres of travel, are
+registered, and their poses are consistent with the odometry between them.
 """
 
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class Confirmation:
         """
         newest = Unconfirmed(closure, candidate)
         waiting = self._waiting if self.is_waiting(closure.source_id) else []
-        agree = self._graph.agree(closure, [one.closure for one in waiting])
+        agree = self._graph.agree(closure, [one.closure for one in waiting]) if waiting else ()
         consistent = [one for one, agrees in zip(waiting, agree, strict=True) if agrees]
         sources = {one.closure.source_id for one in consistent} - {closure.source_id}
         if (

@@ -105,7 +105,7 @@ def _attempt(place: int, T_world_keyframe: np.ndarray) -> LoopAttempt:
     """Even keyframes close, odd ones are rejected, and so are the last two; the closure of 56 is 3 m off."""
     pair = (place, place - 50)
     T_target_source = geometry.inverse(T_world_keyframe[pair[1]]) @ T_world_keyframe[pair[0]]
-    candidate = LoopCandidate(*pair, T_target_source, geometry.distance(T_target_source), 6.0)
+    candidate = LoopCandidate(*pair, T_target_source, geometry.distance(T_target_source))
     if place % 2 or place >= 58:
         reason = RejectReason.SMALL_CLIQUE if place % 2 else RejectReason.LOW_OVERLAP
         return LoopAttempt(candidate, Rejected(reason, "3 < 5"), {"match": 0.01})

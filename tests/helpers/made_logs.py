@@ -67,7 +67,7 @@ def made_steps(num_steps: int, seed: int = 0) -> Iterator[Step]:
             poses[keyframe.id] = pose(rng)
         if keyframe is not None and keyframe.id >= 10:
             pair = (keyframe.id, keyframe.id - 10)
-            candidate = LoopCandidate(*pair, pose(rng), 3.3, 7.1)
+            candidate = LoopCandidate(*pair, pose(rng), 3.3, 7.1 * np.eye(6), 0.9)
             accepted = keyframe.id % 3 == 0
             outcome = _closure(rng, *pair) if accepted else Rejected(RejectReason.LOW_OVERLAP, "0.31 < 0.5")
             attempts = (LoopAttempt(candidate, outcome, {"match": 0.021, "refine": 0.032}),)

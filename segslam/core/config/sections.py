@@ -143,7 +143,8 @@ class RetrievalConfig(Section):
     """Loop closing by place recognition, independent of drift."""
 
     enabled: bool = Field(
-        True, description="search loops also outside the search radius of proximity, by similarity of places [chosen]"
+        True,
+        description="search loops also where the poses do not show which keyframes are near, by similarity of places [chosen]",
     )
 
 

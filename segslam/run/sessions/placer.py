@@ -16,8 +16,9 @@ from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.stopwatch import Stopwatch
-from segslam.core.types import Placement, Rejected, RejectReason, Transform
+from segslam.core.types import LoopCandidate, Placement, Rejected, RejectReason, Transform
 from segslam.graph import AnchoredGraph
+from segslam.graph.chains import far_from_prior
 from segslam.keyframes.submaps import Submaps
 from segslam.registration import refinement
 from segslam.registration.prepared import Observed, prepare_observed
@@ -29,17 +30,10 @@ REACH_M = 12.0
 """Chosen: the map's keyframes within this distance of a prediction are used for registration."""
 NUM_TRIED, APART_M = 2, 4.0
 """Chosen: largest number of these, nearest first, and smallest distance between them."""
-BASE_M, DRIFT = 0.8, 0.02
-"""Chosen: largest correction of a prediction by registration, constant and as a share of the travel since the last."""
-BASE_RAD, DRIFT_RAD_PER_M = np.radians(3.0), np.radians(0.03)
-MOST_M, MOST_RAD = 2.0, np.radians(10.0)
-"""Chosen: largest initial error from which refinement converges."""
 SEARCH_AFTER_M = 20.0
 """Chosen: travel without a placement after which the place is searched without initial guess."""
 SEARCH_EVERY_M = 4.0
 """Chosen: travel between two such searches, each of which takes some tenths of a second."""
-AGREE_M, AGREE_RAD = 1.0, np.radians(4.0)
-"""Chosen: tolerance of two consistent locations, in addition to the drift between them."""
 REMEMBERED_M = 60.0
 """Chosen: travel within which a second location must be found."""
 NUM_PREPARED = 64
@@ -66,7 +60,7 @@ class Placer:
         why = Rejected(RejectReason.NO_PLACE, "not found yet")
         since_m = np.inf if self._last is None else travel_m[keyframe_id] - travel_m[self._last.keyframe_id]
         if since_m < BREAK_TRAVEL_M:
-            tracked = self._tracked(keyframe_id, float(since_m), watch)
+            tracked = self._tracked(keyframe_id, watch)
             if isinstance(tracked, Placement):
                 return self._taken((tracked,)), None
             why = tracked
@@ -82,7 +76,7 @@ class Placer:
         place = Placement(keyframe_id, target_id, found.T_world_lidar, fine.information, found.alignment, is_found=True)
         return self._confirmed(place)
 
-    def _tracked(self, keyframe_id: int, since_m: float, watch: Stopwatch) -> Placement | Rejected:
+    def _tracked(self, keyframe_id: int, watch: Stopwatch) -> Placement | Rejected:
         """The keyframe registered with the nearest ones of the map, starting at the odometry's prediction."""
         assert self._last is not None
         T_world_predicted = self._last.T_world_keyframe @ self._motion(self._last.keyframe_id, keyframe_id)
@@ -98,7 +92,7 @@ class Placer:
                 break
             if all(distance_m >= APART_M for distance_m in near):
                 tried.append(target_id)
-                outcome = self._registered(keyframe_id, own, target_id, T_world_predicted, since_m, watch)
+                outcome = self._registered(keyframe_id, own, target_id, T_world_predicted, watch)
                 if isinstance(outcome, Placement):
                     break
         return outcome
@@ -109,7 +103,6 @@ class Placer:
         own: Observed,
         target_id: int,
         T_world_predicted: Transform,
-        since_m: float,
         watch: Stopwatch,
     ) -> Placement | Rejected:
         with watch("prepare"):
@@ -122,18 +115,17 @@ class Placer:
             )
         if isinstance(fine, Rejected):
             return fine
-        moved = geometry.inverse(T_target_predicted) @ fine.T_target_source
-        most_m, most_rad = BASE_M + DRIFT * since_m, BASE_RAD + DRIFT_RAD_PER_M * since_m
-        if not _within(moved, min(most_m, MOST_M), min(most_rad, MOST_RAD)):
-            detail = f"{geometry.distance(moved):.1f} m, {np.degrees(geometry.angle(moved)):.1f} degrees"
-            return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
+        T_world_keyframe = T_world_target @ fine.T_target_source
+        assert self._last is not None
+        contradiction = self._contradiction(self._last, keyframe_id, T_world_keyframe)
+        if contradiction is not None:
+            return contradiction
         with watch("verify"):
             found = agreement(own, target, fine.T_target_source)
         coarse = replace(fine, T_target_source=T_target_predicted, num_inliers=0, num_correspondences=0)
         alignment = judged(coarse, fine, found, None, config=self._config)
         if isinstance(alignment, Rejected):
             return alignment
-        T_world_keyframe = T_world_target @ fine.T_target_source
         return Placement(keyframe_id, target_id, T_world_keyframe, fine.information, alignment, is_found=False)
 
     def _confirmed(self, found: Placement) -> tuple[tuple[Placement, ...], Rejected | None]:
@@ -152,9 +144,17 @@ class Placer:
         way_m = float(travel_m[later.keyframe_id] - travel_m[earlier.keyframe_id])
         if way_m >= within_m:
             return False
-        T_earlier_later = self._motion(earlier.keyframe_id, later.keyframe_id)
-        off = geometry.inverse(earlier.T_world_keyframe @ T_earlier_later) @ later.T_world_keyframe
-        return _within(off, AGREE_M + DRIFT * way_m, AGREE_RAD + DRIFT_RAD_PER_M * way_m)
+        return self._contradiction(earlier, later.keyframe_id, later.T_world_keyframe) is None
+
+    def _contradiction(self, earlier: Placement, keyframe_id: int, T_world_keyframe: Transform) -> Rejected | None:
+        """Rejects a pose that contradicts an earlier placement and the odometry since."""
+        T_earlier_later = self._motion(earlier.keyframe_id, keyframe_id)
+        (covariance,) = self._graph.covariances(keyframe_id, np.array([earlier.keyframe_id]))
+        moved_m = geometry.distance(T_earlier_later)
+        prior = LoopCandidate(keyframe_id, earlier.keyframe_id, T_earlier_later, moved_m, covariance)
+        T_earlier_found = geometry.inverse(earlier.T_world_keyframe) @ T_world_keyframe
+        allowance = self._config.graph.error_allowance
+        return far_from_prior(T_earlier_found, prior, error_allowance=allowance, slack_m=0.0)
 
     def _taken(self, placements: tuple[Placement, ...]) -> tuple[Placement, ...]:
         for placement in placements:
@@ -168,7 +168,3 @@ class Placer:
     def _seen(self, submaps: Submaps, keyframe_id: int) -> Observed:
         submap = submaps.submap(keyframe_id)
         return prepare_observed(submap.points, submap.labels, config=self._config, seen_from_here=submap.seen_from_here)
-
-
-def _within(T: Transform, most_m: float, most_rad: float) -> bool:
-    return geometry.distance(T) <= most_m and bool(geometry.angle(T) <= most_rad)

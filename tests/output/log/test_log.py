@@ -140,9 +140,9 @@ def test_a_log_whose_records_have_other_fields_and_reasons_is_read(
     own = schema.json_schemas()
     older = deepcopy(own[schema.STEP])
     candidate = older["properties"]["attempts"]["items"]["properties"]["candidate"]
-    del candidate["properties"]["chain_m"]
+    del candidate["properties"]["near_probability"]
     candidate["properties"]["shape"] = {"type": "string"}
-    assert "chain_m" not in candidate["required"]
+    assert "near_probability" not in candidate["required"]
     outcomes = older["properties"]["attempts"]["items"]["properties"]["outcome"]["properties"]
     outcomes["Rejected"]["properties"]["reason"]["enum"].append("inconsistent")
     with monkeypatch.context() as writing:
@@ -152,10 +152,10 @@ def test_a_log_whose_records_have_other_fields_and_reasons_is_read(
 
 
 def test_a_default_stands_for_a_field_that_a_log_does_not_have() -> None:
-    written = codec(LoopCandidate).encode(LoopCandidate(5, 1, np.eye(4), 3.0, 6.0, chain_m=70.0))
-    assert codec(LoopCandidate).decode(written, {}).chain_m == 70.0
-    del written["chain_m"]
-    assert codec(LoopCandidate).decode(written, {}).chain_m == 0.0
+    written = codec(LoopCandidate).encode(LoopCandidate(5, 1, np.eye(4), 3.0, near_probability=0.4))
+    assert codec(LoopCandidate).decode(written, {}).near_probability == 0.4
+    del written["near_probability"]
+    assert codec(LoopCandidate).decode(written, {}).near_probability == 1.0
 
 
 @pytest.mark.parametrize(

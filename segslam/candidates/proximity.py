@@ -1,6 +1,6 @@
 """Loop candidates by distance: older keyframes that are probably near the newest one, but far in travel.
 
-How probable that is follows from the poses of the graph and their covariance. Where it says little, after much drift or
+The poses of the graph and their covariance show how probable that is. Where that is little, after much drift or
 across a break of the odometry, similar places are searched instead (`places`).
 """
 

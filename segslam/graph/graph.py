@@ -91,7 +91,7 @@ class PoseGraph:
         self._weights: list[float] = []
         """Weights of the closures in the last estimate."""
         self._chains: Chains | None = None
-        """Of the last estimate, continued by odometry; None until they are asked for."""
+        """Of the last estimate, continued by odometry; None before the first use."""
         self._adjusted_odometry: list[Edge] = []
         self._measured: list[Edge] = []
         """The motions and the relative poses of the last adjustment."""

@@ -116,7 +116,7 @@ def test_a_place_out_of_the_radius_is_proposed_as_far_as_the_drift_makes_it_prob
         (4.0, 14.0, True),
         (4.0, 16.0, False),
         (30.0, 2.0, True),
-        (60.0, 0.0, False),  # it says next to nothing about the place
+        (60.0, 0.0, False),  # the place is almost unknown
     ):
         poses, travel = square(ROUND + 13)
         poses[:, 1, 3] = 0.0

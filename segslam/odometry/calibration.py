@@ -30,14 +30,17 @@ from segslam.registration.refinement import Surface, downsample, make_surface
 PointsOf = Callable[[int], Points]
 """Returns the points of a keyframe, by id, in its own frame."""
 
-APART_M = (6.0, 10.0, 14.0, 20.0, 30.0)
-"""Travel between the two scans of a pair, in turn. Chosen on KITTI 00: each distance has an error of its own, which
-depends on the density (dense scans: 0.17 to 0.19 degrees, thinned ones: 0.12 to 0.20)."""
+APART_M = (20.0, 30.0)
+"""Travel between the two submaps of a pair, in turn. Chosen on KITTI 00, thin and dense scans, where the angles are
+0.19 degrees at 20 and 30 m, 0.16 to 0.18 at 10 m. Single scans have 0.11 to 0.19, depending on the distance: the rings
+of two of them may lie on each other."""
+REACH = 2
+"""Number of keyframes before and after one in its submap; those nearer than half of the way to the other submap."""
 MOST_APART = 1.5
 """Pairs are dropped if their straight distance is less than their travel divided by this, or more than their travel
 times this: the sensor stood still, or keyframes are missing."""
-MOST_PAIRS = 200
-"""Number of pairs measured. Chosen: 8 s of one core, whatever the length of the drive."""
+MOST_PAIRS = 100
+"""Number of pairs measured, twice. Chosen: 10 s of one core, whatever the length of the drive."""
 MIN_PAIRS = 8
 """Chosen: the scatter of fewer pairs is too uncertain."""
 MOST_TURN_RAD = math.radians(30.0)
@@ -58,11 +61,10 @@ LEVEL_NORMAL_Z, STANDING_NORMAL_Z = 0.95, 0.15
 MIN_PAIRED = 500
 """Chosen: fewer matching points do not come from a dense scan of a street."""
 MOST_SIGMA_DEG = 0.05
-"""Pairs with a larger standard deviation of the angle, from their residuals, are dropped. Chosen: 0.02 for KITTI's
-pairs, 0.07 or more for downsampled clouds of 32 beams."""
+"""Pairs with a larger standard deviation of the angle, from their residuals, are dropped. Chosen: 0.01 for KITTI's
+submaps, 0.02 for those of 32 beams."""
 BIAS_DEG = 0.03
-"""Standard deviation added to that of the median. Chosen: the medians on KITTI 00 scatter so for 6 to 30 m between
-the scans."""
+"""Standard deviation added to that of the median. Chosen: the medians on KITTI 00 scatter less for 20 and 30 m."""
 SIGNIFICANT_SIGMAS, SIGNIFICANT_DEG = 2.5, 0.05
 
 
@@ -106,11 +108,49 @@ def measure_vertical_angle(
     *,
     config: RefineConfig,
 ) -> VerticalAngle | None:
-    """The median over pairs of keyframes that are some metres apart; None if too few pairs determine the angle."""
+    """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
+
+    A submap of distorted scans hides a part of their angle. What is left is therefore measured again with scans that
+    are corrected by the first result: it falls in proportion to the correction.
+    """
+    at_first = angle_left(points_of, T_odom_keyframes, travel_m, 0.0, config=config)
+    if at_first is None or abs(at_first.angle_deg) < at_first.sigma_deg:
+        return at_first
+    at_last = angle_left(points_of, T_odom_keyframes, travel_m, at_first.angle_deg, config=config)
+    return None if at_last is None else without_rest(at_first, at_first.angle_deg, at_last)
+
+
+def without_rest(at_first: VerticalAngle, correction_deg: float, at_last: VerticalAngle) -> VerticalAngle | None:
+    """The correction that leaves no angle, from what is left without one and with another; None if it does not fall."""
+    share = (at_first.angle_deg - at_last.angle_deg) / correction_deg
+    if share <= 0.0:
+        return None
+    angle_deg = correction_deg + at_last.angle_deg / share
+    return VerticalAngle(angle_deg, math.hypot(at_last.sigma_deg / share, BIAS_DEG), at_last.num_pairs)
+
+
+def angle_left(
+    points_of: PointsOf,
+    T_odom_keyframes: Float[np.ndarray, "n 4 4"],
+    travel_m: Vector,
+    correction_deg: float,
+    *,
+    config: RefineConfig,
+) -> VerticalAngle | None:
+    """The median angle of pairs of submaps of corrected scans, and its standard error; None if too few determine it."""
 
     @lru_cache(2)
     def surface(keyframe_id: int) -> Surface:
-        return make_surface(downsample(points_of(keyframe_id), config=config), config=config)
+        near = range(max(keyframe_id - REACH, 0), min(keyframe_id + REACH + 1, len(travel_m)))
+        clouds = [
+            geometry.apply(
+                geometry.inverse(T_odom_keyframes[keyframe_id]) @ T_odom_keyframes[one],
+                geometry.raise_beams(downsample(points_of(one), config=config), correction_deg),
+            )
+            for one in near
+            if abs(travel_m[one] - travel_m[keyframe_id]) < APART_M[0] / 2.0
+        ]
+        return make_surface(downsample(np.vstack(clouds), config=config), config=config)
 
     found = []
     for target, source in _pairs(T_odom_keyframes, travel_m):
@@ -122,8 +162,7 @@ def measure_vertical_angle(
         return None
     median = float(np.median(found))
     spread = 1.4826 * float(np.median(np.abs(np.array(found) - median)))
-    error = math.sqrt(math.pi / 2 / len(found)) * spread  # standard error of the median of normal errors
-    return VerticalAngle(median, math.hypot(error, BIAS_DEG), len(found))
+    return VerticalAngle(median, math.sqrt(math.pi / 2 / len(found)) * spread, len(found))  # of normal errors
 
 
 class Calibrator:

@@ -17,9 +17,11 @@ from segslam.odometry.calibration import (
     MIN_PAIRED,
     MIN_PAIRS,
     VerticalAngle,
+    angle_left,
     measure_vertical_angle,
     register_with_angle,
     vertical_angle_advice,
+    without_rest,
 )
 from segslam.registration import refinement
 from segslam.scans.kitti import read_calibration, read_returns
@@ -84,11 +86,32 @@ def test_keyframes_farther_apart_than_a_pair_give_no_angle() -> None:
 
 
 def test_a_drive_with_a_break_shows_the_angle_too() -> None:
-    places_m = np.arange(-30.0, 31.0, 2.0)
-    travel_m = places_m + 30.0 + np.where(places_m > 0.0, BREAK_TRAVEL_M, 0.0)
+    places_m = np.arange(-44.0, 45.0, 2.0)
+    travel_m = places_m + 44.0 + np.where(places_m > 0.0, BREAK_TRAVEL_M, 0.0)
     found = measure_vertical_angle(lambda i: points_at(float(places_m[i])), poses_at(places_m), travel_m, config=CONFIG)
     assert found is not None
     assert found.angle_deg == pytest.approx(LOW_DEG, abs=0.04)
+
+
+def test_what_is_left_after_a_correction_leads_to_the_angle_that_leaves_nothing() -> None:
+    """Whatever the correction, and although submaps of distorted scans show a part of it."""
+    places_m = np.arange(-30.0, 31.0, 2.0)
+    left = {
+        deg: angle_left(
+            lambda i: points_at(float(places_m[i])), poses_at(places_m), places_m + 30.0, deg, config=CONFIG
+        )
+        for deg in (0.0, 0.1, LOW_DEG, 0.3)
+    }
+    found = [one for one in left.values() if one is not None]
+    assert len(found) == 4
+    assert found[0].angle_deg < 0.9 * LOW_DEG
+    assert found[0].angle_deg > found[1].angle_deg > 0.0 > found[3].angle_deg
+    assert abs(found[2].angle_deg) < 0.02
+    for correction_deg, one in ((0.1, found[1]), (0.3, found[3])):
+        angle = without_rest(found[0], correction_deg, one)
+        assert angle is not None
+        assert angle.angle_deg == pytest.approx(LOW_DEG, abs=0.03)
+    assert without_rest(found[0], 0.1, found[0]) is None, "a correction without effect"
 
 
 def test_a_gap_in_the_drive_is_passed_over() -> None:

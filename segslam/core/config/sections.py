@@ -144,7 +144,8 @@ class RetrievalConfig(Section):
 
     enabled: bool = Field(
         True,
-        description="search loops also where the poses do not show which keyframes are near, by similarity of places [chosen]",
+        description="search loops also where the poses do not show which keyframes are near, by similarity of places "
+        "[chosen]",
     )
 
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config
+from segslam.core.trajectory import Poses
 from segslam.core.types import GraphEstimate, IndexPairs, Mask, Points, Vector
 from segslam.graph import PoseGraph
-from segslam.odometry.calibration import measure_vertical_angle
+from segslam.odometry.calibration import VerticalAngle, angle_left, measure_vertical_angle, without_rest
 from segslam.slam.adjustment.pairs import EVERY, STEPS, all_pairs
 from segslam.slam.adjustment.progress import Progress, no_progress
 from segslam.slam.adjustment.record import Adjustment
@@ -55,9 +56,13 @@ def adjust(
     T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
     angle = measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
     correction_deg = angle.angle_deg if angle is not None and angle.is_significant else 0.0
-    corrected = partial(_raised, points_of, correction_deg)
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
+        if number > 1 and correction_deg:
+            again = _measured_again(points_of, T_before, graph.T_world_keyframes, travel_m, correction_deg, config)
+            if again is not None and again.is_significant:
+                angle, correction_deg = again, again.angle_deg
+        corrected = partial(_raised, points_of, correction_deg)
         title = f"refine {number}/{config.adjustment.rounds}"
         made = _round(graph, corrected, config, end_s, bool(correction_deg), partial(_titled, progress, title))
         last = made or last
@@ -83,6 +88,18 @@ def adjust(
         thickness_m=map_thickness_m(corrected, T_after, shared),
     )
     return Adjusted(record, before, last.estimate)
+
+
+def _measured_again(
+    points_of: PointsOf, T_before: Poses, T_world: Poses, travel_m: Vector, correction_deg: float, config: Config
+) -> VerticalAngle | None:
+    """The angle that leaves none after an adjustment with it, from what is left before and after one.
+
+    The motions of the odometry turn with the angle, so submaps built by them show too much of it.
+    """
+    before = angle_left(points_of, T_before, travel_m, 0.0, config=config.refine)
+    after = angle_left(points_of, T_world, travel_m, correction_deg, config=config.refine)
+    return None if before is None or after is None else without_rest(before, correction_deg, after)
 
 
 def _raised(points_of: PointsOf, angle_deg: float, keyframe_id: int) -> Points:

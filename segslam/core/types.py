@@ -7,9 +7,9 @@ Shapes are checked under pytest only.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum, StrEnum
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 from segslam.core.errors import BadScan as BadScan
 from segslam.core.errors import SegslamError as SegslamError
 from segslam.core.errors import WorkFailed as WorkFailed
-from segslam.core.short_repr import Record
 
 Points = Float[np.ndarray, "_ 3"]
 """Points, a row each, in metres."""
@@ -39,6 +38,36 @@ Indices = Int[np.ndarray, "_"]
 IndexPairs = Int[np.ndarray, "_ 2"]
 Vector = Float[np.ndarray, "_"]
 Mask = Bool[np.ndarray, "_"]
+
+
+class Record:
+    """Base of dataclasses with arrays; a representation of one line."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        parts = (f"{field.name}={_short(getattr(self, field.name))}" for field in fields(self))  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return _pose(value) if value.shape == (4, 4) else f"<{value.dtype} {value.shape}>"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, (tuple, list, dict)) and len(value) > 3:
+        return f"<{len(value)} in a {type(value).__name__}>"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key!r}: {_short(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, (tuple, list)):
+        return f"({', '.join(_short(one) for one in value)})"
+    return repr(value)
+
+
+def _pose(T_a_b: np.ndarray) -> str:
+    cosine = np.clip((np.trace(T_a_b[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
+    x, y, z = T_a_b[:3, 3]
+    return f"<{x:.2f} {y:.2f} {z:.2f} m, turned {np.degrees(np.arccos(cosine)):.1f} deg>"
 
 
 def as_points(points: ArrayLike) -> Points:

@@ -14,8 +14,7 @@ from segslam.core.threads import at_once
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import Graph
 from segslam.graph.confirmation import Confirmation
-from segslam.keyframes.keyframes import Clouds
-from segslam.keyframes.submaps import Submaps
+from segslam.keyframes.keyframes import Clouds, Submaps
 from segslam.registration.hypotheses import Gate, anywhere
 from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops

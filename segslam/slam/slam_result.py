@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from segslam.core.evaluation import align_positions, trajectory_metrics
-from segslam.core.short_repr import Record
 from segslam.core.trajectory import Poses, camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
 from segslam.core.types import (
     GraphEstimate,
@@ -17,6 +16,7 @@ from segslam.core.types import (
     LoopClosure,
     Mask,
     Motion,
+    Record,
     Rejected,
     SegslamError,
     Trajectory,

@@ -18,7 +18,7 @@ from segslam.core.config import Config
 from segslam.core.stopwatch import Stopwatch
 from segslam.core.types import Placement, Rejected, RejectReason, Transform
 from segslam.graph import AnchoredGraph
-from segslam.keyframes.submaps import Submaps
+from segslam.keyframes.keyframes import Submaps
 from segslam.registration import refinement
 from segslam.registration.prepared import Observed, prepare_observed
 from segslam.run.locator import Locator

@@ -10,8 +10,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.short_repr import Record
-from segslam.core.types import GraphEstimate, Points
+from segslam.core.types import GraphEstimate, Points, Record
 from segslam.graph import Edge, PoseGraph
 from segslam.odometry.calibration import measure_vertical_angle
 from segslam.slam.adjustment.alignment import register_pairs

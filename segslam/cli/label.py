@@ -108,8 +108,7 @@ class Tally:
         from segslam.core.types import BadScan
         from segslam.core.whole_files import write_whole
         from segslam.labels import geometric_labels
-        from segslam.labels.label_files import write_labels
-        from segslam.labels.late import computed
+        from segslam.labels.label_files import computed, write_labels
         from segslam.labels.scores import confusion
 
         try:

@@ -185,8 +185,7 @@ def _read_one(
     """Points of a scan and their labels; None for labels if they are to be computed from geometry."""
     import numpy as np
 
-    from segslam.labels.label_files import encoding_of, read_labels
-    from segslam.labels.late import computed
+    from segslam.labels.label_files import computed, encoding_of, read_labels
     from segslam.scans.clouds import read_file
 
     points = read_file(scan).points
@@ -211,8 +210,7 @@ def _read_two(
 ) -> list[tuple["Points", "Labels"]]:
     """Points and labels of the two scans."""
     from segslam.labels import geometric_labels
-    from segslam.labels.label_files import encoding_of, open_labels, read_labels
-    from segslam.labels.late import computed
+    from segslam.labels.label_files import computed, encoding_of, open_labels, read_labels
     from segslam.scans.clouds import read_file
 
     files.check()

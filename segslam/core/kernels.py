@@ -29,7 +29,6 @@ MODULES = (
     "labels.ground_surface",
     "labels.solids",
     "labels.uprights",
-    "labels.walls",
     "labels.range_image",
     "registration.segregator.clusters",
     "registration.segregator.plan",
@@ -41,7 +40,7 @@ MODULES = (
     "scans.pcd",
     "registration.free_space",
     "slam.adjustment.alignment",
-    "odometry.nudge",
+    "odometry.local_map",
     "core.points",
 )
 """Modules of this package that define kernels, the slowest to compile first."""

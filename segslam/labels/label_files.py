@@ -1,4 +1,7 @@
-"""Labels from `.label` files (SemanticKITTI): one file per scan, named like the scan, in any of the encodings."""
+"""Labels from `.label` files (SemanticKITTI): one file per scan, named like the scan, in any of the encodings.
+
+A network's labels are computed on first use: it is slow, and only keyframes need labels.
+"""
 
 import logging
 from collections.abc import Sequence
@@ -172,3 +175,15 @@ def _histogram(file: Path) -> Histogram:
     except BadScan:
         ids = np.empty(0, dtype=np.uint32)
     return np.bincount(ids, minlength=2**16)
+
+
+def computed(labels: ScanLabels) -> Labels:
+    """The labels, computed now if necessary."""
+    return labels() if callable(labels) else labels
+
+
+def of_rows(labels: ScanLabels, rows: Mask) -> ScanLabels:
+    """The labels of some rows; labels that are computed on first use stay so."""
+    if callable(labels):
+        return lambda: labels()[rows]
+    return labels[rows]

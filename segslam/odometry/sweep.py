@@ -10,7 +10,7 @@ from kiss_icp.preprocess import Preprocessor
 from segslam.core.config import OdometryConfig
 from segslam.core.points import is_finite, within_range
 from segslam.core.types import BadScan, Motion, Points, Scan, ScanLabels, Transform, Vector
-from segslam.labels.late import of_rows
+from segslam.labels.label_files import of_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,8 +24,7 @@ from segslam.core.types import (
 )
 from segslam.core.whole_files import expanded
 from segslam.labels.encodings import Encoding
-from segslam.labels.label_files import LabelSource
-from segslam.labels.late import of_rows
+from segslam.labels.label_files import LabelSource, of_rows
 
 logger = logging.getLogger(__name__)
 

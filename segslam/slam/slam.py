@@ -31,7 +31,7 @@ from segslam.core.types import (
 from segslam.graph import Graph, PoseGraph
 from segslam.keyframes.keyframes import Clouds, CloudStore, downsample_keyframe
 from segslam.labels import geometric_labels
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed
 from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
 from segslam.odometry import Tracked as Tracked
 from segslam.registration.prepared import Labeller

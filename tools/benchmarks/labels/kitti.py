@@ -12,7 +12,7 @@ from segslam.bench.experiments.summary import figures, grouped
 from segslam.core.config import Config
 from segslam.core.types import GROUND_LABELS, Label, Points
 from segslam.labels import geometric_labels
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed
 from segslam.scans import open_dataset
 from tools.benchmarks import real_pairs
 

@@ -18,7 +18,7 @@ import numpy as np
 from segslam import keep_freed_memory
 from segslam.bench.experiments.trials import pair_trials
 from segslam.core.config import Config, load_config
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed
 from tools.benchmarks import common, real_pairs
 from tools.benchmarks.common import Row, markdown
 from tools.benchmarks.registration.ablation import Case, ablation

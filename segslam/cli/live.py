@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists, check_free, make_room
+from segslam.cli.checks import check_exists, check_free, live_configs, make_room, show_preset
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.ending import counted, finish
-from segslam.cli.georeference import GnssOptions
-from segslam.cli.options import PresetOption, RunOutput
-from segslam.cli.preset import live_configs, show_preset
+from segslam.cli.options import GnssOptions, PresetOption, RunOutput
 from segslam.cli.viewers import check_display, close_scene, open_scene, serve_foxglove
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.extras import how_to_install

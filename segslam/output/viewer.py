@@ -17,7 +17,7 @@ from segslam.core.types import (
     Step,
     Transform,
 )
-from segslam.labels.class_colors import COLORS
+from segslam.labels.encodings import COLORS
 from segslam.output.log.drawing import ACCEPTED_COLOR, PATH_GROWTH, REJECTED_COLORS, VIEW_EVERY
 
 WORLD, LIDAR, TIMES = "world", "world/lidar", "stage_ms"

@@ -11,10 +11,7 @@ import numpy as np
 from segslam.core.types import BadScan, SegslamError
 from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
-from segslam.scans.pcd import parse_pcd
-from segslam.scans.ply import parse_ply
-from segslam.scans.point_cloud2 import INTENSITY_FIELDS, TIME_FIELDS
-from segslam.scans.scan_files import Columns, read_bytes
+from segslam.scans.scan_files import INTENSITY_FIELDS, TIME_FIELDS, Columns, read_bytes
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 TIMES = (*TIME_FIELDS, "timestamps", "stamps")
@@ -38,8 +35,12 @@ def read_file(file: Path) -> Cloud:
             case ".npy":
                 return _from_rows(_parse_npy(read_bytes(file)))
             case ".ply":
+                from segslam.scans.ply import parse_ply
+
                 return _from_columns(parse_ply(read_bytes(file)))
             case ".pcd":
+                from segslam.scans.pcd import parse_pcd
+
                 return _from_columns(parse_pcd(read_bytes(file)))
             case other:
                 raise SegslamError(f"{file}: unknown format {other or '(no extension)'}; give .bin, .npy, .ply or .pcd")

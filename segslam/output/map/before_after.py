@@ -14,8 +14,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from segslam.core import geometry
 from segslam.core.points import within_range
 from segslam.core.types import GROUND_LABELS, REJECTED_WEIGHT, GraphEstimate, Keyframe, Label, Mask, Points, Transform
-from segslam.output.map.from_above import draw_path, png, scale_bar
-from segslam.output.map.overhead import Window, cut_heights, visible
+from segslam.output.map.from_above import Window, cut_heights, draw_path, png, scale_bar, visible
 
 MOST_PIXELS = 900
 """Chosen: largest number of pixels along the longer side of a panel."""
@@ -37,7 +36,7 @@ class BeforeAfter:
     ) -> None:
         """Takes the poses of all keyframes by odometry, and the last estimate.
 
-        `keyframes`: those whose points show where ceilings hang over the path, which are not drawn; see `overhead`.
+        `keyframes`: those whose points show where ceilings hang over the path, which are not drawn; see `cut_heights`.
         """
         first = min(T_odom_keyframe)
         T_world_odom = estimate.T_world_keyframe[first] @ geometry.inverse(T_odom_keyframe[first])

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from segslam.core.config import MapConfig
-from segslam.labels.class_colors import COLORS
-from segslam.output.map.overhead import Window, visible
+from segslam.labels.encodings import COLORS
+from segslam.output.map.from_above import Window, visible
 from segslam.output.map.part import Extent, Part, scale_of
 from segslam.output.map.tiles import TILE_M, corner
 
@@ -27,7 +27,7 @@ RELIEF_M, CONTRAST = 1.5, 0.35
 
 
 class Picture:
-    """Top view with north (y) up; the highest point of a pixel is visible, below ceilings: see `overhead`."""
+    """Top view with north (y) up; the highest point of a pixel is visible, below ceilings: see `cut_heights`."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._file = file

@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 
 from segslam.core import geometry
 from segslam.core.types import Label, Labels, Points
-from segslam.labels.class_colors import Colors, of_classes
+from segslam.labels.encodings import Colors, of_classes
 from segslam.labels.network_settings import ImageSettings
 from segslam.labels.range_image import EMPTY, project
 from segslam.labels.scores import STILL

@@ -19,7 +19,7 @@ from segslam.core.errors import SegslamError
 if TYPE_CHECKING:
     from segslam.bench.experiments.baselines import Estimate
     from segslam.core.config import Config
-    from segslam.core.stopwatch import Stopwatch
+    from segslam.core.threads import Stopwatch
     from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels
     from segslam.run.locator import Located, Locator
 
@@ -158,7 +158,7 @@ def register(
     settings = changes.load()
     terminal.announce(f"register: reading {source} and {target}")
     from segslam.bench.experiments.methods import find_method, prepare_parts
-    from segslam.core.stopwatch import Stopwatch
+    from segslam.core.threads import Stopwatch
 
     if method == "segregator-c2f" and not refine:
         method = "segregator"

@@ -5,8 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from segslam.core.config import LabelName, Section
-from segslam.core.config.files import parse_yaml, validated
+from segslam.core.config import LabelName, Section, parse_yaml, validated
 from segslam.core.errors import brief, unreadable
 from segslam.core.types import SegslamError
 from segslam.labels.network_import import ARCH, DATA, Architecture, ClassMap, is_architecture

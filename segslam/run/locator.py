@@ -24,7 +24,7 @@ from segslam.core.types import (
     Transform,
     as_points,
 )
-from segslam.keyframes.keyframes import Clouds, Submaps, downsample_keyframe
+from segslam.keyframes import Clouds, Submaps, downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.output.finished import read_run
 from segslam.output.log import read_log

@@ -13,7 +13,7 @@ from segslam.candidates import PlaceCandidate, Places, PlaceSignature
 from segslam.candidates.proximity import BREAK_TRAVEL_M, search_radius_m
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
 from segslam.graph import Graph
 from segslam.graph.confirmation import Confirmation

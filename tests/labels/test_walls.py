@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from segslam.core.geometry import yaw
-from segslam.labels.uprights import LAYER_M, MIN_LENGTH_M, MIN_POINTS, NUM_LAYERS, WALL_CELL_M, on_walls
+from segslam.labels.shapes import LAYER_M, MIN_LENGTH_M, MIN_POINTS, NUM_LAYERS, WALL_CELL_M, on_walls
 
 RULE = {"thickness_m": 0.15, "min_top_m": 1.8}
 

@@ -21,7 +21,7 @@ from segslam.candidates.prior import far_from_prior
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.types import Alignment, LoopCandidate, Rejected, Rotation, Transform
-from segslam.keyframes.keyframes import downsample_keyframe
+from segslam.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register_prepared

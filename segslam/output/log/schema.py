@@ -22,8 +22,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from segslam.core.config import Config, config_to_yaml
 from segslam.core.extras import installed_version
 from segslam.core.types import GraphEstimate, LateLoops, Step, Trajectory, Transform
-from segslam.output.log.cloud import KeyframePoints
-from segslam.output.log.records import codec
+from segslam.output.log.records import KeyframePoints, codec
 from segslam.slam.adjustment import Adjustment
 
 VERSION = 1
@@ -47,7 +46,7 @@ REFERENCE = "/reference"
 TRANSFORMS = "/tf"
 """foxglove.FrameTransform: lidar in odom at every scan, odom in world after every optimisation."""
 KEYFRAME = "/keyframe"
-"""segslam.KeyframePoints (protobuf): all points of the step's keyframe, for replay. See `cloud`."""
+"""segslam.KeyframePoints (protobuf): all points of the step's keyframe, for replay. See `records`."""
 POINTS = "/points"
 """foxglove.PointCloud: a subset of each keyframe's points in the lidar frame, with labels and colours, for display."""
 MAP = "/map"

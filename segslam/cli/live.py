@@ -35,13 +35,9 @@ MOST_BEHIND = 20
 """Chosen: largest number of keyframes that wait for loop closing, 2 MB each. Further keyframes are stored, but their
 loops are searched at the end of the run only."""
 
-MAP_SO_FAR = "map_so_far.ply"
-"""Written by the service `/segslam/save_map`."""
 FINAL_SEARCH_S = 60.0
 """Chosen: the last search for loops ends after this time, so that the results of a live run are soon complete."""
 LINE_EVERY_S, BAR_EVERY_S = 10.0, 0.2
-LATE_S = 5.0
-"""Larger delays of loop closing are shown."""
 MANY_DROPPED = 0.02
 """Chosen: share of dropped scans above which a faster odometry is recommended."""
 COARSER = 1.5
@@ -244,7 +240,7 @@ def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublis
     from segslam.run.live.ros import MappingPublisher
 
     def save() -> str:
-        file = run.folder / MAP_SO_FAR
+        file = run.folder / "map_so_far.ply"
         T_world_keyframe, cloud = run.map_so_far()
         num_points = save_map(T_world_keyframe, cloud, file, config=run.config.map)
         return f"{file}: {num_points} points of {counted(len(T_world_keyframe), 'keyframe')}"
@@ -295,7 +291,7 @@ class LiveFigures:
         text = f"live: {num} scans, {rate:.1f}/s"
         if num:
             text += f", pose {median(self._latency_ms[-20:]):.0f} ms after the scan"
-            if self._lag_s[-1] > LATE_S:
+            if self._lag_s[-1] > 5.0:
                 text += f", loops {self._lag_s[-1]:.1f} s behind"
         if self.num_dropped:
             text += f", {self.num_dropped} dropped"

@@ -283,6 +283,11 @@ class LoopCandidate(Record):
     chain_m: float = 0.0
     """Length of the shortest chain of odometry and closures between the two."""
 
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Ids of the two keyframes, the newer first."""
+        return self.source_id, self.target_id
+
 
 class Found(Record):
     """Base of what is not `Rejected`."""
@@ -368,6 +373,11 @@ class LoopClosure(Found):
     def of(cls, source_id: int, target_id: int, alignment: Alignment) -> "LoopClosure":
         """The loop between two keyframes with the pose and information of their alignment."""
         return cls(source_id, target_id, alignment.fine.T_target_source, alignment.fine.information, alignment)
+
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Ids of the two keyframes, the newer first."""
+        return self.source_id, self.target_id
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

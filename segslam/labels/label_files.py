@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 NETWORK = "network:"
-FILES_LOOKED_AT = 8  # chosen: number of files, spread over the drive, from which the encoding is detected
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +163,7 @@ def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | N
     named = _labelled(folder, scan_names)
     if len(named) < len(scan_names):
         logger.warning("%s: %d of %d scans have no label file", folder, len(scan_names) - len(named), len(scan_names))
-    spread = np.unique(np.linspace(0, len(named) - 1, FILES_LOOKED_AT).astype(int))
+    spread = np.unique(np.linspace(0, len(named) - 1, 8).astype(int))  # chosen: so many files show it
     return LabelFiles(folder, encoding or encoding_of([folder / f"{named[row]}.label" for row in spread]))
 
 

@@ -57,8 +57,7 @@ def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[Loo
     """The closures whose two keyframes have a true pose, the rows of (source, target), and the true poses, by row."""
     rows = rows_of_same_scan(result.trajectory.scan_index[result.keyframe_rows], reference.scan_index)
     place_of_id = {int(keyframe_id): place for place, keyframe_id in enumerate(rows[:, 0])}
-    closures = [attempt.outcome for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
-    known = [c for c in closures if c.source_id in place_of_id and c.target_id in place_of_id]
+    known = [c for c in result.closures() if c.source_id in place_of_id and c.target_id in place_of_id]
     pairs = np.array([(place_of_id[c.source_id], place_of_id[c.target_id]) for c in known], dtype=int).reshape(-1, 2)
     return known, pairs, reference.T_world_lidar[rows[:, 1]]
 

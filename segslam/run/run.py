@@ -20,7 +20,6 @@ from segslam.core.threads import in_other_thread
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import (
     BadScan,
-    LoopClosure,
     MotionState,
     Scan,
     SegslamError,
@@ -239,7 +238,6 @@ class Run:
             if isinstance(self._slam.graph, PoseGraph):
                 self._slam.graph.write_adjusted_g2o(self.folder / ADJUSTED_GRAPH)
             write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
-        closures = [attempt for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
         states = Counter(motion.state for motion in result.motions)
         return result, {
             "num_scans": len(result.trajectory),
@@ -251,7 +249,7 @@ class Run:
             "num_motions_broken": states[MotionState.BROKEN],
             "num_motions_rejected": len(result.estimate.motion_weights),
             "num_candidates": len(result.attempts),
-            "num_loops_accepted": len(closures),
+            "num_loops_accepted": len(result.closures()),
             "num_loops_switched_off": len(result.estimate.rejected),
             "seconds_total": seconds,
             "scans_per_second": (len(result.trajectory) - self.num_scans_resumed) / seconds_mapping,

@@ -16,8 +16,6 @@ from segslam.scans.scan_files import INTENSITY_FIELDS, TIME_FIELDS, Columns, rea
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 TIMES = (*TIME_FIELDS, "timestamps", "stamps")
 """Names of the field with the time of a point; the first that exists is used."""
-NPY_MAGIC = b"\x93NUMPY"
-NPY_NUMBER = re.compile(r"[<>|=]?[fiu][1248]")
 MAX_NPY_HEADER_BYTES = 10_000
 """As in NumPy: a longer header can make Python's parser fail."""
 
@@ -55,7 +53,7 @@ def _parse_npy(content: bytes) -> np.ndarray:
 
     Raises ValueError for another content, and for a file whose size is not that of the array.
     """
-    if not content.startswith(NPY_MAGIC) or len(content) < 12:
+    if not content.startswith(b"\x93NUMPY") or len(content) < 12:
         raise ValueError("it is not a .npy file; save an array by numpy.save")
     size, start = ("<H", 10) if content[6] == 1 else ("<I", 12)
     (num_header,) = struct.unpack_from(size, content, 8)
@@ -70,7 +68,7 @@ def _parse_npy(content: bytes) -> np.ndarray:
             pass
         case _:
             raise ValueError("its array is not of the shape (n, 3) or more, or not of plain numbers, x y z")
-    if not NPY_NUMBER.fullmatch(kind) or kind[-2:] == "f1" or columns < 3 or rows < 0:
+    if not re.fullmatch(r"[<>|=]?[fiu][1248]", kind) or kind[-2:] == "f1" or columns < 3 or rows < 0:
         raise ValueError(f"it contains {kind[:20]} of shape ({rows}, {columns}); expected (n, 3) numbers, x y z")
     start += num_header
     num_bytes = len(content) - start

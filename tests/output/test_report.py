@@ -28,8 +28,9 @@ from segslam.output.folder import ALONE, write_metrics, write_poses
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, gallery, write_report
 from segslam.output.report.figures import draw_loops, paths_of
-from segslam.output.report.gallery import choose, outcome_text
+from segslam.output.report.gallery import choose
 from segslam.output.report.page import number, page, settings_not_default
+from segslam.slam.slam_result import outcome_text
 
 VOID = {"meta", "img", "wbr"}
 
@@ -237,8 +238,11 @@ def test_the_gallery_has_the_best_accepted_and_the_nearest_missed_loops(tmp_path
     loops = [attempt for attempt in run.result.attempts if attempt.candidate.source_id in (50, 51, 58)]
     chosen = choose(loops)
     assert [attempt.candidate.source_id for attempt in chosen] == [50, 58]  # 51, near 58, failed earlier
-    assert outcome_text(run, chosen[0]) == "accepted, overlap 0.80, residual 0.10 m, weight 1.00"
-    assert outcome_text(run, chosen[1]) == "rejected, low overlap (3 < 5)"
+    assert (
+        outcome_text(chosen[0], run.result.estimate.closure_weights)
+        == "accepted, overlap 0.80, residual 0.10 m, weight 1.00"
+    )
+    assert outcome_text(chosen[1], run.result.estimate.closure_weights) == "rejected, low overlap (3 < 5)"
 
 
 @pytest.mark.parametrize(

@@ -188,7 +188,7 @@ def metadata(
             "platform": platform.platform(),
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "command": _command(),
-            "processor": f"{_processor()}, {os.cpu_count()} cores",
+            "processor": f"{processor()}, {os.cpu_count()} cores",
             **calibration,
         },
         CONFIG_METADATA: {"yaml": config_to_yaml(config)},
@@ -217,7 +217,7 @@ def _command() -> str:
     return shlex.join(["segslam" if name == "__main__.py" else name, *sys.argv[1:]])
 
 
-def _processor() -> str:
+def processor() -> str:
     """Name of the processor from Linux; on other systems, from Python."""
     if CPU_INFO.is_file():
         for line in CPU_INFO.read_text(encoding="utf-8").splitlines():

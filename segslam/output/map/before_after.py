@@ -24,7 +24,6 @@ REACH_M = 40.0
 """Chosen: points farther from their keyframe are not drawn; they are sparse and blur both maps."""
 DETAIL_M = 30.0
 """Chosen: smallest half width of the detail."""
-NO_LOOP = "after: adjusted as a whole; no loop was found"
 BEFORE, AFTER, BACKGROUND = "#E69F00", "#56B4E9", "#10141a"
 
 
@@ -81,7 +80,8 @@ class BeforeAfter:
         figure = Figure(figsize=(12.0, 6.0 * sum(heights) + 0.5), facecolor=BACKGROUND, layout=layout)
         grid = figure.subplots(len(rows), 2, squeeze=False, height_ratios=heights)
         num = len(self._loops)
-        titles = ("before: odometry only", f"after: corrected by {num} loop{'s' * (num != 1)}" if num else NO_LOOP)
+        corrected = f"corrected by {num} loop{'s' * (num != 1)}" if num else "adjusted as a whole; no loop was found"
+        titles = ("before: odometry only", f"after: {corrected}")
         for row, panels in zip(grid, rows, strict=True):
             brightest = max(panel.brightest() for panel in panels)
             for axes, panel, poses, color in zip(row, panels, self._maps, (BEFORE, AFTER), strict=True):

@@ -15,7 +15,6 @@ from segslam.output.map.tiles import TILE_M, corner
 MAX_SIDE = 4000
 """Largest number of pixels along the longer side; limits the memory."""
 MARGIN_M = 4.0
-BACKGROUND = 255
 SHADED_M = 3.0
 """Chosen: the shading of a height is relative to the mean height in a square of this size."""
 GAP_PX = 1.5
@@ -36,7 +35,7 @@ class Picture:
         columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
         self._pixels = max(min(round(TILE_M / config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
         size = rows * self._pixels, columns * self._pixels
-        self._image = np.full((*size, 3), BACKGROUND, np.uint8)
+        self._image = np.full((*size, 3), 255, np.uint8)  # white
         self._height_m = np.full(size, np.nan, np.float32)
         self._labels: set[int] = set()
 

@@ -17,7 +17,7 @@ from segslam.output.report import figures, gallery, interactive
 from segslam.output.report.figures import draw_fixes
 from segslam.output.report.page import Pictures, number, page
 
-__all__ = ["BEFORE_AFTER", "draw_before_after", "write_before_after", "write_report"]
+__all__ = ["BEFORE_AFTER", "draw_before_after", "write_report"]
 
 BEFORE_AFTER = "before_after.png"
 
@@ -36,25 +36,15 @@ def write_report(folder: str | Path) -> Path:
     with matplotlib.rc_context(figures.STYLE):
         plots = _plots(run)
     about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
-    return _write(
-        folder / "report.html", page(run, plots, _pictures(run), about=about).encode(errors="backslashreplace")
-    )
-
-
-def write_before_after(folder: Path, file: Path) -> Path:
-    """Write the picture of `draw_before_after` to a file."""
-    return _write(file, draw_before_after(folder))
+    file = folder / "report.html"
+    write_whole(file, page(run, plots, _pictures(run), about=about).encode(errors="backslashreplace"))
+    return file
 
 
 def draw_before_after(folder: Path) -> bytes:
     """A PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
     picture, _ = _drawn(read_run(folder))
     return picture
-
-
-def _write(file: Path, content: bytes) -> Path:
-    write_whole(file, content)
-    return file
 
 
 def _plots(run: FinishedRun) -> dict[str, str]:
@@ -89,7 +79,7 @@ def _pictures(run: FinishedRun) -> Pictures:
 
 
 def _keyframes_of(attempts: Iterable[LoopAttempt]) -> set[int]:
-    return {number for one in attempts for number in (one.candidate.source_id, one.candidate.target_id)}
+    return {number for one in attempts for number in one.candidate.pair}
 
 
 def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:

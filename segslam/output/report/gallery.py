@@ -19,15 +19,13 @@ from segslam.core.types import (
     Transform,
 )
 from segslam.output.finished import FinishedRun
-from segslam.slam import slam_result
+from segslam.slam.slam_result import outcome_text
 
 NUM_EACH = 3
 APART = 10
 """Chosen: keyframes between two pictures of one kind, so that they show different places."""
 SOURCE, TARGET = "#D55E00", "#4D4D4D"
 VIEW_M = 50.0
-LETTERS = 31
-"""Letters of a title that fit above a panel."""
 
 
 def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
@@ -42,7 +40,7 @@ def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int
     """A PNG for each candidate, by caption."""
     pictures = {}
     for attempt in chosen:
-        source_id, target_id = attempt.candidate.source_id, attempt.candidate.target_id
+        source_id, target_id = attempt.candidate.pair
         T_world = run.result.estimate.T_world_keyframe
         poses = {"initial guess": attempt.candidate.T_target_source_prior}
         if isinstance(attempt.outcome, LoopClosure):
@@ -50,14 +48,9 @@ def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int
         else:
             poses["final map"] = geometry.inverse(T_world[target_id]) @ T_world[source_id]
         source, target = (_standing(keyframes[number]) for number in (source_id, target_id))
-        caption = f"{source_id} to {target_id}: {outcome_text(run, attempt)}"
+        caption = f"{source_id} to {target_id}: {outcome_text(attempt, run.result.estimate.closure_weights)}"
         pictures[caption] = draw_pair(source, target, poses=poses, title=f"keyframes {caption}")
     return pictures
-
-
-def outcome_text(run: FinishedRun, attempt: LoopAttempt) -> str:
-    """The outcome of a candidate in one line."""
-    return slam_result.outcome_text(attempt, run.result.estimate.closure_weights)
 
 
 def _apart(attempts: list[LoopAttempt]) -> list[LoopAttempt]:
@@ -86,7 +79,7 @@ def _standing(keyframe: Keyframe) -> Points:
 def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform], title: str) -> bytes:
     """The two scans as a PNG, a panel for each of `poses`: a name and T_target_source."""
     figure = Figure(figsize=(3.6 * len(poses), 4.4), layout="compressed")
-    figure.suptitle(fill(title, LETTERS * len(poses)), fontsize=11)
+    figure.suptitle(fill(title, 31 * len(poses)), fontsize=11)
     panels = figure.subplots(1, len(poses), squeeze=False)[0]
     for axes, (name, T_target_source) in zip(panels, poses.items(), strict=True):
         for points, color, label in (

@@ -99,7 +99,7 @@ def _values(run: FinishedRun) -> dict[str, list[float]]:
 
 
 def _loop(run: FinishedRun, attempt: LoopAttempt, ids: set[int]) -> dict[str, Any]:
-    source_id, target_id = pair = attempt.candidate.source_id, attempt.candidate.target_id
+    source_id, target_id = pair = attempt.candidate.pair
     estimate, rows = run.result.estimate, run.result.keyframe_rows
     T_world, T_odom = estimate.T_world_keyframe, run.result.odometry.T_world_lidar[rows]
     kind = "rejected"

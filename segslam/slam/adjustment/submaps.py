@@ -3,7 +3,7 @@
 Pairs lie along the drive at several distances, and between passes of one place.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -15,12 +15,11 @@ from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Points, Vector
+from segslam.odometry.calibration import PointsOf
 from segslam.registration.refinement import LightSurface, downsample
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
-PointsOf = Callable[[int], Points]
-"""Returns the points of a keyframe, by id, in its own frame."""
 MOST_SUBMAPS = 16
 """Chosen: submaps in memory, about 1.5 MB each; a drive needs 6, and 2 more for each other pass beside it."""
 EVERY = 2

@@ -66,7 +66,7 @@ def speed_part(options: argparse.Namespace, config: Config) -> Tables:
 
     trials = pair_trials(real_pairs.predicted_pairs(options.data), None)
     real_cases: list[Case] = [(trial, network) for trial in trials]
-    simulated_cases = [case for place in places(options) for case in _cases(place, "given", config, options.sample)]
+    simulated_cases = [case for place in places(options) for case in _cases(place, "given", options.sample)]
     scans = [(f"00 {index}", network(index)) for index in real_pairs.PREDICTED]
     return {
         "6,000 correspondences": many_correspondences(config, rng=np.random.default_rng(options.seed)),
@@ -80,18 +80,16 @@ def ablation_part(options: argparse.Namespace, config: Config) -> Tables:
     tables: Tables = {}
     for labels in ("given", "shape"):
         cases = [
-            case
-            for place in places(options)
-            for case in _cases(place, labels, config, options.sample, bands_m=BANDS_M[2:])
+            case for place in places(options) for case in _cases(place, labels, options.sample, bands_m=BANDS_M[2:])
         ]
         tables[f"One thing taken away: 15-30 m, labels {labels}"] = ablation(cases, config, seed=options.seed)
     return tables
 
 
 def _cases(
-    place: SimulatedPlace, labels: str, config: Config, sample: int, bands_m: tuple[tuple[int, int], ...] = BANDS_M
+    place: SimulatedPlace, labels: str, sample: int, bands_m: tuple[tuple[int, int], ...] = BANDS_M
 ) -> list[Case]:
-    scan = cache(scan_of(place, labels, config))
+    scan = cache(scan_of(place, labels))
     return [(pair, scan) for band_m in bands_m for pair in place.pairs(band_m, sample)]
 
 

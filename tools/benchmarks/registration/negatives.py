@@ -24,8 +24,8 @@ NUM_COURTYARD = 100
 
 def real_negatives(data: Path, config: Config, *, every: int) -> list[Row]:
     """A row for each kind of pair; of the courtyard's scans each `every`-th takes part."""
-    kitti = preparer(by_shape(lambda index: real_scan(data, index).points, config), config)
-    court = preparer(by_shape(partial(courtyard_points, data), config), config)
+    kitti = preparer(by_shape(lambda index: real_scan(data, index).points), config)
+    court = preparer(by_shape(partial(courtyard_points, data)), config)
     indices = real_indices(data)
     within: Counter[str] = Counter()
     for source, target in combinations(indices, 2):

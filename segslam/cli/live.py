@@ -100,13 +100,7 @@ def live(
         stack.enter_context(how_to_go_on(go_on))
         place = gnss.placing_live(stack)
         front = stack.enter_context(Front(source, configs, tell=terminal.say, idle_s=idle))
-        stops: list[bool] = []
-
-        def stop() -> None:
-            stops.append(True)
-            front.stop()
-
-        stack.enter_context(stopped_by_signals(stop))
+        stack.enter_context(stopped_by_signals(front.stop))
         front.wait_until_ready()
         terminal.say(f"{source.name}: waiting for scans; Ctrl-C ends the run")
         if (chosen := front.wait_until_chosen()) is not None:
@@ -135,7 +129,7 @@ def live(
             map_files=map_files,
             more=lambda _: more,
             search_s=FINAL_SEARCH_S,
-            stopped=bool(stops),
+            stopped=front.is_stopping,
             place=place,
         )
         if advice := too_slow(more, settings.odometry.voxel_size_m):

@@ -9,11 +9,11 @@ import numpy as np
 
 from segslam.bench.experiments.rows import Row
 from segslam.bench.experiments.summary import figures, grouped
+from segslam.bench.label_scores import confusion, group_scores
 from segslam.core.config import Config
 from segslam.core.types import Points
 from segslam.labels import geometric_labels
 from segslam.labels.label_files import computed
-from segslam.labels.scores import confusion, group_scores
 from segslam.scans import open_dataset
 from tools.benchmarks import real_pairs
 

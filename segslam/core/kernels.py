@@ -39,7 +39,7 @@ MODULES = (
     "scans.pcd",
     "registration.free_space",
     "slam.adjustment.alignment",
-    "odometry.local_map",
+    "odometry.nudge",
     "core.points",
 )
 """Modules of this package that define kernels, the slowest to compile first."""

@@ -1,8 +1,4 @@
-"""The last scans of a drive in one cloud, registration of the next scan with it, and the likelihood of the result.
-
-Registration is by GICP (tens of milliseconds), or by a few robust Gauss-Newton steps from the points of a scan to the
-planes of earlier scans (a few): at the correct pose these are nearly zero.
-"""
+"""The last scans of a drive in one cloud, registration of the next scan with it, and the likelihood of the result."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -12,11 +8,10 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
-from segslam.core.kernels import kernel
 from segslam.core.types import Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
+from segslam.odometry.nudge import CHECK_VOXELS, NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
 from segslam.registration import refinement
-from segslam.registration.refinement import LightSurface, Surface
 
 MAP_SCANS = 40
 """Chosen: number of scans in the map. With 10 the poses drift farther (NCLT 0.7 m, with 40 0.5 m, with 80 0.5 m)."""
@@ -26,18 +21,6 @@ SPACING_VOXELS = 0.4
 """Chosen: a scan nearer than this to the last one in the map (`displacement_m`) adds nothing to it."""
 SEARCH_VOXELS_GICP = (4.0, 1.4)
 """Chosen: search distances of GICP, in voxels."""
-NUM_POINTS, NUM_SEARCH = 1500, 400
-"""Chosen: number of points. With all points the correction of KITTI's scans at 2 m changes by less than 5 mm; fewer are
-enough to find where a search from afar ends."""
-CHECK_VOXELS = (2.0, 2.0, 1.0)
-"""Search distance of each step of a check, in voxels of the points."""
-POLISH_VOXELS = (1.4, 1.4, 1.0, 1.0, 1.0)
-"""Chosen: the same after GICP, to which every point has the same weight."""
-SEARCH_VOXELS = (4.0, 3.0, 2.0, 2.0, 1.4, 1.4, 1.0, 1.0, 1.0, 1.0)
-"""Chosen: the same from an initial guess."""
-SCALE_VOXELS = 0.2
-"""Scale of the Cauchy weights, in voxels; residuals of planar surfaces are half of it."""
-LEAST_POINTS, LEAST_NEAR = 50, 30
 
 
 def displacement_m(points: Points, T_a_points: Transform, T_a_other: Transform) -> float:
@@ -162,57 +145,3 @@ class LocalMap:
     ) -> Transform | None:
         source, target = scan.surface.points, self.surface()
         return nudge(source, target, T_map_guess, voxel_m=self._voxel_m, reaches=reaches, num_points=num_points)
-
-
-def nudge(
-    points: Points,
-    target: Surface | LightSurface,
-    T_target_source: Transform,
-    *,
-    voxel_m: float,
-    reaches: Sequence[float],
-    num_points: int = NUM_POINTS,
-) -> Transform | None:
-    """Point-to-plane correction of a pose, a step for each search distance; None if too few points are near the target.
-
-    `points` (n, 3) of the source, downsampled with `voxel_m`; `reaches`: search distances in voxels. Chen and Medioni
-    1992, with Cauchy weights: points on a vehicle that drives ahead have little weight.
-    """
-    if min(len(points), len(target.points)) < LEAST_POINTS:
-        return None
-    chosen = points[:: max(1, len(points) // num_points)].astype(np.float64)
-    target_points, scale_m = target.points, SCALE_VOXELS * voxel_m
-    T_now = T_target_source
-    for reach in reaches:
-        moved = geometry.apply(T_now, chosen)
-        rows, apart_m = target.nearest(moved)
-        near = apart_m < reach * voxel_m
-        if near.sum() < LEAST_NEAR:
-            return None
-        rows = rows[near]
-        hessian, gradient = _normal_equations(moved[near], target_points[rows], target.normals_at(rows), scale_m)
-        damped = hessian + 1e-3 * np.diag(np.diag(hessian)) + 1e-9 * np.eye(6)
-        T_now = geometry.exp(-np.linalg.solve(damped, gradient)[:, 0]) @ T_now
-    return geometry.nearest_transform(T_now)
-
-
-@kernel("UniTuple(float64[:, ::1], 2)(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64)")
-def _normal_equations(points, planes, normals, scale):
-    """Hessian (6, 6) and gradient (6, 1) of half the weighted squares by the pose, perturbed from the left."""
-    hessian, gradient, row = np.zeros((6, 6)), np.zeros((6, 1)), np.empty(6)
-    for k in range(len(points)):
-        p, n = points[k], normals[k]
-        e = 0.0
-        for i in range(3):
-            e += n[i] * (p[i] - planes[k, i])
-        row[0], row[1], row[2] = p[1] * n[2] - p[2] * n[1], p[2] * n[0] - p[0] * n[2], p[0] * n[1] - p[1] * n[0]
-        row[3], row[4], row[5] = n[0], n[1], n[2]
-        w = 1.0 / (1.0 + (e / scale) ** 2)
-        for i in range(6):
-            gradient[i, 0] += w * e * row[i]
-            for j in range(i, 6):
-                hessian[i, j] += w * row[i] * row[j]
-    for i in range(6):
-        for j in range(i):
-            hessian[i, j] = hessian[j, i]
-    return hessian, gradient

@@ -9,7 +9,8 @@ from segslam.core import geometry
 from segslam.core.types import Alignment, Information, Points, Rejected, Transform
 from segslam.keyframes import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
-from segslam.odometry.local_map import SEARCH_VOXELS, SEARCH_VOXELS_GICP, LocalMap, SeenScan, displacement_m
+from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan, displacement_m
+from segslam.odometry.nudge import SEARCH_VOXELS
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
 """Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""

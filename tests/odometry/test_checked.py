@@ -16,8 +16,9 @@ from segslam.core.types import Motion, MotionState, Registration, Rejected, Reje
 from segslam.graph.noise import odometry_information
 from segslam.odometry import CheckedOdometry, GivenOdometry, KissOdometry, OdometryResult, Tracker, information_of
 from segslam.odometry.likelihood import Fit, fit
-from segslam.odometry.local_map import CHECK_VOXELS, LocalMap, SeenScan, nudge
+from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import Intervals
+from segslam.odometry.nudge import CHECK_VOXELS, nudge
 from segslam.odometry.search import PoseSearch
 from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
 from segslam.registration.refinement import refine as refined

@@ -13,7 +13,7 @@ from segslam.output.finished import FIGURES, FinishedRun, read_run
 from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
-from segslam.output.report import figures, gallery, interactive
+from segslam.output.report import figures, loops
 from segslam.output.report.figures import draw_fixes
 from segslam.output.report.page import Pictures, number, page
 
@@ -66,15 +66,15 @@ def _plots(run: FinishedRun) -> dict[str, str]:
 
 def _pictures(run: FinishedRun) -> Pictures:
     """Pictures that need the clouds of the log: the map before and after, and pairs of keyframes."""
-    chosen, shown = gallery.choose(run.result.attempts), interactive.with_clouds(run)
+    chosen, shown = loops.choose(run.result.attempts), loops.with_clouds(run)
     before_after, kept = _drawn(run, _keyframes_of([*chosen, *shown]))
     of_view = {number: kept[number] for number in sorted(_keyframes_of(shown)) if number in kept}
     map_file = run.folder / "map.png"
     return Pictures(
         before_after=before_after,
         map=small_png(map_file) if map_file.is_file() else None,
-        loops=gallery.draw(run, chosen, kept),
-        top_view=interactive.top_view(run, of_view),
+        loops=loops.draw(run, chosen, kept),
+        top_view=loops.top_view(run, of_view),
     )
 
 

@@ -1,22 +1,17 @@
-"""Registration of pairs of submaps: point to plane, robust against surfaces that only one of them contains.
+"""Alignment of two submaps: point to plane, robust against surfaces that only one of them contains.
 
 Each point of the source is paired with the nearest point of the target. Its squared distance to the plane there counts
 under the Geman-McClure kernel, which is wide at first and then as wide as surfaces are rough.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.config import RefineConfig
 from segslam.core.kernels import kernel
-from segslam.core.trajectory import Poses
-from segslam.core.types import IndexPairs, Information, Transform, Vector
-from segslam.graph import Edge
-from segslam.registration.refinement import INFORMATION_SCALE, LightSurface, limited_information
-from segslam.slam.adjustment.submaps import EVERY, REACH, Submaps
+from segslam.core.types import Information, Transform, Vector
+from segslam.registration.refinement import LightSurface
 
 SEARCH_M = (1.0, 0.8, 0.7)
 """Chosen: search distance of each iteration, the last one for all others; odometry errs by less over 30 m."""
@@ -32,10 +27,6 @@ MOST_POINTS = 3000
 """Chosen: number of points of the source, evenly among all."""
 MIN_PAIRED = 100
 """Chosen: fewer pairs of points do not determine a pose."""
-SHARE = min(1.0, EVERY / (2 * REACH + 1))
-"""Share of the information of a registration: a scan is in so many submaps."""
-MIN_OVERLAP = 0.1
-"""Chosen on KITTI 00: smallest share of a submap's points that lie on the other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,20 +117,3 @@ def _normal_equations(source, normals, target, target_normals, T, width):
         weights += w
         num += 1
     return hessian, gradient, squares, weights, num
-
-
-def register_pairs(
-    pairs: IndexPairs, submaps: Submaps, T_world: Poses, *, config: RefineConfig
-) -> Iterator[Edge | None]:
-    """Register each pair (target, source) from its current pose; None without convergence or enough overlap.
-
-    An edge has a share of its information, so that every scan counts once.
-    """
-    for target_id, source_id in pairs.tolist():
-        T_prior = geometry.inverse(T_world[target_id]) @ T_world[source_id]
-        found = align(submaps.submap(source_id), submaps.submap(target_id), T_prior)
-        if found is None or found.overlap < MIN_OVERLAP:
-            yield None
-            continue
-        information = limited_information(INFORMATION_SCALE * found.information, config=config)
-        yield Edge(target_id, source_id, geometry.nearest_transform(found.T_target_source), SHARE * information)

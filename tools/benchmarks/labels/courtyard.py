@@ -15,7 +15,7 @@ from segslam.bench.experiments.trials import Trial, pair_trials
 from segslam.core.config import Config
 from segslam.core.types import Label, Points, Trajectory
 from segslam.labels import geometric_labels
-from segslam.output.report.gallery import draw_pair
+from segslam.output.report.loops import draw_pair
 from segslam.scans import DataSource
 from tools.benchmarks import real_pairs
 

@@ -1,0 +1,187 @@
+"""Adjustment of the whole map after the loops, in rounds.
+
+A round registers submaps with each other, and solves all poses; the next one builds its submaps from the result.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import takewhile
+from time import monotonic
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from segslam.core import geometry
+from segslam.core.config import Config, RefineConfig
+from segslam.core.trajectory import Poses
+from segslam.core.types import GraphEstimate, IndexPairs, Points, Record
+from segslam.graph import Edge, PoseGraph
+from segslam.odometry.calibration import measure_vertical_angle
+from segslam.registration.refinement import INFORMATION_SCALE, limited_information
+from segslam.slam.adjustment.alignment import align
+from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, PointsOf, Submaps, all_pairs
+from segslam.slam.adjustment.thickness import map_thickness_m
+
+SHARE = min(1.0, EVERY / (2 * REACH + 1))
+"""Share of the information of a registration: a scan is in so many submaps."""
+MIN_OVERLAP = 0.1
+"""Chosen on KITTI 00: smallest share of a submap's points that lie on the other."""
+Progress = Callable[[Iterable[Any], int, str], Iterator[Any]]
+"""Passes items on and shows progress: takes the items, their number, and a title."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Adjustment(Record):
+    """The adjustment of a drive, beside its estimate."""
+
+    num_pairs: int
+    """Number of pairs of submaps chosen in the last round."""
+    num_registered: int
+    """Number of these whose registration converged with enough overlap; each is a factor of the graph."""
+    num_between_passes: int
+    """Number of factors between different passes of a place."""
+    odometry_noise_factor: float
+    """Standard deviations of the odometry on this drive, relative to those of the settings."""
+    noise_factor: float
+    """The same of the factors, relative to those of single registrations."""
+    moved_m: float
+    """Root mean square distance by which keyframes moved."""
+    is_complete: bool
+    """False if the time limit ended it early."""
+    seconds: float
+    vertical_deg: float | None = None
+    """Remaining vertical angle of the scans; positive if their points are too low. None if it was not measured."""
+    vertical_sigma_deg: float | None = None
+    correction_deg: float = 0.0
+    """Elevation added to all points of the keyframes, for the adjustment and for the map; 0 if not significant."""
+    thickness_before_m: float | None = None
+    """Thickness of surfaces in the map (`thickness`) before the adjustment; None if no surface was seen twice."""
+    thickness_m: float | None = None
+    """The same after it."""
+
+    def figures(self) -> dict[str, float]:
+        """The figures of `metrics.json`; unknown ones are omitted. The vertical angle is that left in the scans."""
+        figures = {
+            "vertical_deg": self.vertical_deg,
+            "vertical_sigma_deg": self.vertical_sigma_deg,
+            "vertical_correction_deg": self.correction_deg or None,
+            "map_thickness_before_m": self.thickness_before_m,
+            "map_thickness_m": self.thickness_m,
+            "num_submap_pairs": self.num_registered,
+            "adjustment_moved_m": self.moved_m,
+        }
+        return {name: value for name, value in figures.items() if value is not None}
+
+
+def no_progress(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
+    """Shows nothing."""
+    yield from items
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """The result of an adjustment."""
+
+    record: Adjustment
+    before: GraphEstimate
+    after: GraphEstimate
+
+
+class _Round(NamedTuple):
+    """The pairs registered in a round before the time limit, and the solution with them."""
+
+    num_pairs: int
+    registered: list[Edge]
+    is_complete: bool
+    estimate: GraphEstimate
+    noise_factors: tuple[float, float]
+
+
+def adjust(
+    graph: PoseGraph, before: GraphEstimate, points_of: PointsOf, *, config: Config, progress: Progress = no_progress
+) -> Adjusted | None:
+    """Adjust the poses of a graph after its last optimisation, whose result is `before`.
+
+    Returns None, and changes nothing, if the adjustment is off or no pair of submaps could be registered.
+    """
+    started = monotonic()
+    end_s = started + 60.0 * config.adjustment.max_minutes
+    if started >= end_s:
+        return None
+    T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
+    angle = measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
+    correction_deg = angle.angle_deg if angle is not None and angle.is_significant else 0.0
+
+    def corrected(keyframe_id: int) -> Points:
+        return geometry.raise_beams(points_of(keyframe_id), correction_deg)
+
+    last: _Round | None = None
+    for number in range(1, config.adjustment.rounds + 1):
+        shared_within = STEPS[-1] if correction_deg else 0
+        title = f"refine {number}/{config.adjustment.rounds}"
+        made = _round(graph, corrected, config, end_s, shared_within, progress, title)
+        last = made or last
+        if made is None or not made.is_complete:
+            break
+    if last is None:
+        return None
+    T_after = graph.T_world_keyframes
+    ends = np.array([(edge.a, edge.b) for edge in last.registered])
+    is_between = np.diff(travel_m[ends], axis=1)[:, 0] >= config.proximity.min_travel_m
+    apart = np.diff(ends, axis=1)[:, 0]
+    seen_twice = ends[is_between if is_between.any() else apart == apart.max()]
+    record = Adjustment(
+        num_pairs=last.num_pairs,
+        num_registered=len(last.registered),
+        num_between_passes=int(is_between.sum()),
+        odometry_noise_factor=last.noise_factors[0],
+        noise_factor=last.noise_factors[1],
+        moved_m=float(np.sqrt(np.mean(np.sum((T_after - T_before)[:, :3, 3] ** 2, axis=1)))),
+        is_complete=last.is_complete,
+        seconds=monotonic() - started,
+        vertical_deg=None if angle is None else angle.angle_deg,
+        vertical_sigma_deg=None if angle is None else angle.sigma_deg,
+        correction_deg=correction_deg,
+        thickness_before_m=map_thickness_m(points_of, T_before, seen_twice),
+        thickness_m=map_thickness_m(corrected, T_after, seen_twice),
+    )
+    return Adjusted(record, before, last.estimate)
+
+
+def _round(
+    graph: PoseGraph,
+    points_of: PointsOf,
+    config: Config,
+    end_s: float,
+    shared_within: int,
+    progress: Progress,
+    title: str,
+) -> _Round | None:
+    """Register submaps by the current poses, and solve the graph; None if no pair could be registered."""
+    T_world, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
+    pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
+    submaps = Submaps(points_of, T_world, travel_m, config=config.refine)
+    in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, submaps, T_world, config=config.refine))
+    tried = list(progress(in_time, len(pairs), title))
+    registered = [one for one in tried if one is not None]
+    if not registered:
+        return None
+    estimate, noise_factors = graph.adjust(registered, shared_within=shared_within)
+    return _Round(len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
+
+
+def register_pairs(
+    pairs: IndexPairs, submaps: Submaps, T_world: Poses, *, config: RefineConfig
+) -> Iterator[Edge | None]:
+    """Register each pair (target, source) from its current pose; None without convergence or enough overlap.
+
+    An edge has a share of its information, so that every scan counts once.
+    """
+    for target_id, source_id in pairs.tolist():
+        T_prior = geometry.inverse(T_world[target_id]) @ T_world[source_id]
+        found = align(submaps.submap(source_id), submaps.submap(target_id), T_prior)
+        if found is None or found.overlap < MIN_OVERLAP:
+            yield None
+            continue
+        information = limited_information(INFORMATION_SCALE * found.information, config=config)
+        yield Edge(target_id, source_id, geometry.nearest_transform(found.T_target_source), SHARE * information)

@@ -23,12 +23,13 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def _modules_checked() -> list[str]:
-    """All but packages and the modules with compiled kernels: numba cannot cache what the check has wrapped."""
-    return [
-        ".".join(file.relative_to(ROOT).with_suffix("").parts)
-        for file in sorted((ROOT / "segslam").rglob("*.py"))
-        if file.name != "__init__.py" and "import kernel\n" not in file.read_text()
-    ]
+    """All but the modules with compiled kernels, and packages with such: numba cannot cache what the check wraps."""
+    files = sorted((ROOT / "segslam").rglob("*.py"))
+    compiled = [file for file in files if "import kernel\n" in file.read_text()]
+    packages = {folder / "__init__.py" for file in compiled for folder in file.parents}
+    packages.add(ROOT / "segslam" / "cli" / "__init__.py")  # typer passes None for a flag
+    checked = [file.relative_to(ROOT) for file in files if file not in (*compiled, *packages)]
+    return [".".join(file.with_suffix("").parts).removesuffix(".__init__") for file in checked]
 
 
 install_import_hook(_modules_checked(), "helpers.checker.check")

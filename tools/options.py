@@ -1,4 +1,4 @@
-"""Writes docs/options.md: every setting (unit, default, range, meaning), from segslam/core/config.py.
+"""Writes docs/options.md: every setting (unit, default, range, meaning), from segslam/core/config/sections.py.
 
 python tools/options.py
 """

@@ -16,8 +16,7 @@ from scipy.fft import rfft2
 from scipy.ndimage import map_coordinates
 
 from segslam.core.points import hash_keys, voxel_first
-from segslam.core.short_repr import Record
-from segslam.core.types import Label, Labels, Points, SegslamError
+from segslam.core.types import Label, Labels, Points, Record, SegslamError
 from segslam.labels.geometric import GROUND_CELL_M, MAX_RANGE_M, MAX_SLOPE
 from segslam.labels.ground_surface import heights_above_ground, rotated, upright
 

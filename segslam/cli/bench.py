@@ -358,7 +358,7 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
     """Pictures of the worst failures, by caption."""
     from segslam.bench.experiments.job import BAD_SCAN, points_of
     from segslam.bench.experiments.summary import worst_failures
-    from segslam.output.report.gallery import draw_pair
+    from segslam.output.report.loops import draw_pair
 
     trial_of = {trial.key: trial for trial in trials}
     pictures = {}

@@ -1,16 +1,19 @@
-"""Checks before a command begins: its input exists, a run can be resumed, and nothing is replaced unasked."""
+"""Checks before a command begins: its input exists, a run can be resumed, nothing is replaced unasked; presets."""
 
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
+from segslam.cli.console import Terminal
+from segslam.cli.options import Settings
 from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.core.config import Config
     from segslam.output.log import RunLog
     from segslam.scans import Dataset
+    from segslam.scans.presets import Preset
 
 RUN_LOGS = ("log.mcap", "log.mcap.part")
 """A folder with one of these is a run."""
@@ -123,3 +126,40 @@ def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
     result = recorded.result()
     has_results = (recorded.path.parent / "report.html").is_file()  # the last file that a run writes
     return has_results and result is not None and bool(result[1].scan_index[-1] == scans.scan_index[-1])
+
+
+def check_preset(name: str, *, resumes: bool) -> None:
+    """Raises SegslamError for an unknown preset, and for any preset if a run is resumed."""
+    if name == "auto":
+        return
+    from segslam.scans.presets import SETTINGS
+
+    if name not in SETTINGS:
+        raise SegslamError(f"--preset {name}: unknown preset; known: auto, {', '.join(SETTINGS)}")
+    if resumes:
+        raise SegslamError(f"--preset {name}: a resumed run keeps its settings; omit the option")
+
+
+def preset_config(name: str, scans: "Dataset", terminal: Terminal) -> "Config":
+    """The settings of a preset; with `auto`, of the preset that fits the scans, with a message."""
+    from segslam.scans.presets import extent_m, preset, preset_for
+
+    if name != "auto":
+        return preset(cast("Preset", name))
+    extent = extent_m(scans)
+    show_preset(preset_for(extent), extent, terminal)
+    return preset(preset_for(extent))
+
+
+def live_configs(name: str, output: Settings) -> "dict[Preset, Config]":
+    """The settings for each preset that may fit the first scan: all the same unless `name` is `auto`."""
+    check_preset(name, resumes=False)
+    from segslam.scans.presets import SETTINGS, preset
+
+    return {one: output.load(base=preset(one if name == "auto" else cast("Preset", name))) for one in SETTINGS}
+
+
+def show_preset(chosen: "Preset", extent_m: float | None, terminal: Terminal) -> None:
+    """Print the preset that fits the scans, unless it is the default."""
+    if chosen != "driving":
+        terminal.say(f"surfaces are near (median range {extent_m:.0f} m): using --preset {chosen}")

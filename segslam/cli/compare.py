@@ -16,8 +16,6 @@ from segslam.cli.tables import TableFiles, as_text, figure, with_meaning
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.interrupts import when_stopped
 
-COLUMN = 14
-"""Smallest width of a column of the table, in characters."""
 SOURCE = "replayed.txt"
 """File in the folder of a sweep: the log that its runs replay."""
 
@@ -69,7 +67,7 @@ def _table(figures: dict[str, dict[str, Any]]) -> str:
     """A row for each figure of any run, and a column for each run; `-` for missing figures. Meanings are wrapped."""
     from segslam.output.finished import FIGURES
 
-    width = max(COLUMN, *(len(name) + 2 for name in figures))
+    width = max(14, *(len(name) + 2 for name in figures))
     lines = ["".join(f"{name:>{width}}" for name in figures)]
     for key, meaning in FIGURES.items():
         values = [run.get(key) for run in figures.values()]

@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists, check_free, make_room
+from segslam.cli.checks import check_exists, check_free, live_configs, make_room, show_preset
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.ending import counted, finish
-from segslam.cli.georeference import GnssOptions
-from segslam.cli.options import PresetOption, RunOutput
-from segslam.cli.preset import live_configs, show_preset
+from segslam.cli.options import GnssOptions, PresetOption, RunOutput
 from segslam.cli.viewers import check_display, close_scene, open_scene, serve_foxglove
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.extras import how_to_install
@@ -37,13 +35,9 @@ MOST_BEHIND = 20
 """Chosen: largest number of keyframes that wait for loop closing, 2 MB each. Further keyframes are stored, but their
 loops are searched at the end of the run only."""
 
-MAP_SO_FAR = "map_so_far.ply"
-"""Written by the service `/segslam/save_map`."""
 FINAL_SEARCH_S = 60.0
 """Chosen: the last search for loops ends after this time, so that the results of a live run are soon complete."""
 LINE_EVERY_S, BAR_EVERY_S = 10.0, 0.2
-LATE_S = 5.0
-"""Larger delays of loop closing are shown."""
 MANY_DROPPED = 0.02
 """Chosen: share of dropped scans above which a faster odometry is recommended."""
 COARSER = 1.5
@@ -106,13 +100,7 @@ def live(
         stack.enter_context(how_to_go_on(go_on))
         place = gnss.placing_live(stack)
         front = stack.enter_context(Front(source, configs, tell=terminal.say, idle_s=idle))
-        stops: list[bool] = []
-
-        def stop() -> None:
-            stops.append(True)
-            front.stop()
-
-        stack.enter_context(stopped_by_signals(stop))
+        stack.enter_context(stopped_by_signals(front.stop))
         front.wait_until_ready()
         terminal.say(f"{source.name}: waiting for scans; Ctrl-C ends the run")
         if (chosen := front.wait_until_chosen()) is not None:
@@ -141,7 +129,7 @@ def live(
             map_files=map_files,
             more=lambda _: more,
             search_s=FINAL_SEARCH_S,
-            stopped=bool(stops),
+            stopped=front.is_stopping,
             place=place,
         )
         if advice := too_slow(more, settings.odometry.voxel_size_m):
@@ -246,7 +234,7 @@ def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublis
     from segslam.run.live.ros import MappingPublisher
 
     def save() -> str:
-        file = run.folder / MAP_SO_FAR
+        file = run.folder / "map_so_far.ply"
         T_world_keyframe, cloud = run.map_so_far()
         num_points = save_map(T_world_keyframe, cloud, file, config=run.config.map)
         return f"{file}: {num_points} points of {counted(len(T_world_keyframe), 'keyframe')}"
@@ -297,7 +285,7 @@ class LiveFigures:
         text = f"live: {num} scans, {rate:.1f}/s"
         if num:
             text += f", pose {median(self._latency_ms[-20:]):.0f} ms after the scan"
-            if self._lag_s[-1] > LATE_S:
+            if self._lag_s[-1] > 5.0:
                 text += f", loops {self._lag_s[-1]:.1f} s behind"
         if self.num_dropped:
             text += f", {self.num_dropped} dropped"

@@ -19,7 +19,7 @@ from segslam.core.errors import SegslamError
 if TYPE_CHECKING:
     from segslam.bench.experiments.baselines import Estimate
     from segslam.core.config import Config
-    from segslam.core.stopwatch import Stopwatch
+    from segslam.core.threads import Stopwatch
     from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels
     from segslam.run.locator import Located, Locator
 
@@ -158,7 +158,7 @@ def register(
     settings = changes.load()
     terminal.announce(f"register: reading {source} and {target}")
     from segslam.bench.experiments.methods import find_method, prepare_parts
-    from segslam.core.stopwatch import Stopwatch
+    from segslam.core.threads import Stopwatch
 
     if method == "segregator-c2f" and not refine:
         method = "segregator"
@@ -185,8 +185,7 @@ def _read_one(
     """Points of a scan and their labels; None for labels if they are to be computed from geometry."""
     import numpy as np
 
-    from segslam.labels.label_files import encoding_of, read_labels
-    from segslam.labels.late import computed
+    from segslam.labels.label_files import computed, encoding_of, read_labels
     from segslam.scans.clouds import read_file
 
     points = read_file(scan).points
@@ -211,8 +210,7 @@ def _read_two(
 ) -> list[tuple["Points", "Labels"]]:
     """Points and labels of the two scans."""
     from segslam.labels import geometric_labels
-    from segslam.labels.label_files import encoding_of, open_labels, read_labels
-    from segslam.labels.late import computed
+    from segslam.labels.label_files import computed, encoding_of, open_labels, read_labels
     from segslam.scans.clouds import read_file
 
     files.check()

@@ -14,16 +14,16 @@ from segslam.cli.checks import (
     check_exists,
     check_free,
     check_intensities,
+    check_preset,
     check_same,
     is_finished,
     log_to_resume,
     make_room,
+    preset_config,
 )
 from segslam.cli.console import Terminal, how_to_go_on, print_json, say
 from segslam.cli.ending import finish, is_interrupted, map_summary
-from segslam.cli.georeference import GnssOptions
-from segslam.cli.options import DataArgument, RunOptions, RunOutput, ViewOption
-from segslam.cli.preset import check_preset, preset_config
+from segslam.cli.options import DataArgument, GnssOptions, RunOptions, RunOutput, ViewOption
 from segslam.cli.viewers import check_display, close_scene, open_scene, serve_foxglove
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped

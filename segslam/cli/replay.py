@@ -203,7 +203,7 @@ def _closures(step: "Step") -> set[Pair]:
     from segslam.core.types import LoopClosure
 
     outcomes = (attempt.outcome for attempt in step.attempts)
-    return {(outcome.source_id, outcome.target_id) for outcome in outcomes if isinstance(outcome, LoopClosure)}
+    return {outcome.pair for outcome in outcomes if isinstance(outcome, LoopClosure)}
 
 
 def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool) -> LoopEdits:
@@ -236,7 +236,7 @@ def _check_keyframes(run: Path, edits: LoopEdits, terminal: Terminal) -> None:
     attempts = chain(
         (attempt for step in recorded.steps(clouds=False) for attempt in step.attempts), recorded.late_loops()
     )
-    tried = {(attempt.candidate.source_id, attempt.candidate.target_id) for attempt in attempts}
+    tried = {attempt.candidate.pair for attempt in attempts}
     for newer, older in sorted(edits.forbidden - tried):
         terminal.say(f"{newer}:{older}: {run} has not tried this loop; forbidden all the same (loops.csv has the ids)")
 
@@ -246,7 +246,4 @@ def _outcomes(result: "SlamResult") -> dict[Pair, str]:
     from segslam.slam.slam_result import outcome_text
 
     weights = result.estimate.closure_weights
-    return {
-        (attempt.candidate.source_id, attempt.candidate.target_id): outcome_text(attempt, weights)
-        for attempt in result.attempts
-    }
+    return {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}

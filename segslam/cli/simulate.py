@@ -112,8 +112,9 @@ def demo(
     from segslam.bench import simulation
     from segslam.bench.simulation.files import SETTINGS_FILE
     from segslam.core.config import Config
+    from segslam.core.whole_files import write_whole
     from segslam.output.folder import new_folder
-    from segslam.output.report import BEFORE_AFTER, write_before_after
+    from segslam.output.report import BEFORE_AFTER, draw_before_after
     from segslam.scans import open_dataset
 
     make_room(out, overwrite=overwrite, made_by=(f"data/sequences/{SEQUENCE}/{SETTINGS_FILE}",))
@@ -130,7 +131,8 @@ def demo(
             pass
     scans = open_dataset(data, sequence=SEQUENCE, labels="geometric")
     map_scans(scans, out / "run", terminal, settings=Config(), go_on=begin_again)
-    picture = write_before_after(out / "run", out / "run" / BEFORE_AFTER)
+    picture = out / "run" / BEFORE_AFTER
+    write_whole(picture, draw_before_after(out / "run"))
     terminal.say(f"map before and after loop closing: {picture}")
 
 

@@ -27,8 +27,6 @@ SHORT = {
     "num_poses": "poses",
 }
 """Columns of a table for people: figures that at least one row has."""
-LEAST_WIDTH = 16
-"""Width of a wrapped text on a terminal that is too narrow for it."""
 Rows = Mapping[str, Mapping[str, Any]]
 """Name -> figures."""
 
@@ -41,7 +39,7 @@ def figure(value: float) -> str:
 def with_meaning(cells: str, meaning: str) -> str:
     """Figures and, beside them, their meaning, wrapped to the width of the terminal."""
     indent = " " * (len(cells) + 2)
-    width = max(shutil.get_terminal_size().columns, len(indent) + LEAST_WIDTH)
+    width = max(shutil.get_terminal_size().columns, len(indent) + 16)  # on a narrow terminal, too
     return textwrap.fill(meaning, width, initial_indent=f"{cells}  ", subsequent_indent=indent)
 
 

@@ -91,17 +91,17 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
     aligned = T_reference_estimate @ estimate
     absolute = pose_errors(aligned, reference)
     relative = relative_errors(estimate, reference)
-    ate_m = _rms(absolute.translation_m)
+    ate_m = rms(absolute.translation_m)
     metrics = {
         "ate_m": ate_m,
-        "rpe_m": _rms(relative.translation_m),
-        "rpe_deg": _rms(relative.rotation_deg),
+        "rpe_m": rms(relative.translation_m),
+        "rpe_deg": rms(relative.rotation_deg),
     }
     turn_deg = _turn_about_line_deg(reference[:, :3, 3], ate_m)
     if turn_deg < LINE_TURN_DEG:
-        metrics["are_deg"] = _rms(absolute.rotation_deg)
+        metrics["are_deg"] = rms(absolute.rotation_deg)
     if turn_deg < np.degrees(1.0):
-        metrics["height_m"] = _rms((aligned - reference)[:, :3, 3] @ np.array(up))
+        metrics["height_m"] = rms((aligned - reference)[:, :3, 3] @ np.array(up))
     segments = segment_errors(estimate, reference)
     if len(segments.translation_m):
         metrics["kitti_translation_percent"] = float(100 * segments.translation_m.mean())
@@ -211,5 +211,6 @@ def _turn_about_line_deg(positions: Points, error_m: float) -> float:
     return float(np.degrees(error_m / across)) if across > LINE_TOLERANCE * along else np.inf
 
 
-def _rms(values: Vector) -> float:
+def rms(values: Vector) -> float:
+    """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))

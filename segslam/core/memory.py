@@ -6,12 +6,6 @@ import resource
 import sys
 from pathlib import Path
 
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
-"""M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of glibc's malloc.h."""
-KEPT_BYTES = 256 * 2**20
-MMAP_BYTES = 32 * 2**20
-"""The largest value that glibc accepts."""
-
 
 def keep_freed_memory() -> None:
     """Let this process keep up to 256 MB of freed memory for reuse (glibc only).
@@ -24,8 +18,8 @@ def keep_freed_memory() -> None:
         return
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
-        mallopt(MMAP_THRESHOLD, MMAP_BYTES)
-        mallopt(TRIM_THRESHOLD, KEPT_BYTES)
+        mallopt(-3, 32 * 2**20)  # M_MMAP_THRESHOLD of glibc's malloc.h: the largest value that it accepts
+        mallopt(-1, 256 * 2**20)  # M_TRIM_THRESHOLD
 
 
 def give_back() -> None:

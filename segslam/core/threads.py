@@ -1,15 +1,19 @@
-"""Work in other threads: a pipeline of items, and two calls at the same time."""
+"""Work in other threads: a pipeline of items, two calls at the same time, and the time of all by stage."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from threading import get_ident
+from contextlib import contextmanager
+from threading import Lock, get_ident
+from time import perf_counter
 from typing import TypeVar
 
 First = TypeVar("First")
 Second = TypeVar("Second")
 Item = TypeVar("Item")
 Done = TypeVar("Done")
+_ADDING = Lock()
+"""Held while a stopwatch is changed. All share it: a stopwatch itself can be sent to another process."""
 
 
 def at_once(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
@@ -52,3 +56,24 @@ def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, max_
         thread.shutdown(wait=get_ident() not in worker, cancel_futures=True)
         if isinstance(items, Generator):
             items.close()
+
+
+class Stopwatch:
+    """Seconds spent in each stage, summed over all calls and threads."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Context manager that adds the time within it to this stage."""
+        started = perf_counter()
+        try:
+            yield
+        finally:
+            self.add(stage, perf_counter() - started)
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Add a time measured elsewhere (s)."""
+        with _ADDING:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds

@@ -7,9 +7,9 @@ Shapes are checked under pytest only.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum, StrEnum
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike
 from segslam.core.errors import BadScan as BadScan
 from segslam.core.errors import SegslamError as SegslamError
 from segslam.core.errors import WorkFailed as WorkFailed
-from segslam.core.short_repr import Record
 
 Points = Float[np.ndarray, "_ 3"]
 """Points, a row each, in metres."""
@@ -39,6 +38,36 @@ Indices = Int[np.ndarray, "_"]
 IndexPairs = Int[np.ndarray, "_ 2"]
 Vector = Float[np.ndarray, "_"]
 Mask = Bool[np.ndarray, "_"]
+
+
+class Record:
+    """Base of dataclasses with arrays; a representation of one line."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        parts = (f"{field.name}={_short(getattr(self, field.name))}" for field in fields(self))  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return _pose(value) if value.shape == (4, 4) else f"<{value.dtype} {value.shape}>"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, (tuple, list, dict)) and len(value) > 3:
+        return f"<{len(value)} in a {type(value).__name__}>"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key!r}: {_short(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, (tuple, list)):
+        return f"({', '.join(_short(one) for one in value)})"
+    return repr(value)
+
+
+def _pose(T_a_b: np.ndarray) -> str:
+    cosine = np.clip((np.trace(T_a_b[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
+    x, y, z = T_a_b[:3, 3]
+    return f"<{x:.2f} {y:.2f} {z:.2f} m, turned {np.degrees(np.arccos(cosine)):.1f} deg>"
 
 
 def as_points(points: ArrayLike) -> Points:
@@ -255,6 +284,11 @@ class LoopCandidate(Record):
     near_probability: float = 1.0
     """That the two are so near each other, horizontally, that they see the same place."""
 
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Ids of the two keyframes, the newer first."""
+        return self.source_id, self.target_id
+
 
 class Found(Record):
     """Base of what is not `Rejected`."""
@@ -340,6 +374,11 @@ class LoopClosure(Found):
     def of(cls, source_id: int, target_id: int, alignment: Alignment) -> "LoopClosure":
         """The loop between two keyframes with the pose and information of their alignment."""
         return cls(source_id, target_id, alignment.fine.T_target_source, alignment.fine.information, alignment)
+
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Ids of the two keyframes, the newer first."""
+        return self.source_id, self.target_id
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -8,12 +8,6 @@ from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row
 from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of
 
-NOTE = (
-    "heights: altitude above the geoid and geoid separation, as the receiver gives them, added to ellipsoidal heights"
-)
-NO_DATE = date(1970, 1, 1)
-"""Without RMC or ZDA the times are those of the day."""
-
 
 def is_nmea(lines: Sequence[str]) -> bool:
     """True if one of the first lines is a sentence."""
@@ -30,7 +24,8 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     """
     found: dict[str, list[Row]] = {"GGA": [], "RMC": []}
     dates = (_date(words) for words in map(_words, lines) if words)
-    day = next((one for one in dates if one), NO_DATE)  # fixes before the first date are of the same day
+    # Fixes before the first date are of the same day. Without RMC or ZDA the times are those of a day.
+    day = next((one for one in dates if one), date(1970, 1, 1))
     last, num_wrong, num_right = None, 0, 0
     for number, line in enumerate(lines, 1):
         words = _words(line)
@@ -50,7 +45,10 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     if not num_right:
         raise SegslamError(f"{file}: all {num_wrong} NMEA sentences have wrong checksums; log them again")
     left_out = f"; {num_wrong} lines with wrong checksums left out" if num_wrong else ""
-    return (found["GGA"], NOTE + left_out) if found["GGA"] else (found["RMC"], f"no heights{left_out}")
+    if not found["GGA"]:
+        return found["RMC"], f"no heights{left_out}"
+    heights = "altitude above the geoid and geoid separation, as the receiver gives them, added to ellipsoidal heights"
+    return found["GGA"], f"heights: {heights}{left_out}"
 
 
 def _words(line: str) -> list[str] | None:

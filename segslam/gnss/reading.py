@@ -12,8 +12,6 @@ from segslam.gnss.nmea import is_nmea, read_nmea
 from segslam.gnss.rtklib import is_rtklib, read_rtklib
 from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, text_lines
 
-UNKNOWN = 0
-"""`position_covariance_type` of a covariance that is not known."""
 OXTS_ACCURACY = 23
 """Column of the accuracy of the position (m), counted from 0, as the devkit's dataformat.txt lists them."""
 
@@ -76,7 +74,7 @@ def row_of(message: Any) -> Row:
     stamp = message.header.stamp
     nanosec = stamp.nanosec if hasattr(stamp, "nanosec") else stamp.nsec
     sigma_m = (float("nan"), float("nan"), float("nan"))
-    if message.position_covariance_type != UNKNOWN:
+    if message.position_covariance_type != 0:  # 0: not known
         east, north, up = (float(value) for value in list(message.position_covariance)[::4])
         sigma_m = _root(east), _root(north), _root(up)
     has_fix = int(message.status.status) >= 0

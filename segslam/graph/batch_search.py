@@ -16,9 +16,8 @@ from segslam.graph import noise
 from segslam.graph.closure_pairs import MAX_PAIRED, adjoints, consistent_pairs, ends_m, largest_consistent, neighbours
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph
-from segslam.graph.gnc import Solution, TruncatedProblem, better, settle, solve
+from segslam.graph.gnc import Solution, TruncatedProblem, better, exchange_groups, large_groups, settle, solve
 from segslam.graph.levenberg_marquardt import Search, deeply, search
-from segslam.graph.selection import exchange_groups, large_groups
 
 logger = logging.getLogger(__name__)
 IMPLAUSIBLE = 1e-6

@@ -20,14 +20,11 @@ from segslam.core.types import Indices, SegslamError, Transform
 from segslam.graph.edges import Edge, Transforms
 
 VERTEX, EDGE, FIX = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "FIX"
-NUM_IDS = {VERTEX: 1, EDGE: 2, FIX: 1}
 NUM_FIELDS = {VERTEX: 8, EDGE: 30, FIX: 1}
 """Ids included, the tag not."""
-PLANAR = ("VERTEX_SE2", "EDGE_SE2")
 UPPER = np.triu_indices(6)
 OTHER_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 """Turns [translation; rotation] into [rotation; translation], and back."""
-MAX_ID = 2**63
 QUATERNION_TOLERANCE = 0.01  # chosen: above the rounding of any writer met, far below any other four numbers
 
 
@@ -120,7 +117,7 @@ def _read_fields(path: Path) -> tuple[dict[str, list[list[str]]], dict[str, list
 
 
 def _complaint(tag: str, num_fields: int) -> str:
-    if tag in PLANAR:
+    if tag in ("VERTEX_SE2", "EDGE_SE2"):
         return f"{tag} belongs to a graph in the plane; only graphs in space ({VERTEX}, {EDGE}) can be read"
     if tag not in NUM_FIELDS:
         return f"unknown tag {brief(tag)}; known are {', '.join(NUM_FIELDS)}: remove the line"
@@ -128,7 +125,7 @@ def _complaint(tag: str, num_fields: int) -> str:
 
 
 def _table(path: Path, tag: str, line_numbers: list[int], fields: list[list[str]]) -> _Table:
-    num_ids = NUM_IDS[tag]
+    num_ids = 2 if tag == EDGE else 1
     table = _Table(path, line_numbers, [], np.empty((len(fields), NUM_FIELDS[tag] - num_ids)))
     for row, texts in enumerate(fields):
         try:
@@ -136,7 +133,7 @@ def _table(path: Path, tag: str, line_numbers: list[int], fields: list[list[str]
             table.numbers[row] = texts[num_ids:]
         except ValueError as error:
             raise table.refusal(row, brief(str(error))) from error
-        if not 0 <= min(table.ids[row]) <= max(table.ids[row]) < MAX_ID:
+        if not 0 <= min(table.ids[row]) <= max(table.ids[row]) < 2**63:
             raise table.refusal(row, "ids are at least 0 and below 2**63")
     for broken in np.flatnonzero(~np.isfinite(table.numbers).all(axis=1)):
         raise table.refusal(broken, "every number must be finite")

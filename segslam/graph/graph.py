@@ -15,6 +15,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
+from segslam.core.trajectory import Rows
 from segslam.core.types import (
     REJECTED_WEIGHT,
     GraphEstimate,
@@ -45,7 +46,6 @@ from segslam.graph.g2o import G2oGraph, write_g2o
 from segslam.graph.levenberg_marquardt import Search, Unsolvable, search
 from segslam.graph.motions import Drive, MotionSolution, solve_consistent, solve_gnc, without
 from segslam.graph.noise import INLIER_PROBABILITY
-from segslam.graph.rows import Rows
 from segslam.graph.steady_drift import noise_factor, steady_drift, turned
 
 logger = logging.getLogger(__name__)

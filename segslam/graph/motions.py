@@ -31,7 +31,7 @@ from segslam.graph.closure_pairs import (
     num_near,
 )
 from segslam.graph.edges import Edge, factor_graph, joined, poses_by_id, values_of
-from segslam.graph.selection import MIN_GROUP, select_consistent
+from segslam.graph.gnc import MIN_GROUP, select_consistent
 
 PLACE_M = 30.0
 """Closures whose ends are this near in travel join the same two places, and may be wrong together. Chosen."""

@@ -28,8 +28,6 @@ from segslam.graph.levenberg_marquardt import search
 
 MUCH_LESS = 0.5
 """Chosen: the correction is used if the rest of the drift needs at most this share of the noise."""
-MODELS = ((0,), (1,), (0, 1))
-"""Columns of the growth whose rates are estimated: travel, time, both."""
 RATE_COST = 3.0
 """Chosen: least decrease of the error (half the chi-square) for which a second rate is used, as in Bayes' criterion for
 some hundred motions."""
@@ -37,10 +35,6 @@ MOST_COMPARED = 300
 """Chosen: number of closures, spread over the drive, that are compared pairwise."""
 INDEPENDENT = 1e-6
 """Chosen: below this ratio of eigenvalues, travel and time are proportional; the smallest rates are then used."""
-ROUNDS = 3
-"""Linear estimates, each of which begins where the one before ended."""
-HEADING = 2
-"""Element of a tangent."""
 Growth = Float[np.ndarray, "_ k"]
 
 
@@ -88,9 +82,11 @@ def steady_drift(
     if before <= tolerated:
         return None
     trials = []
-    for model in (list(model) for model in MODELS if growth[:, model].any(axis=0).all()):
+    for model in ([0], [1], [0, 1]):  # rates by travel, by time, by both
+        if not growth[:, model].any(axis=0).all():
+            continue
         rates, at = np.zeros(growth.shape[1]), values
-        for _ in range(ROUNDS):
+        for _ in range(3):  # linear estimates, each from the one before
             corrected = turned(odometry, growth, rates)
             rates[model] += _rates(prior, corrected, closures, growth[:, model], at)
             corrected = turned(odometry, growth, rates)
@@ -135,7 +131,7 @@ def _rates(
     size = 6 * graph.size(), 6 * values.size() + 1
     whole = csc_array((entries, (rows.astype(int) - 1, columns.astype(int) - 1)), shape=size)
     jacobian, errors = whole[:, :-1], whole[:, -1:].toarray()[:, 0]
-    whitened = np.stack([np.linalg.cholesky(edge.information)[HEADING] for edge in odometry])
+    whitened = np.stack([np.linalg.cholesky(edge.information)[2] for edge in odometry])  # of the heading
     rates = np.zeros((size[0], growth.shape[1]))
     rates[: 6 * len(odometry)] = -(whitened[:, :, None] * growth[:, None, :]).reshape(-1, growth.shape[1])
     poses = splu((jacobian.T @ jacobian).tocsc())

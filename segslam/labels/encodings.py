@@ -1,4 +1,4 @@
-"""The three encodings of SemanticKITTI's classes in label files, and their detection.
+"""The three encodings of SemanticKITTI's classes in label files, and their detection; colours of the classes.
 
 `raw`: the ids of the annotation (Behley et al. 2019), 0-99 and 252-259. `learning`: the 19 classes of the benchmark
 as 1-19, 0 = unlabelled, and 20-25 for moving classes. `learning-0`: predictions without the unlabelled class, i.e.
@@ -8,7 +8,7 @@ the learning ids minus one, 0-18.
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Int, Integer
+from jaxtyping import Int, Integer, UInt8
 
 from segslam.core.types import Label, Labels, SegslamError
 
@@ -56,6 +56,32 @@ RARE_MAX_SHARE = (
     0.02  # chosen: together they have 0.1 % of the data set's points, and under 0.1 % of each real scan tried
 )
 ROAD_MIN_SHARE = 0.02  # chosen: the real scans of KITTI 00 contain 20 to 28 %
+COLORS = {
+    Label.UNLABELLED: "#9a9a9a",
+    Label.CAR: "#3f7fd6",
+    Label.BICYCLE: "#43c6c9",
+    Label.MOTORCYCLE: "#2b8f9c",
+    Label.TRUCK: "#5a4fcf",
+    Label.OTHER_VEHICLE: "#7d6be0",
+    Label.PERSON: "#e0332e",
+    Label.BICYCLIST: "#e85a9b",
+    Label.MOTORCYCLIST: "#b03a7c",
+    Label.ROAD: "#6f5b73",
+    Label.PARKING: "#a488a8",
+    Label.SIDEWALK: "#8a6f8e",
+    Label.OTHER_GROUND: "#7c5a4a",
+    Label.BUILDING: "#e8b93c",
+    Label.FENCE: "#d9823b",
+    Label.VEGETATION: "#3f9b45",
+    Label.TRUNK: "#8b5a2b",
+    Label.TERRAIN: "#9bcf6a",
+    Label.POLE: "#f4e58c",
+    Label.TRAFFIC_SIGN: "#ff4f3f",
+}
+"""Chosen, for the classes that maps contain: ground in violet and green, vehicles in blue."""
+
+Colors = UInt8[np.ndarray, "_ 3"]
+"""Red, green and blue, one row per point."""
 
 
 def to_labels(ids: Ids, encoding: Encoding) -> Labels:
@@ -130,3 +156,9 @@ _TABLES: dict[Encoding, Labels] = {
     "learning": _table({int(label): label for label in Label}),
     "learning-0": _table({int(label) - 1: label for label in Label if Label.CAR <= label <= Label.TRAFFIC_SIGN}),
 }
+
+
+def of_classes(labels: Labels) -> Colors:
+    """The colour of each label's class."""
+    table = np.array([list(bytes.fromhex(COLORS.get(label, "#000000")[1:])) for label in Label], np.uint8)
+    return table[labels]

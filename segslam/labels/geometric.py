@@ -8,9 +8,7 @@ import numpy as np
 from segslam.core.points import within_range
 from segslam.core.types import Label, Labels, Mask, Points, Vector
 from segslam.labels.ground_surface import heights_above_ground, rotated, upright
-from segslam.labels.solids import Pieces, grid_cells, pieces
-from segslam.labels.uprights import NUM_SLICES, on_thin_uprights
-from segslam.labels.walls import on_walls
+from segslam.labels.shapes import NUM_SLICES, Pieces, grid_cells, on_thin_uprights, on_walls, pieces
 
 MAX_RANGE_M = 70.0
 """Chosen: points farther away remain unlabelled (m)."""

@@ -1,4 +1,7 @@
-"""Labels from `.label` files (SemanticKITTI): one file per scan, named like the scan, in any of the encodings."""
+"""Labels from `.label` files (SemanticKITTI): one file per scan, named like the scan, in any of the encodings.
+
+A network's labels are computed on first use: it is slow, and only keyframes need labels.
+"""
 
 import logging
 from collections.abc import Sequence
@@ -20,7 +23,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 NETWORK = "network:"
-FILES_LOOKED_AT = 8  # chosen: number of files, spread over the drive, from which the encoding is detected
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +163,7 @@ def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | N
     named = _labelled(folder, scan_names)
     if len(named) < len(scan_names):
         logger.warning("%s: %d of %d scans have no label file", folder, len(scan_names) - len(named), len(scan_names))
-    spread = np.unique(np.linspace(0, len(named) - 1, FILES_LOOKED_AT).astype(int))
+    spread = np.unique(np.linspace(0, len(named) - 1, 8).astype(int))  # chosen: so many files show it
     return LabelFiles(folder, encoding or encoding_of([folder / f"{named[row]}.label" for row in spread]))
 
 
@@ -172,3 +174,15 @@ def _histogram(file: Path) -> Histogram:
     except BadScan:
         ids = np.empty(0, dtype=np.uint32)
     return np.bincount(ids, minlength=2**16)
+
+
+def computed(labels: ScanLabels) -> Labels:
+    """The labels, computed now if necessary."""
+    return labels() if callable(labels) else labels
+
+
+def of_rows(labels: ScanLabels, rows: Mask) -> ScanLabels:
+    """The labels of some rows; labels that are computed on first use stay so."""
+    if callable(labels):
+        return lambda: labels()[rows]
+    return labels[rows]

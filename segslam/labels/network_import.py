@@ -11,8 +11,6 @@ from pydantic import AfterValidator, AliasPath, BaseModel, Field
 from segslam.core.types import Label, SegslamError
 
 ARCH, DATA = "arch_cfg.yaml", "data_cfg.yaml"
-NO_CUTOFF_M = 1e6
-"""Stored as 0 in these files."""
 MERGED = {
     "unlabeled": Label.UNLABELLED,
     "outlier": Label.UNLABELLED,
@@ -80,7 +78,7 @@ class Architecture(BaseModel):
                 "window": self.votes.search,
                 "neighbours": self.votes.knn,
                 "sigma_px": self.votes.sigma,
-                "cutoff_m": self.votes.cutoff or NO_CUTOFF_M,
+                "cutoff_m": self.votes.cutoff or 1e6,  # 0 in these files: no limit
             }
         return {
             "field_of_view_deg": (self.fov_down, self.fov_up),

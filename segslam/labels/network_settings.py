@@ -5,9 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from segslam.core.config import LabelName, Section
-from segslam.core.config.files import validated
-from segslam.core.config.yaml_text import parse_yaml
+from segslam.core.config import LabelName, Section, parse_yaml, validated
 from segslam.core.errors import brief, unreadable
 from segslam.core.types import SegslamError
 from segslam.labels.network_import import ARCH, DATA, Architecture, ClassMap, is_architecture

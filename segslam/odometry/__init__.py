@@ -5,11 +5,10 @@ KISS-ICP or a given trajectory proposes motions; they are compared with the scan
 
 from segslam.odometry.apart import OdometryApart
 from segslam.odometry.checked import CheckedOdometry
-from segslam.odometry.given import GivenOdometry
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.motion_model import information_of
 from segslam.odometry.search import Recover
-from segslam.odometry.sweep import Odometry, OdometryResult, deskew_scan
+from segslam.odometry.sweep import GivenOdometry, Odometry, OdometryResult, deskew_scan
 from segslam.odometry.tracker import Tracked, Tracker
 
 __all__ = [

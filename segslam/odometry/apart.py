@@ -66,23 +66,23 @@ class _AlignerApart:
     def begin(self, config: OdometryConfig) -> None:
         """Replace the aligner by a new one."""
         with self._reported():
-            self._pipe.send((config,))
+            self._pipe.send(("begin", config))
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
         """T_odom_lidar of the next sweep, `gap` intervals after the previous one."""
-        return self._exchange((self._shared_or_sent(points), gap))
+        return self._exchange("align", self._shared_or_sent(points), gap)
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
         """As `Odometry.follow`."""
-        self._exchange((list(scans), T_odom_lidar, T_before_lidar))
+        self._exchange("follow", list(scans), T_odom_lidar, T_before_lidar)
 
     def align_alone(self, points: Points, gap: float = 1.0) -> None:
         """As `Aligner.align_alone`; the other process works while this one continues."""
-        request = (self._shared_or_sent(points), gap, None, None)
+        sent = self._shared_or_sent(points)
         with self._reported():
-            self._pipe.send(request)
+            self._pipe.send(("align_alone", sent, gap))
         self._is_waiting = True
 
     def alone(self) -> list[Transform]:
@@ -101,12 +101,11 @@ class _AlignerApart:
         self._shared[: len(points)] = points
         return len(points)
 
-    def _exchange(self, request: tuple[Any, ...]) -> Transform:
+    def _exchange(self, *request: Any) -> Any:
         self.alone()
         with self._reported():
             self._pipe.send(request)
-            answer: Transform = self._pipe.recv()
-        return answer
+            return self._pipe.recv()
 
     @contextmanager
     def _reported(self) -> Iterator[None]:
@@ -146,11 +145,10 @@ def _as_points(shared: Any) -> Points:
 
 
 def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
-    """Answer requests with a pose until the other side closes the pipe.
+    """Answer requests until the other side closes the pipe: the name of a method of the aligner, and its arguments.
 
-    One value is the argument of `begin`, which gets no answer; two values are the points and the gap of a sweep to
-    align, four those of one to `align_alone`, three the arguments of `follow`. Points are sent themselves or, if they
-    are in the shared memory, as their number.
+    `begin` gets no answer, and `align_alone` the pose. Points of a sweep are sent themselves or, if they are in the
+    shared memory, as their number.
     """
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and then closes the pipe
@@ -158,20 +156,11 @@ def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
     shared_points = _as_points(shared)
     try:
         while True:
-            request = pipe.recv()
-            if len(request) == 1:
-                aligner = KissAligner(*request)
+            name, first, *rest = pipe.recv()
+            if name == "begin":
+                aligner = KissAligner(first)
                 continue
-            if len(request) == 3:
-                aligner.follow(*request)
-                pipe.send(request[1])
-                continue
-            sent, gap = request[:2]
-            points = shared_points[:sent] if isinstance(sent, int) else sent
-            if len(request) == 4:
-                aligner.align_alone(points, gap)
-                pipe.send(aligner.alone().pop())
-            else:
-                pipe.send(aligner.align(points, gap))
+            answer = getattr(aligner, name)(shared_points[:first] if isinstance(first, int) else first, *rest)
+            pipe.send(aligner.alone().pop() if name == "align_alone" else answer)
     except (EOFError, OSError):
         return

@@ -21,8 +21,8 @@ from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig, SensorCalibrationConfig
 from segslam.core.geometry import raising
 from segslam.core.types import Mask, Points, Scan, Transform, Vector
-from segslam.keyframes.keyframes import KeyframeSelector
-from segslam.keyframes.keyframes import downsample_keyframe as thin_keyframe
+from segslam.keyframes import KeyframeSelector
+from segslam.keyframes import downsample_keyframe as thin_keyframe
 from segslam.labels.label_files import unlabelled
 from segslam.odometry import KissOdometry, Odometry
 from segslam.registration.refinement import Surface, downsample, make_surface

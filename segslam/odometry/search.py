@@ -7,7 +7,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.types import Alignment, Information, Points, Rejected, Transform
-from segslam.keyframes.submaps import DENSE_VOXELS
+from segslam.keyframes import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan, displacement_m
 from segslam.odometry.nudge import SEARCH_VOXELS

@@ -9,10 +9,10 @@ import numpy as np
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import Poses
 from segslam.core.types import BadScan, Indices, Motion, MotionState, Scan, Step, Transform
-from segslam.keyframes.keyframes import KeyframeSelector
+from segslam.keyframes import KeyframeSelector
 from segslam.odometry.checked import CheckedOdometry
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.local_map import MAP_SCANS

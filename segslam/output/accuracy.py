@@ -5,9 +5,9 @@ from typing import Literal
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.evaluation import MIN_POSES, Z_UP, align_positions, loop_metrics, pose_errors, trajectory_metrics
+from segslam.core.evaluation import MIN_POSES, Z_UP, align_positions, loop_metrics, pose_errors, rms, trajectory_metrics
 from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
-from segslam.core.types import IndexPairs, LoopClosure, Points, Trajectory, Vector
+from segslam.core.types import IndexPairs, LoopClosure, Points, Trajectory
 from segslam.output.folder import ALONE
 from segslam.slam.slam import SlamResult
 
@@ -57,8 +57,7 @@ def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[Loo
     """The closures whose two keyframes have a true pose, the rows of (source, target), and the true poses, by row."""
     rows = rows_of_same_scan(result.trajectory.scan_index[result.keyframe_rows], reference.scan_index)
     place_of_id = {int(keyframe_id): place for place, keyframe_id in enumerate(rows[:, 0])}
-    closures = [attempt.outcome for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
-    known = [c for c in closures if c.source_id in place_of_id and c.target_id in place_of_id]
+    known = [c for c in result.closures() if c.source_id in place_of_id and c.target_id in place_of_id]
     pairs = np.array([(place_of_id[c.source_id], place_of_id[c.target_id]) for c in known], dtype=int).reshape(-1, 2)
     return known, pairs, reference.T_world_lidar[rows[:, 1]]
 
@@ -85,14 +84,14 @@ def scores(
     figures = trajectory_metrics(scaled, reference, up=up)
     errors = pose_errors(aligned, reference)
     if align in ("first", "none"):  # trajectory_metrics aligns; these are the errors without it
-        figures["ate_m"] = _rms(errors.translation_m)
-        figures["are_deg"] = _rms(errors.rotation_deg)
-        figures["height_m"] = _rms((aligned - reference)[:, :3, 3] @ np.array(up))
+        figures["ate_m"] = rms(errors.translation_m)
+        figures["are_deg"] = rms(errors.rotation_deg)
+        figures["height_m"] = rms((aligned - reference)[:, :3, 3] @ np.array(up))
     figures |= {
         "ate_mean_m": float(errors.translation_m.mean()),
         "ate_median_m": float(np.median(errors.translation_m)),
+        "ate_max_m": float(errors.translation_m.max()),
     }
-    figures |= {"ate_max_m": float(errors.translation_m.max())}
     if align == "sim3":
         figures["scale"] = scale
     return figures | ({} if rpe_distance_m is None else _over_distance(aligned, reference, rpe_distance_m))
@@ -134,10 +133,6 @@ def _over_distance(estimate: Poses, reference: Poses, distance_m: float) -> dict
     errors_m = pose_errors(*motions).translation_m
     return {
         "rpe_distance_m": distance_m,
-        "rpe_over_distance_m": _rms(errors_m),
+        "rpe_over_distance_m": rms(errors_m),
         "rpe_over_distance_percent": float(100 * errors_m.mean() / distance_m),
     }
-
-
-def _rms(values: Vector) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -177,9 +177,10 @@ def room_for(folder: Path) -> Iterator[None]:
 def _loop_cells(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> dict[str, object]:
     """Column -> content, where it is known."""
     candidate, outcome = attempt.candidate, attempt.outcome
-    ids = (candidate.source_id, candidate.target_id)
-    cells: dict[str, object] = {"source": ids[0], "target": ids[1], "distance_m": candidate.distance_m}
-    cells |= {f"{stage}_s": f"{seconds:.6f}" for stage, seconds in attempt.seconds.items()}
+    cells: dict[str, object] = {
+        **{"source": candidate.source_id, "target": candidate.target_id, "distance_m": candidate.distance_m},
+        **{f"{stage}_s": f"{seconds:.6f}" for stage, seconds in attempt.seconds.items()},
+    }
     if isinstance(outcome, Rejected):
         return cells | {"outcome": outcome.reason.value, "detail": outcome.detail} | _judged_cells(outcome)
     found = outcome.alignment
@@ -192,7 +193,7 @@ def _loop_cells(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> 
         "rms_m": found.rms_m,
         "free_space_violation": found.free_space_violation,
         **_judged_cells(found),
-        "weight": weights[ids],
+        "weight": weights[candidate.pair],
         **dict(zip(POSE_COLUMNS, outcome.T_target_source.ravel(), strict=True)),
     }
 

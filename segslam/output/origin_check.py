@@ -24,7 +24,6 @@ HEAD_S = 5.0
 END_S = 2.0
 """Chosen: time for the last messages to reach a slow viewer."""
 BLOCK_BYTES = 2**16
-REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 def is_allowed(origin: str) -> bool:
@@ -98,7 +97,7 @@ class OriginCheck(Thread):
         refused = [origin for origin in _origins(head) if not is_allowed(origin)]
         if refused:
             logger.warning("Foxglove: a web page of %s was refused", ascii(refused[0])[:80])
-            writer.write(REFUSED)
+            writer.write(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
             await writer.drain()
             return
         inner_reader, inner_writer = await asyncio.open_connection(*self._inner, limit=BLOCK_BYTES)

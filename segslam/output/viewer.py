@@ -17,7 +17,7 @@ from segslam.core.types import (
     Step,
     Transform,
 )
-from segslam.labels.class_colors import COLORS
+from segslam.labels.encodings import COLORS
 from segslam.output.log.drawing import ACCEPTED_COLOR, PATH_GROWTH, REJECTED_COLORS, VIEW_EVERY
 
 WORLD, LIDAR, TIMES = "world", "world/lidar", "stage_ms"
@@ -40,12 +40,6 @@ MOTION_COLORS = {
     MotionState.BROKEN: "#CC0000",
 }
 """Colours of the scans whose motions are marked; others are not."""
-SCANS_TIMED = 300
-"""Number of latest scans whose times are drawn."""
-
-
-FLUSH_S = 60.0
-"""Longest wait for a viewer that does not accept data."""
 
 
 class Scene:
@@ -87,7 +81,7 @@ class Scene:
     def end(self) -> None:
         """Draw the final paths, and wait until the viewer has all data. Raises RuntimeError after a timeout."""
         self._draw_paths()
-        self._viewer.flush(timeout_sec=FLUSH_S)
+        self._viewer.flush(timeout_sec=60.0)
         self._viewer.disconnect()
 
     def _draw_paths(self) -> None:
@@ -137,8 +131,7 @@ class Scene:
         self._draw_paths()
 
     def _add_attempt(self, attempt: LoopAttempt) -> None:
-        candidate, outcome = attempt.candidate, attempt.outcome
-        ids = (candidate.source_id, candidate.target_id)
+        outcome, ids = attempt.outcome, attempt.candidate.pair
         rejected = isinstance(outcome, Rejected)
         color = REJECTED_COLORS[outcome.reason] if isinstance(outcome, Rejected) else ACCEPTED_COLOR
         shown = f"{outcome.reason}: {outcome.detail}" if isinstance(outcome, Rejected) else "accepted"
@@ -152,9 +145,9 @@ class Scene:
 
 
 def _layout() -> rrb.Blueprint:
-    """The world above, the time of each stage below."""
+    """The world above, the time of each stage below, of the last 300 scans."""
     now = rrb.TimeRangeBoundary.cursor_relative(seq=0)
-    lately = rrb.VisibleTimeRange("scan", start=rrb.TimeRangeBoundary.cursor_relative(seq=-SCANS_TIMED), end=now)
+    lately = rrb.VisibleTimeRange("scan", start=rrb.TimeRangeBoundary.cursor_relative(seq=-300), end=now)
     world = rrb.Spatial3DView(origin=WORLD, name="world")
     times = rrb.TimeSeriesView(origin=TIMES, name="milliseconds by stage", time_ranges=[lately])
     return rrb.Blueprint(rrb.Vertical(world, times, row_shares=[4, 1]), collapse_panels=True)

@@ -6,7 +6,7 @@ from itertools import islice
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import Registration, Rejected, Transform
 from segslam.registration import segregator
 from segslam.registration.prepared import PreparedScan

@@ -12,20 +12,19 @@ from numpy.typing import ArrayLike
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
 from segslam.core.config import Config
 from segslam.core.points import within_range
-from segslam.core.short_repr import Record
 from segslam.core.threads import at_once
 from segslam.core.types import (
     Alignment,
     Keyframe,
     Labels,
     Points,
+    Record,
     Rejected,
     RejectReason,
     Transform,
     as_points,
 )
-from segslam.keyframes.keyframes import Clouds, downsample_keyframe
-from segslam.keyframes.submaps import Submaps
+from segslam.keyframes import Clouds, Submaps, downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.output.finished import read_run
 from segslam.output.log import read_log

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from segslam.candidates.proximity import MIN_GAP_M
 from segslam.core.config import Config, ProximityConfig, changed_settings, load_config
 from segslam.core.trajectory import travelled_m
-from segslam.core.types import LoopClosure, SegslamError, Vector
+from segslam.core.types import SegslamError, Vector
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import copy_alone, new_folder
 from segslam.output.georeferenced import FILE, read_globe
@@ -114,9 +114,9 @@ def pairs_near_fixes(run_or_log: Path) -> frozenset[Pair]:
     globe = read_globe(run.folder)
     if globe is None:
         raise SegslamError(f"{run.folder / FILE}: missing; `segslam georeference` the run first")
-    rows, attempts = run.result.keyframe_rows, run.result.attempts
-    loops = [(one.outcome.source_id, one.outcome.target_id) for one in attempts if isinstance(one.outcome, LoopClosure)]
-    tried = {(one.candidate.source_id, one.candidate.target_id) for one in attempts}
+    rows = run.result.keyframe_rows
+    loops = [closure.pair for closure in run.result.closures()]
+    tried = {attempt.candidate.pair for attempt in run.result.attempts}
     travel_m = travelled_m(run.result.odometry.T_world_lidar)[rows]
     return pairs_near(globe.T_enu_lidar[rows, :2, 3], travel_m, loops, tried, config=run.config.proximity)
 

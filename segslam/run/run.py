@@ -20,7 +20,6 @@ from segslam.core.threads import in_other_thread
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import (
     BadScan,
-    LoopClosure,
     MotionState,
     Scan,
     SegslamError,
@@ -56,10 +55,6 @@ logger = logging.getLogger(__name__)
 
 MOST_WAITING = 8
 """Chosen: scans by which odometry may lead loop closing, about 2 MB each: the time of a keyframe with two loops."""
-
-
-def _nothing_more(_: SlamResult) -> Mapping[str, Any]:
-    return {}
 
 
 class Run:
@@ -224,22 +219,8 @@ class Run:
             self._note_ms("adjust", result.adjusted.record.seconds)
         if result.alone is None:
             result = replace(result, alone=read_alone(self.folder, result.odometry))  # a replay has a copy
-        late = result.attempts[len(result.attempts) - result.num_late_attempts :]
-        self._log.write_result(result.estimate, result.trajectory, late, result.adjusted)
-        self._log.close()
+        self._write(result)
         seconds, seconds_mapping = (perf_counter() - since for since in (self._started, self._started_mapping))
-        with room_for(self.folder):
-            write_poses(self.folder, "poses", result.trajectory, self._T_camera_lidar, among=result.localised())
-            if result.from_map_m is not None:
-                write_localised(self.folder, result.trajectory, result.from_map_m, result.localised())
-            write_poses(self.folder, "odometry", result.odometry, self._T_camera_lidar)
-            if result.alone is not None:
-                write_poses(self.folder, ALONE, result.alone, self._T_camera_lidar)
-            self._slam.graph.write_g2o(self.folder / "graph.g2o")
-            if isinstance(self._slam.graph, PoseGraph):
-                self._slam.graph.write_adjusted_g2o(self.folder / ADJUSTED_GRAPH)
-            write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
-        closures = [attempt for attempt in result.attempts if isinstance(attempt.outcome, LoopClosure)]
         states = Counter(motion.state for motion in result.motions)
         return result, {
             "num_scans": len(result.trajectory),
@@ -251,7 +232,7 @@ class Run:
             "num_motions_broken": states[MotionState.BROKEN],
             "num_motions_rejected": len(result.estimate.motion_weights),
             "num_candidates": len(result.attempts),
-            "num_loops_accepted": len(closures),
+            "num_loops_accepted": len(result.closures()),
             "num_loops_switched_off": len(result.estimate.rejected),
             "seconds_total": seconds,
             "scans_per_second": (len(result.trajectory) - self.num_scans_resumed) / seconds_mapping,
@@ -264,10 +245,27 @@ class Run:
             },
         }
 
+    def _write(self, result: SlamResult) -> None:
+        """End the log, and write the files of poses, graph and loops."""
+        late = result.attempts[len(result.attempts) - result.num_late_attempts :]
+        self._log.write_result(result.estimate, result.trajectory, late, result.adjusted)
+        self._log.close()
+        with room_for(self.folder):
+            write_poses(self.folder, "poses", result.trajectory, self._T_camera_lidar, among=result.localised())
+            if result.from_map_m is not None:
+                write_localised(self.folder, result.trajectory, result.from_map_m, result.localised())
+            write_poses(self.folder, "odometry", result.odometry, self._T_camera_lidar)
+            if result.alone is not None:
+                write_poses(self.folder, ALONE, result.alone, self._T_camera_lidar)
+            self._slam.graph.write_g2o(self.folder / "graph.g2o")
+            if isinstance(self._slam.graph, PoseGraph):
+                self._slam.graph.write_adjusted_g2o(self.folder / ADJUSTED_GRAPH)
+            write_loops(self.folder / "loops.csv", result.attempts, result.estimate.closure_weights)
+
     def complete(
         self,
         *,
-        more: Callable[[SlamResult], Mapping[str, Any]] = _nothing_more,
+        more: Callable[[SlamResult], Mapping[str, Any]] = lambda _: {},
         place: Callable[[Path], str] | None = None,
         map_files: Sequence[Path] = (),
         search_s: float = math.inf,

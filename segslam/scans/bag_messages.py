@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from segslam.core.config.yaml_text import parse_yaml
+from segslam.core.config import parse_yaml
 from segslam.core.extras import how_to_install
 
 CLOUD = "sensor_msgs/msg/PointCloud2"

@@ -11,16 +11,11 @@ import numpy as np
 from segslam.core.types import BadScan, SegslamError
 from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
-from segslam.scans.pcd import parse_pcd
-from segslam.scans.ply import parse_ply
-from segslam.scans.point_cloud2 import INTENSITY_FIELDS, TIME_FIELDS
-from segslam.scans.scan_files import Columns, read_bytes
+from segslam.scans.scan_files import INTENSITY_FIELDS, TIME_FIELDS, Columns, read_bytes
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 TIMES = (*TIME_FIELDS, "timestamps", "stamps")
 """Names of the field with the time of a point; the first that exists is used."""
-NPY_MAGIC = b"\x93NUMPY"
-NPY_NUMBER = re.compile(r"[<>|=]?[fiu][1248]")
 MAX_NPY_HEADER_BYTES = 10_000
 """As in NumPy: a longer header can make Python's parser fail."""
 
@@ -38,8 +33,12 @@ def read_file(file: Path) -> Cloud:
             case ".npy":
                 return _from_rows(_parse_npy(read_bytes(file)))
             case ".ply":
+                from segslam.scans.ply import parse_ply
+
                 return _from_columns(parse_ply(read_bytes(file)))
             case ".pcd":
+                from segslam.scans.pcd import parse_pcd
+
                 return _from_columns(parse_pcd(read_bytes(file)))
             case other:
                 raise SegslamError(f"{file}: unknown format {other or '(no extension)'}; give .bin, .npy, .ply or .pcd")
@@ -54,7 +53,7 @@ def _parse_npy(content: bytes) -> np.ndarray:
 
     Raises ValueError for another content, and for a file whose size is not that of the array.
     """
-    if not content.startswith(NPY_MAGIC) or len(content) < 12:
+    if not content.startswith(b"\x93NUMPY") or len(content) < 12:
         raise ValueError("it is not a .npy file; save an array by numpy.save")
     size, start = ("<H", 10) if content[6] == 1 else ("<I", 12)
     (num_header,) = struct.unpack_from(size, content, 8)
@@ -69,7 +68,7 @@ def _parse_npy(content: bytes) -> np.ndarray:
             pass
         case _:
             raise ValueError("its array is not of the shape (n, 3) or more, or not of plain numbers, x y z")
-    if not NPY_NUMBER.fullmatch(kind) or kind[-2:] == "f1" or columns < 3 or rows < 0:
+    if not re.fullmatch(r"[<>|=]?[fiu][1248]", kind) or kind[-2:] == "f1" or columns < 3 or rows < 0:
         raise ValueError(f"it contains {kind[:20]} of shape ({rows}, {columns}); expected (n, 3) numbers, x y z")
     start += num_header
     num_bytes = len(content) - start

@@ -19,7 +19,6 @@ from segslam.core.extras import how_to_install
 from segslam.scans.bag_messages import CLOUD, InOrder, one_topic
 from segslam.scans.scan_files import MAX_SCAN_BYTES
 
-RECORD_HEADER_BYTES = 9
 DAMAGE = (McapError, ValueError, OverflowError, struct.error)
 """Exceptions of the library for damaged records."""
 
@@ -122,7 +121,7 @@ def _places(stream: IO[bytes], summary: Summary, channels: dict[int, Channel]) -
     for chunk in summary.chunk_indexes:
         for channel in channels.keys() & chunk.message_index_offsets.keys():
             with suppress(*DAMAGE):
-                stream.seek(chunk.message_index_offsets[channel] + RECORD_HEADER_BYTES)
+                stream.seek(chunk.message_index_offsets[channel] + 9)  # opcode and length of the record
                 index = MessageIndex.read(ReadDataStream(stream))
                 entries = index.records if index.channel_id == channel else []
                 places += [_Place(log_ns, chunk.chunk_start_offset, offset) for log_ns, offset in entries]

@@ -8,11 +8,8 @@ from typing import Any
 import numpy as np
 
 from segslam.scans.dataset import Cloud
+from segslam.scans.scan_files import INTENSITY_FIELDS, TIME_FIELDS
 
-TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time")
-"""Names that drivers (Ouster, Velodyne, Hesai, Robosense, Livox) use for the time of a point, in any unit."""
-INTENSITY_FIELDS = ("intensity", "reflectivity", "signal")
-"""Names that drivers and programs use for the intensity; the first that exists is used."""
 KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of sensor_msgs/PointField by number."""
 

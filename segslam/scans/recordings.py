@@ -17,7 +17,6 @@ from segslam.core.errors import brief
 from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
-from segslam.scans.bag_messages import BagMessages
 from segslam.scans.clouds import SUFFIXES, read_file
 from segslam.scans.dataset import (
     ASSUMED_PERIOD_NS,
@@ -29,11 +28,8 @@ from segslam.scans.dataset import (
     no_topics,
     read_stamps,
     selected_rows,
+    sweep_times,
 )
-from segslam.scans.mcap_messages import McapMessages
-from segslam.scans.ouster import OusterFrames
-from segslam.scans.point_cloud2 import MessageClouds
-from segslam.scans.sweep_times import sweep_times
 
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
 REMEDIES = {
@@ -196,15 +192,26 @@ def _opened(source: DataSource) -> tuple[str, Path, Any]:
 
 
 def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
-    """The reader of a kind of data: scans by their number, as points and times, or as points alone."""
+    """The reader of a kind of data: scans by their number, as points and times, or as points alone.
+
+    Libraries of recordings are imported for their kind only.
+    """
     match kind:
         case "generic":
             return ScanFolder(source)
         case "mcap":
+            from segslam.scans.mcap_messages import McapMessages
+            from segslam.scans.point_cloud2 import MessageClouds
+
             return MessageClouds(McapMessages(source, topic))
         case "rosbag":
+            from segslam.scans.bag_messages import BagMessages
+            from segslam.scans.point_cloud2 import MessageClouds
+
             return MessageClouds(BagMessages(source, topic))
         case "ouster":
+            from segslam.scans.ouster import OusterFrames
+
             return OusterFrames(source)
     from kiss_icp.datasets import dataset_factory
 

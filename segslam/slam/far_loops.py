@@ -12,7 +12,7 @@ import numpy as np
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature
 from segslam.candidates.proximity import Nearness, nearness
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
 from segslam.graph import Graph
 from segslam.graph.confirmation import Confirmation

@@ -8,14 +8,12 @@ from time import monotonic
 from segslam.candidates import PlaceSignature, signature_of
 from segslam.candidates.proximity import ProximityDetector
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
-from segslam.core.threads import at_once
+from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import Graph
 from segslam.graph.chains import far_from_prior
 from segslam.graph.confirmation import Confirmation
-from segslam.keyframes.keyframes import Clouds
-from segslam.keyframes.submaps import Submaps
+from segslam.keyframes import Clouds, Submaps
 from segslam.registration.hypotheses import Gate, anywhere
 from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops

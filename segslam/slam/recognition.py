@@ -13,10 +13,8 @@ import numpy as np
 from segslam.candidates import PlaceCandidate
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.short_repr import Record
-from segslam.core.stopwatch import Stopwatch
-from segslam.core.threads import at_once
-from segslam.core.types import Alignment, Rejected, RejectReason, Transform
+from segslam.core.threads import Stopwatch, at_once
+from segslam.core.types import Alignment, Record, Rejected, RejectReason, Transform
 from segslam.registration.hypotheses import Gate, anywhere
 from segslam.registration.prepared import PreparedScan
 from segslam.verification import score

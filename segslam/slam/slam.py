@@ -11,7 +11,7 @@ from time import monotonic
 import numpy as np
 
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import corrected_poses
 from segslam.core.types import (
     GraphEstimate,
@@ -29,9 +29,9 @@ from segslam.core.types import (
     Transform,
 )
 from segslam.graph import Graph, PoseGraph
-from segslam.keyframes.keyframes import Clouds, CloudStore, downsample_keyframe
+from segslam.keyframes import Clouds, CloudStore, downsample_keyframe
 from segslam.labels import geometric_labels
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed
 from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
 from segslam.odometry import Tracked as Tracked
 from segslam.registration.prepared import Labeller

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from segslam.core.evaluation import align_positions, trajectory_metrics
-from segslam.core.short_repr import Record
 from segslam.core.trajectory import Poses, camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
 from segslam.core.types import (
     GraphEstimate,
@@ -17,6 +16,7 @@ from segslam.core.types import (
     LoopClosure,
     Mask,
     Motion,
+    Record,
     Rejected,
     SegslamError,
     Trajectory,
@@ -59,7 +59,7 @@ class SlamResult(Record):
 
     def __post_init__(self) -> None:
         """Keep the last attempt for each pair."""
-        last = {(one.candidate.source_id, one.candidate.target_id): row for row, one in enumerate(self.attempts)}
+        last = {one.candidate.pair: row for row, one in enumerate(self.attempts)}
         rows = sorted(last.values())
         first_late = len(self.attempts) - self.num_late_attempts
         object.__setattr__(self, "num_late_attempts", sum(row >= first_late for row in rows))
@@ -135,7 +135,7 @@ class SlamResult(Record):
                     "source": closure.source_id,
                     "target": closure.target_id,
                     "T_target_source": closure.T_target_source.tolist(),
-                    "weight": self.estimate.closure_weights.get((closure.source_id, closure.target_id)),
+                    "weight": self.estimate.closure_weights.get(closure.pair),
                 }
                 for closure in self.closures()
             ],
@@ -158,7 +158,7 @@ def outcome_text(attempt: LoopAttempt, closure_weights: Mapping[tuple[int, int],
     if isinstance(outcome, Rejected):
         reason = outcome.reason.value.replace("_", " ")
         return f"rejected, {reason}" + (f" ({outcome.detail})" if outcome.detail else "")
-    weight = closure_weights[outcome.source_id, outcome.target_id]
+    weight = closure_weights[outcome.pair]
     found = outcome.alignment
     probable = "" if found.probability is None else f"{probability_text(found.probability, found.evidence)}, "
     return f"accepted, {probable}overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m, weight {weight:.2f}"

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
-from segslam.core.threads import at_once
+from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import Alignment, Labels, Registration, Rejected, RejectReason, Transform, as_points
 from segslam.labels import geometric_labels
 from segslam.registration import refinement

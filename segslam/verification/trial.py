@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Registration, Rejected, RejectReason, Transform
 from segslam.registration import refinement
 from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Gate, Pair

@@ -4,7 +4,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from segslam.bench.simulation import buildings, plants, vehicles
+from segslam.bench.simulation import buildings, objects
 from segslam.bench.simulation.mesh import Mesh, as_instance, box, extruded, frustum, join_meshes, placed, stem
 from segslam.core.types import Label
 
@@ -70,7 +70,7 @@ def test_placing_turns_counter_clockwise_then_moves():
 
 
 def test_only_the_named_classes_are_numbered():
-    tree = as_instance(plants.tree(np.random.default_rng(0)), 70_000, only=(Label.TRUNK,))
+    tree = as_instance(objects.tree(np.random.default_rng(0)), 70_000, only=(Label.TRUNK,))
     numbers = {label: set(tree.instances[tree.labels == label]) for label in (Label.TRUNK, Label.VEGETATION)}
     assert numbers[Label.VEGETATION] == {0}
     assert numbers[Label.TRUNK] == {70_000 - 65_535}
@@ -78,7 +78,7 @@ def test_only_the_named_classes_are_numbered():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_cars_have_the_size_of_cars(seed):
-    length, width, height = extent(vehicles.car(np.random.default_rng(seed)))
+    length, width, height = extent(objects.car(np.random.default_rng(seed)))
     assert 3.5 < length < 5.7
     assert 1.5 < width < 2.1
     assert 1.3 < height < 2.2
@@ -86,7 +86,7 @@ def test_cars_have_the_size_of_cars(seed):
 
 def test_a_car_is_seen_under_and_its_windows_are_glass():
     rng = np.random.default_rng(0)
-    car = vehicles.car(rng)
+    car = objects.car(rng)
     side = np.column_stack([np.zeros(3), np.full(3, -9.0), [0.1, 0.5, 1.2]])
     ranges, met = cast(car, side, np.broadcast_to([0.0, 1.0, 0.0], (3, 3)))
     assert np.isinf(ranges[0])
@@ -96,7 +96,7 @@ def test_a_car_is_seen_under_and_its_windows_are_glass():
 
 
 def test_lorries_are_longer_and_taller_than_cars():
-    sizes = np.array([extent(vehicles.truck(np.random.default_rng(seed))) for seed in range(10)])
+    sizes = np.array([extent(objects.truck(np.random.default_rng(seed))) for seed in range(10)])
     assert (sizes[:, 0] > 5.0).all()
     assert (sizes[:, 2] > 2.5).all()
 
@@ -124,7 +124,7 @@ def test_all_four_sides_of_a_building_face_outward():
 
 @pytest.mark.parametrize(("seed", "scale"), [(0, 0.0), (1, 1.0), (2, None)])
 def test_a_tree_is_a_trunk_under_a_crown(seed, scale):
-    tree = plants.tree(np.random.default_rng(seed), scale=scale)
+    tree = objects.tree(np.random.default_rng(seed), scale=scale)
     trunk, crown = (
         tree.vertices[np.unique(tree.triangles[tree.labels == label])] for label in (Label.TRUNK, Label.VEGETATION)
     )
@@ -134,7 +134,7 @@ def test_a_tree_is_a_trunk_under_a_crown(seed, scale):
 
 
 def test_a_hedge_stops_most_rays_with_a_rough_face():
-    part = plants.hedge(np.random.default_rng(0), 8.0, 1.0, 1.6)
+    part = objects.hedge(np.random.default_rng(0), 8.0, 1.0, 1.6)
     rng = np.random.default_rng(1)
     origins = np.column_stack([rng.uniform(-3.5, 3.5, 3000), np.full(3000, -5.0), rng.uniform(0.2, 1.4, 3000)])
     ranges, _ = cast(part, origins, np.broadcast_to([0.0, 1.0, 0.0], origins.shape))

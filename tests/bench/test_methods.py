@@ -12,7 +12,7 @@ from segslam.bench.experiments.method_settings import METHOD_NAMES, method_confi
 from segslam.bench.experiments.methods import METHODS, find_method, prepare_parts
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import Rejected, SegslamError
 
 CONFIG = Config()

@@ -10,11 +10,10 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.made_networks import class_network
 
+from segslam.bench.label_scores import STILL, class_scores, confusion, group_scores, largest_confusions
 from segslam.core.types import Label
-from segslam.labels.class_colors import of_classes
-from segslam.labels.encodings import RAW_OF_LABEL, Encoding, to_labels
+from segslam.labels.encodings import RAW_OF_LABEL, Encoding, of_classes, to_labels
 from segslam.labels.label_files import read_ids, read_labels
-from segslam.labels.scores import STILL, class_scores, confusion, group_scores, largest_confusions
 from segslam.scans import open_dataset
 
 NUM_SCANS = 3

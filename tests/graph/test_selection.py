@@ -9,9 +9,8 @@ from segslam.core import geometry
 from segslam.core.config import GraphConfig
 from segslam.graph.closure_pairs import consistent_pairs, ends_m, largest_consistent, neighbours
 from segslam.graph.edges import Edge, factor_graph
-from segslam.graph.gnc import TruncatedProblem, settle, settle_from
+from segslam.graph.gnc import TruncatedProblem, select_consistent, settle, settle_from
 from segslam.graph.noise import first_pose, inlier_bound, odometry_information
-from segslam.graph.selection import select_consistent
 
 BOUND = inlier_bound(0.99, error_allowance=3.0)
 HEADINGS = np.linspace(0.0, 4.0 * np.pi, 160)

@@ -8,11 +8,11 @@ import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
 from helpers.made_networks import save_network
+from segslam.bench.label_scores import NUM_CLASSES, STILL
 from segslam.bench.simulation.files import uncorrected
 from segslam.bench.simulation.sensor import Sweep
 from segslam.labels.network_settings import NetworkSettings
 from segslam.labels.range_image import EMPTY, network_input, project
-from segslam.labels.scores import NUM_CLASSES, STILL
 
 SETTINGS: dict[str, Any] = {
     "field_of_view_deg": [-22.8, 22.5],

@@ -4,7 +4,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import KeyframeConfig
 from segslam.core.types import Keyframe, Label
-from segslam.keyframes.keyframes import CloudStore, KeyframeSelector, downsample_keyframe
+from segslam.keyframes import CloudStore, KeyframeSelector, downsample_keyframe
 
 CONFIG = KeyframeConfig(distance_m=2.0)
 

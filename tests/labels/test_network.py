@@ -17,8 +17,7 @@ from onnx import TensorProto, helper
 
 from segslam.core.config import OdometryConfig
 from segslam.core.types import Label, SegslamError
-from segslam.labels.label_files import open_labels
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed, open_labels
 from segslam.labels.network import open_network
 from segslam.labels.network_settings import read_settings
 from segslam.odometry.sweep import deskew_scan

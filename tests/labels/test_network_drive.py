@@ -15,13 +15,13 @@ from helpers.made_logs import boundaries
 from helpers.made_networks import class_network
 from helpers.trained_network import train_network
 
+from segslam.bench.label_scores import confusion
 from segslam.bench.simulation.files import uncorrected
 from segslam.core.trajectory import write_kitti
 from segslam.core.types import LoopClosure
 from segslam.labels.encodings import to_labels
 from segslam.labels.label_files import read_ids
 from segslam.labels.network import Network, open_network
-from segslam.labels.scores import confusion
 from segslam.output.log import read_log
 
 pytestmark = pytest.mark.usefixtures("short_runs")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from segslam.labels.uprights import NUM_SLICES, on_thin_uprights
+from segslam.labels.shapes import NUM_SLICES, on_thin_uprights
 
 SIDE = 60
 RULE = {"core": 3, "ring": 6, "min_slices": 6, "min_share": 0.7}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from segslam.core.geometry import yaw
-from segslam.labels.walls import CELL_M, LAYER_M, MIN_LENGTH_M, MIN_POINTS, NUM_LAYERS, on_walls
+from segslam.labels.shapes import LAYER_M, MIN_LENGTH_M, MIN_POINTS, NUM_LAYERS, WALL_CELL_M, on_walls
 
 RULE = {"thickness_m": 0.15, "min_top_m": 1.8}
 
@@ -17,7 +17,7 @@ def _face(rng, *, length_m, height_m, thickness_m=0.02, turn_deg=0.0, num_points
 
 def _by_components(points, heights):
     """The rule, point by point, on the points of the 3 x 3 voxels around it."""
-    cells = np.floor(points[:, :2] / CELL_M)
+    cells = np.floor(points[:, :2] / WALL_CELL_M)
     layers = np.clip(heights // LAYER_M, 0, NUM_LAYERS - 1)
     walls = np.zeros(len(points), bool)
     for k in range(len(points)):

@@ -17,8 +17,8 @@ from helpers.finished_run import MadeRun, make_run
 
 from segslam.core import geometry
 from segslam.output.finished import read_run
-from segslam.output.report import interactive, write_report
-from segslam.output.report.interactive import MOST_SCANS, with_clouds
+from segslam.output.report import loops, write_report
+from segslam.output.report.loops import MOST_SCANS, with_clouds
 
 BROWSER = next((name for name in ("chromium", "chromium-browser", "google-chrome") if shutil.which(name)), None)
 BROKEN = """<script>
@@ -96,7 +96,7 @@ def test_text_of_a_run_cannot_end_the_script(made: MadeRun) -> None:
     attempt = next(one for one in run.result.attempts if not one.outcome.ok)
     outcome = replace(attempt.outcome, detail="</script><b>")  # type: ignore[type-var]
     attempts = tuple(replace(one, outcome=outcome) if one is attempt else one for one in run.result.attempts)
-    page = interactive.top_view(replace(run, result=replace(run.result, attempts=attempts)), {})
+    page = loops.top_view(replace(run, result=replace(run.result, attempts=attempts)), {})
     assert "</script><b>" not in page
     assert any("</script><b>" in loop["text"] for loop in _data(page)["loops"])
 
@@ -104,12 +104,12 @@ def test_text_of_a_run_cannot_end_the_script(made: MadeRun) -> None:
 def test_long_drives_are_thinned(made: MadeRun, monkeypatch: pytest.MonkeyPatch) -> None:
     run = read_run(made.folder)
     for most, num_accepted in ((3, 3), (6, 4), (100, 4)):
-        monkeypatch.setattr(interactive, "MOST_PAIRS", most)
+        monkeypatch.setattr(loops, "MOST_PAIRS", most)
         chosen = with_clouds(run)
         assert len(chosen) == min(most, 10)
         assert [one.outcome.ok for one in chosen] == [True] * num_accepted + [False] * (len(chosen) - num_accepted)
     for num in (1, MOST_SCANS, MOST_SCANS + 1, 3 * MOST_SCANS):
-        assert 0 < len(interactive._thinned(np.zeros((num, 3)))) <= MOST_SCANS
+        assert 0 < len(loops._thinned(np.zeros((num, 3)))) <= MOST_SCANS
 
 
 def _shown(page: str, folder: Path, *options: str) -> str:

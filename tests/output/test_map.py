@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from segslam.core import geometry
 from segslam.core.config import MapConfig
 from segslam.core.types import GraphEstimate, Label, SegslamError
-from segslam.labels.class_colors import COLORS
+from segslam.labels.encodings import COLORS
 from segslam.output.map.before_after import BeforeAfter, _details, most_changed
 from segslam.output.map.free_ranges import NUM_DIRECTIONS, free_range_m
 from segslam.output.map.from_above import LEAST_PX, LEGEND_PX, PATH, drawn_map, round_length_m

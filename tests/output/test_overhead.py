@@ -12,10 +12,9 @@ from segslam import open_dataset
 from segslam.core import geometry
 from segslam.core.config import MapConfig
 from segslam.core.types import GraphEstimate, Keyframe, Label, Transform
-from segslam.labels.class_colors import COLORS
+from segslam.labels.encodings import COLORS
 from segslam.output.map.before_after import BeforeAfter
-from segslam.output.map.from_above import LEAST_PX
-from segslam.output.map.overhead import cut_heights, visible
+from segslam.output.map.from_above import LEAST_PX, cut_heights, visible
 from segslam.output.map.picture import MARGIN_M
 from segslam.output.map.write import write_map
 

@@ -26,10 +26,11 @@ from segslam.output.accuracy import accuracy
 from segslam.output.finished import FIGURES, read_run
 from segslam.output.folder import ALONE, write_metrics, write_poses
 from segslam.output.map.from_above import small_png
-from segslam.output.report import figures, gallery, write_report
+from segslam.output.report import figures, loops, write_report
 from segslam.output.report.figures import draw_loops, paths_of
-from segslam.output.report.gallery import choose, outcome_text
+from segslam.output.report.loops import choose
 from segslam.output.report.page import number, page, settings_not_default
+from segslam.slam.slam_result import outcome_text
 
 VOID = {"meta", "img", "wbr"}
 
@@ -237,8 +238,11 @@ def test_the_gallery_has_the_best_accepted_and_the_nearest_missed_loops(tmp_path
     loops = [attempt for attempt in run.result.attempts if attempt.candidate.source_id in (50, 51, 58)]
     chosen = choose(loops)
     assert [attempt.candidate.source_id for attempt in chosen] == [50, 58]  # 51, near 58, failed earlier
-    assert outcome_text(run, chosen[0]) == "accepted, overlap 0.80, residual 0.10 m, weight 1.00"
-    assert outcome_text(run, chosen[1]) == "rejected, low overlap (3 < 5)"
+    assert (
+        outcome_text(chosen[0], run.result.estimate.closure_weights)
+        == "accepted, overlap 0.80, residual 0.10 m, weight 1.00"
+    )
+    assert outcome_text(chosen[1], run.result.estimate.closure_weights) == "rejected, low overlap (3 < 5)"
 
 
 @pytest.mark.parametrize(
@@ -279,9 +283,9 @@ def test_the_title_of_a_pair_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None
         drawn.append(Figure(*args, **kwargs))
         return drawn[-1]
 
-    monkeypatch.setattr(gallery, "Figure", keep)
+    monkeypatch.setattr(loops, "Figure", keep)
     title = "keyframes 1200 to 300: accepted, probability 1.0000 (" + "other pose -14.9, " * 6 + ")"
-    gallery.draw_pair(np.zeros((1, 3)), np.zeros((1, 3)), poses={"a": np.eye(4), "b": np.eye(4)}, title=title)
+    loops.draw_pair(np.zeros((1, 3)), np.zeros((1, 3)), poses={"a": np.eye(4), "b": np.eye(4)}, title=title)
     (words,) = (text for text in drawn[0].texts if "keyframes" in text.get_text())
     assert " ".join(words.get_text().split()) == " ".join(title.split())
     extent = words.get_window_extent()

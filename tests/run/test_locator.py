@@ -103,6 +103,7 @@ def test_the_command_prints_a_pose_a_scan_and_fails_where_it_finds_none(
     assert not lost["found"]
     assert lost["T_world_lidar"] is None
     assert lost["reason"]
+    np.save(nothing, np.ones((30, 3)))  # so few are refused at once
     assert commands.run("locate", run, nothing) == 1
     out, err = capsys.readouterr()
     assert out == ""

@@ -7,8 +7,8 @@ from helpers.commands import run
 from helpers.live_command import LiveCommand, record
 from helpers.near_source import NearSource, ring
 
+from segslam.cli.checks import live_configs
 from segslam.cli.options import Settings
-from segslam.cli.preset import live_configs
 from segslam.core.config import load_config
 from segslam.core.types import BadScan, Scan
 from segslam.run.live import Front

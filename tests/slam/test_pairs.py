@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from segslam.candidates.proximity import BREAK_TRAVEL_M
-from segslam.slam.adjustment import pairs
-from segslam.slam.adjustment.pairs import all_pairs, pairs_along, pairs_between_passes
+from segslam.slam.adjustment import submaps
+from segslam.slam.adjustment.submaps import all_pairs, pairs_along, pairs_between_passes
 
 RADIUS_M = 5.0
 
@@ -11,8 +11,8 @@ RADIUS_M = 5.0
 @pytest.fixture(autouse=True)
 def _short_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Distances that suit the drives of these tests."""
-    monkeypatch.setattr(pairs, "STEPS", (3, 6))
-    monkeypatch.setattr(pairs, "RADIUS_M", RADIUS_M)
+    monkeypatch.setattr(submaps, "STEPS", (3, 6))
+    monkeypatch.setattr(submaps, "RADIUS_M", RADIUS_M)
 
 
 def poses(places: np.ndarray) -> np.ndarray:

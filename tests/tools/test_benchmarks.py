@@ -233,7 +233,7 @@ def test_every_part_of_registration_makes_its_tables(call: Call, data_dir: Path,
 def test_labels_by_shape_agree_with_the_truth_and_align_real_pairs(
     call: Call, data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(labels, "speed", lambda points, config: {"num_points": len(points)} | _no_times())
+    monkeypatch.setattr(labels, "speed", lambda points: {"num_points": len(points)} | _no_times())
     words = ["--yaws", 1, "--pairs", 1, "--methods", "segregator-c2f", "--pictures", tmp_path / "pictures"]
     figures = call(labels, data_dir, *words)
     assert figures["class_iou"]["all"]["ground"] > 0.9

@@ -8,7 +8,7 @@ from helpers.rooms import ground_and_walls
 
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Label, Registration, Rejected, RejectReason
 from segslam.registration import hypotheses, refinement, segregator
 from segslam.registration.free_space import observe_free_space

@@ -6,16 +6,15 @@ POSES.txt: true poses in KITTI format, a line per scan, for runs without ground 
 into a scratch folder; their time of `map` is that of their `metrics.json`.
 """
 
-import argparse
 import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-from segslam.cli import main
 from segslam.output.accuracy import trajectory_accuracy
 from segslam.output.finished import read_metrics, read_run, true_poses
+from tools.benchmarks import common
 
 FIGURES = ("vertical_deg", "vertical_sigma_deg", "map_thickness_before_m", "map_thickness_m", "num_submap_pairs")
 
@@ -27,11 +26,7 @@ def row(run: Path, poses: Path | None, settings: list[str]) -> dict[str, Any]:
     with TemporaryDirectory() as scratch:
         started = perf_counter()
         changes = [word for setting in settings for word in ("--set", setting)]
-        try:
-            main(["refine", str(run), "--out", f"{scratch}/run", "--quiet", *changes])
-        except SystemExit as ended:
-            if ended.code:
-                raise
+        common.segslam("refine", run, "--out", f"{scratch}/run", *changes)
         seconds = perf_counter() - started
         after = read_run(f"{scratch}/run")
         adjustment_s = read_metrics(after.folder)["stage_ms"]["adjust"]["median"] / 1000
@@ -47,17 +42,17 @@ def row(run: Path, poses: Path | None, settings: list[str]) -> dict[str, Any]:
 
 def run_benchmark() -> None:
     """Write the rows to a file, and print them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "adjustment")
     parser.add_argument("out", type=Path)
     parser.add_argument("runs", nargs="+")
-    parser.add_argument("--set", dest="settings", action="append", default=[])
+    common.add_settings(parser)
     options = parser.parse_args()
     rows = []
     for text in options.runs:
         run, _, poses = text.partition("=")
-        rows.append(row(Path(run), Path(poses) if poses else None, options.settings))
+        rows.append(row(Path(run), Path(poses) if poses else None, options.set))
         print(json.dumps(rows[-1]))
-    options.out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    common.write_report(options.out, {"rows": rows})
 
 
 if __name__ == "__main__":

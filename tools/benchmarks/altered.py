@@ -8,14 +8,11 @@ SCANS is a folder of scans (and of `poses.txt`, LiDAR to world, in KITTI format;
 
 import json
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
-from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from segslam.cli import main
 from segslam.core import geometry
 from segslam.core.trajectory import read_poses
 from segslam.core.types import Points, Rotation
@@ -109,12 +106,7 @@ def row(scans: Path, poses: Path, frames: str | None, alteration: str) -> common
             np.column_stack([points, np.zeros(len(points), np.float32)]).tofile(altered / f"{number:06d}.bin")
         np.savetxt(altered / "times.txt", stamps, fmt="%.6f")
         np.savetxt(altered / "poses.txt", T_world_lidar[:, :3].reshape(-1, 12), fmt="%.9g")
-        with redirect_stderr(StringIO()), redirect_stdout(StringIO()):
-            try:
-                main(["map", str(altered), "--out", f"{folder}/run", "--quiet"])
-            except SystemExit as ended:
-                if ended.code:
-                    raise
+        common.segslam("map", altered, "--out", f"{folder}/run")
         metrics = read_metrics(Path(folder) / "run")
     found = {name: metrics.get(name) for name in (*FIGURES, *LOOPS)}
     return {"drive": scans.name, "alteration": alteration, "scans": len(rows), **found}

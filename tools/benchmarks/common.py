@@ -3,12 +3,15 @@
 import argparse
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from segslam.bench.experiments.provenance import commit, machine
+from segslam.cli import main
 from segslam.core.evaluation import PoseError
 from segslam.core.types import Transform
 
@@ -31,6 +34,16 @@ def parser(doc: str | None, name: str) -> argparse.ArgumentParser:
 def add_settings(options: argparse.ArgumentParser) -> None:
     """Add `--set`, whose values `load_config` takes as overrides."""
     options.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="may be repeated")
+
+
+def segslam(*words: object) -> None:
+    """Run a command in this process, without its output. Raises SystemExit if it fails."""
+    with redirect_stderr(StringIO()), redirect_stdout(StringIO()):
+        try:
+            main([*map(str, words), "--quiet"])
+        except SystemExit as ended:
+            if ended.code:
+                raise
 
 
 def write_report(file: Path, figures: Mapping[str, Any]) -> None:

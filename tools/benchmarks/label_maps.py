@@ -6,8 +6,6 @@ WORK is a folder for scans and runs; existing scans and runs are reused. Both ma
 """
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -26,22 +24,17 @@ AXIS_WANDER_DEG = 0.25
 """Chosen: enough error of the sensor for so short a drive to drift visibly, as in the demo."""
 
 
-def segslam(*arguments: object) -> None:
-    """Runs a command; raises CalledProcessError if it fails."""
-    subprocess.run([sys.executable, "-m", "segslam", *map(str, arguments), "--quiet"], check=True)
-
-
 def simulated(folder: Path, sensor: str, *, num_frames: int | None, seed: int) -> None:
     if not (folder / "poses" / "00.txt").exists():
         wander = f"sensor.axis_wander_sigma_deg={AXIS_WANDER_DEG}"
         frames = [] if num_frames is None else ["--frames", num_frames]
-        segslam("simulate", folder, "--sensor", sensor, "--seed", seed, "--set", wander, *frames, "--overwrite")
+        common.segslam("simulate", folder, "--sensor", sensor, "--seed", seed, "--set", wander, *frames, "--overwrite")
 
 
 def mapped(data: Path, out: Path, *options: object) -> dict[str, Any]:
     """The figures of a run, made if it is not there."""
     if not (out / "metrics.json").exists():
-        segslam("map", data, "--sequence", "00", "--out", out, *options)
+        common.segslam("map", data, "--sequence", "00", "--out", out, *options)
     metrics = json.loads((out / "metrics.json").read_text())
     return {key: metrics[key] for key in KEYS if key in metrics}
 

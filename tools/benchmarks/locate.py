@@ -19,7 +19,7 @@ from segslam.core import geometry
 from segslam.core.evaluation import PoseError
 from segslam.core.trajectory import Poses
 from segslam.core.types import Rejected, Transform
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed
 from segslam.output.finished import read_run
 from segslam.run.locator import Located, Locator
 from segslam.scans import open_dataset

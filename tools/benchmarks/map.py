@@ -23,7 +23,7 @@ from segslam import open_dataset
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.types import Keyframe, Label, Transform
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed
 from segslam.output.log import read_log
 from segslam.output.map.write import write_map
 from tools.benchmarks import common

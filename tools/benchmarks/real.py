@@ -7,7 +7,6 @@ is computed again from the data of the first run. The covariances of its motions
 share within the ellipsoid of 99 %, and the median of chi-square divided by the expected one.
 """
 
-import argparse
 import json
 from itertools import pairwise
 from pathlib import Path
@@ -127,7 +126,7 @@ def _standing(points: Points, seed: int) -> Points:
 
 def main() -> None:
     """Write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = common.parser(__doc__, "real")
     parser.add_argument("drives", nargs="+", metavar="NAME=RUN,...")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--picture", metavar="NAME=FILE.png")

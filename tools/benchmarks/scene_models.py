@@ -12,8 +12,7 @@ import numpy as np
 import open3d as o3d
 
 from segslam.bench.simulation.mesh import Mesh, box, join_meshes, leaves, mesh, placed, stem
-from segslam.bench.simulation.plants import bush, tree
-from segslam.bench.simulation.vehicles import car
+from segslam.bench.simulation.objects import bush, car, tree
 from segslam.bench.simulation.world import Hits, cast_mesh, scene_of
 from segslam.core import geometry
 from segslam.core.types import Label, Points, Transform

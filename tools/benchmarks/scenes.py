@@ -21,7 +21,7 @@ from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.types import Alignment, LoopCandidate, Rejected, Transform
 from segslam.graph.chains import far_from_prior
-from segslam.keyframes.keyframes import downsample_keyframe
+from segslam.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.registration.hypotheses import Gate
 from segslam.registration.prepared import PreparedScan, prepare_scan

@@ -18,9 +18,14 @@ from segslam.core.evaluation import trajectory_metrics
 from segslam.core.types import LoopClosure
 from segslam.graph import PoseGraph
 from tools.benchmarks import common
-from tools.benchmarks.back_end.calibration import closure_calibration, odometry_calibration
 from tools.benchmarks.back_end.drives import CONFIG, exact
-from tools.benchmarks.back_end.recorded import Recorded, exact_everywhere, read_recorded
+from tools.benchmarks.back_end.recorded import (
+    Recorded,
+    closure_calibration,
+    exact_everywhere,
+    odometry_calibration,
+    read_recorded,
+)
 
 FIGURES = ("ate_m", "height_m", "kitti_translation_percent")
 

@@ -15,7 +15,7 @@ from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.types import Scan, Trajectory
-from segslam.labels.late import of_rows
+from segslam.labels.label_files import of_rows
 from segslam.odometry import GivenOdometry
 from segslam.output.accuracy import accuracy
 from segslam.scans import open_dataset

@@ -13,7 +13,7 @@ from segslam.bench.experiments.trials import ScanVariant, Trial
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import PoseError
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import BadScan, Points, Rejected
 from segslam.labels import geometric_labels
 from segslam.scans import Dataset, DataSource

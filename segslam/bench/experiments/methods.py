@@ -12,7 +12,7 @@ from segslam.bench.experiments.meter import Cost, measured
 from segslam.bench.experiments.method_settings import check_method, method_config
 from segslam.core.config import Config, RefineConfig
 from segslam.core.extras import how_to_install
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Description, Labels, Points, Registration, Rejected, SegslamError
 from segslam.registration import refinement, segregator
 from segslam.registration.free_space import FreeSpace, observe_free_space

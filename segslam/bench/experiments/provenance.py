@@ -5,16 +5,16 @@ import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from segslam.bench.experiments.job import Job
 from segslam.bench.experiments.pairs import PairList
 from segslam.bench.simulation.files import SETTINGS_FILE
+from segslam.core.extras import installed_version
+from segslam.output.log.schema import processor
 
 PACKAGES = ("segslam", "numpy", "scipy", "numba", "open3d", "small-gicp", "kiss-matcher", "dask", "distributed")
-CPU_INFO = Path("/proc/cpuinfo")
 
 
 def conditions(job: Job) -> dict[str, Any]:
@@ -22,7 +22,7 @@ def conditions(job: Job) -> dict[str, Any]:
     return {
         "machine": machine(),
         "commit": commit(),
-        "packages": _versions(),
+        "packages": {name: found for name in PACKAGES if (found := installed_version(name))},
         "methods": list(job.methods),
         "labels": Path(job.source.labels).name,
         "settings": job.config.model_dump(mode="json"),
@@ -32,7 +32,7 @@ def conditions(job: Job) -> dict[str, Any]:
 def machine() -> dict[str, Any]:
     """Processor, cores, system, and the load average over 15 minutes (1: one busy core)."""
     return {
-        "cpu": _cpu_model(),
+        "cpu": processor(),
         "cores": os.cpu_count(),
         "load": round(os.getloadavg()[2], 1),
         "system": _system(),
@@ -66,31 +66,12 @@ def simulation_of(job: Job) -> dict[str, Any] | None:
     return None
 
 
-def _cpu_model() -> str:
-    """Name of the processor from Linux; on other systems, from Python."""
-    if CPU_INFO.is_file():
-        for line in CPU_INFO.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
 def _system() -> str:
     """Name of the distribution on Linux."""
     try:
         return platform.freedesktop_os_release()["PRETTY_NAME"]
     except (OSError, KeyError):
         return f"{platform.system()} {platform.release()}"
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
 
 
 def account(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from segslam.bench.simulation import vehicles
+from segslam.bench.simulation import objects
 from segslam.bench.simulation.mesh import Mesh
 from segslam.bench.simulation.path import Route, time_between_visits
 from segslam.bench.simulation.site import Frontage, Site, Spot, displaced
@@ -66,7 +66,7 @@ def _cars_at(
     turn = (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(scale=0.03)
     for start, end in _stays(route, spot, config, rng):
         lorry = not across and rng.uniform() < TRUCKS
-        made = vehicles.truck(rng) if lorry else vehicles.car(rng)
+        made = objects.truck(rng) if lorry else objects.car(rng)
         yield ParkedCar(site.stand(made, spot, turn_rad=float(turn)), (spot.x, spot.y), start, end)
 
 

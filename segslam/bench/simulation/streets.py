@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from segslam.bench.simulation import buildings, plants
+from segslam.bench.simulation import buildings, objects
 from segslam.bench.simulation.mesh import Mesh
 from segslam.bench.simulation.site import Frontage, Site, displaced
 from segslam.bench.simulation.world_settings import WorldConfig
@@ -40,7 +40,7 @@ def furnish(site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.
             yield from _shrubs(lot, GARDEN_SHRUBS * config.shrubs, GARDEN_M, rng)
         yield from _closure(lot, config, rng)
         yield from _shrubs(lot, BACKDROP_SHRUBS * config.shrubs, BACKDROP_M, rng)
-    make_tree, tree_jitter = (_equal_tree, 0.0) if config.equal_tree_rows else (plants.tree, 0.8)
+    make_tree, tree_jitter = (_equal_tree, 0.0) if config.equal_tree_rows else (objects.tree, 0.8)
     for per_100m, make, distance_m, jitter in (
         (config.trees, make_tree, TREE_M, tree_jitter),
         (config.lamps, buildings.lamp, LAMP_M, 0.3),
@@ -74,7 +74,7 @@ def _row(
 
 def _equal_tree(_: np.random.Generator) -> Mesh:
     """The same tree each time."""
-    return plants.tree(np.random.default_rng(0), scale=0.5)
+    return objects.tree(np.random.default_rng(0), scale=0.5)
 
 
 def _lots(site: Site, frontage: Frontage, rng: np.random.Generator) -> Iterator[Lot]:
@@ -102,7 +102,7 @@ def _closure(lot: Lot, config: WorldConfig, rng: np.random.Generator) -> Iterato
     spot = lot.site.outward(lot.frontage, lot.middle, HEDGE_M)
     if kind < config.hedged + config.fenced and lot.site.claim(spot, length, 0.8, clearance_m=4.5):
         if kind < config.hedged:
-            yield lot.site.stand(plants.hedge(rng, length, rng.uniform(0.7, 1.1), rng.uniform(0.9, 2.2)), spot)
+            yield lot.site.stand(objects.hedge(rng, length, rng.uniform(0.7, 1.1), rng.uniform(0.9, 2.2)), spot)
         else:
             yield lot.site.stand(buildings.fence(rng, length), spot)
 
@@ -113,7 +113,7 @@ def _shrubs(lot: Lot, mean: float, distance_m: tuple[float, float], rng: np.rand
         away = rng.uniform(-0.5, 0.5) * lot.width_m
         station = int(np.clip(lot.middle + away, 0, len(lot.frontage.at) - 1))
         spot = lot.site.outward(lot.frontage, station, rng.uniform(*distance_m))
-        bush = plants.bush(rng, rng.uniform(1.4, 4.0), rng.uniform(0.8, 4.0))
-        thing = plants.tree(rng) if rng.uniform() < 0.25 else bush
+        bush = objects.bush(rng, rng.uniform(1.4, 4.0), rng.uniform(0.8, 4.0))
+        thing = objects.tree(rng) if rng.uniform() < 0.25 else bush
         if lot.site.claim(spot, 1.4, 1.4, clearance_m=6.0):
             yield lot.site.stand(thing, spot, turn_rad=float(rng.uniform(0.0, 2 * np.pi)))

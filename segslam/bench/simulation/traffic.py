@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from segslam.bench.simulation import vehicles
+from segslam.bench.simulation import objects
 from segslam.bench.simulation.mesh import Mesh, as_instance, placed
 from segslam.bench.simulation.path import Route
 from segslam.bench.simulation.world_settings import WorldConfig
@@ -38,7 +38,7 @@ def _moving_car(route: Route, rng: np.random.Generator) -> MovingCar:
     speed = -rng.uniform(6.0, 12.0) if oncoming else rng.uniform(8.0, 13.0)
     ahead = 0.0 if oncoming else rng.uniform(15.0, 30.0)
     start = route.travel_m[row] - speed * route.time_s[row] + ahead
-    return MovingCar(vehicles.car(rng, Label.MOVING_CAR), float(start), float(speed), LANE_M if oncoming else 0.0)
+    return MovingCar(objects.car(rng, Label.MOVING_CAR), float(start), float(speed), LANE_M if oncoming else 0.0)
 
 
 def meshes_at(

@@ -5,8 +5,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from segslam.core.config import Section
-from segslam.core.config.files import validated, with_overrides
+from segslam.core.config import Section, validated, with_overrides
 
 SensorName = Literal["hdl64", "os1-64", "vlp16"]
 

@@ -1,6 +1,16 @@
-"""All settings: their sections, with units, ranges and sources (`sections`), and their YAML (`files`)."""
+"""All settings: their sections (with units, ranges and sources), read from YAML files and texts `section.key=value`.
 
-from segslam.core.config.files import changed_settings, config_from_yaml, config_to_yaml, load_config
+The YAML of files and of `--set` may be damaged or malicious.
+"""
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
 from segslam.core.config.sections import (
     USER_SETTINGS,
     AdjustmentConfig,
@@ -18,6 +28,7 @@ from segslam.core.config.sections import (
     SensorCalibrationConfig,
     VerifyConfig,
 )
+from segslam.core.errors import SegslamError, brief, unreadable
 
 __all__ = [
     "USER_SETTINGS",
@@ -40,3 +51,215 @@ __all__ = [
     "config_to_yaml",
     "load_config",
 ]
+
+logger = logging.getLogger(__name__)
+Model = TypeVar("Model", bound=BaseModel)
+
+REMOVED = {
+    "adjustment": "every steps radius_m reach min_overlap",
+    "geometric": (
+        "band_m car_length_m car_max_width_m car_top_m ground_cell_m ground_height_m max_range_m max_slope "
+        "max_things min_points pole_clear_m pole_core_m pole_min_m pole_min_share trunk_max_m trunk_min_m "
+        "wall_min_top_m wall_thickness_m"
+    ),
+    "graph": "systematic_drift turn_m closure_sigma_m closure_sigma_deg inlier_probability",
+    "health": (
+        "tolerance_m tolerance_deg watch_scans map_scans map_spacing_m map_spacing_deg correspondence_m "
+        "inlier_m min_overlap max_rms"
+    ),
+    "keyframes": "dense_voxels max_gathered angle_deg",
+    "log": "view_every compression",
+    "map": "view_margin_m view_margin_ratio min_views moved_radius_m cell_m min_obstacle_voxels obstacle_m",
+    "odometry": "stamp_tolerance_s",
+    "proximity": (
+        "base_height_m height_ratio base_turn_deg turn_ratio_deg break_radius_m max_candidates spread_m min_gap_m "
+        "max_radius_m drift_ratio"
+    ),
+    "refine": "max_iterations max_range_m min_points information_scale shared_noise_m shared_noise_deg",
+    "segregator": (
+        "foot_max_distance_m few_clusters dcvc_start_radius_m dcvc_radius_step_m dcvc_azimuth_deg min_range_m "
+        "max_range_m tuple_similarity tuple_trials_per_pair tuple_seed clique_max_nodes certain_inliers "
+        "centroid_noise_m centroid_noise_share shared_noise_m shared_noise_deg ground_noise_m ground_weight "
+        "gnc_factor gnc_max_iterations gnc_cost_tolerance feature_classes"
+    ),
+    "verify": (
+        "min_overlap max_residual_ratio min_weak_support min_second_support max_free_space_violation "
+        "max_violation_ratio well_observed rival_ratio max_hypotheses max_plan_hypotheses max_coarse_fine_m "
+        "min_inliers inlier_m max_range_m free_space_margin_m free_space_margin_ratio max_rivals prior_gate"
+    ),
+}
+"""Settings of older versions, by section: they are ignored with a warning, also in files and `--set`."""
+
+MOST_NAMED = 3
+"""Number of settings that a warning names."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Rejects duplicate keys, of which YAML's own loader uses the last, and aliases, which multiply a short text."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """As in the base class. Raises ComposerError, with its line, for an alias."""
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.composer.ComposerError(None, None, f"*{event.anchor}: write the value itself", event.start_mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As in the base class. Raises ConstructorError, with its line, for a duplicate key."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(None, None, "a key must be a name", key.start_mark)
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """The value of a YAML text. Raises SegslamError, naming the source, for an invalid text."""
+    try:
+        return yaml.load(text, _Loader)
+    except RecursionError as error:
+        raise SegslamError(f"{source}: not valid YAML (nested too deeply)") from error
+    except (yaml.YAMLError, ValueError, ArithmeticError) as error:
+        # The errors after the first are those of dates and numbers that do not exist, such as 2001-99-99 or 0x_.
+        raise SegslamError(f"{source}: not valid YAML ({brief(str(error), 300)})") from error
+
+
+def short(value: Any) -> str:
+    """The value as in Python, cut to 80 characters."""
+    try:
+        return brief(repr(value))
+    except ValueError:  # Python writes no number of more than 4300 digits
+        return f"a {type(value).__name__} with too many digits"
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
+    """The defaults, or `base`, changed by a YAML file and then by `section.key=value` texts.
+
+    Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
+    """
+    values = _changed(base.model_dump(mode="json") if base else {}, _read_yaml(path) if path else {})
+    source = " and ".join([*([str(path)] if path else []), *(["--set"] if overrides or not path else [])])
+    overridden = with_overrides(values, overrides, source=source, example="keyframes.distance_m=1.5")
+    return validated(Config, _without_removed(overridden, source), source)
+
+
+def with_overrides(values: dict[str, Any], overrides: Sequence[str], *, source: str, example: str) -> dict[str, Any]:
+    """The values of sections, changed by `section.key=value` texts; `source` and `example` are for messages."""
+    changed = dict(values)
+    for text in overrides:
+        key, separator, value = text.partition("=")
+        section, _, name = key.strip().partition(".")
+        if not separator or not name:
+            raise SegslamError(f"--set {brief(text)}: write section.key=value, for example {example}")
+        known = changed.get(section, {})
+        if not isinstance(known, dict):
+            raise SegslamError(f"{source}: {section}: expected a section with keys, found {short(known)}")
+        changed[section] = known | {name: parse_yaml(value, f"--set {brief(text)}")}
+    return changed
+
+
+def validated(model: type[Model], values: Any, source: str) -> Model:
+    """The settings of a model from their values. Raises SegslamError, naming `source` and the key, for invalid ones."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = brief(".".join(str(part) for part in first["loc"]))
+        if first["type"] == "extra_forbidden":
+            fields = model.model_fields
+            if len(first["loc"]) > 1 and (section := fields.get(str(first["loc"][0]))) is not None:
+                fields = getattr(section.annotation, "model_fields", fields)
+            known = ", ".join(fields) or "none"
+            raise SegslamError(f"{source}: unknown key {key}; known keys: {known}") from error
+        message = brief(first["msg"].removeprefix("Value error, "), 300)
+        got = "" if isinstance(first["input"], dict) else f", got {short(first['input'])}"
+        raise SegslamError(f"{source}: {key + ': ' if key else ''}{message}{got}") from error
+
+
+def config_to_yaml(config: Config) -> str:
+    """All settings as YAML, from which `load_config` makes an equal Config."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def changed_settings(before: Config, now: Config) -> Iterator[tuple[str, Any, Any]]:
+    """`section.key` and its two values, as in YAML, of each setting that differs."""
+    old, new = before.model_dump(mode="json"), now.model_dump(mode="json")
+    for section, values in new.items():
+        for key, value in values.items():
+            if value != old[section][key]:
+                yield f"{section}.{key}", old[section][key], value
+
+
+def config_from_yaml(text: str, source: str) -> Config:
+    """The Config in a text of this or an older version; `source` is its name in messages.
+
+    Settings that no longer exist are ignored with a warning. Raises SegslamError if the text is not a Config.
+    """
+    known, gone = _known(_parse_yaml(text, source))
+    if gone:
+        more = f" and {len(gone) - MOST_NAMED} more" if len(gone) > MOST_NAMED else ""
+        named = ", ".join(gone[:MOST_NAMED])
+        logger.warning("%s: ignored settings that this version does not have: %s%s", source, named, more)
+    return validated(Config, known, source)
+
+
+def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
+    """The values without settings of older versions that no longer exist."""
+    for section, names in REMOVED.items():
+        given = values.get(section)
+        if not isinstance(given, dict):
+            continue
+        gone = [name for name in given if name in names.split()]
+        for name in gone:
+            logger.warning("%s: %s.%s no longer exists and is ignored", source, section, name)
+        kept = {name: value for name, value in given.items() if name not in gone}
+        values = {name: value for name, value in values.items() if name != section}
+        if kept or section in Config.model_fields:
+            values[section] = kept
+    return values
+
+
+def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """The settings of this version, and the names of the others."""
+    known: dict[str, Any] = {}
+    gone: list[str] = []
+    for name, section in values.items():
+        if name not in Config.model_fields:
+            gone.append(name)
+        elif isinstance(section, dict):
+            fields = type(getattr(Config(), name)).model_fields
+            gone += [f"{name}.{key}" for key in section if key not in fields]
+            known[name] = {key: value for key, value in section.items() if key in fields}
+        else:
+            known[name] = section
+    return known, gone
+
+
+def _changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """The values of all sections, with the changed keys replaced."""
+    keywise = {
+        name: values[name] | section
+        for name, section in changes.items()
+        if isinstance(section, dict) and isinstance(values.get(name), dict)
+    }
+    return values | changes | keywise
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{unreadable(path, 'configuration', error)}; give a YAML file") from error
+    return _parse_yaml(text, str(path))
+
+
+def _parse_yaml(text: str, source: str) -> dict[str, Any]:
+    values = parse_yaml(text, source)
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise SegslamError(f"{source}: expected sections with keys, found {type(values).__name__}")
+    return values

@@ -163,7 +163,7 @@ class Drawing:
                 self._rejected |= {entity.id for entity in entities}
 
     def _attempt(self, attempt: LoopAttempt, stamp_ns: int) -> foxglove.SceneEntity:
-        outcome, pair = attempt.outcome, (attempt.candidate.source_id, attempt.candidate.target_id)
+        outcome, pair = attempt.outcome, attempt.candidate.pair
         color = REJECTED_COLORS[outcome.reason] if isinstance(outcome, Rejected) else ACCEPTED_COLOR
         return foxglove.entity(
             f"{pair[0]} to {pair[1]}",

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
 from segslam.core.types import Labels, Points, Transform, Vector
-from segslam.labels.class_colors import of_classes
+from segslam.labels.encodings import of_classes
 from segslam.output.log.schema import WORLD
 
 _POINT = np.dtype([("xyz", "<f4", 3), ("label", "u1"), ("rgba", "u1", 4)])

@@ -28,10 +28,9 @@ from segslam.core.types import (
 )
 from segslam.output.folder import log_of
 from segslam.output.log import container, schema
-from segslam.output.log.cloud import KeyframePoints, intensities, place_of, points_and_labels
 from segslam.output.log.container import CutError, Span, messages_within
 from segslam.output.log.foxglove import transforms
-from segslam.output.log.records import codec
+from segslam.output.log.records import KeyframePoints, codec, intensities, place_of, points_and_labels
 from segslam.output.log.schema import restored
 from segslam.slam.adjustment import Adjustment
 

@@ -22,8 +22,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from segslam.core.config import Config, config_to_yaml
 from segslam.core.extras import installed_version
 from segslam.core.types import GraphEstimate, LateLoops, Step, Trajectory, Transform
-from segslam.output.log.cloud import KeyframePoints
-from segslam.output.log.records import codec
+from segslam.output.log.records import KeyframePoints, codec
 from segslam.slam.adjustment import Adjustment
 
 VERSION = 1
@@ -47,7 +46,7 @@ REFERENCE = "/reference"
 TRANSFORMS = "/tf"
 """foxglove.FrameTransform: lidar in odom at every scan, odom in world after every optimisation."""
 KEYFRAME = "/keyframe"
-"""segslam.KeyframePoints (protobuf): all points of the step's keyframe, for replay. See `cloud`."""
+"""segslam.KeyframePoints (protobuf): all points of the step's keyframe, for replay. See `records`."""
 POINTS = "/points"
 """foxglove.PointCloud: a subset of each keyframe's points in the lidar frame, with labels and colours, for display."""
 MAP = "/map"
@@ -189,7 +188,7 @@ def metadata(
             "platform": platform.platform(),
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "command": _command(),
-            "processor": f"{_processor()}, {os.cpu_count()} cores",
+            "processor": f"{processor()}, {os.cpu_count()} cores",
             **calibration,
         },
         CONFIG_METADATA: {"yaml": config_to_yaml(config)},
@@ -218,7 +217,7 @@ def _command() -> str:
     return shlex.join(["segslam" if name == "__main__.py" else name, *sys.argv[1:]])
 
 
-def _processor() -> str:
+def processor() -> str:
     """Name of the processor from Linux; on other systems, from Python."""
     if CPU_INFO.is_file():
         for line in CPU_INFO.read_text(encoding="utf-8").splitlines():

@@ -29,10 +29,9 @@ from segslam.core.types import (
     WorkFailed,
 )
 from segslam.output.log import schema
-from segslam.output.log.cloud import KeyframePoints, keyframe_points, points_and_labels
 from segslam.output.log.container import messages_within
 from segslam.output.log.drawing import Drawing, Topical, ground_truth, warning
-from segslam.output.log.records import codec
+from segslam.output.log.records import KeyframePoints, codec, keyframe_points, points_and_labels
 from segslam.output.log.schema import channels, metadata
 from segslam.slam.adjustment import Adjusted, Adjustment
 

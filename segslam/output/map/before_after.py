@@ -14,8 +14,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from segslam.core import geometry
 from segslam.core.points import within_range
 from segslam.core.types import GROUND_LABELS, REJECTED_WEIGHT, GraphEstimate, Keyframe, Label, Mask, Points, Transform
-from segslam.output.map.from_above import draw_path, png, scale_bar
-from segslam.output.map.overhead import Window, cut_heights, visible
+from segslam.output.map.from_above import Window, cut_heights, draw_path, png, scale_bar, visible
 
 MOST_PIXELS = 900
 """Chosen: largest number of pixels along the longer side of a panel."""
@@ -25,7 +24,6 @@ REACH_M = 40.0
 """Chosen: points farther from their keyframe are not drawn; they are sparse and blur both maps."""
 DETAIL_M = 30.0
 """Chosen: smallest half width of the detail."""
-NO_LOOP = "after: adjusted as a whole; no loop was found"
 BEFORE, AFTER, BACKGROUND = "#E69F00", "#56B4E9", "#10141a"
 
 
@@ -37,7 +35,7 @@ class BeforeAfter:
     ) -> None:
         """Takes the poses of all keyframes by odometry, and the last estimate.
 
-        `keyframes`: those whose points show where ceilings hang over the path, which are not drawn; see `overhead`.
+        `keyframes`: those whose points show where ceilings hang over the path, which are not drawn; see `cut_heights`.
         """
         first = min(T_odom_keyframe)
         T_world_odom = estimate.T_world_keyframe[first] @ geometry.inverse(T_odom_keyframe[first])
@@ -82,7 +80,8 @@ class BeforeAfter:
         figure = Figure(figsize=(12.0, 6.0 * sum(heights) + 0.5), facecolor=BACKGROUND, layout=layout)
         grid = figure.subplots(len(rows), 2, squeeze=False, height_ratios=heights)
         num = len(self._loops)
-        titles = ("before: odometry only", f"after: corrected by {num} loop{'s' * (num != 1)}" if num else NO_LOOP)
+        corrected = f"corrected by {num} loop{'s' * (num != 1)}" if num else "adjusted as a whole; no loop was found"
+        titles = ("before: odometry only", f"after: {corrected}")
         for row, panels in zip(grid, rows, strict=True):
             brightest = max(panel.brightest() for panel in panels)
             for axes, panel, poses, color in zip(row, panels, self._maps, (BEFORE, AFTER), strict=True):

@@ -15,8 +15,6 @@ from segslam.output.map.part import Extent, Part
 if TYPE_CHECKING:
     from segslam.gnss.geodesy import Origin
 
-INTENSITY = [("intensity", "<f4")]
-"""Last column, if intensities are known."""
 HEADER_BYTES = 512
 """Bytes reserved for the header, which is written last because it contains the number of points."""
 ASPRS_OF_LABEL = {
@@ -41,7 +39,7 @@ class _BinaryCloud:
         self._stream = file.open("wb")
         self._stream.write(bytes(HEADER_BYTES))
         self._has_intensities = extent.brightest is not None
-        self._row = np.dtype([*self.row, *(INTENSITY if self._has_intensities else [])])
+        self._row = np.dtype([*self.row, *[("intensity", "<f4")] * self._has_intensities])
         self._num_points = 0
 
     def add(self, part: Part) -> None:

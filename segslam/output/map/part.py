@@ -8,7 +8,7 @@ import numpy as np
 
 from segslam.core.config import MapConfig
 from segslam.core.types import Labels, Points, Vector
-from segslam.labels.class_colors import Colors
+from segslam.labels.encodings import Colors
 from segslam.output.map.free_ranges import FreeRanges
 from segslam.output.map.tiles import Tile
 
@@ -33,7 +33,7 @@ class Extent:
     free_ranges: FreeRanges
     """Free space observed by the keyframes."""
     cut_m: Vector | None = None
-    """Heights (n,) of `overhead.cut_heights` for each position of the path; None if no picture is drawn."""
+    """Heights (n,) of `from_above.cut_heights` for each position of the path; None if no picture is drawn."""
     origin: "Origin | None" = None
     """Place of the world frame (east, north, up) on the globe, if it is known."""
 

@@ -7,15 +7,14 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from segslam.core.config import MapConfig
-from segslam.labels.class_colors import COLORS
-from segslam.output.map.overhead import Window, visible
+from segslam.labels.encodings import COLORS
+from segslam.output.map.from_above import Window, visible
 from segslam.output.map.part import Extent, Part, scale_of
 from segslam.output.map.tiles import TILE_M, corner
 
 MAX_SIDE = 4000
 """Largest number of pixels along the longer side; limits the memory."""
 MARGIN_M = 4.0
-BACKGROUND = 255
 SHADED_M = 3.0
 """Chosen: the shading of a height is relative to the mean height in a square of this size."""
 GAP_PX = 1.5
@@ -27,7 +26,7 @@ RELIEF_M, CONTRAST = 1.5, 0.35
 
 
 class Picture:
-    """Top view with north (y) up; the highest point of a pixel is visible, below ceilings: see `overhead`."""
+    """Top view with north (y) up; the highest point of a pixel is visible, below ceilings: see `cut_heights`."""
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._file = file
@@ -36,7 +35,7 @@ class Picture:
         columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
         self._pixels = max(min(round(TILE_M / config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
         size = rows * self._pixels, columns * self._pixels
-        self._image = np.full((*size, 3), BACKGROUND, np.uint8)
+        self._image = np.full((*size, 3), 255, np.uint8)  # white
         self._height_m = np.full(size, np.nan, np.float32)
         self._labels: set[int] = set()
 

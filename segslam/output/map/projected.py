@@ -8,7 +8,7 @@ import numpy as np
 
 from segslam.core.extras import how_to_install
 from segslam.core.types import Points, SegslamError
-from segslam.output.map.overhead import Window
+from segslam.output.map.from_above import Window
 from segslam.output.map.picture import Picture
 
 if TYPE_CHECKING:

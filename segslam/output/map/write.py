@@ -21,11 +21,11 @@ from segslam.core.interrupts import removed_when_stopped
 from segslam.core.points import within_range
 from segslam.core.types import Keyframe, Label, Labels, Points, SegslamError, Transform, Vector
 from segslam.core.whole_files import check_target, whole_file
-from segslam.labels.class_colors import Colors, of_classes
+from segslam.labels.encodings import Colors, of_classes
 from segslam.output.map.clouds import LasCloud, PcdCloud, PlyCloud, check_las
 from segslam.output.map.free_ranges import FreeRanges
+from segslam.output.map.from_above import BESIDE_M, cut_heights
 from segslam.output.map.grid import Grid
-from segslam.output.map.overhead import BESIDE_M, cut_heights
 from segslam.output.map.part import Extent, MapFile, Part, of_numbers
 from segslam.output.map.picture import Picture
 from segslam.output.map.projected import GeoTiff, check_projected

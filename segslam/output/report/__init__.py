@@ -13,11 +13,11 @@ from segslam.output.finished import FIGURES, FinishedRun, read_run
 from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
-from segslam.output.report import figures, gallery, interactive
+from segslam.output.report import figures, loops
 from segslam.output.report.figures import draw_fixes
 from segslam.output.report.page import Pictures, number, page
 
-__all__ = ["BEFORE_AFTER", "draw_before_after", "write_before_after", "write_report"]
+__all__ = ["BEFORE_AFTER", "draw_before_after", "write_report"]
 
 BEFORE_AFTER = "before_after.png"
 
@@ -36,25 +36,15 @@ def write_report(folder: str | Path) -> Path:
     with matplotlib.rc_context(figures.STYLE):
         plots = _plots(run)
     about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
-    return _write(
-        folder / "report.html", page(run, plots, _pictures(run), about=about).encode(errors="backslashreplace")
-    )
-
-
-def write_before_after(folder: Path, file: Path) -> Path:
-    """Write the picture of `draw_before_after` to a file."""
-    return _write(file, draw_before_after(folder))
+    file = folder / "report.html"
+    write_whole(file, page(run, plots, _pictures(run), about=about).encode(errors="backslashreplace"))
+    return file
 
 
 def draw_before_after(folder: Path) -> bytes:
     """A PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
     picture, _ = _drawn(read_run(folder))
     return picture
-
-
-def _write(file: Path, content: bytes) -> Path:
-    write_whole(file, content)
-    return file
 
 
 def _plots(run: FinishedRun) -> dict[str, str]:
@@ -76,20 +66,20 @@ def _plots(run: FinishedRun) -> dict[str, str]:
 
 def _pictures(run: FinishedRun) -> Pictures:
     """Pictures that need the clouds of the log: the map before and after, and pairs of keyframes."""
-    chosen, shown = gallery.choose(run.result.attempts), interactive.with_clouds(run)
+    chosen, shown = loops.choose(run.result.attempts), loops.with_clouds(run)
     before_after, kept = _drawn(run, _keyframes_of([*chosen, *shown]))
     of_view = {number: kept[number] for number in sorted(_keyframes_of(shown)) if number in kept}
     map_file = run.folder / "map.png"
     return Pictures(
         before_after=before_after,
         map=small_png(map_file) if map_file.is_file() else None,
-        loops=gallery.draw(run, chosen, kept),
-        top_view=interactive.top_view(run, of_view),
+        loops=loops.draw(run, chosen, kept),
+        top_view=loops.top_view(run, of_view),
     )
 
 
 def _keyframes_of(attempts: Iterable[LoopAttempt]) -> set[int]:
-    return {number for one in attempts for number in (one.candidate.source_id, one.candidate.target_id)}
+    return {number for one in attempts for number in one.candidate.pair}
 
 
 def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:

@@ -20,7 +20,6 @@ COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")
 ENDINGS = (".png", ".svg", ".pdf")
 ACROSS: dict[Up, list[int]] = {"z": [0, 1], "-y": [0, 2]}
 """The axes of the page by the upward axis: x to the right, and y or z ahead."""
-SAME_TRUTH_M = 0.01
 
 
 def check_picture(file: Path) -> None:
@@ -85,7 +84,7 @@ def _same_data(one: FinishedRun, other: FinishedRun) -> bool:
         return one.dataset == other.dataset
     rows = rows_of_same_scan(one.reference.scan_index, other.reference.scan_index)
     truths = one.reference.T_world_lidar[rows[:, 0], :3, 3], other.reference.T_world_lidar[rows[:, 1], :3, 3]
-    return len(rows) > 0 and bool(np.allclose(truths[0] - truths[0][0], truths[1] - truths[1][0], atol=SAME_TRUTH_M))
+    return len(rows) > 0 and bool(np.allclose(truths[0] - truths[0][0], truths[1] - truths[1][0], atol=0.01))
 
 
 def _plot_group(above: Axes, error: Axes, runs: Mapping[str, FinishedRun], colors: Mapping[str, str]) -> None:

@@ -36,7 +36,6 @@ STYLE: Any = {
 }
 WIDTH_IN = 5.4
 """Text of 11 points is then 10 pixels high on a phone."""
-RESIDUALS = ("residual_east_m", "residual_north_m")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,13 +220,11 @@ class _Outcome(NamedTuple):
 
 def _by_outcome(run: FinishedRun) -> list[_Outcome]:
     """Rejected candidates by reason, in the order of the pipeline; then closures: accepted, rejected later, false."""
-    rejected, closed = defaultdict[RejectReason, list[tuple[int, int]]](list), []
+    rejected = defaultdict[RejectReason, list[tuple[int, int]]](list)
     for attempt in run.result.attempts:
-        pair = (attempt.candidate.source_id, attempt.candidate.target_id)
         if isinstance(attempt.outcome, Rejected):
-            rejected[attempt.outcome.reason].append(pair)
-        else:
-            closed.append(pair)
+            rejected[attempt.outcome.reason].append(attempt.candidate.pair)
+    closed = [closure.pair for closure in run.result.closures()]
     false = _false_closures(run)
     off = run.result.estimate.rejected - false
     reasons = [reason for reason in RejectReason if reason in rejected]
@@ -252,7 +249,7 @@ def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:
     closures, rows, truth = judged_closures(run.result, run.reference)
     measured = np.array([closure.T_target_source for closure in closures]).reshape(-1, 4, 4)
     false = false_loops(measured, rows, truth)
-    return {(c.source_id, c.target_id) for c, is_false in zip(closures, false, strict=True) if is_false}
+    return {closure.pair for closure, is_false in zip(closures, false, strict=True) if is_false}
 
 
 class _PlainPowers(LogFormatter):
@@ -294,7 +291,7 @@ def draw_fixes(folder: Path) -> str | None:
         return None
     with file.open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if row["residual_east_m"]]
-    enu_m, residual_m = (_columns(rows, *names) for names in (("east_m", "north_m"), RESIDUALS))
+    enu_m, residual_m = (_columns(rows, f"{name}east_m", f"{name}north_m") for name in ("", "residual_"))
     minutes = np.array([int(row["stamp_ns"]) for row in rows], float) / 60e9
     kept = np.array([row["kept"] == "1" for row in rows], bool)
     figure = Figure(figsize=(WIDTH_IN, 1.5 * WIDTH_IN), layout="constrained")

@@ -43,7 +43,6 @@ CONDITIONS = {
     "python": "Python",
 }
 """Key in the log -> text on the page."""
-TEXT = ' style="text-align: left; width: auto"'
 STYLE = """
 :root { color-scheme: light; --line: #d8dee4; --soft: #57606a; }
 body { margin: 0 auto; max-width: 76rem; padding: 1rem; font: 16px/1.45 system-ui, sans-serif; color: #1f2328; }
@@ -252,7 +251,8 @@ def table(rows: Iterable[Iterable[str | float | None]], *, head: Iterable[str] =
     titles = ""
     for column, title in enumerate(head):
         has_text = column > 0 and any(isinstance(row[column], str) for row in cells)
-        titles += f"<th{TEXT if has_text else ''}>{title}</th>"
+        style = ' style="text-align: left; width: auto"' if has_text else ""
+        titles += f"<th{style}>{title}</th>"
     lines = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in cells)
     return f"<table>{f'<tr>{titles}</tr>' if titles else ''}{lines}</table>"
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from segslam.core.config.yaml_text import parse_yaml, short
+from segslam.core.config import parse_yaml, short
 from segslam.core.errors import unreadable
 from segslam.core.types import SegslamError
 

@@ -18,10 +18,9 @@ import numpy as np
 from segslam.core.errors import unreadable
 from segslam.core.types import BadScan, Scan, SegslamError, Transform
 from segslam.run.live.waiting import Arrival, Waiting
-from segslam.scans.clouds import read_file
+from segslam.scans.clouds import SUFFIXES, read_file
 from segslam.scans.dataset import make_scan
 
-SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 IN_CLOSE_WRITE, IN_MOVED_TO = 0x8, 0x80
 IN_DELETE_SELF, IN_MOVE_SELF, IN_UNMOUNT, IN_Q_OVERFLOW = 0x400, 0x800, 0x2000, 0x4000
 IN_ONLYDIR = 0x01000000

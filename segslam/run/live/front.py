@@ -46,7 +46,9 @@ class Front:
         """
         self._tell = tell
         self._serving = source, configs, idle_s
-        self._is_ready = self._is_stopping = False
+        self._is_ready = False
+        self.is_stopping = False
+        """True after `stop`."""
         self._tally = RawValue(Tally)
         self._past = Past([], deque(maxlen=CLOUDS_KEPT))
         self._num_placed = 0
@@ -86,7 +88,7 @@ class Front:
 
     def stop(self) -> None:
         """Accept no more scans; waiting scans are still processed."""
-        self._is_stopping = True
+        self.is_stopping = True
         with suppress(OSError):
             self._pipe.send(None)
 
@@ -108,7 +110,7 @@ class Front:
         self._process = context.Process(target=serve, args=arguments, name="front")
         self._process.start()
         theirs.close()
-        if self._is_stopping:
+        if self.is_stopping:
             self.stop()
 
     def _receive(self) -> None:
@@ -120,7 +122,7 @@ class Front:
             self._process.join(timeout=1.0)
             num_lost = self._tally.num_arrived - self._tally.num_dropped - self._num_placed
             self._tally.num_dropped += num_lost
-            if self._is_stopping or not self._is_ready:
+            if self.is_stopping or not self._is_ready:
                 self._received.put(self._final(died))
                 return
             lost = f"{num_lost} scan{'s' * (num_lost != 1)} lost" if num_lost else "no scan lost"
@@ -134,7 +136,7 @@ class Front:
         """The end of the stream with the process that died; a death after the request to stop is no failure."""
         return replace(
             died,
-            failed=not self._is_stopping,
+            failed=not self.is_stopping,
             num_arrived=self._tally.num_arrived,
             num_dropped=self._tally.num_dropped,
             gaps=self._past.gaps,

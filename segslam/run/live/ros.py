@@ -31,9 +31,9 @@ from segslam.gnss.fixes import Row
 from segslam.gnss.reading import row_of
 from segslam.run.live.live_map import DrawnMap
 from segslam.run.live.waiting import Arrival, Waiting
-from segslam.scans.dataset import make_scan
+from segslam.scans.bag_messages import CLOUD
+from segslam.scans.dataset import make_scan, sweep_times
 from segslam.scans.point_cloud2 import read_message
-from segslam.scans.sweep_times import sweep_times
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -45,7 +45,6 @@ except ImportError:  # a minimal installation
     Trigger = None
 
 SpunNode = TypeVar("SpunNode", bound="_Spun")
-CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 NAMESPACE = "segslam"
 ODOM, MAP = "odom", "map"
 """Frames, as in REP 105."""
@@ -133,9 +132,7 @@ class TopicSource:
 
     def _follow_publishers(self, waiting: Waiting) -> None:
         """Subscribe with the reliability of the publishers; subscribe again if it has changed."""
-        publishers = [
-            info for info in self._node.get_publishers_info_by_topic(self._topic) if info.topic_type == CLOUD_TYPE
-        ]
+        publishers = [info for info in self._node.get_publishers_info_by_topic(self._topic) if info.topic_type == CLOUD]
         if not publishers:
             return
         wanted = _common_reliability(info.qos_profile.reliability for info in publishers)
@@ -152,7 +149,7 @@ class TopicSource:
         self._tell(f"{self._topic}: subscribed ({kind})")
 
     def _other_topics(self) -> str:
-        names = [name for name, types in self._node.get_topic_names_and_types() if CLOUD_TYPE in types]
+        names = [name for name, types in self._node.get_topic_names_and_types() if CLOUD in types]
         others = sorted(set(names) - {self._topic, f"/{NAMESPACE}/map"})
         if others:
             return f"point clouds are on {', '.join(others)}"

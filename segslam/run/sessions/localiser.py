@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
 from segslam.graph import AnchoredGraph, Graph

@@ -15,11 +15,11 @@ import numpy as np
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import LoopCandidate, Placement, Rejected, RejectReason, Transform
 from segslam.graph import AnchoredGraph
 from segslam.graph.chains import far_from_prior
-from segslam.keyframes.submaps import Submaps
+from segslam.keyframes import Submaps
 from segslam.registration import refinement
 from segslam.registration.prepared import Observed, prepare_observed
 from segslam.run.locator import Locator

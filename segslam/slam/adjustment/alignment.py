@@ -19,7 +19,6 @@ KERNEL_M = (0.6, 0.4, 0.25, 0.15)
 """Chosen on KITTI 00: distance to a plane at which the weight of a point is a quarter, for each iteration."""
 SAME_NORMAL = 0.9
 """Chosen: smallest cosine between the normals of a pair; others are edges and foliage."""
-MOST_ITERATIONS = 20
 CONVERGED = 1e-3
 """Chosen: the iteration ends after a step smaller than this (rad, m), below the noise of an alignment."""
 SETTLED = 1e-2
@@ -47,7 +46,7 @@ def align(source: LightSurface, target: LightSurface, T_target_source: Transform
         return None
     fit = _Fit(source, target)
     length = np.inf
-    for iteration in range(MOST_ITERATIONS):
+    for iteration in range(20):
         step = fit.step(T_target_source, iteration)
         if step is None:
             return None

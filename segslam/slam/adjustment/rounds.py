@@ -1,6 +1,9 @@
-"""Rounds of the adjustment: register submaps, solve the graph, build the submaps again from the result."""
+"""Adjustment of the whole map after the loops, in rounds.
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+A round registers submaps with each other, and solves all poses; the next one builds its submaps from the result.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
@@ -10,17 +13,70 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.config import Config
+from segslam.core.config import Config, RefineConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import GraphEstimate, IndexPairs, Mask, Points, Vector
-from segslam.graph import PoseGraph
+from segslam.core.types import GraphEstimate, IndexPairs, Points, Record, Vector
+from segslam.graph import Edge, PoseGraph
 from segslam.odometry.calibration import VerticalAngle, angle_left, measure_vertical_angle, without_rest
-from segslam.slam.adjustment.pairs import EVERY, STEPS, all_pairs
-from segslam.slam.adjustment.progress import Progress, no_progress
-from segslam.slam.adjustment.record import Adjustment
-from segslam.slam.adjustment.registrations import RegisteredPair, register_pairs
-from segslam.slam.adjustment.submaps import REACH, PointsOf, Submaps
+from segslam.registration.refinement import INFORMATION_SCALE, limited_information
+from segslam.slam.adjustment.alignment import align
+from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, PointsOf, Submaps, all_pairs
 from segslam.slam.adjustment.thickness import map_thickness_m
+
+SHARE = min(1.0, EVERY / (2 * REACH + 1))
+"""Share of the information of a registration: a scan is in so many submaps."""
+MIN_OVERLAP = 0.1
+"""Chosen on KITTI 00: smallest share of a submap's points that lie on the other."""
+Progress = Callable[[Iterable[Any], int, str], Iterator[Any]]
+"""Passes items on and shows progress: takes the items, their number, and a title."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Adjustment(Record):
+    """The adjustment of a drive, beside its estimate."""
+
+    num_pairs: int
+    """Number of pairs of submaps chosen in the last round."""
+    num_registered: int
+    """Number of these whose registration converged with enough overlap; each is a factor of the graph."""
+    num_between_passes: int
+    """Number of factors between different passes of a place."""
+    odometry_noise_factor: float
+    """Standard deviations of the odometry on this drive, relative to those of the settings."""
+    noise_factor: float
+    """The same of the factors, relative to those of single registrations."""
+    moved_m: float
+    """Root mean square distance by which keyframes moved."""
+    is_complete: bool
+    """False if the time limit ended it early."""
+    seconds: float
+    vertical_deg: float | None = None
+    """Remaining vertical angle of the scans; positive if their points are too low. None if it was not measured."""
+    vertical_sigma_deg: float | None = None
+    correction_deg: float = 0.0
+    """Elevation added to all points of the keyframes, for the adjustment and for the map; 0 if not significant."""
+    thickness_before_m: float | None = None
+    """Thickness of surfaces in the map (`thickness`) before the adjustment; None if no surface was seen twice."""
+    thickness_m: float | None = None
+    """The same after it."""
+
+    def figures(self) -> dict[str, float]:
+        """The figures of `metrics.json`; unknown ones are omitted. The vertical angle is that left in the scans."""
+        figures = {
+            "vertical_deg": self.vertical_deg,
+            "vertical_sigma_deg": self.vertical_sigma_deg,
+            "vertical_correction_deg": self.correction_deg or None,
+            "map_thickness_before_m": self.thickness_before_m,
+            "map_thickness_m": self.thickness_m,
+            "num_submap_pairs": self.num_registered,
+            "adjustment_moved_m": self.moved_m,
+        }
+        return {name: value for name, value in figures.items() if value is not None}
+
+
+def no_progress(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
+    """Shows nothing."""
+    yield from items
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +92,7 @@ class _Round(NamedTuple):
     """The pairs registered in a round before the time limit, and the solution with them."""
 
     num_pairs: int
-    registered: list[RegisteredPair]
+    registered: list[Edge]
     is_complete: bool
     estimate: GraphEstimate
     noise_factors: tuple[float, float]
@@ -63,19 +119,23 @@ def adjust(
             if again is not None and again.is_significant:
                 angle, correction_deg = again, again.angle_deg
         corrected = partial(_raised, points_of, correction_deg)
+        shared_within = STEPS[-1] if correction_deg else 0
         title = f"refine {number}/{config.adjustment.rounds}"
-        made = _round(graph, corrected, config, end_s, bool(correction_deg), partial(_titled, progress, title))
+        made = _round(graph, corrected, config, end_s, shared_within, progress, title)
         last = made or last
         if made is None or not made.is_complete:
             break
     if last is None:
         return None
     T_after = graph.T_world_keyframes
-    shared = _seen_twice(last.registered, travel_m, config)
+    ends = np.array([(edge.a, edge.b) for edge in last.registered])
+    is_between = np.diff(travel_m[ends], axis=1)[:, 0] >= config.proximity.min_travel_m
+    apart = np.diff(ends, axis=1)[:, 0]
+    seen_twice = ends[is_between if is_between.any() else apart == apart.max()]
     record = Adjustment(
         num_pairs=last.num_pairs,
         num_registered=len(last.registered),
-        num_between_passes=int(_is_between_passes(last.registered, travel_m, config).sum()),
+        num_between_passes=int(is_between.sum()),
         odometry_noise_factor=last.noise_factors[0],
         noise_factor=last.noise_factors[1],
         moved_m=float(np.sqrt(np.mean(np.sum((T_after - T_before)[:, :3, 3] ** 2, axis=1)))),
@@ -84,8 +144,8 @@ def adjust(
         vertical_deg=None if angle is None else angle.angle_deg,
         vertical_sigma_deg=None if angle is None else angle.sigma_deg,
         correction_deg=correction_deg,
-        thickness_before_m=map_thickness_m(points_of, T_before, shared),
-        thickness_m=map_thickness_m(corrected, T_after, shared),
+        thickness_before_m=map_thickness_m(points_of, T_before, seen_twice),
+        thickness_m=map_thickness_m(corrected, T_after, seen_twice),
     )
     return Adjusted(record, before, last.estimate)
 
@@ -106,43 +166,40 @@ def _raised(points_of: PointsOf, angle_deg: float, keyframe_id: int) -> Points:
     return geometry.raise_beams(points_of(keyframe_id), angle_deg)
 
 
-def _titled(progress: Progress, title: str, items: Iterable[Any], total: int) -> Iterator[Any]:
-    return progress(items, total, title)
-
-
 def _round(
     graph: PoseGraph,
     points_of: PointsOf,
     config: Config,
     end_s: float,
-    is_corrected: bool,
-    show: Callable[[Iterable[Any], int], Iterator[Any]],
+    shared_within: int,
+    progress: Progress,
+    title: str,
 ) -> _Round | None:
     """Register submaps by the current poses, and solve the graph; None if no pair could be registered."""
     T_world, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
     pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
     submaps = Submaps(points_of, T_world, travel_m, config=config.refine)
     in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, submaps, T_world, config=config.refine))
-    tried = list(show(in_time, len(pairs)))
+    tried = list(progress(in_time, len(pairs), title))
     registered = [one for one in tried if one is not None]
     if not registered:
         return None
-    share = min(1.0, EVERY / (2 * REACH + 1))  # so that every scan counts once
-    estimate, noise_factors = graph.adjust(
-        [one.edge(share=share) for one in registered], shared_within=STEPS[-1] if is_corrected else 0
-    )
+    estimate, noise_factors = graph.adjust(registered, shared_within=shared_within)
     return _Round(len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
 
 
-def _is_between_passes(factors: Sequence[RegisteredPair], travel_m: Vector, config: Config) -> Mask:
-    ends = np.array([(one.target_id, one.source_id) for one in factors])
-    return np.diff(travel_m[ends], axis=1)[:, 0] >= config.proximity.min_travel_m
+def register_pairs(
+    pairs: IndexPairs, submaps: Submaps, T_world: Poses, *, config: RefineConfig
+) -> Iterator[Edge | None]:
+    """Register each pair (target, source) from its current pose; None without convergence or enough overlap.
 
-
-def _seen_twice(factors: Sequence[RegisteredPair], travel_m: Vector, config: Config) -> IndexPairs:
-    """(k, 2) keyframes that see the same surfaces: of two passes or, without such, far apart along the drive."""
-    ends = np.array([(one.target_id, one.source_id) for one in factors])
-    between = _is_between_passes(factors, travel_m, config)
-    if between.any():
-        return ends[between]
-    return ends[np.diff(ends, axis=1)[:, 0] == np.diff(ends, axis=1).max()]
+    An edge has a share of its information, so that every scan counts once.
+    """
+    for target_id, source_id in pairs.tolist():
+        T_prior = geometry.inverse(T_world[target_id]) @ T_world[source_id]
+        found = align(submaps.submap(source_id), submaps.submap(target_id), T_prior)
+        if found is None or found.overlap < MIN_OVERLAP:
+            yield None
+            continue
+        information = limited_information(INFORMATION_SCALE * found.information, config=config)
+        yield Edge(target_id, source_id, geometry.nearest_transform(found.T_target_source), SHARE * information)

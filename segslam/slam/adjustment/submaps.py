@@ -1,39 +1,41 @@
-"""Submaps: the cloud of a keyframe merged with those of its neighbours along the drive, as a surface."""
+"""Submaps (the cloud of a keyframe merged with those of its neighbours), and the pairs of them to register.
 
-from collections.abc import Callable
+Pairs lie along the drive at several distances, and between passes of one place.
+"""
+
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
-from segslam.core.types import Points, Vector
+from segslam.core.types import IndexPairs, Indices, Points, Vector
+from segslam.odometry.calibration import PointsOf
 from segslam.registration.refinement import LightSurface, downsample
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
-
-PointsOf = Callable[[int], Points]
-"""Returns the points of a keyframe, by id, in its own frame."""
-
 MOST_SUBMAPS = 16
 """Chosen: submaps in memory, about 1.5 MB each; a drive needs 6, and 2 more for each other pass beside it."""
+EVERY = 2
+"""Chosen on KITTI 00: a submap is registered for every n-th keyframe."""
+STEPS = (5, 10)
+"""Chosen on KITTI 00: distances of registered submaps along the drive, in keyframes."""
+RADIUS_M = 10.0
+"""Chosen on KITTI 00: largest distance of registered submaps of two passes (m)."""
+STOREY_M = 2.0
+"""Chosen: keyframes of two passes with a larger difference of heights may be on two storeys."""
 
 
 class Submaps:
     """Submaps by the id of their keyframe, in its frame, made when they are needed."""
 
-    def __init__(
-        self,
-        points_of: PointsOf,
-        T_world: Poses,
-        travel_m: Vector,
-        *,
-        config: RefineConfig,
-    ) -> None:
+    def __init__(self, points_of: PointsOf, T_world: Poses, travel_m: Vector, *, config: RefineConfig) -> None:
         self._points_of, self._T_world, self._travel_m = points_of, T_world, travel_m
         self._refine = config
         self._scan = lru_cache(MOST_SUBMAPS * (2 * REACH + 1))(self._scan_of)  # those of the submaps in memory
@@ -53,3 +55,47 @@ def members(keyframe_id: int, travel_m: Vector, *, reach: int) -> list[int]:
     """The keyframes of a submap: up to `reach` before and after one, without those beyond a break."""
     near = range(max(0, keyframe_id - reach), min(len(travel_m), keyframe_id + reach + 1))
     return [other for other in near if abs(travel_m[other] - travel_m[keyframe_id]) < BREAK_TRAVEL_M]
+
+
+def all_pairs(T_world: Poses, travel_m: Vector, *, min_travel_m: float) -> IndexPairs:
+    """(k, 2) target (older) and source of all pairs, sorted by source, so that near rows share submaps."""
+    passes = pairs_between_passes(T_world, travel_m, min_travel_m=min_travel_m)
+    pairs = np.vstack([pairs_along(travel_m), passes])
+    return pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
+
+
+def pairs_along(travel_m: Vector) -> IndexPairs:
+    """(k, 2) target (older) and source of pairs along the drive, without those across a break."""
+    nodes = _nodes(travel_m)
+    pairs = np.vstack([np.column_stack([nodes, nodes + step]) for step in STEPS])
+    pairs = pairs[pairs[:, 1] < len(travel_m)]
+    return pairs[travel_m[pairs[:, 1]] - travel_m[pairs[:, 0]] < BREAK_TRAVEL_M]
+
+
+def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: float) -> IndexPairs:
+    """(k, 2) target (older) and source of pairs of two passes of one place, at least `min_travel_m` of travel apart.
+
+    Each node is paired with the nearest node of each earlier pass within the radius.
+    """
+    nodes = _nodes(travel_m)
+    places = T_world[nodes, :3, 3]
+    near = cKDTree(places[:, :2]).query_ball_point(places[:, :2], RADIUS_M)
+    pairs = []
+    for row, rows in enumerate(near):
+        older = np.array(sorted(rows))
+        older = older[travel_m[nodes[row]] - travel_m[nodes[older]] >= min_travel_m]
+        older = older[np.abs(places[older, 2] - places[row, 2]) < STOREY_M]
+        for one in _passes(older, travel_m[nodes], min_travel_m):
+            nearest = one[np.argmin(np.linalg.norm(places[one] - places[row], axis=1))]
+            pairs.append((nodes[nearest], nodes[row]))
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _nodes(travel_m: Vector) -> Indices:
+    return np.arange(0, len(travel_m), EVERY)
+
+
+def _passes(rows: Indices, travel_m: Vector, min_travel_m: float) -> Iterator[Indices]:
+    """Rows, ascending, divided where the travel between two of them is at least `min_travel_m`."""
+    if len(rows):
+        yield from np.split(rows, 1 + np.flatnonzero(np.diff(travel_m[rows]) >= min_travel_m))

@@ -17,8 +17,7 @@ from mcap.writer import CompressionType, Writer
 from segslam.core.config import Config
 from segslam.core.types import Keyframe, LoopCandidate, SegslamError, Step
 from segslam.output.log import LogWriter, read_log, schema, writer
-from segslam.output.log.cloud import intensities, keyframe_points, points_and_labels
-from segslam.output.log.records import codec
+from segslam.output.log.records import codec, intensities, keyframe_points, points_and_labels
 
 
 def test_steps_read_again_are_those_written(steps: list[Step], whole: Path) -> None:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from segslam.core import geometry
 from segslam.core.types import Rejected, RejectReason, Step
-from segslam.labels.class_colors import of_classes
+from segslam.labels.encodings import of_classes
 from segslam.output.log import LogWriter, drawing, schema
 from segslam.output.log.drawing import MAP_RANGE_M, REJECTED_COLORS, Drawing, weight_color
 from segslam.output.log.records import BULK, codec

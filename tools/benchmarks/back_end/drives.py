@@ -14,7 +14,7 @@ from segslam.core.evaluation import trajectory_metrics
 from segslam.core.trajectory import lidar_from_camera, read_poses, travelled_m
 from segslam.core.types import Alignment, LoopClosure, Registration
 from segslam.graph.noise import odometry_information
-from segslam.keyframes.keyframes import KeyframeSelector
+from segslam.keyframes import KeyframeSelector
 from segslam.scans.kitti import read_calibration
 
 CONFIG = Config()

@@ -80,8 +80,8 @@ def main() -> None:
         "num_yaws": options.yaws,
         "seed": options.seed,
         "config": config.model_dump(mode="json"),
-        "class_iou": class_agreement(options.data, config),
-        "speed": speed(first.points, config),
+        "class_iou": class_agreement(options.data),
+        "speed": speed(first.points),
         "courtyard": courtyard(
             options.data,
             config,

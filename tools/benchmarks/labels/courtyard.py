@@ -12,10 +12,10 @@ from segslam.bench.experiments.pairs import PairList, cut_pairs
 from segslam.bench.experiments.rows import Row
 from segslam.bench.experiments.summary import figures, grouped
 from segslam.bench.experiments.trials import Trial, pair_trials
-from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.types import Label, Trajectory
+from segslam.core.types import Label, Points, Trajectory
 from segslam.labels import geometric_labels
+from segslam.output.report.loops import draw_pair
 from segslam.scans import DataSource
 from tools.benchmarks import real_pairs
 
@@ -53,41 +53,25 @@ def courtyard(
         rows = grouped(real_pairs.register(source, trials, methods, config), lambda row: row.method)
         results[band] = {method: figures(rows[method]) for method in methods}
         if pictures is not None:
-            draw_extremes(pictures, trials, rows[real_pairs.REFINED], source, config)
+            draw_extremes(pictures, trials, rows[real_pairs.REFINED], source)
     return results
 
 
-def draw_extremes(
-    folder: Path, trials: Sequence[Trial], rows: Sequence[Row], source: DataSource, config: Config
-) -> None:
-    """The first success and the first failure from above, both scans at the true pose."""
+def draw_extremes(folder: Path, trials: Sequence[Trial], rows: Sequence[Row], source: DataSource) -> None:
+    """The first success and the first failure from above: what stands above the ground, at the true pose."""
     folder.mkdir(parents=True, exist_ok=True)
     for success, name in ((True, "success"), (False, "failure")):
         at = next((k for k, row in enumerate(rows) if row.success == success), None)
         if at is not None:
-            file = folder / f"courtyard_{trials[at].pairs.split()[0]}_{name}.png"
-            draw_pair(file, trials[at], rows[at], source, config)
+            trial, row = trials[at], rows[at]
+            error = f"error {row.error_m:.2f} m, {row.error_deg:.2f} degrees" if row.accepted else row.reason
+            apart_m = np.linalg.norm(trial.T_target_source[:3, 3])
+            standing = (_standing(points_of(source, scan)) for scan in (trial.source, trial.target))
+            title = f"{row.source} -> {row.target}, {apart_m:.1f} m apart: {error}"
+            picture = draw_pair(*standing, poses={"true pose": trial.T_target_source}, title=title)
+            (folder / f"courtyard_{trial.pairs.split()[0]}_{name}.png").write_bytes(picture)
 
 
-def draw_pair(file: Path, trial: Trial, row: Row, source: DataSource, config: Config) -> None:
-    """What stands above the ground in both scans, in the target's frame."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 9))
-    axes = figure.add_subplot(aspect="equal", xlabel="x (m)", ylabel="y (m)")
-    for scan, T_target_scan, colour, role in (
-        (trial.target, np.eye(4), "tab:blue", "target"),
-        (trial.source, trial.T_target_source, "tab:orange", "source, at its true pose"),
-    ):
-        points = points_of(source, scan)
-        labels = geometric_labels(points)
-        points = points[(labels != Label.ROAD) & (labels != Label.UNLABELLED)]
-        x, y, _ = geometry.apply(T_target_scan, points.astype(np.float64)).T
-        at, label = T_target_scan[:2, 3], f"{scan.index}: {role}"
-        axes.plot(x, y, ",", color=colour, alpha=0.6)
-        axes.plot(*at, "*", color=colour, markeredgecolor="black", markersize=14, label=label)
-    error = f"error {row.error_m:.2f} m, {row.error_deg:.2f} degrees" if row.accepted else row.reason
-    apart_m = np.linalg.norm(trial.T_target_source[:3, 3])
-    axes.set_title(f"{row.source} -> {row.target}, {apart_m:.1f} m apart: {error}")
-    axes.legend(loc="upper right")
-    figure.savefig(file, dpi=110)
+def _standing(points: Points) -> Points:
+    labels = geometric_labels(points)
+    return points[(labels != Label.ROAD) & (labels != Label.UNLABELLED)].astype(np.float64)

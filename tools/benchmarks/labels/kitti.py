@@ -9,43 +9,31 @@ import numpy as np
 
 from segslam.bench.experiments.rows import Row
 from segslam.bench.experiments.summary import figures, grouped
+from segslam.bench.label_scores import confusion, group_scores
 from segslam.core.config import Config
-from segslam.core.types import GROUND_LABELS, Label, Points
+from segslam.core.types import Points
 from segslam.labels import geometric_labels
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed
 from segslam.scans import open_dataset
 from tools.benchmarks import real_pairs
 
-CLASSES = {
-    "ground": GROUND_LABELS,
-    "car": (Label.CAR, Label.MOVING_CAR),
-    "building": (Label.BUILDING,),
-    "vegetation": (Label.VEGETATION,),
-    "trunk_or_pole": (Label.TRUNK, Label.POLE),
-}
 Figures = dict[str, Any]
 
 
-def class_agreement(data: Path, config: Config) -> dict[str, dict[str, float]]:
+def class_agreement(data: Path) -> dict[str, dict[str, float]]:
     """Intersection over union of each class over the points whose truth is known: of scans 0, 1 and 2, and of all."""
-    counts: dict[str, dict[str, np.ndarray]] = {"all": {name: np.zeros(2) for name in CLASSES}}
-    for scan in open_dataset(data / "kitti", sequence="00", frames="0:3"):
-        true_labels = computed(scan.labels)
-        known = true_labels != Label.UNLABELLED
-        labels, truth = geometric_labels(scan.points)[known], true_labels[known]
-        counts[f"scan {scan.index}"] = {}
-        for name, members in CLASSES.items():
-            ours, theirs = np.isin(labels, members), np.isin(truth, members)
-            both_either = np.array([(ours & theirs).sum(), (ours | theirs).sum()])
-            counts[f"scan {scan.index}"][name] = both_either
-            counts["all"][name] += both_either
+    counts = {
+        f"scan {scan.index}": confusion(geometric_labels(scan.points), computed(scan.labels))
+        for scan in open_dataset(data / "kitti", sequence="00", frames="0:3")
+    }
+    counts["all"] = np.sum(list(counts.values()), axis=0)
     return {
-        scans: {name: round(float(both / either), 3) for name, (both, either) in of_class.items()}
-        for scans, of_class in counts.items()
+        scans: {name: round(score, 3) for name, score in group_scores(of_scans).items()}
+        for scans, of_scans in counts.items()
     }
 
 
-def speed(points: Points, config: Config, repeats: int = 21) -> dict[str, float]:
+def speed(points: Points, repeats: int = 21) -> dict[str, float]:
     """Milliseconds to label a scan: CPU time of the thread, wall time, and relative to sorting as many numbers."""
     keys = np.random.default_rng(0).random(len(points))
     clocks: dict[str, list[float]] = {"thread": [], "wall": [], "sort": []}

@@ -18,12 +18,11 @@ import numpy as np
 from segslam import keep_freed_memory
 from segslam.bench.experiments.trials import pair_trials
 from segslam.core.config import Config, load_config
-from segslam.labels.late import computed
+from segslam.labels.label_files import computed
 from tools.benchmarks import common, real_pairs
 from tools.benchmarks.common import Row, markdown
 from tools.benchmarks.registration.ablation import Case, ablation
-from tools.benchmarks.registration.negatives import real_negatives
-from tools.benchmarks.registration.real import real
+from tools.benchmarks.registration.real import real, real_negatives
 from tools.benchmarks.registration.scans import BANDS_M, WORLDS, Labelled, SimulatedPlace, real_scan
 from tools.benchmarks.registration.simulated import scan_of, simulated
 from tools.benchmarks.registration.speed import many_correspondences, sizes, stages
@@ -66,7 +65,7 @@ def speed_part(options: argparse.Namespace, config: Config) -> Tables:
 
     trials = pair_trials(real_pairs.predicted_pairs(options.data), None)
     real_cases: list[Case] = [(trial, network) for trial in trials]
-    simulated_cases = [case for place in places(options) for case in _cases(place, "given", config, options.sample)]
+    simulated_cases = [case for place in places(options) for case in _cases(place, "given", options.sample)]
     scans = [(f"00 {index}", network(index)) for index in real_pairs.PREDICTED]
     return {
         "6,000 correspondences": many_correspondences(config, rng=np.random.default_rng(options.seed)),
@@ -80,18 +79,16 @@ def ablation_part(options: argparse.Namespace, config: Config) -> Tables:
     tables: Tables = {}
     for labels in ("given", "shape"):
         cases = [
-            case
-            for place in places(options)
-            for case in _cases(place, labels, config, options.sample, bands_m=BANDS_M[2:])
+            case for place in places(options) for case in _cases(place, labels, options.sample, bands_m=BANDS_M[2:])
         ]
         tables[f"One thing taken away: 15-30 m, labels {labels}"] = ablation(cases, config, seed=options.seed)
     return tables
 
 
 def _cases(
-    place: SimulatedPlace, labels: str, config: Config, sample: int, bands_m: tuple[tuple[int, int], ...] = BANDS_M
+    place: SimulatedPlace, labels: str, sample: int, bands_m: tuple[tuple[int, int], ...] = BANDS_M
 ) -> list[Case]:
-    scan = cache(scan_of(place, labels, config))
+    scan = cache(scan_of(place, labels))
     return [(pair, scan) for band_m in bands_m for pair in place.pairs(band_m, sample)]
 
 

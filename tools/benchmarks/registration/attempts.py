@@ -11,7 +11,7 @@ from segslam.bench.experiments.trials import Trial
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import PoseError
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Registration, Rejected, Transform
 from segslam.registration import refinement, segregator
 from segslam.registration.prepared import PreparedScan, prepare_scan

@@ -3,10 +3,10 @@
 import numpy as np
 from pydantic import Field
 
+from segslam.bench.label_scores import STILL
 from segslam.core import geometry
 from segslam.core.config import Section
 from segslam.core.types import Label, Labels, Points
-from segslam.labels.scores import STILL
 
 # Classes that networks confuse with each class, most likely first.
 CONFUSED_WITH: dict[Label, tuple[Label, ...]] = {

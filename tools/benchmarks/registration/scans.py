@@ -23,7 +23,6 @@ from segslam.bench.simulation import (
 from segslam.bench.simulation.sensor import Sensor
 from segslam.bench.simulation.world import World
 from segslam.core import geometry
-from segslam.core.config import Config
 from segslam.core.types import Labels, Points, Scan, Transform
 from segslam.labels import geometric_labels
 from segslam.scans.kitti import read_returns
@@ -143,7 +142,7 @@ def courtyard_points(data: Path, index: int) -> Points:
     return read_returns(data / "courtyard" / "velodyne" / f"{index:06d}.bin")[:, :3]
 
 
-def by_shape(points_of: Callable[[int], Points], config: Config) -> Callable[[int], Labelled]:
+def by_shape(points_of: Callable[[int], Points]) -> Callable[[int], Labelled]:
     """The same scans with geometric labels."""
 
     def scan(index: int) -> Labelled:

@@ -27,9 +27,9 @@ class Tables(NamedTuple):
     information: list[Row]
 
 
-def scan_of(place: SimulatedPlace, labels: str, config: Config) -> Callable[[int], Labelled]:
+def scan_of(place: SimulatedPlace, labels: str) -> Callable[[int], Labelled]:
     """The place's scans with the labels `given`, or labelled by `shape`."""
-    return place.scan if labels == "given" else by_shape(lambda index: place.scan(index)[0], config)
+    return place.scan if labels == "given" else by_shape(lambda index: place.scan(index)[0])
 
 
 def simulated(
@@ -40,7 +40,7 @@ def simulated(
     for place in places:
         for labels in ("given", "shape"):
             name = {"place": place.name, "labels": labels}
-            prepared = preparer(scan_of(place, labels, config), config)
+            prepared = preparer(scan_of(place, labels), config)
             by_band = {band_m: place.pairs(band_m, sample) for band_m in BANDS_M}
             trials = {
                 band_m: [attempt(pair, prepared, config=config) for pair in pairs] for band_m, pairs in by_band.items()

@@ -11,9 +11,9 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import PoseError
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Points, Rejected, Transform
-from segslam.keyframes.keyframes import downsample_keyframe
+from segslam.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.registration.hypotheses import Gate, anywhere
 from segslam.registration.prepared import PreparedScan, prepare_scan

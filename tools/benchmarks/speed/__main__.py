@@ -18,9 +18,7 @@ from typing import Any
 from segslam import keep_freed_memory
 from tools.benchmarks import common
 from tools.benchmarks.speed.growth import curves, drives, optimisation
-from tools.benchmarks.speed.latency import latency
-from tools.benchmarks.speed.start import start
-from tools.benchmarks.speed.throughput import throughput
+from tools.benchmarks.speed.throughput import latency, start, throughput
 
 PACKAGES = ("segslam", "kiss-icp", "numpy", "numba", "gtsam", "small-gicp", "mcap")
 DRIVE_SIZES = (1_000, 2_000, 5_000, 10_000)

@@ -13,7 +13,7 @@ import numpy as np
 from segslam.candidates.proximity import ProximityDetector
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.stopwatch import Stopwatch
+from segslam.core.threads import Stopwatch
 from segslam.core.types import (
     Alignment,
     GraphEstimate,

@@ -1,4 +1,8 @@
-"""Scans per second of `segslam map` and of other programs on the same scans, run in turn; memory of `segslam map`."""
+"""Scans per second of `segslam map` and of other programs on the same scans, run in turn; memory of `segslam map`.
+
+Also how long one scan takes in `Slam.process`, closures and optimisations included, and how long the first command
+waits for imports, and kernels that are compiled on first use.
+"""
 
 import json
 import os
@@ -7,15 +11,20 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
 
+from segslam import open_dataset
+from segslam.core.config import Config
 from segslam.output.log import schema
+from segslam.slam.slam import Slam
 
 RIVALS = Path(__file__).with_name("rivals.py")
+REPEATS = 7
 
 
 def throughput(
@@ -85,3 +94,48 @@ def _median_of(runs: list[dict[str, Any]]) -> dict[str, Any]:
         name: statistics.median(run[name] for run in runs) if isinstance(value, (int, float)) else value
         for name, value in runs[-1].items()
     }
+
+
+def start() -> dict[str, Any]:
+    """Seconds of `segslam --help` (median) and of `segslam warm-up`, kernels not yet cached and cached."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        cold, warm = (_seconds("warm-up", environment) for _ in range(2))
+    return {
+        "help_s": float(np.median([_seconds("--help", dict(os.environ)) for _ in range(REPEATS)])),
+        "bare_python_s": float(np.median([_seconds(None, dict(os.environ)) for _ in range(REPEATS)])),
+        "warm_up_cold_s": cold,
+        "warm_up_cached_s": warm,
+    }
+
+
+def _seconds(argument: str | None, environment: dict[str, str]) -> float:
+    command = [sys.executable, "-m", "segslam", argument] if argument else [sys.executable, "-c", "pass"]
+    started = time.perf_counter()
+    subprocess.run(command, env=environment, capture_output=True, check=True)
+    return time.perf_counter() - started
+
+
+def latency(data: Path, sequence: str, frames: tuple[int, int], *, labels: str) -> dict[str, Any]:
+    """Milliseconds of `process`, of odometry in it, of all else, and of the steps that tried a loop."""
+    slam = Slam(Config())
+    dataset = open_dataset(data, sequence=sequence, frames=f"{frames[0]}:{frames[1]}", labels=labels)
+    steps = [slam.process(scan) for scan in dataset]
+    odometry = np.array([1e3 * step.stage_seconds["odometry"] for step in steps])
+    total = np.array([1e3 * sum(step.stage_seconds.values()) for step in steps])
+    tried = np.array([bool(step.attempts) for step in steps])
+    return {
+        "process_ms": _summary(total),
+        "odometry_ms": _summary(odometry),
+        "all_else_ms": _summary(total - odometry),
+        "with_loops_ms": _summary(total[tried]),
+        "share_with_loops": float(tried.mean()),
+        "labels": labels,
+    }
+
+
+def _summary(milliseconds: np.ndarray) -> dict[str, float]:
+    if not len(milliseconds):
+        return {}
+    median, p95 = np.percentile(milliseconds, [50, 95])
+    return {"median": float(median), "p95": float(p95), "max": float(milliseconds.max())}

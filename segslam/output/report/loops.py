@@ -1,14 +1,21 @@
-"""The interactive top view of the report: data for `interactive.js`, drawn by plotly.js, all embedded in the page."""
+"""The loops of the report: pictures of some pairs, and the interactive top view.
+
+Pictures show the best accepted candidates, and the rejected ones closest to acceptance. The data of the top view are
+for `interactive.js`, drawn by plotly.js, all embedded in the page.
+"""
 
 import base64
 import gzip
+import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from importlib import resources
+from textwrap import fill
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from segslam.core import geometry
 from segslam.core.evaluation import align_positions, pose_errors
@@ -20,6 +27,8 @@ from segslam.core.types import (
     LoopAttempt,
     LoopClosure,
     Points,
+    Rejected,
+    RejectReason,
     Transform,
 )
 from segslam.output.finished import FinishedRun
@@ -35,6 +44,11 @@ NEAR_M = 50.0
 """Chosen: points drawn of each cloud, and their largest distance."""
 STEP_M = 0.1
 """Resolution of the coordinates of clouds, in whole numbers of 16 bits."""
+NUM_EACH = 3
+APART = 10
+"""Chosen: keyframes between two pictures of one kind, so that they show different places."""
+SOURCE, TARGET = "#D55E00", "#4D4D4D"
+VIEW_M = 50.0
 
 
 def with_clouds(run: FinishedRun) -> list[LoopAttempt]:
@@ -99,7 +113,7 @@ def _values(run: FinishedRun) -> dict[str, list[float]]:
 
 
 def _loop(run: FinishedRun, attempt: LoopAttempt, ids: set[int]) -> dict[str, Any]:
-    source_id, target_id = pair = attempt.candidate.source_id, attempt.candidate.target_id
+    source_id, target_id = pair = attempt.candidate.pair
     estimate, rows = run.result.estimate, run.result.keyframe_rows
     T_world, T_odom = estimate.T_world_keyframe, run.result.odometry.T_world_lidar[rows]
     kind = "rejected"
@@ -146,3 +160,69 @@ def _spread(attempts: list[LoopAttempt], most: int) -> list[LoopAttempt]:
     if len(attempts) <= most:
         return attempts
     return [attempts[row] for row in np.linspace(0, len(attempts) - 1, most).astype(int)] if most else []
+
+
+def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
+    """Accepted candidates by overlap; then rejected ones, those that failed last first, by distance."""
+    attempts = list(attempts)
+    accepted = [a for a in attempts if isinstance(a.outcome, LoopClosure)]
+    rejected = [a for a in attempts if isinstance(a.outcome, Rejected)]
+    return _apart(sorted(accepted, key=_overlap, reverse=True)) + _apart(sorted(rejected, key=_miss))
+
+
+def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int, Keyframe]) -> dict[str, bytes]:
+    """A PNG for each candidate, by caption."""
+    pictures = {}
+    for attempt in chosen:
+        source_id, target_id = attempt.candidate.pair
+        T_world = run.result.estimate.T_world_keyframe
+        poses = {"initial guess": attempt.candidate.T_target_source_prior}
+        if isinstance(attempt.outcome, LoopClosure):
+            poses["registered"] = attempt.outcome.T_target_source
+        else:
+            poses["final map"] = geometry.inverse(T_world[target_id]) @ T_world[source_id]
+        source, target = (_standing(keyframes[number]) for number in (source_id, target_id))
+        caption = f"{source_id} to {target_id}: {outcome_text(attempt, run.result.estimate.closure_weights)}"
+        pictures[caption] = draw_pair(source, target, poses=poses, title=f"keyframes {caption}")
+    return pictures
+
+
+def _apart(attempts: list[LoopAttempt]) -> list[LoopAttempt]:
+    chosen: list[LoopAttempt] = []
+    for attempt in attempts:
+        source_id = attempt.candidate.source_id
+        if len(chosen) < NUM_EACH and all(abs(source_id - one.candidate.source_id) >= APART for one in chosen):
+            chosen.append(attempt)
+    return chosen
+
+
+def _overlap(attempt: LoopAttempt) -> float:
+    return attempt.outcome.alignment.overlap if isinstance(attempt.outcome, LoopClosure) else 0.0
+
+
+def _miss(attempt: LoopAttempt) -> tuple[int, float]:
+    reason = attempt.outcome.reason if isinstance(attempt.outcome, Rejected) else RejectReason.TOO_FEW_POINTS
+    return -list(RejectReason).index(reason), attempt.candidate.distance_m
+
+
+def _standing(keyframe: Keyframe) -> Points:
+    """The points above ground; all points if none is labelled as ground."""
+    return keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))].astype(np.float64)
+
+
+def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform], title: str) -> bytes:
+    """The two scans as a PNG, a panel for each of `poses`: a name and T_target_source."""
+    figure = Figure(figsize=(3.6 * len(poses), 4.4), layout="compressed")
+    figure.suptitle(fill(title, 31 * len(poses)), fontsize=11)
+    panels = figure.subplots(1, len(poses), squeeze=False)[0]
+    for axes, (name, T_target_source) in zip(panels, poses.items(), strict=True):
+        for points, color, label in (
+            (target, TARGET, "target"),
+            (geometry.apply(T_target_source, source), SOURCE, "source"),
+        ):
+            near = points[np.abs(points[:, :2]).max(axis=1) < VIEW_M]
+            axes.plot(near[:, 0], near[:, 1], ",", color=color, label=label, rasterized=True)
+        axes.set(title=name, xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), aspect="equal", xlabel="x (m)")
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=140)
+    return image.getvalue()

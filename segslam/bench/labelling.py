@@ -1,0 +1,168 @@
+"""Labels of the scans of a drive: written to files, drawn, counted, and compared with true ones."""
+
+import io
+import logging
+from pathlib import Path
+from statistics import median_low
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from segslam.bench.label_scores import NUM_CLASSES, STILL, class_scores, confusion, group_scores, largest_confusions
+from segslam.core import geometry
+from segslam.core.types import BadScan, Label, Labels, Points, Scan
+from segslam.core.whole_files import write_whole
+from segslam.labels import geometric_labels
+from segslam.labels.encodings import Colors, Encoding, of_classes
+from segslam.labels.label_files import computed, write_labels
+from segslam.labels.network_settings import ImageSettings
+from segslam.labels.range_image import EMPTY, project
+from segslam.output.folder import write_csv
+from segslam.scans import Dataset
+
+logger = logging.getLogger(__name__)
+REACH_M = 50.0
+CELL_M = 0.2
+BACKGROUND, WRONG, RIGHT, MOVING = (24, 24, 24), (255, 60, 40), (110, 110, 110), (255, 42, 42)
+"""Red, green, blue."""
+
+Image = UInt8[np.ndarray, "_ _ 3"]
+
+
+class Tally:
+    """Labels scans, writes their labels, and counts classes and confusions."""
+
+    def __init__(
+        self, scans: Dataset, true_scans: Dataset | None, folder: Path, *, write_as: Encoding, num_pictures: int
+    ) -> None:
+        self._scans, self._true_scans = scans, true_scans
+        self._folder = folder
+        self._encoding = write_as
+        self._drawn = set(np.linspace(0, len(scans) - 1, num_pictures).astype(int).tolist())
+        self._num_points = np.zeros(len(Label), np.int64)
+        self._confusion = np.zeros((NUM_CLASSES, NUM_CLASSES), np.int64)
+        self.seconds: list[float] = []
+
+    def add(self, row: int) -> None:
+        """Label a scan; a warning for an unusable one. It is drawn if it was selected for drawing."""
+        try:
+            scan = self._scans[row]
+            truth = None if self._true_scans is None else computed(self._true_scans[row].labels)
+        except BadScan as error:
+            logger.warning("%s; skipped", error)
+            return
+        started = perf_counter()
+        labels = computed(scan.labels)
+        if self._scans.labels.geometric and not labels.any():
+            labels = geometric_labels(scan.points)
+        self.seconds.append(perf_counter() - started)
+        self._num_points += np.bincount(labels, minlength=len(self._num_points))
+        if truth is not None:
+            self._confusion += confusion(labels, truth)
+        name = self._scans.names[row]
+        write_labels(self._folder / f"{name}.label", labels, scan.kept, self._encoding)
+        if row in self._drawn:
+            write_whole(self._folder / f"{name}.png", self._picture(name, scan, labels, truth))
+
+    def figures(self) -> dict[str, Any]:
+        """Shares of the classes and time; with true labels also scores, and `confusion.csv` is written."""
+        shares = self._num_points / self._num_points.sum()
+        most_first = np.argsort(-shares, kind="stable")
+        figures: dict[str, Any] = {
+            "num_scans": len(self.seconds),
+            "num_points": int(self._num_points.sum()),
+            "ms_per_scan": 1000 * median_low(self.seconds),
+            "shares": {Label(int(i)).name.lower(): float(shares[i]) for i in most_first if shares[i]},
+        }
+        counts = self._confusion
+        if not counts.any():
+            return figures
+        names = [label.name.lower() for label in list(Label)[: len(counts)]]
+        rows = ([name, *row] for name, row in zip(names[1:], counts[1:].tolist(), strict=True))
+        write_csv(self._folder / "confusion.csv", ["truth \\ label", *names], rows)
+        by_class = class_scores(counts)
+        known = [by_class[Label(int(i)).name.lower()] for i in np.flatnonzero(counts.sum(axis=1))]
+        return figures | {
+            "accuracy": float(np.trace(counts) / counts.sum()),
+            "mean_iou": float(np.mean(known)),
+            "iou": by_class,
+            "iou_of_groups": group_scores(counts),
+            "confusions": [
+                {"truth": true.name.lower(), "label": given.name.lower(), "share": share}
+                for true, given, share in largest_confusions(counts, 6)
+            ],
+        }
+
+    def _picture(self, name: str, scan: Scan, labels: Labels, truth: Labels | None) -> bytes:
+        network = self._scans.labels.network
+        image = network.settings if network else fitting_image(scan.points)
+        title = f"{self._scans.name}, scan {name}, {len(labels)} points"
+        return draw_labels(scan.points, labels, truth=truth, image=image, title=title)
+
+
+def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: ImageSettings, title: str) -> bytes:
+    """A PNG of the labels; with true labels also these, and the wrong labels in red."""
+    panels = {"labels": _colors(labels)}
+    if truth is not None:
+        known = truth != Label.UNLABELLED
+        wrong = known & (STILL[labels] != STILL[truth])
+        colors = np.where(wrong[:, None], WRONG, RIGHT).astype(np.uint8)
+        panels |= {"true labels": _colors(truth), f"{wrong.sum() / max(known.sum(), 1):.1%} wrong (red)": colors}
+    figure = Figure(figsize=(15, 1.2 * len(panels) + (8.5 if len(panels) == 1 else 5.8)), layout="constrained")
+    ranges, above, legend = figure.subfigures(3, 1, squeeze=False, height_ratios=[1.2 * len(panels), 5.0, 0.8])[:, 0]
+    ranges.suptitle(title, parse_math=False)  # names of files may contain a dollar sign
+    strips = ranges.subplots(len(panels), 1, squeeze=False)[:, 0]
+    squares = above.subplots(1, len(panels), squeeze=False)[0]
+    for (name, colors), strip, square in zip(panels.items(), strips, squares, strict=True):
+        strip.imshow(_range_image(points, colors, image), aspect="auto", interpolation="nearest")
+        strip.set(title=f"range image, {name}", xticks=[], yticks=[])
+        square.imshow(_from_above(points, colors), extent=(REACH_M, -REACH_M, -REACH_M, REACH_M))
+        square.set(title=f"top view, {name}", xlabel="y, left (m)", ylabel="x, ahead (m)")
+    legend.legend(handles=_legend(labels, truth), loc="center", ncols=7, frameon=False)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=100)
+    return content.getvalue()
+
+
+def fitting_image(points: Points) -> ImageSettings:
+    """An image for a scan of any sensor; excludes the lowest and highest percent of its points."""
+    elevations = np.degrees(geometry.spherical(points)[1])
+    low, high = np.percentile(elevations, [1, 99])
+    return ImageSettings(field_of_view_deg=(float(low), float(max(high, low + 1.0))), height=64, width=1024)
+
+
+def _colors(labels: Labels) -> Colors:
+    colors = of_classes(STILL[labels])
+    colors[labels >= Label.MOVING_CAR] = MOVING
+    return colors
+
+
+def _range_image(points: Points, colors: Colors, settings: ImageSettings) -> Image:
+    nearest = project(points.astype(np.float64), settings=settings).nearest
+    return np.where((nearest == EMPTY)[..., None], BACKGROUND, colors[nearest]).astype(np.uint8)
+
+
+def _from_above(points: Points, colors: Colors) -> Image:
+    """Top view with x up and y to the left; the highest point of a pixel is visible."""
+    side = round(2 * REACH_M / CELL_M)
+    picture = np.full((side, side, 3), BACKGROUND, np.uint8)
+    order = np.argsort(points[:, 2], kind="stable")  # the last assignment to a pixel remains
+    rows, columns = np.floor((REACH_M - points[order, :2].astype(np.float64)) / CELL_M).astype(np.int64).T
+    inside = (rows >= 0) & (rows < side) & (columns >= 0) & (columns < side)
+    picture[rows[inside], columns[inside]] = colors[order[inside]]
+    return picture
+
+
+def _legend(labels: Labels, truth: Labels | None) -> list[Patch]:
+    """A patch for each class in the labels, with its share."""
+    shares = np.bincount(labels, minlength=len(Label)) / max(len(labels), 1)
+    drawn = np.union1d(np.unique(labels), [] if truth is None else np.unique(truth)).astype(np.uint8)
+    colors = _colors(drawn) / 255
+    return [
+        Patch(color=color, label=f"{Label(label).name.lower()} {shares[label]:.1%}")
+        for label, color in zip(drawn, colors, strict=True)
+    ]

@@ -1,0 +1,262 @@
+"""Shapes above the ground: thin objects in a grid of columns, walls, and segments of connected cells, with their sizes.
+
+A column is a square cell of the x-y plane. A bit mask holds its occupied height slices, so that neighbourhoods are
+combined by bitwise operations. A pole is an object with free space all around, as in occupancy-grid pole extractors
+(Schaefer, Büscher, Vertens, Luft, Burgard, "Long-term urban vehicle localization using pole landmarks extracted from
+3-D lidar scans", ECMR 2019). A wall is a voxel whose points lie along one line and reach high enough.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import label, maximum_filter
+
+from segslam.core.kernels import kernel
+from segslam.core.types import IndexPairs, Indices, Mask, Points, Vector
+
+NUM_SLICES = 16
+WALL_CELL_M = 0.6
+"""Chosen, like the next constants, by the IoU of buildings on the real KITTI scans 0-2 (`tools/benchmarks/labels`)."""
+LAYER_M = 2.0
+NUM_LAYERS = 5
+MIN_LENGTH_M = 0.3
+"""Smallest standard deviation along the line."""
+MIN_POINTS = 8
+CELL_M = 0.3
+"""Chosen: objects nearer to each other than this form one segment."""
+NO_PIECE = -1
+RECTANGLE_STEP_DEG = 5.0
+"""Chosen: angle steps for which the short side of a car is overestimated by at most 20 cm."""
+_ANGLES = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
+DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+
+
+@kernel("boolean[::1](int64[:, ::1], int64[::1], UniTuple(int64, 2), int64, int64, int64, float64)")
+def on_thin_uprights(cells, slices, shape, core, ring, min_slices, min_share):
+    """(n,) bool: whether each point belongs to a thin, tall, free-standing object.
+
+    Point k lies in column `cells[k]` of a grid of the given shape, in height slice `slices[k]`. For each occupied
+    column: combine the slices occupied within `core` cells, and remove those occupied between `core` and `ring` cells
+    away. The remaining slices must span `min_slices` and be a share `min_share` of the slices before removal. Points
+    outside the grid or the slices 0 to NUM_SLICES - 1 are ignored, as are columns within `ring` cells of the border.
+    """
+    masks, thin = np.zeros(shape, np.uint16), np.zeros(shape, np.uint16)
+    for k in range(len(cells)):
+        if _takes_part(cells[k], slices[k], shape):
+            masks[cells[k, 0], cells[k, 1]] |= np.uint16(1 << slices[k])
+    inner, outer = _disc(core, -1), _disc(ring, core)
+    for i in range(ring, shape[0] - ring):
+        for j in range(ring, shape[1] - ring):
+            if masks[i, j] == 0:
+                continue
+            held = _joined(masks, inner, i, j)
+            if _span(held) < min_slices:
+                continue
+            clear = _left_clear(masks, outer, i, j, held, min_share * _count(held))
+            if _span(clear) >= min_slices:
+                for n in range(len(inner)):
+                    thin[i + inner[n, 0], j + inner[n, 1]] |= np.uint16(clear)
+    chosen = np.zeros(len(cells), np.bool_)
+    for k in range(len(cells)):
+        if _takes_part(cells[k], slices[k], shape):
+            chosen[k] = thin[cells[k, 0], cells[k, 1]] >> slices[k] & 1
+    return chosen
+
+
+@kernel("boolean(int64[::1], int64, UniTuple(int64, 2))")
+def _takes_part(cell, slice_index, shape):
+    return 0 <= cell[0] < shape[0] and 0 <= cell[1] < shape[1] and 0 <= slice_index < NUM_SLICES
+
+
+@kernel("int64[:, ::1](int64, int64)")
+def _disc(radius, inner_radius):
+    """Offsets of the cells farther than `inner_radius` and at most `radius` cells from the centre."""
+    offsets = np.empty(((2 * radius + 1) ** 2, 2), np.int64)
+    count = 0
+    for a in range(-radius, radius + 1):
+        for b in range(-radius, radius + 1):
+            squared = a * a + b * b
+            if squared <= radius * radius and (inner_radius < 0 or squared > inner_radius * inner_radius):
+                offsets[count, 0], offsets[count, 1] = a, b
+                count += 1
+    return offsets[:count]
+
+
+@kernel("int64(uint16[:, ::1], int64[:, ::1], int64, int64)")
+def _joined(masks, offsets, i, j):
+    joined = 0
+    for n in range(len(offsets)):
+        joined |= masks[i + offsets[n, 0], j + offsets[n, 1]]
+    return joined
+
+
+@kernel("int64(uint16[:, ::1], int64[:, ::1], int64, int64, int64, float64)")
+def _left_clear(masks, offsets, i, j, held, min_count):
+    """The bits of `held` that no surrounding column contains; 0 if fewer than `min_count` remain."""
+    clear = held
+    for n in range(len(offsets)):
+        taken = clear & masks[i + offsets[n, 0], j + offsets[n, 1]]
+        if taken:
+            clear ^= taken
+            if _count(clear) < min_count:
+                return 0
+    return clear
+
+
+@kernel("int64(int64)")
+def _count(mask):
+    count = 0
+    while mask:
+        mask &= mask - 1
+        count += 1
+    return count
+
+
+@kernel("int64(int64)")
+def _span(mask):
+    """Number of bits from the lowest to the highest set bit, both included."""
+    first, last = NUM_SLICES, -1
+    for bit in range(NUM_SLICES):
+        if mask >> bit & 1:
+            first, last = min(first, bit), bit
+    return max(last - first + 1, 0)
+
+
+def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: float) -> Mask:
+    """(n,) bool: whether each point lies on a vertical surface, for points in a level frame.
+
+    Each voxel is tested with its 8 neighbours: the standard deviation of the points perpendicular to their line must be
+    below `thickness_m`, and one of the points must be higher than `min_top_m` above the ground.
+    """
+    cells, corner, shape = grid_cells(points, WALL_CELL_M, border=1)
+    layers = np.clip(heights / LAYER_M, 0, NUM_LAYERS - 1).astype(np.int64)
+    voxel, moments = _moments(points, layers, cells, corner, (NUM_LAYERS, *shape))
+    top = np.full(shape, -np.inf)
+    np.maximum.at(top.ravel(), cells[:, 0] * shape[1] + cells[:, 1], heights)
+    tall = maximum_filter(top, 3) >= min_top_m
+    walls = _walls(voxel, moments, tall, thickness_m * 1000, MIN_LENGTH_M * 1000)
+    return walls[voxel[layers, cells[:, 0], cells[:, 1]]]
+
+
+@kernel(
+    "Tuple((int32[:, :, ::1], int64[:, ::1]))(float64[:, ::1], int64[::1], int64[:, ::1], float64[::1],"
+    "UniTuple(int64, 3))"
+)
+def _moments(points, layers, cells, corner, shape):
+    """Index of each occupied voxel (-1 elsewhere), and the sums of 1, x, y, xx, xy, yy over the points of each voxel.
+
+    The sums are in integer millimetres and do not depend on the order of the points.
+    """
+    voxel = np.full(shape, -1, np.int32)
+    moments = np.zeros((len(layers), 6), np.int64)
+    num_voxels = 0
+    for k in range(len(layers)):
+        layer, i, j = layers[k], cells[k, 0], cells[k, 1]
+        if voxel[layer, i, j] < 0:
+            voxel[layer, i, j] = num_voxels
+            num_voxels += 1
+        x = int(np.round((points[k, 0] - corner[0]) * 1000))
+        y = int(np.round((points[k, 1] - corner[1]) * 1000))
+        m = moments[voxel[layer, i, j]]
+        m[0] += 1
+        m[1] += x
+        m[2] += y
+        m[3] += x * x
+        m[4] += x * y
+        m[5] += y * y
+    return voxel, moments[:num_voxels]
+
+
+@kernel("boolean[::1](int32[:, :, ::1], int64[:, ::1], boolean[:, ::1], float64, float64)")
+def _walls(voxel, moments, tall, thickness_mm, min_length_mm):
+    """True for each voxel that is part of a vertical surface. Neighbours are within the grid, whose border is empty."""
+    walls = np.zeros(len(moments), np.bool_)
+    total = np.zeros(6, np.int64)
+    for layer in range(voxel.shape[0]):
+        for i in range(1, voxel.shape[1] - 1):
+            for j in range(1, voxel.shape[2] - 1):
+                if voxel[layer, i, j] < 0 or not tall[i, j]:
+                    continue
+                total[:] = 0
+                for a in range(i - 1, i + 2):
+                    for b in range(j - 1, j + 2):
+                        if voxel[layer, a, b] >= 0:
+                            for m in range(6):
+                                total[m] += moments[voxel[layer, a, b], m]
+                walls[voxel[layer, i, j]] = _is_line(total, thickness_mm, min_length_mm)
+    return walls
+
+
+@kernel("boolean(int64[::1], float64, float64)")
+def _is_line(moments, thickness_mm, min_length_mm):
+    n, x, y = moments[0], moments[1], moments[2]
+    xx, xy, yy = moments[3], moments[4], moments[5]
+    if n < MIN_POINTS:
+        return False
+    a, b, c = xx / n - (x / n) ** 2, xy / n - (x / n) * (y / n), yy / n - (y / n) ** 2
+    middle, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
+    return middle - spread < thickness_mm**2 and middle + spread > min_length_mm**2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pieces:
+    """Segments of connected cells. All fields but `of_point` have one row per segment, from its chosen points."""
+
+    of_point: Indices
+    """(n,) segment of each point, also of points that were not chosen; NO_PIECE if it has none."""
+    num_points: Indices
+    top_m: Vector
+    """Height of the highest point above the ground."""
+    length_m: Vector
+    """Longer side of the smallest-area bounding rectangle in the x-y plane."""
+    width_m: Vector
+
+
+def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
+    """The segments of the chosen points of a level cloud."""
+    cells, _, shape = grid_cells(points, CELL_M, border=1)
+    occupied = np.zeros(shape, bool)
+    occupied[cells[chosen, 0], cells[chosen, 1]] = True
+    grid, num_pieces = label(occupied, structure=np.ones((3, 3), bool))
+    of_point = grid[cells[:, 0], cells[:, 1]].astype(np.int64) + NO_PIECE  # labels start at 1; 0 is the background
+    num_points = np.bincount(of_point[chosen], minlength=num_pieces)
+    top_m = np.full(num_pieces, -np.inf)
+    np.maximum.at(top_m, of_point[chosen], heights[chosen])
+    sides_m = _tightest_rectangles(points, of_point, chosen, num_pieces, DIRECTIONS)
+    return Pieces(of_point, num_points, top_m, sides_m[:, 0], sides_m[:, 1])
+
+
+def grid_cells(points: Points, cell_m: float, *, border: int) -> tuple[IndexPairs, Vector, tuple[int, int]]:
+    """The cell (n, 2) of each point, the corner of the grid (m), and the number of rows and columns.
+
+    The grid contains all points and a margin of `border` empty cells.
+    """
+    whole = [np.floor(points[:, axis] / cell_m) for axis in (0, 1)]
+    first = np.array([column.min() if len(points) else 0.0 for column in whole]) - border
+    cells = np.column_stack([column - start for column, start in zip(whole, first, strict=True)]).astype(np.int64)
+    rows, columns = (int(cells[:, axis].max(initial=0)) + border + 1 for axis in (0, 1))
+    return cells, first * cell_m, (rows, columns)
+
+
+@kernel("float64[:, ::1](float64[:, ::1], int64[::1], boolean[::1], int64, float64[:, ::1])")
+def _tightest_rectangles(points, piece, chosen, num_pieces, directions):
+    """(num_pieces, 2) longer and shorter side (m) of the smallest-area bounding rectangle of each segment."""
+    low = np.full((num_pieces, len(directions), 2), np.inf)
+    high = np.full((num_pieces, len(directions), 2), -np.inf)
+    for k in range(len(points)):
+        if chosen[k]:
+            lows, highs = low[piece[k]], high[piece[k]]
+            for n in range(len(directions)):
+                u = directions[n, 0] * points[k, 0] + directions[n, 1] * points[k, 1]
+                v = directions[n, 0] * points[k, 1] - directions[n, 1] * points[k, 0]
+                lows[n, 0], highs[n, 0] = min(lows[n, 0], u), max(highs[n, 0], u)
+                lows[n, 1], highs[n, 1] = min(lows[n, 1], v), max(highs[n, 1], v)
+    sides = np.empty((num_pieces, 2))
+    for k in range(num_pieces):
+        least = np.inf
+        for n in range(len(directions)):
+            first, second = high[k, n, 0] - low[k, n, 0], high[k, n, 1] - low[k, n, 1]
+            if first * second < least:
+                least = first * second
+                sides[k, 0], sides[k, 1] = max(first, second), min(first, second)
+    return sides

@@ -15,9 +15,10 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import PoseGraph
-from segslam.run.locator import Locator, submaps_of
+from segslam.run.locator import NUM_FIRST, Locator, submaps_of
 from segslam.run.sessions.recorded import FIRST_MOTION, Session
 from segslam.slam.adjustment import Progress, no_progress
+from segslam.slam.recognition import MAX_PLACES
 
 NUM_QUERIES = 60
 """Chosen: number of keyframes of a session that are searched in another, spread over its travel."""
@@ -60,7 +61,8 @@ def find_session(
 
     At most `NUM_QUERIES` keyframes, spread over the session, are searched; sparse ones together with their neighbours.
     `likely`: these keyframes are searched instead, in this order, and those before and after each that is found, until
-    the first `MOST_FAILED` were not.
+    the first `MOST_FAILED` were not. They look like a place of the earlier session, so the views from points around the
+    sensor, two thirds of the time of a keyframe that is not found, are not tried.
     """
     recorded = session.log.keyframes()
     submaps = submaps_of([recorded[number] for number in range(len(recorded))], recorded, config)
@@ -73,7 +75,7 @@ def find_session(
     for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
         num_tried += 1
         submap = submaps.submap(keyframe_id)
-        place = locator.locate(submap.points, submap.labels)
+        place = locator.locate(submap.points, submap.labels, max_places=MAX_PLACES if likely is None else NUM_FIRST)
         if not isinstance(place, Rejected):
             found.append((keyframe_id, place.keyframe_id, place.alignment))
         if len(found) == NUM_ENOUGH or (likely is not None and not found and num_tried == MOST_FAILED):

@@ -3,6 +3,7 @@
 A step writes its result beside the final name and renames it when it is whole. What is there is not done again.
 """
 
+import hashlib
 import json
 import logging
 import shutil
@@ -16,7 +17,7 @@ from uuid import uuid4
 import numpy as np
 
 from segslam.candidates import Places, PlaceSignature
-from segslam.core.config import Config, load_config
+from segslam.core.config import Config, RefineConfig, load_config
 from segslam.core.types import SegslamError, Trajectory
 from segslam.gnss.fixes import Fixes
 from segslam.gnss.reading import read_fixes
@@ -24,7 +25,8 @@ from segslam.labels.encodings import Encoding
 from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
-from segslam.run.fleets.drives import Drive
+from segslam.run.fleets.alignments import Alignments, Part, write_alignments
+from segslam.run.fleets.drives import Drive, key_of
 from segslam.run.fleets.relations import Relation, read_relation, write_relation
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_source, open_scans
@@ -35,7 +37,7 @@ from segslam.scans import DataSource
 from segslam.scans.presets import SETTINGS, Preset, extent_m, preset, preset_for
 
 logger = logging.getLogger(__name__)
-RUNS, INDEX, PROPOSALS, PAIRS = "runs", "index", "proposals", "pairs"
+RUNS, INDEX, PROPOSALS, PAIRS, ALIGNMENTS = "runs", "index", "proposals", "pairs", "alignments"
 KEY = "fleet.key"
 """File in a run folder of a fleet: the key that it was made with."""
 UNFINISHED = ".part"
@@ -74,7 +76,7 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
     mapped = Mapped(drive.name, key)
     if is_made(mapped.folder(fleet), key):
         return mapped
-    part = _part_of(mapped.folder(fleet))
+    part = _beside(mapped.folder(fleet))
     source = DataSource(
         Path(drive.data),
         drive.sequence,
@@ -173,7 +175,7 @@ def join(
 ) -> Mapping[str, Any]:
     """The drives of a component as one run, each with its pose in one before it; returns the figures of the run."""
     if not is_made(folder, key):
-        part = _part_of(folder)
+        part = _beside(folder)
         sessions = [read_session(drive.folder(fleet)) for drive in drives]
         if len(drives) == 1:
             shutil.copytree(drives[0].folder(fleet), part)
@@ -181,10 +183,21 @@ def join(
         else:
             part.mkdir()
             merged = arranged(sessions, poses, same_reference=same_reference)
-            together = write_merged(merged, part, sessions[0].run.config).result.trajectory
+            config = sessions[0].run.config
+            kept = Alignments(fleet / ALIGNMENTS, list(map(partial(_part, config.refine), drives, sessions)))
+            together = write_merged(merged, part, config, kept=kept).result.trajectory
+            for file, alignments in kept.changed():
+                _replace(file, partial(write_alignments, kept=alignments))
         _write_drives(part / "drives", drives, sessions, together)
         _made(part, folder, key)
     return read_metrics(folder)
+
+
+def _part(config: RefineConfig, drive: Mapped, session: Session) -> Part:
+    """A drive with the key of all that the alignments of its submaps depend on."""
+    poses = hashlib.sha256(session.T_world_keyframe.tobytes()).hexdigest()
+    key = key_of(drive.key, poses, session.correction_deg, config.model_dump())
+    return Part(drive.name, key, len(session.travel_m))
 
 
 def _write_drives(folder: Path, drives: Sequence[Mapped], sessions: Sequence[Session], together: Trajectory) -> None:
@@ -204,7 +217,7 @@ def _locator(fleet: Path, drive: Mapped) -> Locator:
     return Locator.from_run(drive.folder(fleet))
 
 
-def _part_of(target: Path) -> Path:
+def _beside(target: Path) -> Path:
     """A new name beside the target: two workers may do the same work, if the first seemed to be lost."""
     return target.with_name(f".{target.name}.{uuid4().hex}{UNFINISHED}")
 
@@ -216,7 +229,7 @@ def _made(part: Path, folder: Path, key: str) -> None:
         shutil.rmtree(part)
         return
     if folder.exists():
-        old = _part_of(folder)
+        old = _beside(folder)
         folder.rename(old)
         shutil.rmtree(old)
     part.rename(folder)
@@ -225,7 +238,7 @@ def _made(part: Path, folder: Path, key: str) -> None:
 def _replace(file: Path, write: Any) -> None:
     """Write a file under another name, then rename it."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = _part_of(file).with_suffix(file.suffix)
+    part = _beside(file).with_suffix(file.suffix)
     write(part)
     part.replace(file)
 
@@ -239,6 +252,6 @@ def remove_components(fleet: Path, *, keep: int) -> None:
 
 def remove_unfinished(fleet: Path) -> None:
     """Remove what interrupted steps left."""
-    for folder in (fleet, *(fleet / name for name in (RUNS, INDEX, PROPOSALS, PAIRS))):
+    for folder in (fleet, *(fleet / name for name in (RUNS, INDEX, PROPOSALS, PAIRS, ALIGNMENTS))):
         for part in folder.glob(f".*{UNFINISHED}*") if folder.is_dir() else ():
             shutil.rmtree(part) if part.is_dir() else part.unlink()

@@ -18,9 +18,10 @@ from segslam.output.folder import new_folder
 from segslam.output.georeferenced import georeference_if_possible, recorded_fixes, use_of
 from segslam.run.locator import Locator
 from segslam.run.run import Run
-from segslam.run.sessions.recorded import Session, Shift, next_shift, read_sessions, shifted_steps
+from segslam.run.sessions.recorded import Session, Shift, known_of, next_shift, read_sessions, shifted_steps
 from segslam.run.sessions.session_pose import SessionPose, attempt, find_session
 from segslam.slam.adjustment import Progress, no_progress
+from segslam.slam.adjustment.known import Kept, nothing_kept
 from segslam.slam.slam import Slam, SlamResult
 
 OPTIMIZE_EVERY = 25
@@ -75,11 +76,11 @@ class Merged:
         ]
         return {"sessions": json.dumps(rows)}
 
-    def begun(self, folder: Path, config: Config) -> Run:
-        """The merged run in its folder, before it takes over the first of `steps`."""
+    def begun(self, folder: Path, config: Config, *, kept: Kept = nothing_kept) -> Run:
+        """The merged run in its folder, before it takes over the first of `steps`. `kept`: as for `write_merged`."""
         return Run(
             folder,
-            Slam(config),
+            Slam(config, known=known_of(self.sessions, kept)),
             dataset=self.dataset,
             T_camera_lidar=self.sessions[0].run.T_camera_lidar,
             reference=self.reference,
@@ -190,10 +191,15 @@ def merge(
 
 
 def write_merged(
-    merged: Merged, folder: Path, config: Config, *, on_step: Callable[[Step], object] = lambda step: None
+    merged: Merged,
+    folder: Path,
+    config: Config,
+    *,
+    kept: Kept = nothing_kept,
+    on_step: Callable[[Step], object] = lambda step: None,
 ) -> FinishedRun:
-    """The merged run, in an empty folder."""
-    with merged.begun(folder, config) as run:
+    """The merged run, in an empty folder. `kept` knows alignments of submaps from earlier."""
+    with merged.begun(folder, config, kept=kept) as run:
         for step in run.take(merged.steps()):
             on_step(step)
         run.complete(more=merged.figures, place=merged.georeference)

@@ -1,17 +1,18 @@
 """Registration of pairs of submaps."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import IndexPairs, Information
+from segslam.core.types import IndexPairs, Information, Transform
 from segslam.graph import Edge
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
-from segslam.slam.adjustment.alignment import Alignment, align
-from segslam.slam.adjustment.submaps import Submaps
+from segslam.slam.adjustment.alignment import Alignment
 
+Aligned = Callable[[int, int, Transform], Alignment | None]
+"""The alignment of a target and a source, by their ids, near an initial guess."""
 MIN_OVERLAP = 0.1
 """Chosen on KITTI 00: smallest share of a submap's points that lie on the other."""
 
@@ -33,12 +34,12 @@ class RegisteredPair:
 
 
 def register_pairs(
-    pairs: IndexPairs, submaps: Submaps, T_world: Poses, *, config: RefineConfig
+    pairs: IndexPairs, aligned: Aligned, T_world: Poses, *, config: RefineConfig
 ) -> Iterator[RegisteredPair | None]:
     """Register each pair (target, source) from its current pose; None without convergence or enough overlap."""
     for target_id, source_id in pairs.tolist():
         T_prior = geometry.inverse(T_world[target_id]) @ T_world[source_id]
-        found = align(submaps.submap(source_id), submaps.submap(target_id), T_prior)
+        found = aligned(target_id, source_id, T_prior)
         if found is None or found.overlap < MIN_OVERLAP:
             yield None
             continue

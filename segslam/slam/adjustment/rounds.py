@@ -14,10 +14,11 @@ from segslam.core.config import Config
 from segslam.core.types import GraphEstimate, IndexPairs, Mask, Points, Vector
 from segslam.graph import PoseGraph
 from segslam.odometry.calibration import measure_vertical_angle
+from segslam.slam.adjustment.known import Known
 from segslam.slam.adjustment.pairs import EVERY, STEPS, all_pairs
 from segslam.slam.adjustment.progress import Progress, no_progress
 from segslam.slam.adjustment.record import Adjustment
-from segslam.slam.adjustment.registrations import RegisteredPair, register_pairs
+from segslam.slam.adjustment.registrations import Aligned, RegisteredPair, register_pairs
 from segslam.slam.adjustment.submaps import REACH, PointsOf, Submaps
 from segslam.slam.adjustment.thickness import map_thickness_m
 
@@ -42,24 +43,34 @@ class _Round(NamedTuple):
 
 
 def adjust(
-    graph: PoseGraph, before: GraphEstimate, points_of: PointsOf, *, config: Config, progress: Progress = no_progress
+    graph: PoseGraph,
+    before: GraphEstimate,
+    points_of: PointsOf,
+    *,
+    config: Config,
+    known: Known | None = None,
+    progress: Progress = no_progress,
 ) -> Adjusted | None:
     """Adjust the poses of a graph after its last optimisation, whose result is `before`.
 
-    Returns None, and changes nothing, if the adjustment is off or no pair of submaps could be registered.
+    `known`: the results of the drives' own adjustments, for several drives. Returns None, and changes nothing, if the
+    adjustment is off or no pair of submaps could be registered.
     """
     started = monotonic()
     end_s = started + 60.0 * config.adjustment.max_minutes
     if started >= end_s:
         return None
     T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
-    angle = measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
+    angle = known.angle if known else measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
     correction_deg = angle.angle_deg if angle is not None and angle.is_significant else 0.0
     corrected = partial(_raised, points_of, correction_deg)
+    is_corrected = bool(known.correction_deg.any()) if known else correction_deg != 0.0
+    of_drives = known.aligned(points_of, travel_m, config=config.refine) if known else None
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
         title = f"refine {number}/{config.adjustment.rounds}"
-        made = _round(graph, corrected, config, end_s, bool(correction_deg), partial(_titled, progress, title))
+        aligned = of_drives or _submaps(graph, corrected, config).aligned
+        made = _round(graph, aligned, config, end_s, is_corrected, partial(_titled, progress, title))
         last = made or last
         if made is None or not made.is_complete:
             break
@@ -93,9 +104,14 @@ def _titled(progress: Progress, title: str, items: Iterable[Any], total: int) ->
     return progress(items, total, title)
 
 
+def _submaps(graph: PoseGraph, points_of: PointsOf, config: Config) -> Submaps:
+    """Submaps by the current poses."""
+    return Submaps(points_of, graph.T_world_keyframes.copy(), graph.travel_m, config=config.refine)
+
+
 def _round(
     graph: PoseGraph,
-    points_of: PointsOf,
+    aligned: Aligned,
     config: Config,
     end_s: float,
     is_corrected: bool,
@@ -104,8 +120,7 @@ def _round(
     """Register submaps by the current poses, and solve the graph; None if no pair could be registered."""
     T_world, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
     pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
-    submaps = Submaps(points_of, T_world, travel_m, config=config.refine)
-    in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, submaps, T_world, config=config.refine))
+    in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, aligned, T_world, config=config.refine))
     tried = list(show(in_time, len(pairs)))
     registered = [one for one in tried if one is not None]
     if not registered:

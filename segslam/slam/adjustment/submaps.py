@@ -10,8 +10,9 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
-from segslam.core.types import Points, Vector
+from segslam.core.types import Points, Transform, Vector
 from segslam.registration.refinement import LightSurface, downsample
+from segslam.slam.adjustment.alignment import Alignment, align
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
@@ -38,6 +39,10 @@ class Submaps:
         self._refine = config
         self._scan = lru_cache(MOST_SUBMAPS * (2 * REACH + 1))(self._scan_of)  # those of the submaps in memory
         self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
+
+    def aligned(self, target_id: int, source_id: int, T_target_source: Transform) -> Alignment | None:
+        """The alignment of two submaps near an initial guess."""
+        return align(self.submap(source_id), self.submap(target_id), T_target_source)
 
     def _scan_of(self, keyframe_id: int) -> Points:
         return downsample(self._points_of(keyframe_id), config=self._refine).astype(np.float64)

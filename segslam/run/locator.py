@@ -101,8 +101,9 @@ class Locator:
     ) -> Located | Rejected:
         """The pose of a scan, or the reason why it was not found. `points`: rows of x, y, z in the sensor's frame (m).
 
-        `labels`: learning ids, one per point; without labels, geometric labels are computed. Views from points around
-        the sensor are tried if `max_places` is above `NUM_FIRST`. Raises SegslamError for an array of another shape.
+        `labels`: learning ids, one per point; without labels, geometric labels are computed. At most `max_places`, the
+        most similar ones, are tried; if more than `NUM_FIRST`, also for views from points around the sensor. Raises
+        SegslamError for an array of another shape.
         """
         started = perf_counter()
         config = self.config
@@ -116,7 +117,7 @@ class Locator:
         scan, (own, candidates) = at_once(
             lambda: prepare_scan(kept, kept_labels, config=config), lambda: self._candidates(kept, kept_labels)
         )
-        found = self._recognised(scan, candidates, max_places=NUM_FIRST)
+        found = self._recognised(scan, candidates, max_places=min(max_places, NUM_FIRST))
         if isinstance(found, Rejected) and found.reason != RejectReason.AMBIGUOUS and max_places > NUM_FIRST:
             around = signatures_around(kept, kept_labels)
             found = self._recognised(scan, self.places.shortlist_around((own, *around)), max_places=max_places)

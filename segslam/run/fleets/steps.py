@@ -25,12 +25,13 @@ from segslam.labels.encodings import Encoding
 from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
+from segslam.output.log import read_log
 from segslam.run.fleets.alignments import Alignments, Part, write_alignments
 from segslam.run.fleets.drives import Drive, key_of
 from segslam.run.fleets.relations import Relation, read_relation, write_relation
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_source, open_scans
-from segslam.run.sessions.merge import arranged, write_merged
+from segslam.run.sessions.merge import Before, arranged, write_merged
 from segslam.run.sessions.recorded import Session, read_session
 from segslam.run.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
 from segslam.scans import DataSource
@@ -63,12 +64,17 @@ class Mapped:
         return fleet / INDEX / f"{self.name}-{self.key}.npy"
 
 
+def _made_with(folder: Path) -> str:
+    """The key that a whole folder was made with; empty if there is none."""
+    try:
+        return (folder / KEY).read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
 def is_made(folder: Path, key: str) -> bool:
     """True if a folder is whole and was made with this key."""
-    try:
-        return (folder / KEY).read_text(encoding="utf-8") == key
-    except OSError:
-        return False
+    return _made_with(folder) == key
 
 
 def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
@@ -185,12 +191,20 @@ def join(
             merged = arranged(sessions, poses, same_reference=same_reference)
             config = sessions[0].run.config
             kept = Alignments(fleet / ALIGNMENTS, list(map(partial(_part, config.refine), drives, sessions)))
-            together = write_merged(merged, part, config, kept=kept).result.trajectory
+            before = _before(folder, key)
+            together = write_merged(merged, part, config, kept=kept, before=before).result.trajectory
             for file, alignments in kept.changed():
                 _replace(file, partial(write_alignments, kept=alignments))
         _write_drives(part / "drives", drives, sessions, together)
         _made(part, folder, key)
     return read_metrics(folder)
+
+
+def _before(folder: Path, key: str) -> Before | None:
+    """The component that is replaced, if it has two or more drives, the first of the new one."""
+    made = _made_with(folder)
+    num_drives = len(made.splitlines())
+    return Before(read_log(folder), num_drives) if num_drives > 1 and key.startswith(made) else None
 
 
 def _part(config: RefineConfig, drive: Mapped, session: Session) -> Part:

@@ -1,11 +1,14 @@
 """Alignments of submaps kept in files, one for each pair of drives, so that a component is adjusted again quickly."""
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from segslam.core.config import RefineConfig
+from segslam.core.trajectory import Poses
 from segslam.core.types import SegslamError
 from segslam.run.fleets.drives import key_of
 from segslam.slam.adjustment.alignment import Alignment
@@ -30,8 +33,16 @@ class Part(NamedTuple):
 
     name: str
     key: str
-    """A hash of all that alignments depend on: recording, settings, poses, and correction of the vertical angle."""
+    """A hash of all that its submaps depend on."""
     num_keyframes: int
+
+
+def part_of(name: str, drive_key: str, T_own_keyframe: Poses, correction_deg: float, *, config: RefineConfig) -> Part:
+    """A drive with the key of its submaps: of the recording and its settings, of the poses and the correction that
+    its own run found, and of the settings of the component."""
+    poses = hashlib.sha256(T_own_keyframe.tobytes()).hexdigest()
+    key = key_of(drive_key, poses, correction_deg, config.model_dump())
+    return Part(name, key, len(T_own_keyframe))
 
 
 class Alignments:

@@ -3,7 +3,6 @@
 A step writes its result beside the final name and renames it when it is whole. What is there is not done again.
 """
 
-import hashlib
 import json
 import logging
 import shutil
@@ -17,7 +16,7 @@ from uuid import uuid4
 import numpy as np
 
 from segslam.candidates import Places, PlaceSignature
-from segslam.core.config import Config, RefineConfig, load_config
+from segslam.core.config import Config, load_config
 from segslam.core.types import SegslamError, Trajectory
 from segslam.gnss.fixes import Fixes
 from segslam.gnss.reading import read_fixes
@@ -26,8 +25,8 @@ from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
 from segslam.output.log import read_log
-from segslam.run.fleets.alignments import Alignments, Part, write_alignments
-from segslam.run.fleets.drives import Drive, key_of
+from segslam.run.fleets.alignments import Alignments, part_of, write_alignments
+from segslam.run.fleets.drives import Drive
 from segslam.run.fleets.relations import Relation, read_relation, write_relation
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_source, open_scans
@@ -190,7 +189,11 @@ def join(
             part.mkdir()
             merged = arranged(sessions, poses, same_reference=same_reference)
             config = sessions[0].run.config
-            kept = Alignments(fleet / ALIGNMENTS, list(map(partial(_part, config.refine), drives, sessions)))
+            parts = [
+                part_of(drive.name, drive.key, one.T_world_keyframe, one.correction_deg, config=config.refine)
+                for drive, one in zip(drives, sessions, strict=True)
+            ]
+            kept = Alignments(fleet / ALIGNMENTS, parts)
             before = _before(folder, key)
             together = write_merged(merged, part, config, kept=kept, before=before).result.trajectory
             for file, alignments in kept.changed():
@@ -205,13 +208,6 @@ def _before(folder: Path, key: str) -> Before | None:
     made = _made_with(folder)
     num_drives = len(made.splitlines())
     return Before(read_log(folder), num_drives) if num_drives > 1 and key.startswith(made) else None
-
-
-def _part(config: RefineConfig, drive: Mapped, session: Session) -> Part:
-    """A drive with the key of all that the alignments of its submaps depend on."""
-    poses = hashlib.sha256(session.T_world_keyframe.tobytes()).hexdigest()
-    key = key_of(drive.key, poses, session.correction_deg, config.model_dump())
-    return Part(drive.name, key, len(session.travel_m))
 
 
 def _write_drives(folder: Path, drives: Sequence[Mapped], sessions: Sequence[Session], together: Trajectory) -> None:

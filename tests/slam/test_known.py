@@ -64,7 +64,7 @@ def test_kept_alignments_are_used_again_and_give_the_same_poses() -> None:
         assert result.record.vertical_deg is None, "it is not measured again"
         found.append(made.T_world_keyframes.copy())
         if len(found) == 1:
-            assert len(num_computed) > 20
+            assert len(num_computed) >= 17, "pairs 5 and 10 keyframes apart"
         else:
             assert len(num_computed) - before <= (0 if len(found) == 2 else 5)
     np.testing.assert_array_equal(found[0], found[1])

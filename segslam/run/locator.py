@@ -95,11 +95,14 @@ class Locator:
         keyframes = [recorded[number] for number in range(len(recorded))]
         return cls(keyframes, recorded, run.result.estimate.T_world_keyframe, config=run.config)
 
-    def locate(self, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:
+    def locate(
+        self, points: ArrayLike, labels: Labels | None = None, *, max_places: int = MAX_PLACES
+    ) -> Located | Rejected:
         """The pose of a scan, or the reason why it was not found. `points`: rows of x, y, z in the sensor's frame (m).
 
-        `labels`: learning ids, one per point; without labels, geometric labels are computed. Raises SegslamError for an
-        array of another shape.
+        `labels`: learning ids, one per point; without labels, geometric labels are computed. At most `max_places`, the
+        most similar ones, are tried; if more than `NUM_FIRST`, also for views from points around the sensor. Raises
+        SegslamError for an array of another shape.
         """
         started = perf_counter()
         config = self.config
@@ -113,10 +116,10 @@ class Locator:
         scan, (own, candidates) = at_once(
             lambda: prepare_scan(kept, kept_labels, config=config), lambda: self._candidates(kept, kept_labels)
         )
-        found = self._recognised(scan, candidates, max_places=NUM_FIRST)
-        if isinstance(found, Rejected) and found.reason != RejectReason.AMBIGUOUS:
+        found = self._recognised(scan, candidates, max_places=min(max_places, NUM_FIRST))
+        if isinstance(found, Rejected) and found.reason != RejectReason.AMBIGUOUS and max_places > NUM_FIRST:
             around = signatures_around(kept, kept_labels)
-            found = self._recognised(scan, self.places.shortlist_around((own, *around)), max_places=MAX_PLACES)
+            found = self._recognised(scan, self.places.shortlist_around((own, *around)), max_places=max_places)
         if isinstance(found, Rejected):
             return found
         return Located(found.T_world_lidar, found.place_id, found.alignment, perf_counter() - started)

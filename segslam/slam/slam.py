@@ -35,7 +35,7 @@ from segslam.labels.label_files import computed
 from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
 from segslam.odometry import Tracked as Tracked
 from segslam.registration.prepared import Labeller
-from segslam.slam.adjustment import Adjusted, Progress, adjust, no_progress
+from segslam.slam.adjustment import Adjusted, Known, Progress, adjust, no_progress
 from segslam.slam.loop_edits import LoopEdits
 from segslam.slam.loops import NO_EDITS, ROUNDS, LoopCloser
 from segslam.slam.slam_result import SlamResult as SlamResult
@@ -55,12 +55,15 @@ class Slam:
         odometry: Odometry | None = None,
         labeller: Labeller | None = None,
         edits: LoopEdits = NO_EDITS,
+        known: Known | None = None,
     ) -> None:
         """`odometry` replaces KISS-ICP; `labeller` replaces the geometric labels of scans without labels.
 
-        `edits` forbids loops between keyframes, or has them tried.
+        `edits` forbids loops between keyframes, or has them tried. `known`: results of the drives' own adjustments, if
+        several are repeated as one.
         """
         self.config = config or Config()
+        self._known = known
         by_shape = geometric_labels
         self._tracker = Tracker(self.config, odometry=odometry)
         self._labeller = labeller or by_shape
@@ -205,7 +208,7 @@ class Slam:
         def points_of(keyframe_id: int) -> Points:
             return self._clouds.cloud(keyframe_id)[0]
 
-        return adjust(self.graph, estimate, points_of, config=self.config, progress=progress)
+        return adjust(self.graph, estimate, points_of, config=self.config, known=self._known, progress=progress)
 
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         """The final estimate, after a second search for loops with better poses; and the attempts of that search.

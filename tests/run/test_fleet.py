@@ -17,7 +17,7 @@ from helpers.terminal import in_terminal
 
 import segslam.run.fleets.orchestrate
 from segslam.core.trajectory import read_poses
-from segslam.core.types import SegslamError
+from segslam.core.types import SegslamError, Step
 from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import read_run
 from segslam.run.fleets import Drive, FleetResult, fleet, read_drives, workers
@@ -25,6 +25,8 @@ from segslam.run.fleets.orchestrate import FILE
 from segslam.run.fleets.steps import map_drive
 from segslam.run.sessions import session_pose
 from segslam.scans import DataSource, open_dataset
+from segslam.slam.adjustment import submaps
+from segslam.slam.slam import Slam
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 SETTINGS = ("adjustment.max_minutes=0",)
@@ -159,6 +161,45 @@ def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
         (recordings[2].parent / "kept").replace(recordings[2])
     assert whole.drives["damaged"]["state"] == "mapped"
     assert tried == ["damaged.mcap"]
+
+
+@pytest.mark.slow
+def test_an_added_drive_needs_its_own_loops_and_alignments_only_and_the_component_is_the_same(
+    recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_pose, "NUM_ENOUGH", 5)
+    aligned: list[int] = []
+    searched: list[int] = []
+    align, take = submaps.align, Slam.take
+
+    def counted(*arguments: Any) -> Any:
+        aligned.append(1)
+        return align(*arguments)
+
+    def taken(self: Slam, step: Step, *, below: int = 0, optimize: bool = False) -> Step:
+        searched.extend([1] if below else [])
+        return take(self, step, below=below, optimize=optimize)
+
+    sunday = write_day(tmp_path / "sunday", day=2, first=3, num_scans=22)
+    days = [recordings[0], recordings[3], sunday]
+    fleet(days[:2], tmp_path / "grown", num_workers=1)
+    fleet(days[2:], tmp_path / "mapped", num_workers=1)
+    shutil.copytree(tmp_path / "mapped" / "runs" / "sunday", tmp_path / "grown" / "runs" / "sunday")
+    shutil.copytree(tmp_path / "grown" / "runs", tmp_path / "at once" / "runs")
+    monkeypatch.setattr(submaps, "align", counted)
+    monkeypatch.setattr(Slam, "take", taken)
+    counts, poses = [], []
+    for name in ("grown", "at once"):
+        aligned.clear()
+        searched.clear()
+        result = fleet(days, tmp_path / name, num_workers=1)
+        assert [one["drives"] for one in result.components] == [["monday", "friday", "sunday"]]
+        poses.append(read_run(result.folder / "component_0").result.trajectory.T_world_lidar)
+        counts.append((len(aligned), len(searched)))
+    np.testing.assert_allclose(poses[0], poses[1], rtol=0, atol=1e-9)
+    (num_aligned, num_searched), (num_aligned_at_once, num_searched_at_once) = counts
+    assert 0 < num_aligned < 0.8 * num_aligned_at_once
+    assert 0 < num_searched < 0.8 * num_searched_at_once
 
 
 @pytest.mark.slow

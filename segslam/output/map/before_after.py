@@ -67,6 +67,8 @@ class BeforeAfter:
         return replace(keyframe, points=keyframe.points[seen], labels=keyframe.labels[seen], intensities=None)
 
     def _is_visible(self, keyframe: Keyframe) -> Mask:
+        if not np.isfinite(self._cut_m).any():
+            return np.ones(len(keyframe.points), bool)
         return visible(self._placed(keyframe), self._path_m, self._cut_m)
 
     def _placed(self, keyframe: Keyframe) -> Points:
@@ -108,7 +110,7 @@ class _Density:
         column, row = ((points[:, :2] - [self._window[0], self._window[2]]) // self._pixel_m).astype(np.int64).T
         rows, columns = self._counts.shape
         seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        np.add.at(self._counts, (row[seen], column[seen]), 1)
+        np.add.at(self._counts.reshape(-1), row[seen] * columns + column[seen], np.uint32(1))
 
     def brightest(self) -> float:
         """A count that few pixels exceed."""

@@ -16,7 +16,7 @@ from segslam.run.fleets.drives import Drive, drives_of, key_of, read_drives, wit
 from segslam.run.fleets.relations import Components, Relation
 from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
-from segslam.run.sessions.session_pose import MIN_FOUND
+from segslam.run.sessions.session_pose import MIN_FOUND, SessionPose
 from segslam.slam.adjustment import Progress, no_progress
 
 FILE = "fleet.json"
@@ -183,9 +183,7 @@ class _Fleet:
             order, poses = components.arranged(members)
             drives = [mapped[drive] for drive in order]
             folder = self._folder / f"component_{number}"
-            related = [pose and [pose.earlier, pose.T_earlier_world.tolist()] for pose in poses]
-            key = key_of([drive.key for drive in drives], related, same)
-            tasks.append((self._folder, folder, drives, poses, key, same))
+            tasks.append((self._folder, folder, drives, poses, _key(drives, poses, same), same))
             made.append({"folder": folder.name, "drives": [drive.name for drive in drives]})
         for one, outcome in zip(made, self._all("join", steps.join, tasks), strict=True):
             figures = outcome.value or {}
@@ -194,6 +192,15 @@ class _Fleet:
             one |= {"reason": outcome.failure} if outcome.failure else {}
         steps.remove_components(self._folder, keep=len(made))
         return made
+
+
+def _key(drives: Sequence[Mapped], poses: Sequence[SessionPose | None], same: bool) -> str:
+    """A line for each drive, which depends on it and on those before: a component of the first has the first lines."""
+    lines = [""]
+    for drive, pose in zip(drives, poses, strict=True):
+        related = pose and [pose.earlier, pose.T_earlier_world.tolist()]
+        lines.append(key_of(lines[-1], drive.key, related, same))
+    return "\n".join(lines[1:])
 
 
 def _write(result: FleetResult) -> None:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
 
@@ -103,26 +104,34 @@ class Components:
         self._num_failed[one] = 0
 
     def arranged(self, members: Sequence[int]) -> tuple[list[int], list[SessionPose | None]]:
-        """The drives of a component, each after one in which its pose is known, and these poses."""
-        order, poses = [members[0]], list[SessionPose | None]([None])
-        for before in order:  # which grows
-            for drive in members:
-                pose = None if drive in order else self._pose(drive, before, order.index(before))
-                if pose is not None:
-                    order.append(drive)
-                    poses.append(pose)
+        """The drives of a component, each after one in which its pose is known, and these poses.
+
+        Of the drives that may be next the first is, so that one that is added to a fleet is the last if it can be.
+        """
+        related: dict[int, list[int]] = {drive: [] for drive in members}
+        for later, earlier in self._relations:
+            if later in related:
+                related[later].append(earlier)
+                related[earlier].append(later)
+        order, poses = list[int](), list[SessionPose | None]()
+        waiting = [(members[0], -1)]
+        while waiting:
+            drive, number = heappop(waiting)
+            if drive not in order:
+                for other in related[drive]:
+                    heappush(waiting, (other, len(order)))
+                poses.append(self._pose(drive, order[number], number) if order else None)
+                order.append(drive)
         return order, poses
 
-    def _pose(self, drive: int, before: int, number: int) -> SessionPose | None:
-        """The pose of a drive in another, which has this number in the order; None if they are not related."""
-        if relation := self._relations.get((drive, before)):
-            assert relation.T_earlier_later is not None
+    def _pose(self, drive: int, before: int, number: int) -> SessionPose:
+        """The pose of a drive in one that it is related to, which has this number in the order."""
+        relation = self._relations.get((drive, before)) or self._relations[before, drive]
+        assert relation.T_earlier_later is not None
+        if (drive, before) in self._relations:
             return SessionPose(number, relation.T_earlier_later, relation.found)
-        if relation := self._relations.get((before, drive)):
-            assert relation.T_earlier_later is not None
-            found = tuple((target, own, inverted(alignment)) for own, target, alignment in relation.found)
-            return SessionPose(number, geometry.inverse(relation.T_earlier_later), found)
-        return None
+        found = tuple((target, own, inverted(alignment)) for own, target, alignment in relation.found)
+        return SessionPose(number, geometry.inverse(relation.T_earlier_later), found)
 
     def next_pairs(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
         """For each component its most similar pair with an earlier drive of another one, of those not tried yet.

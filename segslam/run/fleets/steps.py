@@ -24,18 +24,20 @@ from segslam.labels.encodings import Encoding
 from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
+from segslam.output.log import read_log
+from segslam.run.fleets.alignments import Alignments, part_of, write_alignments
 from segslam.run.fleets.drives import Drive
 from segslam.run.fleets.relations import Relation, read_relation, write_relation
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_source, open_scans
-from segslam.run.sessions.merge import arranged, write_merged
+from segslam.run.sessions.merge import Before, arranged, write_merged
 from segslam.run.sessions.recorded import Session, read_session
 from segslam.run.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
 from segslam.scans import DataSource
 from segslam.scans.presets import SETTINGS, Preset, extent_m, preset, preset_for
 
 logger = logging.getLogger(__name__)
-RUNS, INDEX, PROPOSALS, PAIRS = "runs", "index", "proposals", "pairs"
+RUNS, INDEX, PROPOSALS, PAIRS, ALIGNMENTS = "runs", "index", "proposals", "pairs", "alignments"
 KEY = "fleet.key"
 """File in a run folder of a fleet: the key that it was made with."""
 UNFINISHED = ".part"
@@ -61,12 +63,17 @@ class Mapped:
         return fleet / INDEX / f"{self.name}-{self.key}.npy"
 
 
+def _made_with(folder: Path) -> str:
+    """The key that a whole folder was made with; empty if there is none."""
+    try:
+        return (folder / KEY).read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
 def is_made(folder: Path, key: str) -> bool:
     """True if a folder is whole and was made with this key."""
-    try:
-        return (folder / KEY).read_text(encoding="utf-8") == key
-    except OSError:
-        return False
+    return _made_with(folder) == key
 
 
 def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
@@ -74,7 +81,7 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
     mapped = Mapped(drive.name, key)
     if is_made(mapped.folder(fleet), key):
         return mapped
-    part = _part_of(mapped.folder(fleet))
+    part = _beside(mapped.folder(fleet))
     source = DataSource(
         Path(drive.data),
         drive.sequence,
@@ -173,7 +180,7 @@ def join(
 ) -> Mapping[str, Any]:
     """The drives of a component as one run, each with its pose in one before it; returns the figures of the run."""
     if not is_made(folder, key):
-        part = _part_of(folder)
+        part = _beside(folder)
         sessions = [read_session(drive.folder(fleet)) for drive in drives]
         if len(drives) == 1:
             shutil.copytree(drives[0].folder(fleet), part)
@@ -181,10 +188,26 @@ def join(
         else:
             part.mkdir()
             merged = arranged(sessions, poses, same_reference=same_reference)
-            together = write_merged(merged, part, sessions[0].run.config).result.trajectory
+            config = sessions[0].run.config
+            parts = [
+                part_of(drive.name, drive.key, one.T_world_keyframe, one.correction_deg, config=config.refine)
+                for drive, one in zip(drives, sessions, strict=True)
+            ]
+            kept = Alignments(fleet / ALIGNMENTS, parts)
+            before = _before(folder, key)
+            together = write_merged(merged, part, config, kept=kept, before=before).result.trajectory
+            for file, alignments in kept.changed():
+                _replace(file, partial(write_alignments, kept=alignments))
         _write_drives(part / "drives", drives, sessions, together)
         _made(part, folder, key)
     return read_metrics(folder)
+
+
+def _before(folder: Path, key: str) -> Before | None:
+    """The component that is replaced, if it has two or more drives, the first of the new one."""
+    made = _made_with(folder)
+    num_drives = len(made.splitlines())
+    return Before(read_log(folder), num_drives) if num_drives > 1 and key.startswith(made) else None
 
 
 def _write_drives(folder: Path, drives: Sequence[Mapped], sessions: Sequence[Session], together: Trajectory) -> None:
@@ -204,7 +227,7 @@ def _locator(fleet: Path, drive: Mapped) -> Locator:
     return Locator.from_run(drive.folder(fleet))
 
 
-def _part_of(target: Path) -> Path:
+def _beside(target: Path) -> Path:
     """A new name beside the target: two workers may do the same work, if the first seemed to be lost."""
     return target.with_name(f".{target.name}.{uuid4().hex}{UNFINISHED}")
 
@@ -216,7 +239,7 @@ def _made(part: Path, folder: Path, key: str) -> None:
         shutil.rmtree(part)
         return
     if folder.exists():
-        old = _part_of(folder)
+        old = _beside(folder)
         folder.rename(old)
         shutil.rmtree(old)
     part.rename(folder)
@@ -225,7 +248,7 @@ def _made(part: Path, folder: Path, key: str) -> None:
 def _replace(file: Path, write: Any) -> None:
     """Write a file under another name, then rename it."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = _part_of(file).with_suffix(file.suffix)
+    part = _beside(file).with_suffix(file.suffix)
     write(part)
     part.replace(file)
 
@@ -239,6 +262,6 @@ def remove_components(fleet: Path, *, keep: int) -> None:
 
 def remove_unfinished(fleet: Path) -> None:
     """Remove what interrupted steps left."""
-    for folder in (fleet, *(fleet / name for name in (RUNS, INDEX, PROPOSALS, PAIRS))):
+    for folder in (fleet, *(fleet / name for name in (RUNS, INDEX, PROPOSALS, PAIRS, ALIGNMENTS))):
         for part in folder.glob(f".*{UNFINISHED}*") if folder.is_dir() else ():
             shutil.rmtree(part) if part.is_dir() else part.unlink()

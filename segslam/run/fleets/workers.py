@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from time import process_time
 from typing import Any, NamedTuple
 from uuid import uuid4
 
@@ -16,6 +17,8 @@ from segslam.core.types import SegslamError
 
 logger = logging.getLogger(__name__)
 DIED = "every worker process that tried it died"
+IDLE_S = 0.2
+"""Chosen: CPU time of a task that found its result there; it freed no memory, and a collection takes half of this."""
 
 
 class Outcome(NamedTuple):
@@ -41,6 +44,7 @@ def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
     Memory that the task freed is returned to the system: a worker does many tasks, and what each leaves behind in
     another place of the heap would add up.
     """
+    started_s = process_time()
     try:
         return Outcome(function(*arguments))
     except (SegslamError, OSError) as error:
@@ -49,8 +53,9 @@ def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
         logger.exception("%s failed", function.__name__)
         return Outcome(None, f"{type(error).__name__}: {error}")
     finally:
-        gc.collect()
-        give_back()
+        if process_time() - started_s > IDLE_S:
+            gc.collect()
+            give_back()
 
 
 @contextmanager

@@ -3,8 +3,9 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,11 +17,13 @@ from segslam.gnss.fixes import Row
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import new_folder
 from segslam.output.georeferenced import georeference_if_possible, recorded_fixes, use_of
+from segslam.output.log import RunLog
 from segslam.run.locator import Locator
 from segslam.run.run import Run
-from segslam.run.sessions.recorded import Session, Shift, next_shift, read_sessions, shifted_steps
+from segslam.run.sessions.recorded import Session, Shift, known_of, next_shift, read_sessions, shifted_steps
 from segslam.run.sessions.session_pose import SessionPose, attempt, find_session
 from segslam.slam.adjustment import Progress, no_progress
+from segslam.slam.adjustment.known import Kept, nothing_kept
 from segslam.slam.slam import Slam, SlamResult
 
 OPTIMIZE_EVERY = 25
@@ -29,6 +32,13 @@ SEARCH_EVERY_M = 12.0
 """Chosen: travel between two keyframes of a later session for which loops with earlier sessions are searched."""
 StepToTake = tuple[Step, int, bool]
 """A step, and the arguments `below` and `optimize` of `Slam.take`."""
+
+
+class Before(NamedTuple):
+    """A merged run of the first sessions, with the same order, poses and settings."""
+
+    log: RunLog
+    num_sessions: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,28 +85,34 @@ class Merged:
         ]
         return {"sessions": json.dumps(rows)}
 
-    def begun(self, folder: Path, config: Config) -> Run:
-        """The merged run in its folder, before it takes over the first of `steps`."""
+    def begun(self, folder: Path, config: Config, *, kept: Kept = nothing_kept) -> Run:
+        """The merged run in its folder, before it takes over the first of `steps`. `kept`: as for `write_merged`."""
         return Run(
             folder,
-            Slam(config),
+            Slam(config, known=known_of(self.sessions, kept)),
             dataset=self.dataset,
             T_camera_lidar=self.sessions[0].run.T_camera_lidar,
             reference=self.reference,
             options=self.options(),
         )
 
-    def steps(self) -> Iterator[StepToTake]:
-        """The steps of all sessions; loops with earlier sessions are searched for the later ones."""
-        for session, shift, found in zip(self.sessions, self.shifts, self.session_poses, strict=True):
+    def steps(self, before: Before | None = None) -> Iterator[StepToTake]:
+        """The steps of all sessions; loops with earlier sessions are searched for the later ones.
+
+        The sessions merged `before` bring the loops that were found then.
+        """
+        merged = iter(()) if before is None else before.log.steps()
+        for row, (session, shift, found) in enumerate(zip(self.sessions, self.shifts, self.session_poses, strict=True)):
+            is_new = before is None or row >= before.num_sessions
+            own = shifted_steps(session, shift, self._found(shift, found))
             last_id = len(session.travel_m) - 1
             searched_m = -np.inf
-            for step in shifted_steps(session, shift, self._found(shift, found)):
+            for step in own if is_new else islice(merged, len(session.run.result.trajectory)):
                 below, optimize = 0, False
                 if step.keyframe is not None:
                     number = step.keyframe.id - shift.keyframe_id
                     optimize = number == last_id or (found is not None and number % OPTIMIZE_EVERY == 0)
-                    if step.keyframe.travel_m - searched_m >= SEARCH_EVERY_M:
+                    if is_new and step.keyframe.travel_m - searched_m >= SEARCH_EVERY_M:
                         below, searched_m = shift.keyframe_id, step.keyframe.travel_m
                 yield step, below, optimize
 
@@ -190,11 +206,17 @@ def merge(
 
 
 def write_merged(
-    merged: Merged, folder: Path, config: Config, *, on_step: Callable[[Step], object] = lambda step: None
+    merged: Merged,
+    folder: Path,
+    config: Config,
+    *,
+    kept: Kept = nothing_kept,
+    before: Before | None = None,
+    on_step: Callable[[Step], object] = lambda step: None,
 ) -> FinishedRun:
-    """The merged run, in an empty folder."""
-    with merged.begun(folder, config) as run:
-        for step in run.take(merged.steps()):
+    """The merged run, in an empty folder. `kept` knows alignments of submaps from earlier, `before` loops."""
+    with merged.begun(folder, config, kept=kept) as run:
+        for step in run.take(merged.steps(before)):
             on_step(step)
         run.complete(more=merged.figures, place=merged.georeference)
     return read_run(folder)

@@ -1,6 +1,6 @@
 """A finished run as one session of a merged run: its keyframes, and its steps with new numbers."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,12 +20,16 @@ from segslam.core.types import (
     Vector,
 )
 from segslam.odometry import information_of
+from segslam.odometry.calibration import MIN_PAIRS, VerticalAngle
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
+from segslam.slam.adjustment.known import Kept, Known, nothing_kept
 
 GAP_NS = 1_000_000_000
 """Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
+GAP_M = 1.0
+"""Chosen: travel between two sessions beyond that of a break, so that rounding does not make it shorter than one."""
 FIRST_MOTION = Motion(MotionState.BEGUN, information=1e-12 * np.eye(6))
 """The motion to the first scan of a session, which is unknown."""
 
@@ -47,6 +51,28 @@ class Session:
     def name(self) -> str:
         """The folder of the run."""
         return str(self.run.folder)
+
+    @property
+    def correction_deg(self) -> float:
+        """Elevation that the run's own adjustment added to all points."""
+        return float(self.run.metrics.get("vertical_correction_deg", 0.0))
+
+
+def known_of(sessions: Sequence[Session], kept: Kept = nothing_kept) -> Known:
+    """The results of the sessions' own adjustments, for all of them together."""
+    corrections = [np.full(len(session.travel_m), session.correction_deg) for session in sessions]
+    poses = np.concatenate([session.T_world_keyframe for session in sessions])
+    return Known(poses, np.concatenate(corrections), _angle(sessions), kept)
+
+
+def _angle(sessions: Sequence[Session]) -> VerticalAngle | None:
+    """The mean of the sessions' angles, weighted by their errors, which may have a common cause and remain."""
+    measured = [one.run.metrics for one in sessions if "vertical_deg" in one.run.metrics]
+    if not measured:
+        return None
+    angles, sigmas = (np.array([one[name] for one in measured]) for name in ("vertical_deg", "vertical_sigma_deg"))
+    mean, sigma = np.average([angles, sigmas], axis=1, weights=sigmas**-2.0).tolist()
+    return VerticalAngle(mean, sigma, MIN_PAIRS)
 
 
 def read_session(folder: Path) -> Session:
@@ -144,6 +170,6 @@ def next_shift(before: Shift, session: Session, T_new_old: Transform, following:
         keyframe_id=before.keyframe_id + len(session.travel_m),
         scan_index=before.scan_index + int(session.run.result.trajectory.scan_index[-1]) + 1,
         stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
-        travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_TRAVEL_M,
+        travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_TRAVEL_M + GAP_M,
         T_new_old=T_new_old,
     )

@@ -18,6 +18,7 @@ from segslam.graph import PoseGraph
 from segslam.run.locator import Locator, submaps_of
 from segslam.run.sessions.recorded import FIRST_MOTION, Session
 from segslam.slam.adjustment import Progress, no_progress
+from segslam.slam.recognition import MAX_PLACES
 
 NUM_QUERIES = 60
 """Chosen: number of keyframes of a session that are searched in another, spread over its travel."""
@@ -27,7 +28,7 @@ MIN_FOUND = 3
 """Chosen: smallest number of consistent locations that relate two sessions."""
 MOST_FAILED = 4
 """Chosen on two fleets: the search for the pose of a session ends when so many of its likely keyframes, the first ones,
-were not found; in each of 15 pairs of drives that share places the first was."""
+were not found; in each of 16 pairs of drives that share places the first was, at the place that it looks like most."""
 MIN_SPREAD_M = 10.0
 """Chosen: smallest travel between the first and the last of them; a single place may be a wrong one."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
@@ -60,7 +61,7 @@ def find_session(
 
     At most `NUM_QUERIES` keyframes, spread over the session, are searched; sparse ones together with their neighbours.
     `likely`: these keyframes are searched instead, in this order, and those before and after each that is found, until
-    the first `MOST_FAILED` were not.
+    the first `MOST_FAILED` were not. They look like a place of the earlier session, and no other place is tried.
     """
     recorded = session.log.keyframes()
     submaps = submaps_of([recorded[number] for number in range(len(recorded))], recorded, config)
@@ -73,7 +74,7 @@ def find_session(
     for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
         num_tried += 1
         submap = submaps.submap(keyframe_id)
-        place = locator.locate(submap.points, submap.labels)
+        place = locator.locate(submap.points, submap.labels, max_places=MAX_PLACES if likely is None else 1)
         if not isinstance(place, Rejected):
             found.append((keyframe_id, place.keyframe_id, place.alignment))
         if len(found) == NUM_ENOUGH or (likely is not None and not found and num_tried == MOST_FAILED):

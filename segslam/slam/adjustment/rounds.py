@@ -19,8 +19,8 @@ from segslam.core.types import GraphEstimate, IndexPairs, Points, Record, Vector
 from segslam.graph import Edge, PoseGraph
 from segslam.odometry.calibration import VerticalAngle, angle_left, measure_vertical_angle, without_rest
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
-from segslam.slam.adjustment.alignment import align
-from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, PointsOf, Submaps, all_pairs
+from segslam.slam.adjustment.known import Known
+from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, PointsOf, Submaps, all_pairs
 from segslam.slam.adjustment.thickness import map_thickness_m
 
 SHARE = min(1.0, EVERY / (2 * REACH + 1))
@@ -99,29 +99,39 @@ class _Round(NamedTuple):
 
 
 def adjust(
-    graph: PoseGraph, before: GraphEstimate, points_of: PointsOf, *, config: Config, progress: Progress = no_progress
+    graph: PoseGraph,
+    before: GraphEstimate,
+    points_of: PointsOf,
+    *,
+    config: Config,
+    known: Known | None = None,
+    progress: Progress = no_progress,
 ) -> Adjusted | None:
     """Adjust the poses of a graph after its last optimisation, whose result is `before`.
 
-    Returns None, and changes nothing, if the adjustment is off or no pair of submaps could be registered.
+    `known`: the results of the drives' own adjustments, for several drives. Returns None, and changes nothing, if the
+    adjustment is off or no pair of submaps could be registered.
     """
     started = monotonic()
     end_s = started + 60.0 * config.adjustment.max_minutes
     if started >= end_s:
         return None
     T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
-    angle = measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
+    angle = known.angle if known else measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
     correction_deg = angle.angle_deg if angle is not None and angle.is_significant else 0.0
+    of_drives = known.aligned(points_of, travel_m, config=config.refine) if known else None
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
-        if number > 1 and correction_deg:
+        if number > 1 and correction_deg and known is None:
             again = _measured_again(points_of, T_before, graph.T_world_keyframes, travel_m, correction_deg, config)
             if again is not None and again.is_significant:
                 angle, correction_deg = again, again.angle_deg
         corrected = partial(_raised, points_of, correction_deg)
-        shared_within = STEPS[-1] if correction_deg else 0
+        is_corrected = bool(known.correction_deg.any()) if known else correction_deg != 0.0
+        shared_within = STEPS[-1] if is_corrected else 0
         title = f"refine {number}/{config.adjustment.rounds}"
-        made = _round(graph, corrected, config, end_s, shared_within, progress, title)
+        aligned = of_drives or _submaps(graph, corrected, config).aligned
+        made = _round(graph, aligned, config, end_s, shared_within, progress, title)
         last = made or last
         if made is None or not made.is_complete:
             break
@@ -166,9 +176,14 @@ def _raised(points_of: PointsOf, angle_deg: float, keyframe_id: int) -> Points:
     return geometry.raise_beams(points_of(keyframe_id), angle_deg)
 
 
+def _submaps(graph: PoseGraph, points_of: PointsOf, config: Config) -> Submaps:
+    """Submaps by the current poses."""
+    return Submaps(points_of, graph.T_world_keyframes.copy(), graph.travel_m, config=config.refine)
+
+
 def _round(
     graph: PoseGraph,
-    points_of: PointsOf,
+    aligned: Aligned,
     config: Config,
     end_s: float,
     shared_within: int,
@@ -178,8 +193,7 @@ def _round(
     """Register submaps by the current poses, and solve the graph; None if no pair could be registered."""
     T_world, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
     pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
-    submaps = Submaps(points_of, T_world, travel_m, config=config.refine)
-    in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, submaps, T_world, config=config.refine))
+    in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, aligned, T_world, config=config.refine))
     tried = list(progress(in_time, len(pairs), title))
     registered = [one for one in tried if one is not None]
     if not registered:
@@ -189,7 +203,7 @@ def _round(
 
 
 def register_pairs(
-    pairs: IndexPairs, submaps: Submaps, T_world: Poses, *, config: RefineConfig
+    pairs: IndexPairs, aligned: Aligned, T_world: Poses, *, config: RefineConfig
 ) -> Iterator[Edge | None]:
     """Register each pair (target, source) from its current pose; None without convergence or enough overlap.
 
@@ -197,7 +211,7 @@ def register_pairs(
     """
     for target_id, source_id in pairs.tolist():
         T_prior = geometry.inverse(T_world[target_id]) @ T_world[source_id]
-        found = align(submaps.submap(source_id), submaps.submap(target_id), T_prior)
+        found = aligned(target_id, source_id, T_prior)
         if found is None or found.overlap < MIN_OVERLAP:
             yield None
             continue

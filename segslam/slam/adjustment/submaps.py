@@ -3,7 +3,7 @@
 Pairs lie along the drive at several distances, and between passes of one place.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -14,9 +14,10 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
-from segslam.core.types import IndexPairs, Indices, Points, Vector
+from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
 from segslam.odometry.calibration import PointsOf
 from segslam.registration.refinement import LightSurface, downsample
+from segslam.slam.adjustment.alignment import Alignment, align
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
@@ -31,6 +32,9 @@ RADIUS_M = 10.0
 STOREY_M = 2.0
 """Chosen: keyframes of two passes with a larger difference of heights may be on two storeys."""
 
+Aligned = Callable[[int, int, Transform], Alignment | None]
+"""The alignment of a target and a source, by their ids, near an initial guess."""
+
 
 class Submaps:
     """Submaps by the id of their keyframe, in its frame, made when they are needed."""
@@ -40,6 +44,10 @@ class Submaps:
         self._refine = config
         self._scan = lru_cache(MOST_SUBMAPS * (2 * REACH + 1))(self._scan_of)  # those of the submaps in memory
         self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
+
+    def aligned(self, target_id: int, source_id: int, T_target_source: Transform) -> Alignment | None:
+        """The alignment of two submaps near an initial guess."""
+        return align(self.submap(source_id), self.submap(target_id), T_target_source)
 
     def _scan_of(self, keyframe_id: int) -> Points:
         return downsample(self._points_of(keyframe_id), config=self._refine).astype(np.float64)

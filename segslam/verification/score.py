@@ -1,10 +1,11 @@
 """The probability that a pose between two scans is right, and what it is made of.
 
-A pose is wrong if it fits by chance, or if another fits as well. That it does not fit by chance is told by how much
-more often right poses show what the patches of the scans show (`patches`) than the wrong poses that resemble them most,
-by the share of the patches where the other scan saw through, and by their number; that no other fits as well by the
-least lead over the other poses that were tried. Patches beside each other err together, so the same lead counts less if
-there are many. `tools.benchmarks.score` measures all numbers in `score.json` on pairs of scans whose poses are known.
+A pose is wrong if it fits by chance, or if another fits as well. The log odds against a chance fit are a sum of how
+much more often right poses show what the patches of the scans show (`patches`) than the wrong poses that resemble them
+most, of the share of the patches where the other scan saw through, and of their number. The log odds against another
+pose are a sum of the least lead over the poses that were tried, and of the number of patches: patches beside each other
+err together, so the same lead counts less if there are many. `tools.benchmarks.score` measures all numbers in
+`score.json` on pairs of scans whose poses are known.
 """
 
 import json

@@ -352,7 +352,7 @@ class Alignment(Found):
     probability: float | None = None
     """That the pose is right; None in logs of older versions."""
     evidence: dict[str, float] = field(default_factory=dict)
-    """Summands of its log odds by name (nats): `free_space`, `usual`, `other_pose`, and `chance_fit` if it is one."""
+    """Summands of its log odds by name (nats): `surfaces`, `free_space`, `usual` and `other_pose`."""
 
     @property
     def T_target_source(self) -> Transform:  # noqa: N802  (a transform)

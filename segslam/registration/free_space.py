@@ -9,12 +9,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int8
 
 from segslam.core import geometry
 from segslam.core.kernels import kernel
 from segslam.core.points import within_range
-from segslam.core.types import Indices, Mask, Points, Transform, Vector
+from segslam.core.types import Indices, Points, Transform, Vector
 
 FREE_SPACE_MARGIN_M = 1.0
 """Chosen for KITTI's streets: distance before a return at which a point violates free space; less in narrow places
@@ -33,6 +33,11 @@ SHARE_OF_PATH = 0.125
 """Chosen: the margin as a share of the free path. 1 m where the sensor sees 8 m far, as in KITTI's streets (7 to 9)."""
 MIN_MARGIN_M = 0.3
 """Chosen: three times the range noise of a poor sensor."""
+
+Fates = Int8[np.ndarray, "_"]
+"""For each point one of the following."""
+IN_FRONT, AT_RETURN, BEHIND, NO_RETURN = range(4)
+"""A point in front of all returns around its direction violates free space; behind them it is hidden."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,13 +105,10 @@ def violation(points: Points, seen: FreeSpace, T_view_points: Transform) -> floa
     return num_violations / num_seen if num_seen else 0.0
 
 
-def fates(points: Points, seen: FreeSpace) -> tuple[Mask, Mask]:
-    """(n,) each: points that violate free space, and points behind all that was seen or where nothing was.
-
-    `points` (n, 3) in the frame of the scan that sees.
-    """
-    found = _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, seen.margins)
-    return found < 0, found > 0
+def fates(points: Points, seen: FreeSpace) -> Fates:
+    """Where points (n, 3) in the frame of the scan that sees are, compared with the returns in their direction."""
+    found: Fates = _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, seen.margins)
+    return found
 
 
 @kernel("UniTuple(int64, 2)(float32, float32, float32, float64, float64)")
@@ -147,17 +149,19 @@ def _count_violations(points, nearest, lowest_rad, row_rad, margins):
 
 @kernel("int8[:](float32[:, :], float32[:, :], float64, float64, float64[:])")
 def _fates(points, nearest, lowest_rad, row_rad, margins):
-    """For each point -1 if it is in front of the returns in its direction by `margins` (m, and per metre), 1 if it is
-    behind them by as much or there is no return, else 0."""
-    found = np.zeros(len(points), np.int8)
+    """For each point whether it is in front of the returns in its direction, or behind them, by `margins` (m, and per
+    metre)."""
+    found = np.full(len(points), AT_RETURN, np.int8)
     for at in range(len(points)):
         x, y, z = points[at]
         row, column = _cell(x, y, z, lowest_rad, row_rad)
         return_m = nearest[row, column] if 0 <= row < len(nearest) else np.inf
         distance = math.sqrt(x * x + y * y + z * z)
         margin_m = margins[0] + margins[1] * distance
-        if return_m == np.inf or distance > return_m + margin_m:
-            found[at] = 1
+        if return_m == np.inf:
+            found[at] = NO_RETURN
+        elif distance > return_m + margin_m:
+            found[at] = BEHIND
         elif distance + margin_m < return_m:
-            found[at] = -1
+            found[at] = IN_FRONT
     return found

@@ -1,8 +1,9 @@
 """Coarse poses of a pair of scans: from clusters and features, then from floor plans."""
 
 from collections.abc import Iterator
+from copy import copy
 from functools import lru_cache
-from itertools import islice
+from itertools import islice, tee
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from segslam.core.config import Config
@@ -71,9 +72,15 @@ def plans_near(pair: Pair, *, num_poses: int) -> list[Registration]:
     if num_poses == 0:
         return []
     with pair.watch("match"):
-        plans = _floor_plan(pair.source), _floor_plan(pair.target)
-        ranked = segregator.plan_hypotheses(*plans, num_poses=max(MOST_PLANS, num_poses))
+        ranked = copy(_ranked_plans(pair.source, pair.target))
         return list(islice((coarse for coarse in ranked if _is_possible(coarse, pair)), num_poses))
+
+
+@lru_cache(1)
+def _ranked_plans(source: PreparedScan, target: PreparedScan) -> Iterator[Registration]:
+    """Poses by the floor plans, the best first; copies start again, so that rivals need no other search."""
+    (plans,) = tee(segregator.plan_hypotheses(_floor_plan(source), _floor_plan(target), num_poses=MOST_PLANS), 1)
+    return plans
 
 
 @lru_cache(NUM_FLOOR_PLANS)

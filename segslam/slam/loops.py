@@ -6,7 +6,7 @@ from functools import lru_cache
 from time import monotonic
 
 from segslam.candidates import PlaceSignature, signature_of
-from segslam.candidates.proximity import ProximityDetector
+from segslam.candidates.proximity import LEAST_PROBABILITY, ProximityDetector
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
@@ -19,7 +19,7 @@ from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops
 from segslam.slam.loop_edits import LoopEdits
 from segslam.verification import register_near, register_prepared
-from segslam.verification.score import MOST_LOG_ODDS, shipped
+from segslam.verification.score import MISLED
 
 NO_EDITS = LoopEdits()
 NUM_PREPARED = 64
@@ -166,7 +166,7 @@ class LoopCloser:
         if isinstance(outcome, Rejected):
             return (LoopAttempt(candidate, outcome, own.seconds),)
         closure = LoopClosure.of(candidate.source_id, candidate.target_id, outcome)
-        if is_known or is_by_hand or self._is_certain(candidate, outcome):
+        if is_known or is_by_hand or self._is_certain(candidate, outcome.T_target_source):
             return (LoopAttempt(candidate, closure, own.seconds),)
         return self._confirmation.attempts(candidate, closure, own.seconds)
 
@@ -177,17 +177,16 @@ class LoopCloser:
             T_target_source, candidate, error_allowance=allowance, slack_m=radius_m + slack_m
         )
 
-    def _is_certain(self, candidate: LoopCandidate, found: Alignment) -> bool:
-        """True for a pose that the motions and loops between two keyframes allow, and that is probable with them.
+    def _is_certain(self, candidate: LoopCandidate, T_target_source: Transform) -> bool:
+        """True for a pose that the prior does not contradict, and that is hardly that of a place that looks the same.
 
-        Where it is improbable that the two are near each other, the pose of a place that looks the same is likely.
+        Of the places that the scans take for the same, `MISLED` only look so, and fewer where the prior is narrow.
         """
         allowance = self._config.graph.error_allowance
-        if far_from_prior(found.T_target_source, candidate, error_allowance=allowance, slack_m=0.0) is not None:
+        if far_from_prior(T_target_source, candidate, error_allowance=allowance, slack_m=0.0) is not None:
             return False
-        own = min(sum(found.evidence.values()), MOST_LOG_ODDS)
-        prior = math.log(max(candidate.near_probability, 1e-300))
-        return own + prior >= shipped().least_odds(self._config.verify)
+        near = candidate.near_probability
+        return MISLED * (1.0 - near) <= LEAST_PROBABILITY * near
 
 
 def _once_each(candidates: list[LoopCandidate]) -> list[LoopCandidate]:

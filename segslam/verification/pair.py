@@ -1,4 +1,4 @@
-"""Registration of two scans: hypotheses are tried in turn; the first that is no chance fit is compared with rivals."""
+"""Registration of two scans: hypotheses are tried in turn; the first that is probable is compared with rivals."""
 
 import math
 from collections.abc import Sequence
@@ -58,10 +58,10 @@ def register_prepared(
 ) -> Alignment | Rejected:
     """The refined and verified pose of the source in the target without an initial guess, or the reason of rejection.
 
-    Hypotheses are tried from best to worst until one that the prior allows is no chance fit. It is compared with all
-    other poses that were tried and with rivals; the best is returned if it is as probable as `verify.max_false_share`
-    asks. `gate` may reject a pose before and after refinement. If no hypothesis leads anywhere, the rejection of the
-    best one is returned.
+    Hypotheses are tried from best to worst until one that the prior allows is probable by itself. It is compared with
+    all other poses that were tried and with rivals; the best is returned if it is as probable as
+    `verify.max_false_share` asks. `gate` may reject a pose before and after refinement. If no hypothesis leads
+    anywhere, the rejection of the best one is returned.
     """
     trial = Trial(source, target, config, gate, watch or Stopwatch(), score.shipped())
     tried = tried_poses(trial)
@@ -74,7 +74,7 @@ def register_prepared(
 def tried_poses(trial: Trial) -> list[Found] | Rejected:
     """The best pose that the prior allows, then all that differ from it; or the rejection of the best hypothesis.
 
-    Rivals are searched unless the best pose is a chance fit already.
+    Rivals are searched unless the best pose is improbable already.
     """
     rejections: list[Rejected] = []
     found: list[Found] = []

@@ -1,4 +1,4 @@
-"""What the patches of two scans show at a pose: on a surface of the other scan, on none, or where it saw free space.
+"""What the patches of two scans show at a pose: on a surface of the other scan, on none, in free space, or hidden.
 
 A patch has the standing points of a scan in a cube of `PATCH_M` whose normals have the same largest component. The
 residuals of its points have a cause in common, so it counts once, however many points it has. Ground does not count,
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int8
 from segslam.core import geometry
 from segslam.core.points import cell_keys, within_range
 from segslam.core.types import Indices, Points, Transform, Vector
-from segslam.registration.free_space import fates, violation
+from segslam.registration.free_space import AT_RETURN, BEHIND, IN_FRONT, NO_RETURN, fates, violation
 from segslam.registration.prepared import Observed
 from segslam.registration.refinement import Surface
 
@@ -32,32 +32,24 @@ RESIDUALS = (0.6, 1.0, 1.6)
 """Edges of the bins of a patch's root mean square distance to the surface, in units of the roughness."""
 FAR_M = 10.0
 """Patches farther from the other sensor than this have bins of their own."""
-SAME_NORMAL = 0.8
-"""Two surfaces face the same way within 37 degrees."""
 VIOLATING, KNOWN = 0.3, 1.0 / 3.0
 """Shares of the points of a patch: in free space, and known, for a patch that is there or that is judged at all."""
-BINS = (
-    "free space",
-    "no surface",
-    *(
-        f"{where}, {how}, residual {level}"
-        for where in ("near", "far")
-        for how in ("same normal", "turned")
-        for level in range(len(RESIDUALS) + 1)
-    ),
-)
+FREE_SPACE, NO_SURFACE, HIDDEN, RESIDUAL = range(4)
+KINDS = ("free space", "no surface", "hidden", *(f"residual {level}" for level in range(len(RESIDUALS) + 1)))
+"""What a patch shows: it is where the other scan saw through, within its view but on none of its surfaces, behind what
+it saw, or on a surface."""
+BINS = tuple(f"{where}, {kind}" for where in ("near", "far") for kind in KINDS)
 
-Counts = Float[np.ndarray, "18"]
+Counts = Float[np.ndarray, "14"]
 """Number of patches in each of `BINS`."""
 Shown = Int8[np.ndarray, "_"]
-"""Bin of each patch of a scan, -1 for patches of which nothing is known."""
+"""Bin of each patch of a scan, -1 for patches outside the view of the other."""
 
 
 class Patches(NamedTuple):
     """The standing points of a scan in its frame, and the patch of each."""
 
     points: Points
-    normals: Points
     patch: Indices
     size: Vector
     """Number of points of each patch."""
@@ -87,10 +79,10 @@ def patches_of(surface: Surface) -> Patches:
     """The patches of a scan."""
     points, normals = surface.standing_with_normals
     if not len(points):
-        return Patches(points, normals, np.empty(0, np.int64), np.empty(0))
+        return Patches(points, np.empty(0, np.int64), np.empty(0))
     keys, _ = cell_keys(points, PATCH_M)
     _, patch = np.unique(3 * keys + np.abs(normals).argmax(axis=1), return_inverse=True)
-    return Patches(points, normals, patch, np.bincount(patch).astype(np.float64))
+    return Patches(points, patch, np.bincount(patch).astype(np.float64))
 
 
 def agreement(source: Observed, target: Observed, T_target_source: Transform) -> Agreement:
@@ -120,30 +112,30 @@ def _seen_from(b: Observed, a: Observed, T_b_a: Transform, roughness_m: float) -
     surface, standing = b[0], patches_of(a[0])
     moved = geometry.apply(T_b_a, standing.points)
     within = within_range(moved, 0.0, MAX_RANGE_M)
-    points, normals = moved[within], standing.normals[within] @ T_b_a[:3, :3].T
+    points = moved[within]
     if not len(points):
         return 0.0, math.inf, np.full(len(standing.size), -1, np.int8)
     rows, apart_m = surface.nearest(points)
-    there = surface.normals[rows]
-    to_plane_m = np.einsum("ij,ij->i", points - surface.points[rows], there)
+    to_plane_m = np.einsum("ij,ij->i", points - surface.points[rows], surface.normals[rows])
     is_near = apart_m < INLIER_M
     rms_m = float(np.sqrt(np.mean(to_plane_m[is_near] ** 2))) if is_near.any() else math.inf
-    is_same = np.abs(np.einsum("ij,ij->i", normals, there)) > SAME_NORMAL
-    violates, is_beyond = fates(points, b[1])
-    known, near, same, squared, violating, range_m = (
+    fate = fates(points, b[1])
+    known, near, squared, violating, hidden, unseen, range_m = (
         np.bincount(standing.patch[within], weights, minlength=len(standing.size))
         for weights in (
-            is_near | violates | ~is_beyond,
+            is_near | (fate == IN_FRONT) | (fate == AT_RETURN),
             is_near,
-            is_near & is_same,
             is_near * (to_plane_m / roughness_m) ** 2,
-            violates,
+            fate == IN_FRONT,
+            ~is_near & (fate == BEHIND),
+            ~is_near & (fate == NO_RETURN),
             np.linalg.norm(points, axis=1),
         )
     )
     level = np.digitize(np.sqrt(squared / np.maximum(near, 1.0)), RESIDUALS)
-    level += (len(RESIDUALS) + 1) * ((same <= 0.5 * near) + 2 * (range_m >= FAR_M * standing.size))
-    shown = np.where(near > KNOWN * known, 2 + level, 1)
-    shown[violating > VIOLATING * standing.size] = 0
-    shown[known < KNOWN * standing.size] = -1
+    shown = np.where(near > KNOWN * known, RESIDUAL + level, NO_SURFACE)
+    shown[violating > VIOLATING * standing.size] = FREE_SPACE
+    shown[known < KNOWN * standing.size] = HIDDEN
+    shown += len(KINDS) * (range_m >= FAR_M * standing.size)
+    shown[(known < KNOWN * standing.size) & ((hidden < unseen) | (hidden + unseen == 0.0))] = -1
     return float(np.mean(is_near)), rms_m, shown.astype(np.int8)

@@ -1,10 +1,11 @@
 """The probability that a pose between two scans is right, and what it is made of.
 
-A pose is a chance fit unless the patches of the scans (`patches`) show enough of what right poses show more often than
-the wrong poses that resemble them most, and few of them are where the other scan saw through. The log odds of a pose
-that fits are a sum: its least lead over the other poses that were tried, the share of its patches in free space, and
-the number of its patches. Patches beside each other err together, so the same lead counts less if there are many.
-`tools.benchmarks.score` measures all numbers in `score.json` on pairs of scans whose poses are known.
+A pose is wrong if it fits by chance, or if another fits as well. The log odds against a chance fit are a sum of how
+much more often right poses show what the patches of the scans show (`patches`) than the wrong poses that resemble them
+most, of the share of the patches where the other scan saw through, and of their number. The log odds against another
+pose are a sum of the least lead over the poses that were tried, and of the number of patches: patches beside each other
+err together, so the same lead counts less if there are many. `tools.benchmarks.score` measures all numbers in
+`score.json` on pairs of scans whose poses are known.
 """
 
 import json
@@ -19,7 +20,7 @@ import numpy as np
 
 from segslam.core.config import VerifyConfig
 from segslam.core.types import Vector
-from segslam.verification.patches import BINS, Agreement, Counts, Shown
+from segslam.verification.patches import BINS, FREE_SPACE, KINDS, Agreement, Counts, Shown
 
 NO_OTHER = 10.0
 """Lead of a pose (standard deviations) if no other pose was found, and at most."""
@@ -30,8 +31,6 @@ LEAST_SCATTER = 1.0
 MISLED = 0.002
 """Share of the poses that are right or wrong for a reason that no patch shows, such as a place that looks the same.
 Chosen: without it one pose at a wrong height decides all weights."""
-MOST_LOG_ODDS = math.log((1.0 - MISLED) / MISLED)
-"""Log odds of a pose of which scans alone cannot make more certain."""
 
 
 class Judged(NamedTuple):
@@ -40,8 +39,8 @@ class Judged(NamedTuple):
     log_odds: float
     """That it is right, in nats; right and wrong poses being equally frequent."""
     evidence: dict[str, float]
-    """Its summands by name: what the patches show, what is `usual` for so many of them, the best `other_pose`, and what
-    makes it a `chance_fit`."""
+    """Its summands by name: the `surfaces` that patches lie on, `free_space`, what is `usual` for so many patches, and
+    by how much the best `other_pose` lowers the sum of these."""
 
     @property
     def probability(self) -> float:
@@ -50,15 +49,24 @@ class Judged(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What the log odds of a pose that fits are made of."""
+    """What the log odds that a pose does not fit by chance, and that no other fits as well, are made of."""
 
+    ratio: float
+    """Of the mean log ratio of a patch."""
     free_space: float
     """Of the root of the share of patches in free space, against the pose."""
     number: float
     """Of the root of the number of patches, against the pose."""
+    offset: float
     lead: float
     """Of the least lead over another pose."""
-    offset: float
+    lead_number: float
+    """Of the root of the number of patches, against the lead."""
+    lead_offset: float
+    slope: float = 1.0
+    """Of the odds of places that taught nothing, against the odds that these numbers give."""
+    shift: float = 0.0
+    """Added to the odds after that (nats)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,12 +75,6 @@ class Table:
 
     ratios: Vector
     """log of how much more often right poses show a patch of each of `BINS` than wrong ones (nats)."""
-    least_ratio: float
-    """Mean log ratio of a patch that a pose has at least unless it is a chance fit (nats)."""
-    most_free: float
-    """Root of the share of patches in free space that it has at most."""
-    chance: float
-    """Log odds of a chance fit."""
     weights: Weights
     margin: float = 0.0
     """How much more the odds of all accepted poses together are than those of the least probable of them (nats)."""
@@ -85,28 +87,18 @@ class Table:
         """Mean log ratio of a patch (nats); 0 without patches."""
         return float(counts @ self.ratios / max(counts.sum(), 1.0))
 
-    def fits(self, counts: Counts) -> bool:
-        """False for a chance fit, which no other evidence can make probable."""
-        return self.mean_ratio(counts) >= self.least_ratio and violating_root(counts) <= self.most_free
-
-    def log_odds(self, counts: Counts, lead: float) -> float:
-        """Log odds of a pose by its patches, and by its least lead over another pose."""
-        return self._fit_odds(counts, lead) if self.fits(counts) else self.chance
-
-    def _fit_odds(self, counts: Counts, lead: float) -> float:
+    def log_odds(self, counts: Counts, lead: float = NO_OTHER) -> float:
+        """Log odds of a pose by its patches, and by its least lead over another pose, which can only lower them."""
         weights = self.weights
-        return (
-            -weights.free_space * violating_root(counts)
-            - weights.number * math.sqrt(counts.sum())
-            + weights.lead * min(lead, NO_OTHER)
-            + weights.offset
-        )
+        fit = (sum(self._fit(counts).values()) - weights.shift) / weights.slope
+        unique = self._unique(counts, lead)
+        # log odds of p q, for the probabilities p, q that neither way to be wrong is the case
+        return weights.shift - weights.slope * float(np.logaddexp.reduce([-fit, -unique, -fit - unique]))
 
     def lead_of(self, found: Agreement, other: Agreement) -> float:
         """How much more likely the patches are at one pose than at another, in standard deviations of the difference.
 
-        Patches of which nothing is known at either pose do not count; nor do those of the target if the other pose
-        has none.
+        Patches that are out of view at either pose do not count; nor do those of the target if the other pose has none.
         """
         pairs = [(found.of_source, other.of_source)]
         if len(other.of_target):
@@ -115,31 +107,41 @@ class Table:
 
     def judge_patches(self, counts: Counts) -> Judged:
         """A pose by its patches alone, whatever other poses show, which can only lower its odds."""
-        return self._judged(counts, NO_OTHER)
+        evidence = self._fit(counts)
+        return Judged(sum(evidence.values()), evidence)
 
     def judge(self, found: Agreement, others: Sequence[Agreement] | None = None) -> Judged:
         """A pose that shows `found`, where other poses that were tried show `others`.
 
         None for a pose that is known beforehand, so that no others were tried: it is judged by its patches alone.
         """
+        alone = self.judge_patches(found.counts)
         if others is None:
-            return self.judge_patches(found.counts)
+            return alone
         lead = min((self.lead_of(found, other) for other in others), default=NO_OTHER)
-        judged = self._judged(found.counts, lead)
-        of_lead = self.weights.lead * (min(lead, NO_OTHER) - NO_OTHER)
-        judged.evidence["usual"] -= of_lead
-        return judged._replace(evidence=judged.evidence | {"other_pose": of_lead})
+        odds = self.log_odds(found.counts, lead)
+        return Judged(odds, alone.evidence | {"other_pose": odds - alone.log_odds})
 
-    def _judged(self, counts: Counts, lead: float) -> Judged:
-        evidence = {"free_space": -self.weights.free_space * violating_root(counts)}
-        evidence["usual"] = self._fit_odds(counts, lead) - evidence["free_space"]
-        if not self.fits(counts):
-            evidence["chance_fit"] = self.chance - sum(evidence.values())
-        return Judged(self.log_odds(counts, lead), evidence)
+    def _fit(self, counts: Counts) -> dict[str, float]:
+        """Summands of the log odds of a pose that no other can rival."""
+        weights = self.weights
+        usual = weights.offset - weights.number * math.sqrt(counts.sum())
+        return {
+            "surfaces": weights.slope * weights.ratio * self.mean_ratio(counts),
+            "free_space": -weights.slope * weights.free_space * violating_root(counts),
+            "usual": weights.slope * usual + weights.shift,
+        }
+
+    def _unique(self, counts: Counts, lead: float) -> float:
+        """Log odds that no other pose fits as well, before `slope` and `shift`."""
+        weights = self.weights
+        return weights.lead * min(lead, NO_OTHER) - weights.lead_number * math.sqrt(counts.sum()) + weights.lead_offset
 
     def most_lead(self, counts: Counts, least_odds: float) -> float:
-        """Lead over another pose beyond which it cannot lower the odds of a pose that fits below `least_odds`."""
-        return (least_odds + RIVAL_NATS - self._fit_odds(counts, 0.0)) / self.weights.lead
+        """Lead over another pose beyond which it cannot lower the odds of a pose below `least_odds`."""
+        weights = self.weights
+        least_unique = (least_odds + RIVAL_NATS - weights.shift) / weights.slope
+        return (least_unique - self._unique(counts, 0.0)) / weights.lead
 
 
 def paired_lead(ratios: Vector, pairs: Sequence[tuple[Shown, Shown]]) -> float:
@@ -153,11 +155,11 @@ def paired_lead(ratios: Vector, pairs: Sequence[tuple[Shown, Shown]]) -> float:
 
 def violating_root(counts: Counts) -> float:
     """Root of the share of the patches that are in free space; two more of four count, for scans with few patches."""
-    return math.sqrt((counts[0] + 2.0) / (counts.sum() + 4.0))
+    return math.sqrt((counts[FREE_SPACE :: len(KINDS)].sum() + 2.0) / (counts.sum() + 4.0))
 
 
 RIVAL_NATS = 3.0
-"""Other poses are not looked for if their lead odds are more than this above the least odds of an accepted pose."""
+"""Other poses are not looked for if the lead alone gives odds this far above the least odds of an accepted pose."""
 
 
 @cache
@@ -170,6 +172,6 @@ def shipped() -> Table:
 def table_of(content: dict[str, object]) -> Table:
     """A table from JSON: `ratios` by the name of the bin, and numbers by theirs. Raises KeyError for a missing one."""
     ratios: Any = content["ratios"]
-    numbers: list[Any] = [content[name] for name in ("least_ratio", "most_free", "chance", *Weights._fields, "margin")]
-    least_ratio, most_free, chance, *weights, margin = map(float, numbers)
-    return Table(np.array([ratios[name] for name in BINS]), least_ratio, most_free, chance, Weights(*weights), margin)
+    numbers: list[Any] = [content[name] for name in (*Weights._fields, "margin")]
+    *weights, margin = map(float, numbers)
+    return Table(np.array([ratios[name] for name in BINS]), Weights(*weights), margin)

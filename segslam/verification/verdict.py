@@ -26,7 +26,7 @@ def judged(
     judgement = table.judge(found, others)
     least = table.least_odds(config.verify)
     if judgement.log_odds < least:
-        reason = RejectReason.AMBIGUOUS if table.fits(found.counts) else RejectReason.IMPROBABLE
+        reason = RejectReason.AMBIGUOUS if table.log_odds(found.counts) >= least else RejectReason.IMPROBABLE
         detail = probability_text(judgement.probability, judgement.evidence)
         return Rejected(reason, detail, judgement.probability, judgement.evidence)
     observability, _ = refinement.observability(fine.information)

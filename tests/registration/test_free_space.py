@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from segslam.core.config import VerifyConfig
-from segslam.registration.free_space import NUM_COLUMNS, observe_free_space, violation
+from segslam.registration.free_space import (
+    AT_RETURN,
+    BEHIND,
+    IN_FRONT,
+    NO_RETURN,
+    NUM_COLUMNS,
+    fates,
+    observe_free_space,
+    violation,
+)
 
 CONFIG = VerifyConfig()
 
@@ -101,3 +110,10 @@ def test_the_share_is_of_points_where_something_returned() -> None:
     assert violation(_ring(10.0), half_seen, np.eye(4)) == 1.0
     ahead_only = _ring(10.0, azimuths_deg=(180.0, 270.0))
     assert violation(ahead_only, half_seen, np.eye(4)) == 0.0
+
+
+def test_points_are_in_front_of_a_return_at_it_behind_it_or_where_nothing_returned() -> None:
+    seen = observe_free_space(_ring(20.0, azimuths_deg=(-90.0, 90.0)))
+    found = [fates(radius_m * np.array([[np.cos(yaw), np.sin(yaw), 0.0]]), seen)[0]
+             for radius_m, yaw in ((10.0, 0.5), (20.5, 0.5), (30.0, 0.5), (10.0, 3.0))]  # fmt: skip
+    assert found == [IN_FRONT, AT_RETURN, BEHIND, NO_RETURN]

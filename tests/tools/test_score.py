@@ -1,5 +1,7 @@
 """The table of the score is learnt from pairs whose poses are known."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from segslam.core import geometry
@@ -18,7 +20,7 @@ from tools.benchmarks.score.ratio import (
     odds_of,
 )
 
-GOOD, BAD = BINS.index("near, same normal, residual 0"), BINS.index("free space")
+GOOD, BAD = BINS.index("near, residual 0"), BINS.index("near, free space")
 
 
 def _pose(good: int, bad: int, x: float = 0.0, *, is_right: bool, is_allowed: bool = True) -> Pose:
@@ -71,9 +73,12 @@ def test_parts_that_taught_nothing_are_separated() -> None:
     assert odds[True] > 3.0 > -3.0 > odds[False]
 
 
-def test_a_chance_fit_is_no_best_pose() -> None:
+def test_a_pose_around_which_none_was_searched_is_no_best_pose() -> None:
     table = learnt(TAUGHT)
-    assert best_of(Pair("street", "64", True, 0.5, [_pose(60, 40, is_right=False)], "improbable", 0.1), table) is None
+    poor = Pair("street", "64", True, 0.5, [_pose(60, 40, is_right=False)], "improbable", 0.1)
+    best = best_of(poor, table)
+    assert best is not None
+    assert best_of(replace(poor, is_searched=False), table) is None
 
 
 def test_tenths_compare_probabilities_with_what_is_right() -> None:

@@ -8,7 +8,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.registration.prepared import Observed, prepare_observed
-from segslam.verification.patches import BINS, agreement, first_look, patches_of
+from segslam.verification.patches import BINS, KINDS, agreement, first_look, patches_of
 
 CONFIG = Config()
 
@@ -32,25 +32,27 @@ def _room(seed: int, length_m: float = 16.0) -> Observed:
 
 
 def _shares(T_target_source: np.ndarray) -> dict[str, float]:
-    """Shares of the patches, by what they show."""
+    """Shares of the patches, near and far, by what they show."""
     counts = agreement(_room(1), _room(2), T_target_source).counts
-    return dict(zip(BINS, counts / counts.sum(), strict=True))
+    return dict(zip(KINDS, counts.reshape(2, -1).sum(axis=0) / counts.sum(), strict=True))
 
 
 def test_at_the_true_pose_patches_lie_on_the_surfaces_of_the_other_scan() -> None:
     shares = _shares(np.eye(4))
     assert shares["free space"] < 0.02
-    assert sum(share for name, share in shares.items() if "same normal" in name) > 0.8
+    assert sum(share for name, share in shares.items() if "residual" in name) > 0.8
+    assert shares["hidden"] < 0.1
     found = agreement(_room(1), _room(2), np.eye(4))
     assert found.overlap > 0.95
     assert found.rms_m < 0.05
     assert found.free_space_violation < 0.01
 
 
-def test_patches_that_lie_where_the_other_scan_saw_through_are_in_free_space() -> None:
-    """Turned by 90 degrees, the ends of the room stand in its middle, or beyond its walls, out of sight."""
+def test_patches_are_in_free_space_or_hidden_behind_what_the_other_scan_saw() -> None:
+    """Turned by 90 degrees, the sides of the room stand in its middle, and its ends behind its walls."""
     turned = geometry.transform(geometry.yaw(np.pi / 2), 0.0)
     assert _shares(turned)["free space"] > 0.2
+    assert _shares(turned)["hidden"] > 0.2
     assert agreement(_room(1), _room(2), turned).free_space_violation > 0.1
 
 
@@ -59,6 +61,28 @@ def test_what_is_out_of_sight_or_out_of_range_counts_for_nothing() -> None:
     assert far.counts.sum() == 0.0
     assert far.overlap == 0.0
     assert math.isinf(far.rms_m)
+
+
+def test_what_the_other_scan_did_not_look_at_counts_for_nothing() -> None:
+    """Of one scan of the room only the front half is left: the patches behind are not hidden, but out of its view."""
+    surface, _ = _room(2)
+    front = surface.points[surface.points[:, 0] > 0.0].astype(np.float32)
+    half = prepare_observed(front, np.zeros(len(front), np.uint8), config=CONFIG)
+    seen = first_look(_room(1), half, np.eye(4))
+    patches = patches_of(_room(1)[0])
+    x = np.bincount(patches.patch, patches.points[:, 0]) / patches.size
+    assert (seen[x < -1.5] == -1).mean() > 0.95
+    assert (seen[x > 1.5] >= 0).mean() > 0.95
+
+
+def test_near_and_far_patches_have_bins_of_their_own() -> None:
+    patches = patches_of(_room(1)[0])
+    range_m = np.bincount(patches.patch, np.linalg.norm(patches.points, axis=1)) / patches.size
+    seen = first_look(_room(1), _room(2), np.eye(4))
+    is_far = seen >= len(KINDS)
+    assert (range_m[is_far] > 9.0).all()
+    assert (range_m[~is_far & (seen >= 0)] < 11.0).all()
+    assert [name.split(", ")[0] for name in BINS] == ["near"] * len(KINDS) + ["far"] * len(KINDS)
 
 
 def test_the_patches_are_the_same_in_both_directions() -> None:

@@ -14,11 +14,11 @@ from segslam.verification.score import NO_OTHER, RIVAL_NATS, Table, Weights, shi
 from segslam.verification.verdict import judged
 
 STORED = Path(__file__).with_name("judged_pairs.npz")
-"""Best poses of pairs of scenes, towns and real drives: patches in each bin, lead over other poses, right or not."""
+"""Best poses of pairs of scenes and real drives: patches in each bin, lead over other poses, right or not."""
 CONFIG = load_config()
-MOST_WRONG = 2 / 191
-NUMBERS = ("least_ratio", "most_free", "chance", *Weights._fields, "margin")
-GOOD, BAD = BINS.index("far, same normal, residual 0"), BINS.index("free space")
+MOST_WRONG = 3 / 625
+NUMBERS = (*Weights._fields, "margin")
+GOOD, BAD = BINS.index("far, residual 0"), BINS.index("far, free space")
 
 
 def _wrong_and_lost(table: Table) -> tuple[float, float]:
@@ -31,10 +31,10 @@ def _wrong_and_lost(table: Table) -> tuple[float, float]:
 
 
 def test_on_stored_pairs_hardly_a_wrong_pose_is_accepted_and_few_right_ones_are_lost() -> None:
-    """191 wrong poses, each the best of a pair: two are accepted."""
+    """625 wrong poses, each the best of a pair: three are accepted, two of them of scans of one place."""
     wrong, lost = _wrong_and_lost(shipped())
     assert wrong <= MOST_WRONG
-    assert lost < 0.03
+    assert lost < 0.05
 
 
 @pytest.mark.parametrize("change", ["bins exchanged", "signs exchanged", "no lead", "too certain", "free space good"])
@@ -75,9 +75,9 @@ def test_the_evidence_adds_up_to_the_log_odds() -> None:
         assert judgement.probability == pytest.approx(1.0 / (1.0 + math.exp(-judgement.log_odds)))
         assert ("other_pose" in judgement.evidence) == (others is not None)
         assert judgement.evidence["usual"] > 0.0 > judgement.evidence["free_space"]
-    poor = shipped().judge(_agreement(60, 120), [_agreement(150, 20)])
-    assert sum(poor.evidence.values()) == pytest.approx(poor.log_odds) == shipped().chance
-    assert "chance_fit" in poor.evidence
+    poor = shipped().judge(_agreement(60, 120))
+    assert poor.evidence["surfaces"] < 0.0
+    assert poor.log_odds < shipped().judge(_agreement(170, 10)).log_odds - 10.0
 
 
 def test_the_lead_counts_differences_of_the_same_patches_in_their_scatter() -> None:
@@ -100,7 +100,7 @@ def test_the_same_lead_counts_less_if_there_are_many_patches() -> None:
 def test_only_poses_that_can_lower_the_odds_below_the_least_are_looked_for() -> None:
     table, counts = shipped(), _agreement(198, 2).counts
     lead = table.most_lead(counts, 3.0)
-    assert table.log_odds(counts, lead) == pytest.approx(3.0 + RIVAL_NATS)
+    assert table.log_odds(counts, lead) == pytest.approx(3.0 + RIVAL_NATS, abs=0.01)
 
 
 def test_the_patches_of_another_place_are_not_compared() -> None:
@@ -130,5 +130,5 @@ def test_the_share_of_false_loops_is_the_one_threshold() -> None:
 
 
 def test_a_table_without_a_bin_is_refused() -> None:
-    with pytest.raises(KeyError, match="no surface"):
-        table_of({"ratios": {"free space": -1.0}, **dict.fromkeys(NUMBERS, 0.0)})
+    with pytest.raises(KeyError, match="near, no surface"):
+        table_of({"ratios": {"near, free space": -1.0}, **dict.fromkeys(NUMBERS, 0.0)})

@@ -83,9 +83,6 @@ def _learn(options: Namespace) -> None:
         "made_by": "python -m tools.benchmarks.score learn",
         "pairs": len(pairs),
         "ratios": {name: round(float(value), 3) for name, value in zip(BINS, table.ratios, strict=True)},
-        "least_ratio": round(table.least_ratio, 3),
-        "most_free": round(table.most_free, 3),
-        "chance": round(table.chance, 2),
         **{name: round(value, 3) for name, value in table.weights._asdict().items()},
         "margin": round(table.margin, 2),
     }
@@ -94,10 +91,9 @@ def _learn(options: Namespace) -> None:
 
 
 def _shipped(pairs: Sequence[Pair]) -> Table:
-    scored = ratio.left_out(pairs)
-    line = ratio.calibration(pairs, scored)
-    margin = ratio.margin(pairs, [(best, line[0] * odds + line[1]) for best, odds in scored], SHARE)
-    return replace(ratio.calibrated(ratio.learnt(pairs), line), margin=margin)
+    table = ratio.calibrated(ratio.learnt(pairs), ratio.calibration(pairs, ratio.left_out(pairs)))
+    scored = [(best, ratio.odds_of(best, table)) for best in ratio.bests(pairs, table)]
+    return replace(table, margin=ratio.margin(pairs, scored, SHARE))
 
 
 def _test(options: Namespace) -> None:

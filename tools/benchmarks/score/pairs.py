@@ -32,7 +32,7 @@ SEEN_M, APART_M, GAP = 20.0, 100.0, 40
 """Pairs of real drives: scans this near and this many later are true ones, farther than `APART_M` false ones."""
 TRUTH_KITTI = 3.0, 3.0
 """m, degrees: the truth of KITTI's thinned keyframes is off by up to 0.8 m along the road, and its own revisits."""
-SEARCH_SHARE = 0.1
+SEARCH_SHARE = 0.99
 """Poses are searched as for this `verify.max_false_share`: also around poses that would be rejected without rivals."""
 DAYS = ("_0", "_1", "_2", "_3")
 """Ends of the names of the drives through a town."""

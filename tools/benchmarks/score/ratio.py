@@ -4,7 +4,7 @@ A pair counts as much as all others of its part together allow: each part weighs
 poses, so the prior odds are even.
 """
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from segslam.core.types import Transform, Vector
-from segslam.verification.patches import BINS, Counts, Shown, counted
+from segslam.verification.patches import BINS, FREE_SPACE, KINDS, Counts, Shown, counted
 from segslam.verification.rivals import SAME_POSE_M, SAME_POSE_RAD
 from segslam.verification.score import MISLED, NO_OTHER, Table, Weights, paired_lead, violating_root
 from segslam.verification.trial import is_near
@@ -23,11 +23,8 @@ PRIOR_COUNT = 0.5
 """Jeffreys': pseudo-counts of a bin or case that was never seen."""
 PART_WEIGHT = 100.0
 """Number of poses as which a part counts in the ratios."""
-LOST = 0.03, 0.02
-"""Chosen: shares of right poses that are given up as chance fits for their mean ratio, and for free space."""
-HUNDREDTHS = np.linspace(0.0, 1.0, 101)
-SIGMA = 3.0
-"""Normal prior of the weights, in standard deviations of what they multiply."""
+FITS, LEADS = 3, [3, 2]
+"""Of `ingredients`."""
 TAIL = 20
 """Number of wrong poses that show how fast their odds fall."""
 HOPELESS = -2.0
@@ -67,7 +64,7 @@ class Pair:
     seconds: float
     """CPU of the registration."""
     is_searched: bool = True
-    """False if no other poses were searched, because the best one was a chance fit by the table of the package."""
+    """False if no other poses were searched, because the best one was improbable already."""
 
 
 class Best(NamedTuple):
@@ -86,7 +83,7 @@ def log_ratios(pairs: Sequence[Pair]) -> Vector:
     A pose counts once, however many patches it has. What resembles right poses is judged by the ratios themselves.
     """
     ratios = np.zeros(len(BINS))
-    ratios[0] = -1.0
+    ratios[FREE_SPACE :: len(KINDS)] = -1.0
     weight = {part: PART_WEIGHT / number for part, number in Counter(pair.part for pair in pairs).items()}
     for _ in range(3):
         right, wrong = np.full(len(BINS), PRIOR_COUNT), np.full(len(BINS), PRIOR_COUNT)
@@ -105,15 +102,13 @@ def _shares(counts: Counts) -> Counts:
 
 
 def best_of(pair: Pair, table: Table) -> Best | None:
-    """The best pose, and its lead over those that differ; None for a chance fit, or if the prior allows no pose."""
+    """The best pose, and its lead over those that differ; None if no others were searched, or the prior allows none."""
     ratios = [table.mean_ratio(pose.counts) for pose in pair.poses]
     allowed = [number for number, pose in enumerate(pair.poses) if pose.is_allowed]
     if not allowed or not pair.is_searched:
         return None
     first = max(allowed, key=ratios.__getitem__)
     best = pair.poses[first]
-    if not table.fits(best.counts):
-        return None
     leads = [
         paired_lead(table.ratios, [(best.of_source, pose.of_source), (best.of_target, pose.of_target)])
         for pose in pair.poses
@@ -130,24 +125,27 @@ def bests(pairs: Sequence[Pair], table: Table) -> list[Best]:
 def learnt(pairs: Sequence[Pair]) -> Table:
     """The table that these pairs teach. Its odds are too certain for other parts: `calibrated`.
 
-    The weights are those of a logistic regression in which right and wrong poses weigh the same.
+    The weights are the most probable ones of a product of two logistic functions, in which right and wrong poses weigh
+    the same.
     """
-    ratios = log_ratios(pairs)
-    limits = _limits(pairs, ratios)
-    blank = Table(ratios, *limits, _chance(pairs, ratios, *limits), Weights(0.0, 0.0, 0.0, 0.0))
+    blank = Table(log_ratios(pairs), Weights._make([0.0] * len(Weights._fields)))
     found = bests(pairs, blank)
     is_right = np.array([best.pose.is_right for best in found])
     values = np.array([ingredients(best) for best in found])
     mean, scale = values.mean(axis=0), values.std(axis=0) + 1e-9
-    weight = _weights(found)
+    weight, standard = _weights(found), (values - mean) / scale
 
     def loss(numbers: Vector) -> float:
-        odds = (values - mean) / scale @ numbers[:-1] + numbers[-1]
-        return _surprise(odds, is_right, weight) + 0.5 * float(((numbers[:-1] / SIGMA) ** 2).sum())
+        fit = standard[:, :FITS] @ numbers[:FITS] + numbers[FITS]
+        unique = standard[:, LEADS] @ numbers[-3:-1] + numbers[-1]
+        odds = -np.logaddexp(-fit, np.logaddexp(-unique, -fit - unique))
+        return _surprise(odds, is_right, weight) + 0.5 * float((numbers**2).sum())
 
-    numbers = minimize(loss, np.array([1.0, 1.0, 1.0, 0.0])).x
-    weights = numbers[:-1] / scale
-    return replace(blank, weights=Weights._make([*weights.tolist(), float(numbers[-1] - weights @ mean)]))
+    numbers = minimize(loss, np.ones(FITS + len(LEADS) + 2)).x
+    fit, unique = numbers[:FITS] / scale[:FITS], numbers[-3:-1] / scale[LEADS]
+    offset, lead_offset = numbers[FITS] - fit @ mean[:FITS], numbers[-1] - unique @ mean[LEADS]
+    weights = np.array([*fit, offset, *unique, lead_offset, 1.0, 0.0])
+    return replace(blank, weights=Weights._make(weights.tolist()))
 
 
 def _weights(found: Sequence[Best]) -> Vector:
@@ -167,32 +165,9 @@ def _surprise(odds: Vector, is_right: np.ndarray, weight: Vector) -> float:
 
 
 def ingredients(best: Best) -> Vector:
-    """(3,) of a best pose, in the order of `Weights`."""
+    """(4,) of a best pose: what tells whether it fits by chance (`FITS`), or another fits as well (`LEADS`)."""
     counts = best.pose.counts
-    return np.array([-violating_root(counts), -np.sqrt(counts.sum()), best.lead])
-
-
-def _limits(pairs: Sequence[Pair], ratios: Vector) -> tuple[float, float]:
-    """Least mean ratio and largest root of the share in free space: all but `LOST` of the right poses keep them.
-
-    Each part weighs the same.
-    """
-    right: defaultdict[str, list[Counts]] = defaultdict(list)
-    for pair in pairs:
-        right[pair.part] += [pose.counts for pose in pair.poses if pose.is_right]
-    ratio = [np.quantile([_shares(counts) @ ratios for counts in part], HUNDREDTHS) for part in right.values()]
-    free = [np.quantile([violating_root(counts) for counts in part], HUNDREDTHS) for part in right.values()]
-    return float(np.quantile(ratio, LOST[0])), float(np.quantile(free, 1.0 - LOST[1]))
-
-
-def _chance(pairs: Sequence[Pair], ratios: Vector, least_ratio: float, most_free: float) -> float:
-    """Log odds of a pose beyond the limits, right and wrong poses being equally frequent."""
-    beyond: dict[bool, list[bool]] = {True: [], False: []}
-    for pose in (pose for pair in pairs for pose in pair.poses):
-        fits = _shares(pose.counts) @ ratios >= least_ratio and violating_root(pose.counts) <= most_free
-        beyond[pose.is_right].append(not fits)
-    shares = {is_right: (sum(rows) + PRIOR_COUNT) / (len(rows) + 1.0) for is_right, rows in beyond.items()}
-    return float(np.log(shares[True] / shares[False]))
+    return np.array([best.ratio, -violating_root(counts), -np.sqrt(counts.sum()), best.lead])
 
 
 def left_out(pairs: Sequence[Pair]) -> list[tuple[Best, float]]:
@@ -230,19 +205,17 @@ def calibration(pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]]) -> 
 def margin(pairs: Sequence[Pair], scored: Sequence[tuple[Best, float]], share: float) -> float:
     """How far below the log odds of this share of false poses the least odds may be, of which all above have it.
 
-    The odds of wrong poses beyond the `TAIL` best of them are taken to fall exponentially; because few of them show
-    how fast, a third of the share is aimed at.
+    The odds of wrong poses beyond the `TAIL` best of them are taken to fall exponentially.
     """
     number = Counter(pair.is_true for pair in pairs)
     wrong = np.sort([odds for best, odds in scored if not best.pose.is_right])[::-1]
     right = np.array([odds for best, odds in scored if best.pose.is_right])
     start, scale = wrong[TAIL], float(np.median(wrong[:TAIL] - wrong[TAIL])) / np.log(2.0)
     accepted = float(np.mean(right > start)) * len(right) / number[True]
-    least = start + scale * np.log(TAIL / number[False] / (share / 3.0 * accepted))
+    least = start + scale * np.log(TAIL / number[False] / (share * accepted))
     return float(np.log((1.0 - share) / share) - least)
 
 
 def calibrated(table: Table, line: tuple[float, float]) -> Table:
     """A table whose log odds are those of `table` moved to this line."""
-    *weights, offset = (line[0] * weight for weight in table.weights)
-    return replace(table, weights=Weights._make([*weights, offset + line[1]]))
+    return replace(table, weights=table.weights._replace(slope=line[0], shift=line[1]))

@@ -63,8 +63,9 @@ MIN_PAIRED = 500
 MOST_SIGMA_DEG = 0.05
 """Pairs with a larger standard deviation of the angle, from their residuals, are dropped. Chosen: 0.01 for KITTI's
 submaps, 0.02 for those of 32 beams."""
-BIAS_DEG = 0.03
-"""Standard deviation added to that of the median. Chosen: the medians on KITTI 00 scatter less for 20 and 30 m."""
+BIAS_DEG = 0.05
+"""Standard deviation added to that of the median, for what distorts surfaces otherwise: grass seems higher from afar.
+Chosen: KITTI 00 shows 0.18 of 0.205 degrees, a campus (NCLT) -0.08 of 0, simulated streets 0.07 of 0.03."""
 SIGNIFICANT_SIGMAS, SIGNIFICANT_DEG = 2.5, 0.05
 
 

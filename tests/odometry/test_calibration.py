@@ -67,7 +67,7 @@ def test_a_drive_shows_the_angle_whichever_way_it_goes(direction: float) -> None
     assert found is not None
     assert found.num_pairs >= MIN_PAIRS
     assert found.angle_deg == pytest.approx(LOW_DEG, abs=0.03)
-    assert found.sigma_deg < 0.04
+    assert found.sigma_deg < 0.06
     assert found.is_significant
 
 

@@ -32,7 +32,11 @@ def test_a_setting_that_was_removed_is_dropped_with_a_warning(tmp_path: Path, ca
     assert [record.getMessage() for record in caplog.records] == [
         f"{file}: graph.systematic_drift no longer exists and is ignored"
     ]
+    caplog.clear()
     assert load_config(None, ["graph.systematic_drift=auto", "geometric.max_things=9"]) == Config()
+    assert [record.getMessage() for record in caplog.records] == [
+        "--set: geometric.max_things, graph.systematic_drift no longer exist and are ignored"
+    ]
     assert config_from_yaml(file.read_text(), "log.mcap") == config
 
 

@@ -208,17 +208,20 @@ def config_from_yaml(text: str, source: str) -> Config:
 
 def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
     """The values without settings of older versions that no longer exist."""
+    all_gone: list[str] = []
     for section, names in REMOVED.items():
         given = values.get(section)
         if not isinstance(given, dict):
             continue
         gone = [name for name in given if name in names.split()]
-        for name in gone:
-            logger.warning("%s: %s.%s no longer exists and is ignored", source, section, name)
+        all_gone += [f"{section}.{name}" for name in gone]
         kept = {name: value for name, value in given.items() if name not in gone}
         values = {name: value for name, value in values.items() if name != section}
         if kept or section in Config.model_fields:
             values[section] = kept
+    if all_gone:
+        verbs = "no longer exists and is" if len(all_gone) == 1 else "no longer exist and are"
+        logger.warning("%s: %s %s ignored", source, ", ".join(all_gone), verbs)
     return values
 
 

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature
-from segslam.candidates.proximity import Nearness, nearness
+from segslam.candidates.proximity import LEAST_PROBABILITY, Nearness, nearness
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
@@ -72,7 +72,7 @@ class FarLoops:
                 _not_far,
                 candidate=candidate,
                 reach_m=self._reach_m(candidate),
-                expected_m=float(self._nearness(keyframe_id, candidate.target_id).reach_m[0]),
+                expected_m=self._expected_m(candidate),
             ),
             watch=own,
         )
@@ -98,8 +98,14 @@ class FarLoops:
             for one in listed
             if one.score >= MIN_SCORE and (keyframe_id, one.place_id) not in self._forbidden
         ]
-        elsewhere = (one for one in candidates if ELSEWHERE_M <= one.distance_m <= self._reach_m(one) + ELSEWHERE_M)
-        return next(elsewhere, None)
+        return next((one for one in candidates if self._is_left(one)), None)
+
+    def _is_left(self, candidate: LoopCandidate) -> bool:
+        """True for a place that the search by distance does not try: one elsewhere, or one near after unknown motions."""
+        distance_m = candidate.distance_m
+        if distance_m >= ELSEWHERE_M:
+            return distance_m <= self._reach_m(candidate) + ELSEWHERE_M
+        return candidate.near_probability < LEAST_PROBABILITY and distance_m <= self._expected_m(candidate)
 
     def candidate(self, keyframe_id: int, target_id: int) -> LoopCandidate:
         """A loop between these two."""
@@ -109,6 +115,10 @@ class FarLoops:
         radius_m = self._config.proximity.base_radius_m
         T_world = self._graph.T_world_keyframes
         return nearness(keyframe_id, np.array([target_id]), T_world, self._graph.covariances, radius_m=radius_m)
+
+    def _expected_m(self, candidate: LoopCandidate) -> float:
+        """Largest distance at which the two may seem to be and yet be near each other (m)."""
+        return float(self._nearness(candidate.source_id, candidate.target_id).reach_m[0])
 
     def _reach_m(self, candidate: LoopCandidate) -> float:
         """Largest drift between the two keyframes (m)."""

@@ -101,7 +101,7 @@ class FarLoops:
         return next((one for one in candidates if self._is_left(one)), None)
 
     def _is_left(self, candidate: LoopCandidate) -> bool:
-        """True for a place that the search by distance does not try: one elsewhere, or one near after unknown motions."""
+        """True for a place that the search by distance does not try: elsewhere, or near after unknown motions."""
         distance_m = candidate.distance_m
         if distance_m >= ELSEWHERE_M:
             return distance_m <= self._reach_m(candidate) + ELSEWHERE_M

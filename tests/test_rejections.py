@@ -46,7 +46,7 @@ def test_no_rejection_is_tested_for_its_truth_value(file: Path) -> None:
 
 @pytest.mark.parametrize(
     "code",
-    ["x = far_from_prior(pose) or pose", "if self.gate(T, slack_m=0.0): pass", "y = 1 if _not_far() else 2"],
+    ["x = far_from_prior(pose) or pose", "if self.gate(T, slack_m=0.0): pass", "y = 1 if far_from_prior() else 2"],
 )
 def test_a_lost_rejection_is_found(code: str) -> None:
     assert _lost_rejections(ast.parse(code))

@@ -74,12 +74,12 @@ def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, Any
 
 
 def _summary(found: "VerticalAngle | None", applied_deg: float, travel_m: float) -> str:
-    from segslam.odometry.calibration import MIN_PAIRS, described
+    from segslam.odometry.calibration import APART_M, MIN_PAIRS, described
 
     if found is None:
         return (
-            f"the vertical angle cannot be measured: fewer than {MIN_PAIRS} usable pairs of scans 10 m apart in "
-            f"{travel_m:.0f} m of travel; give a longer drive along a street, or denser scans"
+            f"the vertical angle cannot be measured: fewer than {MIN_PAIRS} usable pairs of scans {APART_M[0]:g} m "
+            f"apart in {travel_m:.0f} m of travel; give a longer drive along a street, or denser scans"
         )
     text = f"{described(found)} ({found.num_pairs} pairs of scans, {applied_deg:g} degrees corrected on reading)"
     if found.is_significant:

@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from segslam.core import geometry
+from segslam.core.trajectory import Rows
 from segslam.core.types import Indices, Information, LoopCandidate, Rejected, RejectReason, Transform, Vector
 from segslam.graph import noise
 from segslam.graph.closure_pairs import Matrices, adjoints, carried
@@ -30,22 +31,21 @@ class Chains:
 
     def __init__(self, T_world: Transforms, odometry: Sequence[Edge], closures: Sequence[Edge]) -> None:
         """`odometry` leads from each vertex 0, 1, 2, ... to the next; `T_world` (n, 4, 4): their poses."""
-        self._T_world = T_world
-        self._summed = np.zeros((len(T_world), 6, 6))
-        self._length = np.zeros(len(T_world))
+        self._T_world = Rows(T_world)
+        summed, length = np.zeros((len(T_world), 6, 6)), np.zeros(len(T_world))
         if odometry:
-            self._summed[1:] = np.cumsum(carried(T_world[1:], odometry), axis=0)
-            self._length[1:] = np.cumsum([_length(edge) for edge in odometry])
+            summed[1:] = np.cumsum(carried(T_world[1:], odometry), axis=0)
+            length[1:] = np.cumsum([_length(edge) for edge in odometry])
+        self._summed, self._length = Rows(summed), Rows(length)
         self._ends = np.unique(np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64))
         self._links = self._linked(closures)
         self._found: dict[int, tuple[Vector, Matrices]] = {}
 
     def add(self, T_world: Transform, motion: Edge) -> None:
         """Add the next vertex."""
-        own = carried(T_world[None], [motion])
-        self._T_world = np.concatenate([self._T_world, T_world[None]])
-        self._summed = np.concatenate([self._summed, self._summed[-1:] + own])
-        self._length = np.append(self._length, self._length[-1] + _length(motion))
+        self._T_world.append(T_world)
+        self._summed.append(self._summed.all()[-1] + carried(T_world[None], [motion])[0])
+        self._length.append(self._length.all()[-1] + _length(motion))
 
     def covariances(self, source_id: int, ids: Indices) -> Matrices:
         """(k, 6, 6) covariance of the pose of one keyframe in each of others, as a tangent of `source_id`."""
@@ -53,7 +53,7 @@ class Chains:
         if len(self._ends):
             starts = [self._ends[row] for row in sorted({int(row[0]) for row in self._beside(np.array([source_id]))})]
             for row in self._beside(ids):
-                along, between = np.abs(self._length[self._ends[row]] - self._length[ids]), self._along(ids, row)
+                along, between = self._odometry(self._ends[row], ids)
                 for start in starts:
                     way, own = self._odometry(source_id, np.array([start]))
                     lengths, covariances = self._from(int(start))
@@ -61,17 +61,14 @@ class Chains:
                     shorter = total < length
                     length = np.where(shorter, total, length)
                     summed[shorter] = (own + covariances[row] + between)[shorter]
-        (turn,) = adjoints(geometry.inverse(self._T_world[source_id])[None])
+        (turn,) = adjoints(geometry.inverse(self._T_world.all()[source_id])[None])
         return np.einsum("kij,lj->kil", np.einsum("ij,kjl->kil", turn, summed), turn)  # uses one thread
 
-    def _odometry(self, source_id: int, ids: Indices) -> tuple[Vector, Matrices]:
+    def _odometry(self, a: int | Indices, b: Indices) -> tuple[Vector, Matrices]:
         """Lengths and covariances along the odometry alone."""
-        later, earlier = np.maximum(source_id, ids), np.minimum(source_id, ids)
-        return self._length[later] - self._length[earlier], self._summed[later] - self._summed[earlier]
-
-    def _along(self, ids: Indices, row: Indices) -> Matrices:
-        ends = self._ends[row]
-        return self._summed[np.maximum(ends, ids)] - self._summed[np.minimum(ends, ids)]
+        later, earlier = np.maximum(a, b), np.minimum(a, b)
+        length, summed = self._length.all(), self._summed.all()
+        return length[later] - length[earlier], summed[later] - summed[earlier]
 
     def _beside(self, ids: Indices) -> tuple[Indices, Indices]:
         """Rows of the closure ends before and after each keyframe; the same row twice at the margins."""
@@ -80,11 +77,10 @@ class Chains:
 
     def _linked(self, closures: Sequence[Edge]) -> dict[tuple[int, int], Link]:
         """The shortest link between each two neighbouring rows of ends."""
-        links: dict[tuple[int, int], Link] = {}
-        for row, (first, last) in enumerate(zip(self._ends[:-1], self._ends[1:], strict=True)):
-            links[row, row + 1] = self._length[last] - self._length[first], self._summed[last] - self._summed[first]
+        between = zip(*self._odometry(self._ends[:-1], self._ends[1:]), strict=True)
+        links: dict[tuple[int, int], Link] = {(row, row + 1): link for row, link in enumerate(between)}
         if closures:
-            own = carried(self._T_world[[edge.b for edge in closures]], closures)
+            own = carried(self._T_world.all()[[edge.b for edge in closures]], closures)
             for edge, covariance in zip(closures, own, strict=True):
                 first, last = np.searchsorted(self._ends, sorted((edge.a, edge.b))).tolist()
                 length = _length(edge)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -69,6 +69,15 @@ Chosen: KITTI 00 shows 0.18 of 0.205 degrees, a campus (NCLT) -0.08 of 0, simula
 SIGNIFICANT_SIGMAS, SIGNIFICANT_DEG = 2.5, 0.05
 
 
+class AngleShown(NamedTuple):
+    """The vertical angle that pairs of submaps show: a part of it, because their scans are distorted."""
+
+    median_deg: float
+    error_deg: float
+    """Standard error of the median of normal errors."""
+    num_pairs: int
+
+
 @dataclass(frozen=True, slots=True)
 class VerticalAngle:
     """The remaining vertical angle of some scans; positive if their points are too low."""
@@ -76,11 +85,18 @@ class VerticalAngle:
     angle_deg: float
     sigma_deg: float
     num_pairs: int
+    shown: AngleShown | None = None
+    """By submaps of the scans as they are; None if it is not known."""
 
     @property
     def is_significant(self) -> bool:
         """True if the angle differs from zero by more than its error, and by a relevant amount."""
         return abs(self.angle_deg) > max(SIGNIFICANT_SIGMAS * self.sigma_deg, SIGNIFICANT_DEG)
+
+    @property
+    def correction_deg(self) -> float:
+        """Elevation to be added to the points: the angle, or 0 if it is not significant."""
+        return self.angle_deg if self.is_significant else 0.0
 
 
 def vertical_angle_advice(metrics: Mapping[str, Any], sensor: SensorCalibrationConfig) -> str:
@@ -111,34 +127,46 @@ def measure_vertical_angle(
 ) -> VerticalAngle | None:
     """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
 
-    A submap of distorted scans hides a part of their angle. What is left is therefore measured again with scans that
-    are corrected by the first result: it falls in proportion to the correction.
+    An angle within `BIAS_DEG` is as they show it; of a larger one they hide a part (`leaving_none`).
     """
-    at_first = angle_left(points_of, T_odom_keyframes, travel_m, 0.0, config=config)
-    if at_first is None or abs(at_first.angle_deg) < at_first.sigma_deg:
-        return at_first
-    at_last = angle_left(points_of, T_odom_keyframes, travel_m, at_first.angle_deg, config=config)
-    return None if at_last is None else without_rest(at_first, at_first.angle_deg, at_last)
-
-
-def without_rest(at_first: VerticalAngle, correction_deg: float, at_last: VerticalAngle) -> VerticalAngle | None:
-    """The correction that leaves no angle, from what is left without one and with another; None if it does not fall."""
-    share = (at_first.angle_deg - at_last.angle_deg) / correction_deg
-    if share <= 0.0:
+    shown = angle_shown(points_of, T_odom_keyframes, travel_m, 0.0, config=config)
+    if shown is None:
         return None
-    angle_deg = correction_deg + at_last.angle_deg / share
-    return VerticalAngle(angle_deg, math.hypot(at_last.sigma_deg / share, BIAS_DEG), at_last.num_pairs)
+    if abs(shown.median_deg) < BIAS_DEG:
+        return VerticalAngle(shown.median_deg, math.hypot(shown.error_deg, BIAS_DEG), shown.num_pairs, shown)
+    return leaving_none(shown, shown.median_deg, points_of, T_odom_keyframes, travel_m, config=config)
 
 
-def angle_left(
+def leaving_none(
+    shown: AngleShown,
+    correction_deg: float,
+    points_of: PointsOf,
+    T_odom_keyframes: Float[np.ndarray, "n 4 4"],
+    travel_m: Vector,
+    *,
+    config: RefineConfig,
+) -> VerticalAngle | None:
+    """The correction after which submaps show no angle, by what they show before any and after one.
+
+    It falls in proportion to the correction. None if it does not fall, or if too few pairs determine it.
+    """
+    left = angle_shown(points_of, T_odom_keyframes, travel_m, correction_deg, config=config)
+    share = 0.0 if left is None else (shown.median_deg - left.median_deg) / correction_deg
+    if left is None or share <= 0.0:
+        return None
+    angle_deg = correction_deg + left.median_deg / share
+    return VerticalAngle(angle_deg, math.hypot(left.error_deg / share, BIAS_DEG), left.num_pairs, shown)
+
+
+def angle_shown(
     points_of: PointsOf,
     T_odom_keyframes: Float[np.ndarray, "n 4 4"],
     travel_m: Vector,
     correction_deg: float,
     *,
     config: RefineConfig,
-) -> VerticalAngle | None:
-    """The median angle of pairs of submaps of corrected scans, and its standard error; None if too few determine it."""
+) -> AngleShown | None:
+    """The angle that pairs of submaps of corrected scans show; None if too few determine it."""
 
     @lru_cache(2)
     def surface(keyframe_id: int) -> Surface:
@@ -163,7 +191,7 @@ def angle_left(
         return None
     median = float(np.median(found))
     spread = 1.4826 * float(np.median(np.abs(np.array(found) - median)))
-    return VerticalAngle(median, math.sqrt(math.pi / 2 / len(found)) * spread, len(found))  # of normal errors
+    return AngleShown(median, math.sqrt(math.pi / 2 / len(found)) * spread, len(found))
 
 
 class Calibrator:

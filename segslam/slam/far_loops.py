@@ -4,8 +4,8 @@ A loop is closed only if several keyframes confirm it (`Confirmation`).
 """
 
 import math
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,9 +58,10 @@ class FarLoops:
     def attempt(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
         """Try the place most similar to that of a keyframe, once; closures follow once enough others confirm it."""
         with watch("propose"):
-            candidate = self._candidate(keyframe_id, self._signatures[keyframe_id])
-        if candidate is None:
+            loop = self._loop(keyframe_id, self._signatures[keyframe_id])
+        if loop is None:
             return ()
+        candidate = loop.candidate
         own = Stopwatch()
         found = recognise(
             self._prepared(keyframe_id),
@@ -68,12 +69,7 @@ class FarLoops:
             self._prepared,
             lambda number: self._graph.T_world_keyframes[number],
             config=self._config,
-            gate=lambda place_id: partial(
-                _not_far,
-                candidate=candidate,
-                reach_m=self._reach_m(candidate),
-                expected_m=self._expected_m(candidate),
-            ),
+            gate=lambda place_id: loop,
             watch=own,
         )
         for stage, seconds in own.seconds.items():
@@ -84,8 +80,8 @@ class FarLoops:
         closure = LoopClosure.of(keyframe_id, candidate.target_id, found.alignment)
         return self._confirmation.attempts(candidate, closure, own.seconds)
 
-    def _candidate(self, keyframe_id: int, signature: PlaceSignature) -> LoopCandidate | None:
-        """The most similar older place within the largest drift; None if only the search by distance may try it."""
+    def _loop(self, keyframe_id: int, signature: PlaceSignature) -> "_FarLoop | None":
+        """With the most similar older place within the largest drift; None if only the search by distance may try."""
         travel_m = self._graph.travel_m
         if not self._confirmation.is_waiting(keyframe_id) and abs(travel_m[keyframe_id] - self._rejected_m) < RETRY_M:
             return None
@@ -93,46 +89,48 @@ class FarLoops:
             np.searchsorted(travel_m, travel_m[keyframe_id] - self._config.proximity.min_travel_m, side="right")
         )
         listed = self._places.shortlist(signature, most=NUM_LISTED, below_id=min(num_old, keyframe_id))
-        candidates = [
-            self.candidate(keyframe_id, one.place_id)
+        ids = [
+            one.place_id
             for one in listed
             if one.score >= MIN_SCORE and (keyframe_id, one.place_id) not in self._forbidden
         ]
-        return next((one for one in candidates if self._is_left(one)), None)
-
-    def _is_left(self, candidate: LoopCandidate) -> bool:
-        """True for a place that the search by distance does not try: elsewhere, or near after unknown motions."""
-        distance_m = candidate.distance_m
-        if distance_m >= ELSEWHERE_M:
-            return distance_m <= self._reach_m(candidate) + ELSEWHERE_M
-        return candidate.near_probability < LEAST_PROBABILITY and distance_m <= self._expected_m(candidate)
+        near = self._nearness(keyframe_id, ids)
+        drift_m = (MOST_DRIFT * (travel_m[keyframe_id] - travel_m[near.ids])).tolist()
+        loops = map(_FarLoop, map(near.candidate, range(len(ids))), drift_m, near.reach_m.tolist())
+        return next((loop for loop in loops if loop.is_left), None)
 
     def candidate(self, keyframe_id: int, target_id: int) -> LoopCandidate:
         """A loop between these two."""
-        return self._nearness(keyframe_id, target_id).candidate(0)
+        return self._nearness(keyframe_id, [target_id]).candidate(0)
 
-    def _nearness(self, keyframe_id: int, target_id: int) -> Nearness:
+    def _nearness(self, keyframe_id: int, ids: Sequence[int]) -> Nearness:
         radius_m = self._config.proximity.base_radius_m
-        T_world = self._graph.T_world_keyframes
-        return nearness(keyframe_id, np.array([target_id]), T_world, self._graph.covariances, radius_m=radius_m)
-
-    def _expected_m(self, candidate: LoopCandidate) -> float:
-        """Largest distance at which the two may seem to be and yet be near each other (m)."""
-        return float(self._nearness(candidate.source_id, candidate.target_id).reach_m[0])
-
-    def _reach_m(self, candidate: LoopCandidate) -> float:
-        """Largest drift between the two keyframes (m)."""
-        travel_m = self._graph.travel_m
-        return MOST_DRIFT * float(travel_m[candidate.source_id] - travel_m[candidate.target_id])
+        others, T_world = np.array(ids, dtype=np.int64), self._graph.T_world_keyframes
+        return nearness(keyframe_id, others, T_world, self._graph.covariances, radius_m=radius_m)
 
 
-def _not_far(
-    T_target_source: Transform, *, candidate: LoopCandidate, reach_m: float, expected_m: float, slack_m: float
-) -> Rejected | None:
-    """Rejects poses beyond the largest drift, and poses as predicted of places that are surely not near."""
-    off_m = float(np.linalg.norm(T_target_source[:3, 3] - candidate.T_target_source_prior[:3, 3]))
-    if off_m > reach_m + slack_m:
-        return Rejected(RejectReason.FAR_FROM_PRIOR, f"distance {off_m:.1f} m > {reach_m:.1f} m")
-    if off_m + slack_m < expected_m < candidate.distance_m:
-        return Rejected(RejectReason.FAR_FROM_PRIOR, f"near the predicted position, {candidate.distance_m:.1f} m away")
-    return None
+class _FarLoop(NamedTuple):
+    """A loop with a similar place, and the gate of its pose."""
+
+    candidate: LoopCandidate
+    most_drift_m: float
+    near_m: float
+    """Largest distance at which the two may seem to be and yet be near each other."""
+
+    @property
+    def is_left(self) -> bool:
+        """True for a place that the search by distance does not try: elsewhere, or near after unknown motions."""
+        distance_m = self.candidate.distance_m
+        if distance_m >= ELSEWHERE_M:
+            return distance_m <= self.most_drift_m + ELSEWHERE_M
+        return self.candidate.near_probability < LEAST_PROBABILITY and distance_m <= self.near_m
+
+    def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+        """Rejects poses beyond the largest drift, and poses as predicted of places that are surely not near."""
+        predicted_m = self.candidate.distance_m
+        off_m = float(np.linalg.norm(T_target_source[:3, 3] - self.candidate.T_target_source_prior[:3, 3]))
+        if off_m > self.most_drift_m + slack_m:
+            return Rejected(RejectReason.FAR_FROM_PRIOR, f"distance {off_m:.1f} m > {self.most_drift_m:.1f} m")
+        if off_m + slack_m < self.near_m < predicted_m:
+            return Rejected(RejectReason.FAR_FROM_PRIOR, f"near the predicted position, {predicted_m:.1f} m away")
+        return None

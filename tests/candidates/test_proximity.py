@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from segslam.candidates import proximity
-from segslam.candidates.proximity import FARTHEST, LEAST_PROBABILITY, ProximityDetector, nearness
+from segslam.candidates.proximity import FARTHEST, ProximityDetector, nearness
 from segslam.core import geometry
 from segslam.core.config import ProximityConfig
 from segslam.core.types import Alignment, LoopCandidate, LoopClosure, Registration
@@ -140,7 +140,6 @@ def test_the_probability_is_that_of_errors_drawn_at_random() -> None:
     drawn = rng.normal(size=(200_000, 2)) * np.sqrt([along[0], across[1]]) + [np.hypot(5.0, 2.0), 0.0]
     assert near.probability[0] == pytest.approx(np.mean(np.abs(drawn).max(axis=1) < 6.0), abs=0.005)
     assert near.reach_m[0] == pytest.approx(6.0 + FARTHEST * np.sqrt(max(along[0], across[1])))
-    assert LEAST_PROBABILITY == 0.01
 
 
 def test_where_a_loop_was_just_closed_no_other_is_searched() -> None:

@@ -14,14 +14,15 @@ from segslam.core.geometry import raise_beams
 from segslam.core.points import voxel_first, within_range
 from segslam.core.trajectory import lidar_from_camera, read_poses
 from segslam.odometry.calibration import (
+    BIAS_DEG,
     MIN_PAIRED,
     MIN_PAIRS,
     VerticalAngle,
-    angle_left,
+    angle_shown,
+    leaving_none,
     measure_vertical_angle,
     register_with_angle,
     vertical_angle_advice,
-    without_rest,
 )
 from segslam.registration import refinement
 from segslam.scans.kitti import read_calibration, read_returns
@@ -93,25 +94,33 @@ def test_a_drive_with_a_break_shows_the_angle_too() -> None:
     assert found.angle_deg == pytest.approx(LOW_DEG, abs=0.04)
 
 
-def test_what_is_left_after_a_correction_leads_to_the_angle_that_leaves_nothing() -> None:
-    """Whatever the correction, and although submaps of distorted scans show a part of it."""
+def test_the_angle_is_the_correction_that_leaves_none_whatever_the_first_one_was() -> None:
+    """Although submaps of distorted scans show a part of it."""
     places_m = np.arange(-30.0, 31.0, 2.0)
-    left = {
-        deg: angle_left(
-            lambda i: points_at(float(places_m[i])), poses_at(places_m), places_m + 30.0, deg, config=CONFIG
-        )
-        for deg in (0.0, 0.1, LOW_DEG, 0.3)
-    }
-    found = [one for one in left.values() if one is not None]
-    assert len(found) == 4
-    assert found[0].angle_deg < 0.9 * LOW_DEG
-    assert found[0].angle_deg > found[1].angle_deg > 0.0 > found[3].angle_deg
-    assert abs(found[2].angle_deg) < 0.02
-    for correction_deg, one in ((0.1, found[1]), (0.3, found[3])):
-        angle = without_rest(found[0], correction_deg, one)
+    drive = lambda i: points_at(float(places_m[i])), poses_at(places_m), places_m + 30.0
+    shown = [angle_shown(*drive, deg, config=CONFIG) for deg in (0.0, 0.1, LOW_DEG, 0.3)]
+    medians_deg = [one.median_deg for one in shown if one is not None]
+    assert len(medians_deg) == 4
+    assert 0.9 * LOW_DEG > medians_deg[0] > medians_deg[1] > 0.0 > medians_deg[3]
+    assert abs(medians_deg[2]) < 0.02
+    for correction_deg in (0.1, 0.3):
+        angle = leaving_none(shown[0], correction_deg, *drive, config=CONFIG)
         assert angle is not None
         assert angle.angle_deg == pytest.approx(LOW_DEG, abs=0.03)
-    assert without_rest(found[0], 0.1, found[0]) is None, "a correction without effect"
+        assert angle.shown == shown[0]
+    assert leaving_none(shown[1], 0.1, *drive, config=CONFIG) is None, "a correction without effect"
+
+
+def test_a_small_angle_is_as_uncertain_as_a_large_one() -> None:
+    places_m = np.arange(-30.0, 31.0, 2.0)
+    travel_m, poses = places_m + 30.0, poses_at(places_m)
+    small = measure_vertical_angle(
+        lambda i: raise_beams(points_at(float(places_m[i])), LOW_DEG), poses, travel_m, config=CONFIG
+    )
+    assert small is not None
+    assert abs(small.angle_deg) < 0.02
+    assert small.sigma_deg >= BIAS_DEG
+    assert small.correction_deg == 0.0
 
 
 def test_a_gap_in_the_drive_is_passed_over() -> None:

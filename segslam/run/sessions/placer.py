@@ -21,6 +21,7 @@ from segslam.graph import AnchoredGraph
 from segslam.graph.chains import far_from_prior
 from segslam.keyframes import Submaps
 from segslam.registration import refinement
+from segslam.registration.hypotheses import MAX_COARSE_FINE_M
 from segslam.registration.prepared import Observed, prepare_observed
 from segslam.run.locator import Locator
 from segslam.verification.patches import agreement
@@ -115,6 +116,9 @@ class Placer:
             )
         if isinstance(fine, Rejected):
             return fine
+        moved_m = geometry.distance(geometry.inverse(T_target_predicted) @ fine.T_target_source)
+        if moved_m > MAX_COARSE_FINE_M:
+            return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {MAX_COARSE_FINE_M} m")
         T_world_keyframe = T_world_target @ fine.T_target_source
         assert self._last is not None
         contradiction = self._contradiction(self._last, keyframe_id, T_world_keyframe)

@@ -28,8 +28,6 @@ from segslam.slam.adjustment.known import Kept, Known, nothing_kept
 
 GAP_NS = 1_000_000_000
 """Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
-GAP_M = 1.0
-"""Chosen: travel between two sessions beyond that of a break, so that rounding does not make it shorter than one."""
 FIRST_MOTION = Motion(MotionState.BEGUN, information=1e-12 * np.eye(6))
 """The motion to the first scan of a session, which is unknown."""
 
@@ -170,6 +168,6 @@ def next_shift(before: Shift, session: Session, T_new_old: Transform, following:
         keyframe_id=before.keyframe_id + len(session.travel_m),
         scan_index=before.scan_index + int(session.run.result.trajectory.scan_index[-1]) + 1,
         stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
-        travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_TRAVEL_M + GAP_M,
+        travel_m=before.travel_m + float(session.travel_m[-1]) + 2.0 * BREAK_TRAVEL_M,  # rounded, it is still a break
         T_new_old=T_new_old,
     )

@@ -15,9 +15,9 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import GraphEstimate, IndexPairs, Points, Record, Vector
+from segslam.core.types import GraphEstimate, IndexPairs, Points, Record
 from segslam.graph import Edge, PoseGraph
-from segslam.odometry.calibration import VerticalAngle, angle_left, measure_vertical_angle, without_rest
+from segslam.odometry.calibration import VerticalAngle, leaving_none, measure_vertical_angle
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
 from segslam.slam.adjustment.known import Known
 from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, PointsOf, Submaps, all_pairs
@@ -91,6 +91,8 @@ class Adjusted:
 class _Round(NamedTuple):
     """The pairs registered in a round before the time limit, and the solution with them."""
 
+    angle: VerticalAngle | None
+    """By which the scans were corrected, if it is significant."""
     num_pairs: int
     registered: list[Edge]
     is_complete: bool
@@ -118,20 +120,17 @@ def adjust(
         return None
     T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
     angle = known.angle if known else measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
-    correction_deg = angle.angle_deg if angle is not None and angle.is_significant else 0.0
     of_drives = known.aligned(points_of, travel_m, config=config.refine) if known else None
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
-        if number > 1 and correction_deg and known is None:
-            again = _measured_again(points_of, T_before, graph.T_world_keyframes, travel_m, correction_deg, config)
-            if again is not None and again.is_significant:
-                angle, correction_deg = again, again.angle_deg
-        corrected = partial(_raised, points_of, correction_deg)
-        is_corrected = bool(known.correction_deg.any()) if known else correction_deg != 0.0
+        if number > 1:
+            angle = _measured_again(angle, points_of, graph, config)
+        corrected = partial(_raised, points_of, angle)
+        is_corrected = bool(known.correction_deg.any()) if known else _correction_deg(angle) != 0.0
         shared_within = STEPS[-1] if is_corrected else 0
         title = f"refine {number}/{config.adjustment.rounds}"
         aligned = of_drives or _submaps(graph, corrected, config).aligned
-        made = _round(graph, aligned, config, end_s, shared_within, progress, title)
+        made = _round(graph, aligned, angle, config, end_s, shared_within, progress, title)
         last = made or last
         if made is None or not made.is_complete:
             break
@@ -151,29 +150,35 @@ def adjust(
         moved_m=float(np.sqrt(np.mean(np.sum((T_after - T_before)[:, :3, 3] ** 2, axis=1)))),
         is_complete=last.is_complete,
         seconds=monotonic() - started,
-        vertical_deg=None if angle is None else angle.angle_deg,
-        vertical_sigma_deg=None if angle is None else angle.sigma_deg,
-        correction_deg=correction_deg,
+        vertical_deg=None if last.angle is None else last.angle.angle_deg,
+        vertical_sigma_deg=None if last.angle is None else last.angle.sigma_deg,
+        correction_deg=_correction_deg(last.angle),
         thickness_before_m=map_thickness_m(points_of, T_before, seen_twice),
-        thickness_m=map_thickness_m(corrected, T_after, seen_twice),
+        thickness_m=map_thickness_m(partial(_raised, points_of, last.angle), T_after, seen_twice),
     )
     return Adjusted(record, before, last.estimate)
 
 
 def _measured_again(
-    points_of: PointsOf, T_before: Poses, T_world: Poses, travel_m: Vector, correction_deg: float, config: Config
+    angle: VerticalAngle | None, points_of: PointsOf, graph: PoseGraph, config: Config
 ) -> VerticalAngle | None:
-    """The angle that leaves none after an adjustment with it, from what is left before and after one.
+    """The angle that leaves none after an adjustment with it, if that is significant, too.
 
     The motions of the odometry turn with the angle, so submaps built by them show too much of it.
     """
-    before = angle_left(points_of, T_before, travel_m, 0.0, config=config.refine)
-    after = angle_left(points_of, T_world, travel_m, correction_deg, config=config.refine)
-    return None if before is None or after is None else without_rest(before, correction_deg, after)
+    if angle is None or angle.shown is None or not angle.is_significant:
+        return angle
+    T_world, travel_m = graph.T_world_keyframes, graph.travel_m
+    again = leaving_none(angle.shown, angle.angle_deg, points_of, T_world, travel_m, config=config.refine)
+    return again if again is not None and again.is_significant else angle
 
 
-def _raised(points_of: PointsOf, angle_deg: float, keyframe_id: int) -> Points:
-    return geometry.raise_beams(points_of(keyframe_id), angle_deg)
+def _correction_deg(angle: VerticalAngle | None) -> float:
+    return 0.0 if angle is None else angle.correction_deg
+
+
+def _raised(points_of: PointsOf, angle: VerticalAngle | None, keyframe_id: int) -> Points:
+    return geometry.raise_beams(points_of(keyframe_id), _correction_deg(angle))
 
 
 def _submaps(graph: PoseGraph, points_of: PointsOf, config: Config) -> Submaps:
@@ -184,6 +189,7 @@ def _submaps(graph: PoseGraph, points_of: PointsOf, config: Config) -> Submaps:
 def _round(
     graph: PoseGraph,
     aligned: Aligned,
+    angle: VerticalAngle | None,
     config: Config,
     end_s: float,
     shared_within: int,
@@ -199,7 +205,7 @@ def _round(
     if not registered:
         return None
     estimate, noise_factors = graph.adjust(registered, shared_within=shared_within)
-    return _Round(len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
+    return _Round(angle, len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
 
 
 def register_pairs(

@@ -13,11 +13,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from segslam.core import geometry
+from segslam.core.config import Config
 from segslam.core.trajectory import Rows
 from segslam.core.types import Indices, Information, LoopCandidate, Rejected, RejectReason, Transform, Vector
 from segslam.graph import noise
 from segslam.graph.closure_pairs import Matrices, adjoints, carried
 from segslam.graph.edges import Edge, Transforms
+from segslam.registration.hypotheses import Gate
 
 Link = tuple[float, Information]
 """Length of a link, and its covariance in the world frame."""
@@ -127,3 +129,11 @@ def far_from_prior(
         return None
     away = f"{np.linalg.norm(off[3:]):.1f} m and {np.degrees(np.linalg.norm(off[:3])):.0f} degrees"
     return Rejected(RejectReason.FAR_FROM_PRIOR, f"{away} from the predicted pose, chi-square {chi2:.0f} > {bound:.0f}")
+
+
+def prior_gate(candidate: LoopCandidate, config: Config) -> Gate:
+    """Excludes poses that even a drift far beyond the noise of the odometry cannot explain."""
+    radius_m, allowance = config.proximity.base_radius_m, config.graph.error_allowance
+    return lambda T_target_source, *, slack_m: far_from_prior(
+        T_target_source, candidate, error_allowance=allowance, slack_m=radius_m + slack_m
+    )

@@ -11,10 +11,10 @@ from segslam.core.config import Config
 from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import Graph
-from segslam.graph.chains import far_from_prior
+from segslam.graph.chains import far_from_prior, prior_gate
 from segslam.graph.confirmation import Confirmation
 from segslam.keyframes import Clouds, Submaps
-from segslam.registration.hypotheses import Gate, anywhere
+from segslam.registration.hypotheses import anywhere
 from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops
 from segslam.slam.loop_edits import LoopEdits
@@ -158,7 +158,7 @@ class LoopCloser:
                 source,
                 target,
                 config=self._config,
-                gate=anywhere if is_by_hand else self._near_prior(candidate),
+                gate=anywhere if is_by_hand else prior_gate(candidate, self._config),
                 watch=own,
             )
         for stage, seconds in own.seconds.items():
@@ -169,13 +169,6 @@ class LoopCloser:
         if is_known or is_by_hand or self._is_certain(candidate, outcome.T_target_source):
             return (LoopAttempt(candidate, closure, own.seconds),)
         return self._confirmation.attempts(candidate, closure, own.seconds)
-
-    def _near_prior(self, candidate: LoopCandidate) -> Gate:
-        """Excludes poses that even a drift far beyond the noise of the odometry cannot explain."""
-        radius_m, allowance = self._config.proximity.base_radius_m, self._config.graph.error_allowance
-        return lambda T_target_source, *, slack_m: far_from_prior(
-            T_target_source, candidate, error_allowance=allowance, slack_m=radius_m + slack_m
-        )
 
     def _is_certain(self, candidate: LoopCandidate, T_target_source: Transform) -> bool:
         """True for a pose that the prior does not contradict, and that is hardly that of a place that looks the same.

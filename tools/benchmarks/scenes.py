@@ -12,7 +12,7 @@ Settings were chosen on even seeds and on seed 1; report others.
 import math
 import time
 from collections import Counter
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.types import Alignment, LoopCandidate, Rejected, Transform
-from segslam.graph.chains import far_from_prior
+from segslam.graph.chains import prior_gate
 from segslam.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.registration.hypotheses import Gate
@@ -79,14 +79,13 @@ class Judge:
         self._config = config
 
     def __call__(self, source: PreparedScan, target: PreparedScan, T_prior: Transform) -> Alignment | Rejected:
-        return register_prepared(source, target, config=self._config, gate=near(T_prior))
+        return register_prepared(source, target, config=self._config, gate=near(T_prior, self._config))
 
 
-def near(T_prior: Transform) -> Gate:
-    """The gate of a prior."""
-    sigmas = np.array([*np.radians([DRIFT_DEG] * 3), DRIFT_M, DRIFT_M, HEIGHT_M])
-    candidate = LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), np.diag(sigmas**2))
-    return partial(far_from_prior, candidate=candidate, error_allowance=1.0)
+def near(T_prior: Transform, config: Config) -> Gate:
+    """The gate of a run whose odometry errs as much as it tolerates."""
+    sigmas = np.array([*np.radians([DRIFT_DEG] * 3), DRIFT_M, DRIFT_M, HEIGHT_M]) / config.graph.error_allowance
+    return prior_gate(LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), np.diag(sigmas**2)), config)
 
 
 def prior(T_target_source: Transform, rng: np.random.Generator) -> Transform:

@@ -103,7 +103,7 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
         first, second = visits()
         T_source, T_target = here.pose(source, first), here.pose(target, second)
         T_true = geometry.inverse(T_target) @ T_source
-        prior = scenes.near(scenes.prior(T_true, rng))
+        prior = scenes.near(scenes.prior(T_true, rng), config)
         scans = here.prepared(source, first), here.prepared(target, second)
         yield Task(name, sensor, *scans, T_true, True, prior, TRUTH)
     for number, (source, target) in enumerate(scenes.false_pairs(here.scene, count, rng)):
@@ -113,7 +113,7 @@ def of_scene(name: str, sensor: str, noise_m: float, *, count: int, seed: int, c
         T_near = scenes.beside(here.scene, source, target, rng, is_same=place is here)
         T_true = geometry.inverse(here.pose(target, second)) @ place.pose(source, first)
         scans = place.prepared(source, first), here.prepared(target, second)
-        prior = scenes.near(scenes.prior(T_near, rng))
+        prior = scenes.near(scenes.prior(T_near, rng), config)
         yield Task(name, sensor, *scans, T_true if place is here else None, False, prior, TRUTH)
 
 

@@ -100,9 +100,9 @@ class Nearness:
     T_world_keyframes: Float[np.ndarray, "n 4 4"]
     covariances: Float[np.ndarray, "k 6 6"]
     distance_m: Vector
-    """Horizontal."""
+    """Horizontal distance."""
     probability: Vector
-    """That the two are within the radius; 0 on another storey."""
+    """Probability that the two are within the radius; 0 on another storey."""
     reach_m: Vector
     """Largest distance that is probably within the radius."""
 

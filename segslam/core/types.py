@@ -280,9 +280,9 @@ class LoopCandidate(Record):
     distance_m: float
     """Distance between the two positions, by the current estimate."""
     covariance: Information = field(default_factory=lambda: np.zeros((6, 6)))
-    """Of the prior, by the motions and loops between the two; zero if it is exact, or in logs of older versions."""
+    """Covariance of the prior, from the motions and loops between the two; zero if it is exact, or in older logs."""
     near_probability: float = 1.0
-    """That the two are so near each other, horizontally, that they see the same place."""
+    """Probability that the two are so near each other, horizontally, that they see the same place."""
 
     @property
     def pair(self) -> tuple[int, int]:

@@ -87,7 +87,7 @@ class AnchoredGraph:
         """As `PoseGraph.covariances`."""
         return self._graph.covariances(keyframe_id + 1, others + 1)
 
-    def agree(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
+    def consistent_with(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
         """As `add_closure`."""
         raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 

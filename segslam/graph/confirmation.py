@@ -47,8 +47,8 @@ class Confirmation:
         """
         newest = Unconfirmed(closure, candidate)
         waiting = self._waiting if self.is_waiting(closure.source_id) else []
-        agree = self._graph.agree(closure, [one.closure for one in waiting]) if waiting else ()
-        consistent = [one for one, agrees in zip(waiting, agree, strict=True) if agrees]
+        is_consistent = self._graph.consistent_with(closure, [one.closure for one in waiting]) if waiting else ()
+        consistent = [one for one, keep in zip(waiting, is_consistent, strict=True) if keep]
         sources = {one.closure.source_id for one in consistent} - {closure.source_id}
         if (
             len(sources) + 1 < MIN_CONSISTENT

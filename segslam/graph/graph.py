@@ -91,7 +91,7 @@ class PoseGraph:
         self._weights: list[float] = []
         """Weights of the closures in the last estimate."""
         self._chains: Chains | None = None
-        """Of the last estimate, continued by odometry; None before the first use."""
+        """Chains of the last estimate, continued by odometry; None before the first use."""
         self._adjusted_odometry: list[Edge] = []
         self._measured: list[Edge] = []
         """The motions and the relative poses of the last adjustment."""
@@ -200,7 +200,7 @@ class PoseGraph:
             self._chains = Chains(self.T_world_keyframes, self._kept_odometry(), kept)
         return self._chains.covariances(keyframe_id, others)
 
-    def agree(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
+    def consistent_with(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
         """(k,) which other closures are consistent with one and the odometry between their ends.
 
         None of them needs to be in the graph, but their keyframes must be.

@@ -35,7 +35,7 @@ DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 def on_thin_uprights(cells, slices, shape, core, ring, min_slices, min_share):
     """(n,) bool: whether each point belongs to a thin, tall, free-standing object.
 
-    Point k lies in column `cells[k]` of a grid of the given shape, in height slice `slices[k]`. For each occupied
+    Point k is in column `cells[k]` of a grid of the given shape, in height slice `slices[k]`. For each occupied
     column: combine the slices occupied within `core` cells, and remove those occupied between `core` and `ring` cells
     away. The remaining slices must span `min_slices` and be a share `min_share` of the slices before removal. Points
     outside the grid or the slices 0 to NUM_SLICES - 1 are ignored, as are columns within `ring` cells of the border.
@@ -123,7 +123,7 @@ def _span(mask):
 
 
 def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: float) -> Mask:
-    """(n,) bool: whether each point lies on a vertical surface, for points in a level frame.
+    """(n,) bool: whether each point is on a vertical surface, for points in a level frame.
 
     Each voxel is tested with its 8 neighbours: the standard deviation of the points perpendicular to their line must be
     below `thickness_m`, and one of the points must be higher than `min_top_m` above the ground.

@@ -86,7 +86,7 @@ class VerticalAngle:
     sigma_deg: float
     num_pairs: int
     shown: AngleShown | None = None
-    """By submaps of the scans as they are; None if it is not known."""
+    """Angle that submaps of the scans without correction show; None if it is not known."""
 
     @property
     def is_significant(self) -> bool:

@@ -92,7 +92,7 @@ class _Round(NamedTuple):
     """The pairs registered in a round before the time limit, and the solution with them."""
 
     angle: VerticalAngle | None
-    """By which the scans were corrected, if it is significant."""
+    """Angle by which the scans were corrected, if it is significant."""
     num_pairs: int
     registered: list[Edge]
     is_complete: bool

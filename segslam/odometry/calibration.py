@@ -25,7 +25,7 @@ from segslam.keyframes import KeyframeSelector
 from segslam.keyframes import downsample_keyframe as thin_keyframe
 from segslam.labels.label_files import unlabelled
 from segslam.odometry import KissOdometry, Odometry
-from segslam.registration.refinement import Surface, downsample, make_surface
+from segslam.registration.refinement import LightSurface, downsample
 
 PointsOf = Callable[[int], Points]
 """Returns the points of a keyframe, by id, in its own frame."""
@@ -39,8 +39,8 @@ REACH = 2
 MOST_APART = 1.5
 """Pairs are dropped if their straight distance is less than their travel divided by this, or more than their travel
 times this: the sensor stood still, or keyframes are missing."""
-MOST_PAIRS = 100
-"""Number of pairs measured, twice. Chosen: 10 s of one core, whatever the length of the drive."""
+MOST_PAIRS = 40
+"""Number of pairs measured, twice. Chosen: the error of the median is then a quarter of `BIAS_DEG` or less, in 3 s."""
 MIN_PAIRS = 8
 """Chosen: the scatter of fewer pairs is too uncertain."""
 MOST_TURN_RAD = math.radians(30.0)
@@ -169,7 +169,7 @@ def angle_shown(
     """The angle that pairs of submaps of corrected scans show; None if too few determine it."""
 
     @lru_cache(2)
-    def surface(keyframe_id: int) -> Surface:
+    def surface(keyframe_id: int) -> LightSurface:
         near = range(max(keyframe_id - REACH, 0), min(keyframe_id + REACH + 1, len(travel_m)))
         clouds = [
             geometry.apply(
@@ -179,7 +179,7 @@ def angle_shown(
             for one in near
             if abs(travel_m[one] - travel_m[keyframe_id]) < APART_M[0] / 2.0
         ]
-        return make_surface(downsample(np.vstack(clouds), config=config), config=config)
+        return LightSurface(downsample(np.vstack(clouds), config=config))
 
     found = []
     for target, source in _pairs(T_odom_keyframes, travel_m):
@@ -244,25 +244,26 @@ class PairAngle:
     """Standard deviation of the angle for independent errors of the points."""
 
 
-def register_with_angle(source: Surface, target: Surface, T_target_source: Transform) -> PairAngle | None:
+def register_with_angle(source: LightSurface, target: LightSurface, T_target_source: Transform) -> PairAngle | None:
     """Estimate pose and angle together, starting at an initial guess of the pose.
 
     Minimises point-to-plane distances under the Geman-McClure kernel. Returns None if too few points match, or the
     angle does not converge.
     """
-    if min(len(source.points), len(target.points)) < MIN_PAIRED:
+    if min(len(source), len(target)) < MIN_PAIRED:
         return None
-    points = source.points[_is_clear(source.normals)]
+    points = source.points[_is_clear(source.normals_at(np.arange(len(source))))]
     points = points[:: math.ceil(max(len(points), 1) / MOST_POINTS)]
-    target_is_clear = _is_clear(target.normals)
     angle_rad = 0.0
     for search_m in SEARCH_M:
         nearest, distance_m = target.nearest(geometry.apply(T_target_source, points))
-        paired = (distance_m < search_m) & target_is_clear[nearest]
-        if paired.sum() < MIN_PAIRED:
+        rows = np.flatnonzero(distance_m < search_m)
+        normals = target.normals_at(nearest[rows])
+        clear = _is_clear(normals)
+        rows, normals = rows[clear], normals[clear]
+        if len(rows) < MIN_PAIRED:
             return None
-        rows = nearest[paired]
-        step, sigma_rad = _step(points[paired], target.points[rows], target.normals[rows], T_target_source, angle_rad)
+        step, sigma_rad = _step(points[rows], target.points[nearest[rows]], normals, T_target_source, angle_rad)
         T_target_source = T_target_source @ geometry.exp(step[:6])
         angle_rad += float(step[6])
         if np.linalg.norm(step) < CONVERGED:

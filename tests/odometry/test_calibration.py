@@ -31,8 +31,8 @@ CONFIG = RefineConfig()
 LOW_DEG = 0.2
 
 
-def surface(points: np.ndarray) -> refinement.Surface:
-    return refinement.make_surface(refinement.downsample(points.astype(np.float32), config=CONFIG), config=CONFIG)
+def surface(points: np.ndarray) -> refinement.LightSurface:
+    return refinement.LightSurface(refinement.downsample(points.astype(np.float32), config=CONFIG))
 
 
 @cache

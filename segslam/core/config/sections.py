@@ -284,7 +284,11 @@ class AdjustmentConfig(Section):
         60.0, ge=0, description="time limit, after which the registrations so far are used; 0: off (minutes) [chosen]"
     )
     rounds: int = Field(
-        2, ge=1, le=5, description="number of times that submaps are built and registered [chosen on KITTI 00]"
+        2,
+        ge=1,
+        le=5,
+        description="number of times that submaps are built and registered if a vertical angle is corrected, else 1 "
+        "[chosen on KITTI 00]",
     )
 
 

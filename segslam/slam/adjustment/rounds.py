@@ -1,6 +1,7 @@
 """Adjustment of the whole map after the loops, in rounds.
 
-A round registers submaps with each other, and solves all poses; the next one builds its submaps from the result.
+A round registers submaps with each other, and solves all poses. If the vertical angle of the scans is significant, its
+result shows the angle better, and another round corrects the scans by it.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -124,7 +125,10 @@ def adjust(
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
         if number > 1:
-            angle = _measured_again(angle, points_of, graph, config)
+            again = _measured_again(angle, points_of, graph, config)
+            if again is angle:
+                break
+            angle = again
         corrected = partial(_raised, points_of, angle)
         is_corrected = bool(known.correction_deg.any()) if known else _correction_deg(angle) != 0.0
         shared_within = STEPS[-1] if is_corrected else 0

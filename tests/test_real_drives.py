@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.commands import run
 
+from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import trajectory_metrics
 from segslam.odometry import CheckedOdometry, KissOdometry
@@ -45,3 +46,25 @@ def test_a_drive_where_kiss_icp_fails_is_mapped(data_dir: Path, tmp_path: Path, 
     assert metrics["ate_m"] < ate_m
     assert metrics.get("num_loops_false", 0) == 0
     assert metrics.get("loop_recall", 1.0) >= 0.8
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize(("first", "missing"), [(100, 30), (300, 60), (450, 60), (400, 80)])
+def test_the_motion_while_scans_were_missing_is_as_wrong_as_it_says(data_dir: Path, first: int, missing: int) -> None:
+    """Metres from the last scan (a person stood still) or 50 of them, where no scan shows the same place."""
+    dataset = open_dataset(data_dir / "nclt")
+    assert dataset.reference is not None
+    config = Config()
+    odometry = CheckedOdometry(KissOdometry(config.odometry), config, recover=partial(register, config=config))
+    for row in range(first - 50, first):
+        before = odometry.register(dataset[row])
+    after = odometry.register(dataset[first + missing])
+    T_true = geometry.inverse(dataset.reference.T_world_lidar[first - 1])
+    T_true = T_true @ dataset.reference.T_world_lidar[first + missing]
+    T_found = geometry.inverse(before.T_odom_lidar) @ after.T_odom_lidar
+    assert after.motion is not None
+    assert after.motion.covariance is not None
+    error_m = T_found[:3, 3] - T_true[:3, 3]
+    sigma_m = np.sqrt(np.linalg.eigvalsh(after.motion.covariance[3:, 3:])[-1])
+    assert np.linalg.norm(error_m) < 3.0 * max(sigma_m, 0.1)

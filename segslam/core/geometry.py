@@ -159,3 +159,9 @@ def raising(points: Points) -> Points:
     horizontal = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
     x, y, z = points.T
     return np.column_stack([-z * x / horizontal, -z * y / horizontal, horizontal])
+
+
+def displacement_m(points: Points, T_a_points: Transform, T_a_other: Transform) -> float:
+    """Root mean square distance between the points (n, 3) at two poses: one figure for translation and rotation."""
+    T = inverse(T_a_other) @ T_a_points - np.eye(4)
+    return float(np.sqrt(np.mean(np.sum((points @ T[:3, :3].T + T[:3, 3]) ** 2, axis=1))))

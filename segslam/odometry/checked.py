@@ -19,15 +19,14 @@ from segslam.core.config import Config
 from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
+from segslam.odometry.kiss import RESOLUTION
 from segslam.odometry.likelihood import Fit
-from segslam.odometry.local_map import LocalMap, SeenScan, displacement_m
+from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual
 from segslam.odometry.search import PoseSearch, Recover, as_likely
 from segslam.odometry.sweep import Odometry, OdometryResult
 from segslam.registration.refinement import MIN_POINTS, SHARED_NOISE_DEG, SHARED_NOISE_M
 
-RESOLUTION = math.sqrt(1.0 / 20.0)
-"""Distance between points in KISS-ICP's map, in voxels: at most 20 points a voxel."""
 ACCURACY = 0.6
 """Chosen: accuracy of a pose as a share of the resolution of its map; half repairs thin scans of KITTI without need."""
 ELSEWHERE_M = 30.0
@@ -112,8 +111,8 @@ class CheckedOdometry:
         """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion."""
         if len(self._map) == 0 or self._num_to_watch > 0 or gap > 1.0 or self._num_unchecked >= MOST_UNCHECKED:
             return True
-        moved_m = displacement_m(scan.few, T_odom_proposed, self._map.T_odom_map)
-        sudden_m = displacement_m(scan.few, T_odom_proposed, T_odom_predicted)
+        moved_m = geometry.displacement_m(scan.few, T_odom_proposed, self._map.T_odom_map)
+        sudden_m = geometry.displacement_m(scan.few, T_odom_proposed, T_odom_predicted)
         return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._refine.voxel_m
 
     def _confirmed(self, T_odom_proposed: Transform, scan: SeenScan, gap: float) -> tuple[Transform, Motion] | None:
@@ -123,7 +122,7 @@ class CheckedOdometry:
         found = self._map.check(scan, T_map_proposed)
         if found is None:
             return None
-        moved_m = displacement_m(scan.few, found.T_map_lidar, T_map_proposed)
+        moved_m = geometry.displacement_m(scan.few, found.T_map_lidar, T_map_proposed)
         is_usual = self._usual_check.includes(found.mean_log, least_spread=found.num_patches**-0.5)
         if moved_m > self._tolerance_m or not is_usual:
             if moved_m <= self._tolerance_m:
@@ -134,7 +133,7 @@ class CheckedOdometry:
             return self._kept(T_odom_proposed, T_map_proposed, found, scan, gap, is_unsure=False)
         T_last_lidar = geometry.inverse(self._T_odom_last) @ T_odom_proposed
         T_last_fused = self._motion.fused(T_last_lidar, self._covariance(found), gap)
-        if displacement_m(scan.few, T_last_fused, T_last_lidar) > self._tolerance_m:
+        if geometry.displacement_m(scan.few, T_last_fused, T_last_lidar) > self._tolerance_m:
             return None  # the last motions say more than the scan does
         _, covariance = self._motion.update(T_last_lidar, self._covariance(found), gap)
         self._map.add(T_odom_proposed, scan)
@@ -161,6 +160,9 @@ class CheckedOdometry:
             fits = self._search.around(self._map, scan, T_map_last, T_step, fits)
         if not is_rejoined and not self._is_usual(fits):
             elsewhere = self._search.elsewhere(scan, fits)
+            untried = self._motion.may_exceed(self._search.far_m, gap)
+            if fits and untried > elsewhere:
+                elsewhere = max(elsewhere, untried * self._search.is_wrong(self._map, scan, fits[0]))
             if elsewhere * ELSEWHERE_M**2 > BREAK_M**2 or not self._motion.is_known:
                 recognised = self._search.without_guess(self._map, scan)
                 if recognised and (not fits or recognised[0].mean_log >= fits[0].mean_log):
@@ -249,7 +251,7 @@ class CheckedOdometry:
         """Name of the result; the next scans are watched after a repair."""
         is_break = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > BREAK_M**2
         is_watched = self._num_to_watch > 0
-        is_repaired = displacement_m(scan.few, T_odom_lidar, T_odom_proposed) > self._tolerance_m
+        is_repaired = geometry.displacement_m(scan.few, T_odom_lidar, T_odom_proposed) > self._tolerance_m
         self._note(is_repaired=is_repaired)
         if is_break:
             return MotionState.BROKEN

@@ -18,15 +18,9 @@ MAP_SCANS = 40
 NUM_WHOLE = 10
 """Number of the newest scans of which all points are kept, for registration without initial guess."""
 SPACING_VOXELS = 0.4
-"""Chosen: a scan nearer than this to the last one in the map (`displacement_m`) adds nothing to it."""
+"""Chosen: a scan nearer than this to the last one in the map (`geometry.displacement_m`) adds nothing to it."""
 SEARCH_VOXELS_GICP = (4.0, 1.4)
 """Chosen: search distances of GICP, in voxels."""
-
-
-def displacement_m(points: Points, T_a_points: Transform, T_a_other: Transform) -> float:
-    """Root mean square distance between the points (n, 3) at two poses: one figure for translation and rotation."""
-    T = geometry.inverse(T_a_other) @ T_a_points - np.eye(4)
-    return float(np.sqrt(np.mean(np.sum((points @ T[:3, :3].T + T[:3, 3]) ** 2, axis=1))))
 
 
 class SeenScan:
@@ -90,7 +84,7 @@ class LocalMap:
     def add(self, T_odom_lidar: Transform, scan: SeenScan) -> None:
         """Add a scan, unless it is too near to the newest one."""
         if self._scans:
-            moved_m = displacement_m(scan.few, T_odom_lidar, self.T_odom_map)
+            moved_m = geometry.displacement_m(scan.few, T_odom_lidar, self.T_odom_map)
             if moved_m < SPACING_VOXELS * self._voxel_m:
                 return
         self._scans.append((T_odom_lidar, scan.thinned))

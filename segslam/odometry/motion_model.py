@@ -5,6 +5,7 @@ measured on the last ones. Where the scans constrain the pose, the prediction ha
 a tunnel, the motion continues as before, and its covariance grows from scan to scan.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from statistics import median
@@ -99,6 +100,16 @@ class MotionModel:
         noise = np.diag(np.median(np.square(self._changes), axis=0) / CHI_SQUARE_MEDIAN)
         before = np.zeros((6, 6)) if self._covariance is None else self._covariance
         return gap**2 * (before + gap * noise)
+
+    def may_exceed(self, reach_m: float, gap: float) -> float:
+        """Probability that the motion over `gap` intervals ends farther than `reach_m` from the predicted one.
+
+        It is 0 while nothing is known of the motion.
+        """
+        prior = self._predicted_covariance(gap)
+        if prior is None:
+            return 0.0
+        return math.erfc(reach_m / math.sqrt(2.0 * float(np.linalg.eigvalsh(prior[3:, 3:])[-1])))
 
     def fused(self, T_last_lidar: Transform, measured: Information, gap: float) -> Transform:
         """The most likely motion since the last scan, given a measured one with its covariance and the prediction."""

@@ -9,8 +9,10 @@ from segslam.core import geometry
 from segslam.core.types import Alignment, Information, Points, Rejected, Transform
 from segslam.keyframes import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
-from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan, displacement_m
+from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan
 from segslam.odometry.nudge import SEARCH_VOXELS
+from segslam.registration.free_space import observe_free_space
+from segslam.verification import chance_of_wrong
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
 """Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
@@ -29,11 +31,12 @@ class PoseSearch:
         """`recover` receives the newest scans of a map, as many as have `DENSE_VOXELS`."""
         self._recover = recover
         self._same_m = SEARCH_VOXELS_GICP[-1] * voxel_m
-        self._far_m = SEARCH_VOXELS[0] * voxel_m
+        self.far_m = SEARCH_VOXELS[0] * voxel_m
+        """Distance that a registration reaches."""
 
     def is_same(self, scan: SeenScan, T_map_a: Transform, T_map_b: Transform) -> bool:
         """True if a registration from one of two poses reaches the other."""
-        return displacement_m(scan.few, T_map_a, T_map_b) < self._same_m
+        return geometry.displacement_m(scan.few, T_map_a, T_map_b) < self._same_m
 
     def near(
         self, local: LocalMap, scan: SeenScan, T_map_proposed: Sequence[Transform], known: Sequence[Fit] = ()
@@ -72,14 +75,19 @@ class PoseSearch:
         """Probability that the most likely of different poses is as wrong as those far from it; 1 without any pose."""
         if not fits:
             return 1.0
-        far = [fit for fit in fits[1:] if self._apart_m(scan, fits[0], fit) > self._far_m]
+        far = [fit for fit in fits[1:] if self._apart_m(scan, fits[0], fit) > self.far_m]
         return as_likely(far[0], fits[0]) if far else 0.0
+
+    def is_wrong(self, local: LocalMap, scan: SeenScan, best: Fit) -> float:
+        """Probability that a pose is wrong, by the score of loops, if it may be far from all that were tried."""
+        seen = observe_free_space(scan.points), observe_free_space(local.newest.points)
+        return chance_of_wrong((scan.surface, seen[0]), (local.surface(), seen[1]), best.T_map_lidar)
 
     def spread(self, scan: SeenScan, fits: Sequence[Fit]) -> Information:
         """Covariance (6, 6) of the choice between poses near the most likely one, tangent in the scan's frame."""
         covariance, total = np.zeros((6, 6)), 1.0
         for fit in fits[1:]:
-            if self._apart_m(scan, fits[0], fit) <= self._far_m:
+            if self._apart_m(scan, fits[0], fit) <= self.far_m:
                 offset = geometry.log(geometry.inverse(fits[0].T_map_lidar) @ fit.T_map_lidar)
                 weight = as_likely(fit, fits[0])
                 covariance += weight * np.outer(offset, offset)
@@ -87,7 +95,7 @@ class PoseSearch:
         return covariance / total
 
     def _apart_m(self, scan: SeenScan, one: Fit, other: Fit) -> float:
-        return displacement_m(scan.few, one.T_map_lidar, other.T_map_lidar)
+        return geometry.displacement_m(scan.few, one.T_map_lidar, other.T_map_lidar)
 
     def _different(self, scan: SeenScan, fits: Sequence[Fit]) -> list[Fit]:
         """The fits, the most likely first, without those that are near a more likely one."""

@@ -13,8 +13,8 @@ from segslam.core.types import Alignment, Labels, Registration, Rejected, Reject
 from segslam.labels import geometric_labels
 from segslam.registration import refinement
 from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Gate, anywhere, coarse_poses
-from segslam.registration.prepared import PreparedScan, prepare_scan
-from segslam.verification import score
+from segslam.registration.prepared import Observed, PreparedScan, prepare_scan
+from segslam.verification import patches, score
 from segslam.verification.rivals import differs, rivals_of
 from segslam.verification.trial import EQUAL_M, EQUAL_RAD, Found, Trial, is_near
 
@@ -138,3 +138,9 @@ def register_near(
         return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
     coarse = replace(fine, T_target_source=T_target_source, num_inliers=0, num_correspondences=0)
     return trial.judge(trial.found(coarse, fine), None)
+
+
+def chance_of_wrong(source: Observed, target: Observed, T_target_source: Transform) -> float:
+    """The probability that a pose of the source in the target is wrong, if it was found among many."""
+    counts = patches.agreement(source, target, T_target_source).counts
+    return 1.0 / (1.0 + math.exp(score.shipped().log_odds(counts)))

@@ -17,7 +17,7 @@ from segslam.graph.noise import odometry_information
 from segslam.odometry import CheckedOdometry, GivenOdometry, KissOdometry, OdometryResult, Tracker, information_of
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
-from segslam.odometry.motion_model import Intervals
+from segslam.odometry.motion_model import Intervals, MotionModel
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
 from segslam.odometry.search import PoseSearch
 from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
@@ -450,6 +450,16 @@ def test_a_given_odometry_is_kept_in_a_smooth_tunnel() -> None:
     results = _registered(CheckedOdometry(given, CONFIG, recover=partial(register, config=CONFIG)), scans)
     steps = [geometry.inverse(before.T_odom_lidar) @ after.T_odom_lidar for before, after in pairwise(results[13:])]
     np.testing.assert_allclose([T[:3, 3] for T in steps], [[STEP_M, 0.0, 0.0]] * len(steps), atol=0.05)
+
+
+def test_a_motion_may_end_far_from_the_predicted_one_after_a_gap_only() -> None:
+    model = MotionModel()
+    assert model.may_exceed(0.1, 100.0) == 0.0, "nothing is known yet"
+    steps = np.random.default_rng(0).normal(1.0, 0.02, 20)
+    for step_m in steps:
+        model.update(geometry.transform(np.eye(3), [step_m, 0.0, 0.0]), 1e-6 * np.eye(6), 1.0)
+    assert model.may_exceed(1.0, 1.0) < 1e-9
+    assert model.may_exceed(1.0, 30.0) == pytest.approx(0.8, abs=0.15), "0.04 m an interval, 30 ** 1.5 times"
 
 
 def test_an_odometry_that_reports_no_motion_is_checked_too() -> None:

@@ -33,8 +33,8 @@ ELSEWHERE_M = 30.0
 ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
 SIGNIFICANT = 0.001
-"""Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans; and the
-map before a break is not used again."""
+"""Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans; the map
+before a break is not used again; and less likely motions are not considered."""
 MOST_UNCHECKED = 9
 """Chosen: number of scans after which a sensor that seems to stand still is checked."""
 
@@ -150,7 +150,8 @@ class CheckedOdometry:
         T_odom_map = self._map.T_odom_map
         T_map_odom = geometry.inverse(T_odom_map)
         T_map_proposed, T_map_last = T_map_odom @ T_odom_proposed, T_map_odom @ self._T_odom_last
-        unsure, elsewhere = np.zeros((6, 6)), float(is_rejoined)  # the scan before is not in the map before a break
+        unsure, by_chance = np.zeros((6, 6)), 0.0
+        elsewhere = float(is_rejoined)  # the scan before is not in the map before a break
         starts = [T_map_proposed, T_map_odom @ T_odom_predicted]
         if not is_rejoined and not self._is_found(fits, starts, scan):
             starts.append(T_map_last)
@@ -159,14 +160,12 @@ class CheckedOdometry:
             T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
             fits = self._search.around(self._map, scan, T_map_last, T_step, fits)
         if not is_rejoined and not self._is_usual(fits):
-            elsewhere = self._search.elsewhere(scan, fits)
-            untried = self._motion.may_exceed(self._search.far_m, gap)
-            if fits and untried > elsewhere:
-                elsewhere = max(elsewhere, untried * self._search.is_wrong(self._map, scan, fits[0]))
+            by_chance = self._by_chance(scan, fits, gap)
+            elsewhere = max(self._search.elsewhere(scan, fits), by_chance)
             if elsewhere * ELSEWHERE_M**2 > BREAK_M**2 or not self._motion.is_known:
                 recognised = self._search.without_guess(self._map, scan)
                 if recognised and (not fits or recognised[0].mean_log >= fits[0].mean_log):
-                    fits, elsewhere = recognised, 0.0
+                    fits, elsewhere, by_chance = recognised, 0.0, 0.0
             unsure = self._search.spread(scan, fits)
         best = fits[0] if fits else self._map.fit(scan, T_map_proposed)
         self._usual_fit.note(best.mean_log)
@@ -176,7 +175,9 @@ class CheckedOdometry:
             return self._kept(T_odom_proposed, T_map_proposed, best, scan, gap, is_unsure=is_unsure)
         is_lost = elsewhere * ELSEWHERE_M**2 > BREAK_M**2 and not is_rejoined
         T_last_lidar = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_map @ best.T_map_lidar)
-        T_last_lidar, covariance = self._motion.update(T_last_lidar, self._covariance(best), gap)
+        covariance = self._covariance(best)
+        if by_chance < 0.5:  # otherwise the pose says nothing about the speed
+            T_last_lidar, covariance = self._motion.update(T_last_lidar, covariance, gap)
         T_odom_lidar, covariance = geometry.nearest_transform(self._T_odom_last @ T_last_lidar), covariance + unsure
         state = self._state(T_odom_proposed, T_odom_lidar, covariance, scan)
         if state is MotionState.CONFIRMED:
@@ -189,6 +190,14 @@ class CheckedOdometry:
             self._inner.follow(self._map.scans, T_odom_lidar, self._motion.T_step)
             self._T_odom_inner = np.eye(4)
         return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
+
+    def _by_chance(self, scan: SeenScan, fits: Sequence[Fit], gap: float) -> float:
+        """Probability that the scan is far from all poses that were tried, so that the most likely one fits by chance.
+
+        After a gap the sensor may be anywhere: the prior is that of the motion, the evidence the score of loops.
+        """
+        untried = self._motion.may_exceed(self._search.far_m, gap)
+        return untried * self._search.is_wrong(self._map, scan, fits[0]) if fits and untried > SIGNIFICANT else untried
 
     def _contradicts(self, fits: Sequence[Fit], T_map_proposed: Transform, scan: SeenScan) -> bool:
         """True if the most likely pose is significantly more likely than one at the proposed pose, or near it."""

@@ -176,7 +176,7 @@ class CheckedOdometry:
         is_lost = elsewhere * ELSEWHERE_M**2 > BREAK_M**2 and not is_rejoined
         T_last_lidar = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_map @ best.T_map_lidar)
         covariance = self._covariance(best)
-        if by_chance < 0.5:  # otherwise the pose says nothing about the speed
+        if by_chance < 0.5:  # a pose by chance does not show the speed
             T_last_lidar, covariance = self._motion.update(T_last_lidar, covariance, gap)
         T_odom_lidar, covariance = geometry.nearest_transform(self._T_odom_last @ T_last_lidar), covariance + unsure
         state = self._state(T_odom_proposed, T_odom_lidar, covariance, scan)

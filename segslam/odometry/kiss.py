@@ -109,7 +109,7 @@ class KissOdometry:
         self._is_alone, self._is_pending = True, False
         """Whether the odometry is KISS-ICP alone; whether the pose of the last scan by KISS-ICP alone is pending."""
         self._alone: list[Transform] = []
-        self._num_alike = 0
+        self._num_equal = 0
         """Number of last motions in which the odometry and KISS-ICP alone do not differ."""
         self._few = np.empty((0, 3))
         self._last_gap = 1.0
@@ -135,7 +135,7 @@ class KissOdometry:
     ) -> None:
         """Continue from another pose of the last scan, with a local map of these scans alone."""
         self._receive_alone()
-        self._is_alone, self._num_alike, self._T_odom_kiss = False, 0, np.eye(4)
+        self._is_alone, self._num_equal, self._T_odom_kiss = False, 0, np.eye(4)
         self._aligner.follow(scans, T_odom_lidar, T_before_lidar)
         self._T_odom_last, self._T_last_lidar = T_odom_lidar, T_before_lidar
 
@@ -163,8 +163,8 @@ class KissOdometry:
         self._alone.append(self._aligner.pose_alone())
         T_last_alone = self._last_motion_alone()
         apart_m = geometry.displacement_m(self._few, T_last_alone, self._T_last_lidar)
-        self._num_alike = self._num_alike + 1 if apart_m < RESOLUTION * self._config.voxel_size_m else 0
-        if self._num_alike == WINDOW:
+        self._num_equal = self._num_equal + 1 if apart_m < RESOLUTION * self._config.voxel_size_m else 0
+        if self._num_equal == WINDOW:
             self._aligner.rejoin()
             self._is_alone, self._T_last_lidar = True, T_last_alone
             self._T_odom_kiss = geometry.nearest_transform(self._T_odom_last @ geometry.inverse(self._alone[-1]))

@@ -6,8 +6,8 @@ WORDS = {
     "keyframe": "A scan that is kept, about every 2 m of travel; a node of the graph. Loops join keyframes.",
     "odometry": "The pose of every scan from the scans before it. Its error grows with the travel: drift.",
     "repair": "A motion of KISS-ICP that the scans contradict, replaced by the most likely one.",
-    "break": "A motion that no pose explains, or a pose that fits by chance after missing scans. The drive continues in "
-    "a new part, which only loops join to the old one.",
+    "break": "A motion that no pose explains, or a pose that fits by chance after missing scans. The drive continues "
+    "in a new part, which only loops join to the old one.",
     "submap": "The points of a keyframe and its neighbours, in its frame.",
     "candidate": "Two keyframes that may show the same place: near each other by the graph, or similar.",
     "prior": "The pose between the two that the graph predicts before they are registered.",

@@ -40,7 +40,7 @@ MOST_APART = 1.5
 """Pairs are dropped if their straight distance is less than their travel divided by this, or more than their travel
 times this: the sensor stood still, or keyframes are missing."""
 MOST_PAIRS = 40
-"""Number of pairs measured, twice. Chosen: the error of the median is then a quarter of `BIAS_DEG` or less, in 3 s."""
+"""Number of pairs measured, twice. Chosen: the error of the median is then a third of `BIAS_DEG` or less, in 3 s."""
 MIN_PAIRS = 8
 """Chosen: the scatter of fewer pairs is too uncertain."""
 MOST_TURN_RAD = math.radians(30.0)

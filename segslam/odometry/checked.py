@@ -197,7 +197,9 @@ class CheckedOdometry:
         After a gap the sensor may be anywhere: the prior is that of the motion, the evidence the score of loops.
         """
         untried = self._motion.may_exceed(self._search.far_m, gap)
-        return untried * self._search.is_wrong(self._map, scan, fits[0]) if fits and untried > SIGNIFICANT else untried
+        if not fits or untried < SIGNIFICANT:
+            return untried
+        return untried * self._search.chance_of_wrong(self._map, scan, fits[0])
 
     def _contradicts(self, fits: Sequence[Fit], T_map_proposed: Transform, scan: SeenScan) -> bool:
         """True if the most likely pose is significantly more likely than one at the proposed pose, or near it."""

@@ -78,7 +78,7 @@ class PoseSearch:
         far = [fit for fit in fits[1:] if self._apart_m(scan, fits[0], fit) > self.far_m]
         return as_likely(far[0], fits[0]) if far else 0.0
 
-    def is_wrong(self, local: LocalMap, scan: SeenScan, best: Fit) -> float:
+    def chance_of_wrong(self, local: LocalMap, scan: SeenScan, best: Fit) -> float:
         """Probability that a pose is wrong, by the score of loops, if it may be far from all that were tried."""
         seen = observe_free_space(scan.points), observe_free_space(local.newest.points)
         return chance_of_wrong((scan.surface, seen[0]), (local.surface(), seen[1]), best.T_map_lidar)

@@ -1,7 +1,8 @@
 import multiprocessing
 import subprocess
 import sys
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,13 +90,24 @@ def test_a_process_of_its_own_changes_nothing() -> None:
         np.testing.assert_array_equal(mine.labels, theirs.labels)
 
 
+def _by_kiss_icp(scans: list[Scan]) -> list[np.ndarray]:
+    plain = KissOdometry(ONE_THREAD)
+    found = [plain.register(scan).T_odom_lidar for scan in scans]
+    assert len(plain.alone()) == 0, "not kept unless wanted"
+    return found
+
+
+@contextmanager
+def _keeping_alone(*, apart: bool) -> Iterator[KissOdometry]:
+    with OdometryApart(ONE_THREAD, keeps_alone=True) if apart else nullcontext() as other:
+        yield other or KissOdometry(ONE_THREAD, keeps_alone=True)
+
+
 @pytest.mark.parametrize("apart", [False, True])
 def test_the_poses_of_kiss_icp_alone_are_kept_while_the_odometry_follows_others(apart: bool) -> None:
     scans = _street(8)
-    plain = KissOdometry(ONE_THREAD)
-    expected = [plain.register(scan).T_odom_lidar for scan in scans]
-    with OdometryApart(ONE_THREAD, keeps_alone=True) if apart else nullcontext() as other:
-        odometry = other or KissOdometry(ONE_THREAD, keeps_alone=True)
+    expected = _by_kiss_icp(scans)
+    with _keeping_alone(apart=apart) as odometry:
         found = []
         for number, scan in enumerate(scans):
             found.append(odometry.register(scan))
@@ -106,20 +118,17 @@ def test_the_poses_of_kiss_icp_alone_are_kept_while_the_odometry_follows_others(
             np.testing.assert_allclose(odometry.alone(), expected, atol=1e-9)
     np.testing.assert_allclose(odometry.alone(), expected, atol=1e-9)
     assert geometry.distance(geometry.inverse(found[-1].T_odom_lidar) @ expected[-1]) > 0.1
-    assert len(plain.alone()) == 0, "not kept unless wanted"
 
 
 @pytest.mark.parametrize("apart", [False, True])
 def test_kiss_icp_alone_is_the_odometry_again_when_their_motions_do_not_differ(
     apart: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its motions since then are the same, in the frame of the correction, and no scan is aligned twice."""
+    """Its motions since then are the same, in the frame of the correction."""
     monkeypatch.setattr("segslam.odometry.kiss.WINDOW", 3)
     scans = _street(12)
-    plain = KissOdometry(ONE_THREAD)
-    expected = [plain.register(scan).T_odom_lidar for scan in scans]
-    with OdometryApart(ONE_THREAD, keeps_alone=True) if apart else nullcontext() as other:
-        odometry = other or KissOdometry(ONE_THREAD, keeps_alone=True)
+    expected = _by_kiss_icp(scans)
+    with _keeping_alone(apart=apart) as odometry:
         found = []
         for number, scan in enumerate(scans):
             found.append(odometry.register(scan))

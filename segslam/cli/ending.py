@@ -122,6 +122,8 @@ def _adjustment(metrics: dict[str, Any]) -> str:
         line += f"; thickness of surfaces {before:.0f} mm before, {after:.0f} mm after"
     if "vertical_correction_deg" in metrics:
         line += f"; points raised by {metrics['vertical_correction_deg']:.2f} degrees, the measured vertical angle"
+    if "sweep_s" in metrics:
+        line += f"; points corrected for the motion within sweeps of {abs(metrics['sweep_s']):.2f} s, as measured"
     return line
 
 

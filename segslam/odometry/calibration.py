@@ -66,7 +66,8 @@ submaps, 0.02 for those of 32 beams."""
 BIAS_DEG = 0.05
 """Standard deviation added to that of the median, for what distorts surfaces otherwise: grass seems higher from afar.
 Chosen: KITTI 00 shows 0.18 of 0.205 degrees, a campus (NCLT) -0.08 of 0, simulated streets 0.07 of 0.03."""
-SIGNIFICANT_SIGMAS, SIGNIFICANT_DEG = 2.5, 0.05
+SIGNIFICANT_SIGMAS = 2.5
+"""Chosen: an angle is significant above so many standard deviations, 0.125 degrees or more."""
 
 
 class AngleShown(NamedTuple):
@@ -90,8 +91,8 @@ class VerticalAngle:
 
     @property
     def is_significant(self) -> bool:
-        """True if the angle differs from zero by more than its error, and by a relevant amount."""
-        return abs(self.angle_deg) > max(SIGNIFICANT_SIGMAS * self.sigma_deg, SIGNIFICANT_DEG)
+        """True if the angle differs from zero by more than its error."""
+        return abs(self.angle_deg) > SIGNIFICANT_SIGMAS * self.sigma_deg
 
     @property
     def correction_deg(self) -> float:

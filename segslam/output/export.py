@@ -13,9 +13,9 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from segslam.core.config import MapConfig, load_config
-from segslam.core.geometry import raise_beams
 from segslam.core.types import GraphEstimate, Indices, Keyframe, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import cannot_write, whole_file
+from segslam.output.finished import read_corrections
 from segslam.output.folder import PLACE_ON_GLOBE
 from segslam.output.log import RunLog, read_log
 from segslam.output.map.write import check_files, write_map
@@ -98,13 +98,12 @@ def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tupl
     The world of a georeferenced run is its local frame.
     """
     estimate, _ = _finished(log)
-    adjustment = log.adjustment()
-    raised_deg = 0.0 if adjustment is None else adjustment.correction_deg
+    corrections = read_corrections(log, len(estimate.T_world_keyframe))
     num_gathered = 0
     for row, step in enumerate(show(log.steps(), log.num_steps(), "gather")):
         if step.keyframe is not None:
             num_gathered += 1
-            points = raise_beams(step.keyframe.points, raised_deg)
+            points = corrections[step.keyframe.id](step.keyframe.points)
             T_world_keyframe = estimate.T_world_keyframe[step.keyframe.id] if globe is None else globe.T_enu_lidar[row]
             yield replace(step.keyframe, points=points), T_world_keyframe
     if num_gathered < len(estimate.T_world_keyframe):

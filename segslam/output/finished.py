@@ -14,6 +14,7 @@ from segslam.core.trajectory import PoseFile, lidar_from_camera, read_poses, row
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log
+from segslam.slam.adjustment import Correction, corrections_of, velocities_of
 from segslam.slam.slam import SlamResult
 
 STAMP_TOLERANCE_NS = 10_000_000
@@ -52,6 +53,9 @@ FIGURES = {
     "vertical_deg": "remaining error of the vertical angles; positive: points are too low (degrees)",
     "vertical_sigma_deg": "standard deviation of this error (degrees)",
     "vertical_correction_deg": "elevation added to all points for the adjustment and the map (degrees)",
+    "sweep_s": "duration of a sweep; the motion within it is corrected for the adjustment and the map (s; negative: "
+    "clockwise)",
+    "sweep_sigma_s": "standard deviation of this duration (s)",
     "map_thickness_before_m": "thickness of surfaces in the map before the adjustment (m)",
     "map_thickness_m": "thickness of surfaces in the map: median standard deviation about local planes (m)",
     "num_submap_pairs": "pairs of submaps registered for the adjustment",
@@ -217,3 +221,13 @@ def _result(log: RunLog) -> SlamResult:
     return SlamResult(
         trajectory, odometry, estimate, np.array(keyframe_rows), (*attempts, *late), tuple(motions), len(late)
     )
+
+
+def read_corrections(log: RunLog, num_keyframes: int) -> list[Correction]:
+    """The corrections of the points of the keyframes, by the adjustment of the run. Raises as `read_run`."""
+    adjustment = log.adjustment()
+    if adjustment is None or adjustment.sweep is None:
+        return [Correction(0.0 if adjustment is None else adjustment.correction_deg)] * num_keyframes
+    result = _result(log)
+    velocities = velocities_of(result.odometry, result.keyframe_rows, result.motions)
+    return corrections_of(adjustment.correction_deg, adjustment.sweep, velocities)

@@ -35,7 +35,7 @@ from segslam.labels.label_files import computed
 from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
 from segslam.odometry import Tracked as Tracked
 from segslam.registration.prepared import Labeller
-from segslam.slam.adjustment import Adjusted, Known, Progress, adjust, no_progress
+from segslam.slam.adjustment import Adjusted, Known, Progress, Velocities, adjust, no_progress, velocities_of
 from segslam.slam.loop_edits import LoopEdits
 from segslam.slam.loops import NO_EDITS, ROUNDS, LoopCloser
 from segslam.slam.slam_result import SlamResult as SlamResult
@@ -168,13 +168,13 @@ class Slam:
             raise ValueError("no scan was processed")
         self._is_finished = True
         estimate, late = self._settle(monotonic() + search_s)
-        adjusted = self._adjust(estimate, progress)
         odometry = Trajectory(
             scan_index=np.array([index for index, _, _ in self._steps]),
             stamp_ns=self._stamps(),
             T_world_lidar=np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]),
         )
         rows = np.array(self._keyframe_rows)
+        adjusted = self._adjust(estimate, velocities_of(odometry, rows, self._motions), progress)
         T_world_lidar = corrected_poses(
             odometry.T_world_lidar,
             rows,
@@ -200,7 +200,7 @@ class Slam:
         poses = self._tracker.alone()[: len(odometry)]  # tracking may be ahead when a run is stopped
         return replace(odometry, T_world_lidar=np.stack(poses)) if len(poses) == len(odometry) else None
 
-    def _adjust(self, estimate: GraphEstimate, progress: Progress) -> Adjusted | None:
+    def _adjust(self, estimate: GraphEstimate, velocities: Velocities, progress: Progress) -> Adjusted | None:
         """The adjustment of the whole map; None if it is off, or for a graph in the frame of an existing map."""
         if not isinstance(self.graph, PoseGraph):
             return None
@@ -208,7 +208,15 @@ class Slam:
         def points_of(keyframe_id: int) -> Points:
             return self._clouds.cloud(keyframe_id)[0]
 
-        return adjust(self.graph, estimate, points_of, config=self.config, known=self._known, progress=progress)
+        return adjust(
+            self.graph,
+            estimate,
+            points_of,
+            velocities,
+            config=self.config,
+            known=self._known,
+            progress=progress,
+        )
 
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         """The final estimate, after a second search for loops with better poses; and the attempts of that search.

@@ -150,7 +150,7 @@ def test_scans_of_one_place_do_not_determine_the_angle() -> None:
     ("metrics", "applied_deg", "expected"),
     [
         ({}, None, ""),
-        ({"vertical_deg": 0.04, "vertical_sigma_deg": 0.01}, None, ""),
+        ({"vertical_deg": 0.12, "vertical_sigma_deg": 0.05}, None, ""),
         ({"vertical_deg": 0.15, "vertical_sigma_deg": 0.07}, None, ""),
         (
             {"vertical_deg": 0.15, "vertical_sigma_deg": 0.03},

@@ -1,5 +1,6 @@
 """Alignments of submaps that are kept in files, and what they depend on."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,12 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.types import SegslamError
 from segslam.run.fleets.alignments import Alignments, Part, part_of, read_alignments, write_alignments
+from segslam.slam.adjustment import Adjustment
 from segslam.slam.adjustment.alignment import Alignment
 from segslam.slam.adjustment.known import Guess
 
 RNG = np.random.default_rng(5)
+FOUND = Adjustment(9, 8, 0, 1.0, 1.0, 0.2, True, 1.0, sweep_s=0.1, sweep_sigma_s=0.002, sweep_from_deg=180.0)
 GUESS: Guess = (0, 0, 314, 4, -1, 0)
 MONDAY, FRIDAY = Part("monday", "key of monday", 10), Part("friday", "key of friday", 20)
 
@@ -83,13 +86,15 @@ def test_the_key_of_a_drive_contains_recording_settings_poses_and_correction() -
     moved[2, 0, 3] += 1e-9
     settings = RefineConfig()
     parts = [
-        part_of("monday", "key", poses, 0.0, config=settings),
-        part_of("monday", "key of another version", poses, 0.0, config=settings),
-        part_of("monday", "key", moved, 0.0, config=settings),
-        part_of("monday", "key", poses, 0.1, config=settings),
-        part_of("monday", "key", poses, 0.0, config=settings.model_copy(update={"voxel_m": 0.7})),
+        part_of("monday", "key", poses, FOUND, config=settings),
+        part_of("monday", "key of another version", poses, FOUND, config=settings),
+        part_of("monday", "key", moved, FOUND, config=settings),
+        part_of("monday", "key", poses, None, config=settings),
+        part_of("monday", "key", poses, replace(FOUND, correction_deg=0.1), config=settings),
+        part_of("monday", "key", poses, replace(FOUND, sweep_s=0.05), config=settings),
+        part_of("monday", "key", poses, FOUND, config=settings.model_copy(update={"voxel_m": 0.7})),
     ]
-    assert parts[0] == part_of("monday", "key", poses.copy(), 0.0, config=RefineConfig())
+    assert parts[0] == part_of("monday", "key", poses.copy(), replace(FOUND), config=RefineConfig())
     assert len({part.key for part in parts}) == len(parts)
 
 

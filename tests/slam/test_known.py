@@ -10,13 +10,14 @@ from segslam.core.points import voxel_first
 from segslam.core.types import Transform
 from segslam.graph import PoseGraph
 from segslam.odometry.calibration import VerticalAngle
-from segslam.slam.adjustment import Known, adjust
+from segslam.slam.adjustment import Correction, Known, Velocities, adjust
 from segslam.slam.adjustment.alignment import Alignment
 from segslam.slam.adjustment.known import STEP_M, STEP_RAD, Compute, Guess, rounded, transform_of
 
 RNG = np.random.default_rng(2)
 NUM, STEP = 24, 2.0
 X_M = np.arange(NUM) * STEP - NUM * STEP / 2
+STILL = Velocities(np.zeros((NUM, 6)), 0.1)
 T_TRUE = np.array([geometry.transform(np.eye(3), [x_m, 0.0, 0.0]) for x_m in X_M])
 
 
@@ -58,8 +59,8 @@ def test_kept_alignments_are_used_again_and_give_the_same_poses() -> None:
     found: list[np.ndarray] = []
     for bend_deg in (0.02, 0.02, 0.021):
         made, before = _graph(bend_deg), len(num_computed)
-        known = Known(T_TRUE, np.zeros(NUM), None, keep)
-        result = adjust(made, made.finish(), _points, config=Config(), known=known)
+        known = Known(T_TRUE, [Correction()] * NUM, None, None, keep)
+        result = adjust(made, made.finish(), _points, STILL, config=Config(), known=known)
         assert result is not None
         assert result.record.vertical_deg is None, "it is not measured again"
         found.append(made.T_world_keyframes.copy())
@@ -83,7 +84,7 @@ def test_submaps_are_built_by_the_poses_of_the_drives_and_with_their_corrections
 
     sources = []
     for correction_deg in (0.0, 0.2):
-        known = Known(T_TRUE, np.full(NUM, correction_deg), angle, exact)
+        known = Known(T_TRUE, [Correction(correction_deg)] * NUM, angle, None, exact)
         aligned = known.aligned(_points, STEP * np.arange(NUM), config=Config().refine)
         found = aligned(4, 9, geometry.inverse(T_TRUE[4]) @ T_TRUE[9])
         assert found is not None

@@ -11,12 +11,13 @@ from segslam.core.config import Config
 from segslam.core.points import voxel_first
 from segslam.core.types import Alignment, LoopClosure, Registration
 from segslam.graph import PoseGraph
-from segslam.slam.adjustment import Adjusted, adjust
+from segslam.slam.adjustment import Adjusted, Velocities, adjust
 
 STEP_M = 2.0
 NUM = 40
 CONFIG = Config()
 TRUE_M = np.arange(NUM) * STEP_M - NUM * STEP_M / 2
+STILL = Velocities(np.zeros((NUM, 6)), 0.1)
 T_TRUE = np.array([geometry.transform(np.eye(3), [x_m, 0.0, 0.0]) for x_m in TRUE_M])
 
 
@@ -41,7 +42,7 @@ def graph(*, pitch_deg: float = 0.02) -> PoseGraph:
 def straightened() -> tuple[PoseGraph, Adjusted | None]:
     """The adjusted graph of the bent drive; only read."""
     made = graph()
-    return made, adjust(made, made.finish(), points, config=CONFIG)
+    return made, adjust(made, made.finish(), points, STILL, config=CONFIG)
 
 
 def error_m(made: PoseGraph) -> float:
@@ -65,7 +66,7 @@ def test_submaps_straighten_a_bent_drive_and_its_surfaces_become_thinner() -> No
 
 def test_low_beams_are_measured_and_do_not_bend_the_drive() -> None:
     made = graph(pitch_deg=0.0)
-    found = adjust(made, made.finish(), lambda keyframe_id: points(keyframe_id, 0.2), config=CONFIG)
+    found = adjust(made, made.finish(), lambda keyframe_id: points(keyframe_id, 0.2), STILL, config=CONFIG)
     assert found is not None
     assert found.record.correction_deg == pytest.approx(0.2, abs=0.03)
     assert error_m(made) < 0.05
@@ -74,7 +75,7 @@ def test_low_beams_are_measured_and_do_not_bend_the_drive() -> None:
 @pytest.mark.slow
 def test_the_adjustment_repeats_exactly() -> None:
     again = graph()
-    adjust(again, again.finish(), points, config=CONFIG)
+    adjust(again, again.finish(), points, STILL, config=CONFIG)
     np.testing.assert_array_equal(again.T_world_keyframes, straightened()[0].T_world_keyframes)
 
 
@@ -89,7 +90,7 @@ def test_one_wrong_loop_left_in_does_no_more_harm_than_without_the_adjustment() 
         made = graph(pitch_deg=0.005)
         made.add_closure(closure)
         config = CONFIG.model_copy(update={"adjustment": CONFIG.adjustment.model_copy(update={"max_minutes": minutes})})
-        adjust(made, made.finish(), points, config=config)
+        adjust(made, made.finish(), points, STILL, config=config)
         errors.append(error_m(made))
     assert errors[1] <= 1.02 * errors[0]
 
@@ -99,10 +100,10 @@ def test_no_time_leaves_the_graph_unchanged() -> None:
     before = made.finish()
     off = CONFIG.model_copy(update={"adjustment": CONFIG.adjustment.model_copy(update={"max_minutes": 0.0})})
     T_before = made.T_world_keyframes.copy()
-    assert adjust(made, before, points, config=off) is None
+    assert adjust(made, before, points, STILL, config=off) is None
     np.testing.assert_array_equal(made.T_world_keyframes, T_before)
 
 
 def test_keyframes_without_points_are_not_adjusted() -> None:
     made = graph()
-    assert adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), config=CONFIG) is None
+    assert adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), STILL, config=CONFIG) is None

@@ -11,6 +11,7 @@ from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import SegslamError
 from segslam.run.fleets.drives import key_of
+from segslam.slam.adjustment import Adjustment
 from segslam.slam.adjustment.alignment import Alignment
 from segslam.slam.adjustment.known import Compute, Guess
 
@@ -37,11 +38,14 @@ class Part(NamedTuple):
     num_keyframes: int
 
 
-def part_of(name: str, drive_key: str, T_own_keyframe: Poses, correction_deg: float, *, config: RefineConfig) -> Part:
-    """A drive with the key of its submaps: of the recording and its settings, of the poses and the correction that
+def part_of(
+    name: str, drive_key: str, T_own_keyframe: Poses, adjustment: Adjustment | None, *, config: RefineConfig
+) -> Part:
+    """A drive with the key of its submaps: of the recording and its settings, of the poses and the corrections that
     its own run found, and of the settings of the component."""
     poses = hashlib.sha256(T_own_keyframe.tobytes()).hexdigest()
-    key = key_of(drive_key, poses, correction_deg, config.model_dump())
+    corrections = None if adjustment is None else (adjustment.correction_deg, adjustment.sweep)
+    key = key_of(drive_key, poses, corrections, config.model_dump())
     return Part(name, key, len(T_own_keyframe))
 
 

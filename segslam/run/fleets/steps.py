@@ -190,7 +190,7 @@ def join(
             merged = arranged(sessions, poses, same_reference=same_reference)
             config = sessions[0].run.config
             parts = [
-                part_of(drive.name, drive.key, one.T_world_keyframe, one.correction_deg, config=config.refine)
+                part_of(drive.name, drive.key, one.T_world_keyframe, one.adjustment, config=config.refine)
                 for drive, one in zip(drives, sessions, strict=True)
             ]
             kept = Alignments(fleet / ALIGNMENTS, parts)

@@ -21,10 +21,12 @@ from segslam.core.types import (
 )
 from segslam.odometry import information_of
 from segslam.odometry.calibration import MIN_PAIRS, VerticalAngle
-from segslam.output.finished import FinishedRun, read_run
+from segslam.output.finished import FinishedRun, read_corrections, read_run
 from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
-from segslam.slam.adjustment.known import Kept, Known, nothing_kept
+from segslam.slam.adjustment import Adjustment, Known
+from segslam.slam.adjustment.correction import common_sweep
+from segslam.slam.adjustment.known import Kept, nothing_kept
 
 GAP_NS = 1_000_000_000
 """Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
@@ -51,16 +53,17 @@ class Session:
         return str(self.run.folder)
 
     @property
-    def correction_deg(self) -> float:
-        """Elevation that the run's own adjustment added to all points."""
-        return float(self.run.metrics.get("vertical_correction_deg", 0.0))
+    def adjustment(self) -> Adjustment | None:
+        """The run's own adjustment."""
+        return self.log.adjustment()
 
 
 def known_of(sessions: Sequence[Session], kept: Kept = nothing_kept) -> Known:
     """The results of the sessions' own adjustments, for all of them together."""
-    corrections = [np.full(len(session.travel_m), session.correction_deg) for session in sessions]
     poses = np.concatenate([session.T_world_keyframe for session in sessions])
-    return Known(poses, np.concatenate(corrections), _angle(sessions), kept)
+    corrections = [one for each in sessions for one in read_corrections(each.log, len(each.travel_m))]
+    sweeps = [None if one.adjustment is None else one.adjustment.sweep for one in sessions]
+    return Known(poses, corrections, _angle(sessions), common_sweep(sweeps), kept)
 
 
 def _angle(sessions: Sequence[Session]) -> VerticalAngle | None:

@@ -5,12 +5,13 @@ under the Geman-McClure kernel, which is wide at first and then as wide as surfa
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from segslam.core import geometry
 from segslam.core.kernels import kernel
-from segslam.core.types import Information, Transform, Vector
+from segslam.core.types import Information, Points, Transform, Vector
 from segslam.registration.refinement import LightSurface
 
 SEARCH_M = (1.0, 0.8, 0.7)
@@ -59,12 +60,40 @@ def align(source: LightSurface, target: LightSurface, T_target_source: Transform
     return Alignment(T_target_source, fit.hessian / fit.variance, fit.num / len(fit.points))
 
 
+class Pairs(NamedTuple):
+    """The pairs of points of an alignment: of source and target, each in its own frame."""
+
+    source: Points
+    target: Points
+    normals: Points
+    """Normals of the target."""
+    normals_source: Points
+    """The same normals in the frame of the source."""
+    residual_m: Vector
+    weights: Vector
+
+
+def pairs_of(source: LightSurface, target: LightSurface, T_target_source: Transform) -> Pairs:
+    """The pairs of points at the pose of an alignment, as its last steps choose and weigh them."""
+    fit = _Fit(source, target)
+    moved = geometry.apply(T_target_source, fit.points)
+    nearest, distance_m = target.nearest(moved)
+    normals = target.normals_at(nearest)
+    normals_source = normals @ T_target_source[:3, :3]
+    same = np.abs(np.einsum("ij,ij->i", normals_source, fit.normals)) >= SAME_NORMAL
+    rows = np.flatnonzero(same & (distance_m < SEARCH_M[-1]))
+    points = target.points[nearest[rows]]
+    residual_m = np.einsum("ij,ij->i", moved[rows] - points, normals[rows])
+    weights = (1.0 + (residual_m / KERNEL_M[-1]) ** 2) ** -2
+    return Pairs(fit.points[rows], points, normals[rows], normals_source[rows], residual_m, weights)
+
+
 class _Fit:
     """Steps of Gauss and Newton for one pair, and the system of the last of them."""
 
     def __init__(self, source: LightSurface, target: LightSurface) -> None:
         rows = np.arange(0, len(source), max(1, -(-len(source) // MOST_POINTS)))
-        self.points, self._normals = source.points[rows], source.normals_at(rows)
+        self.points, self.normals = source.points[rows], source.normals_at(rows)
         self._target = target
 
     def step(self, T_target_source: Transform, iteration: int) -> Vector | None:
@@ -75,7 +104,7 @@ class _Fit:
         rows = nearest[paired]
         self.hessian, gradient, squares, weights, self.num = _normal_equations(
             self.points[paired],
-            self._normals[paired],
+            self.normals[paired],
             target.points[rows],
             target.normals_at(rows),
             np.ascontiguousarray(T_target_source),

@@ -5,7 +5,7 @@ of two of them depends on the initial guess only. The guess is rounded, so that 
 where the poses of the drives, all together, moved a little.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,9 +14,10 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import Points, Transform, Vector
+from segslam.core.types import Transform, Vector
 from segslam.odometry.calibration import VerticalAngle
 from segslam.slam.adjustment.alignment import Alignment
+from segslam.slam.adjustment.correction import Correction, Sweep, corrected_by
 from segslam.slam.adjustment.submaps import Aligned, PointsOf, Submaps
 
 Guess = tuple[int, int, int, int, int, int]
@@ -40,19 +41,18 @@ class Known:
 
     T_own_keyframe: Poses
     """Poses, each in the world of its own drive."""
-    correction_deg: Vector
-    """(n,) elevation that is added to the points of each keyframe."""
+    corrections: Sequence[Correction]
+    """Of the points of each keyframe."""
     angle: VerticalAngle | None
     """Vertical angle of the scans of all drives together; None if it was measured in no drive."""
+    sweep: Sweep | None = None
+    """Sweep of the scans of all drives together; None if not all have one, or not the same."""
     kept: Kept = nothing_kept
 
     def aligned(self, points_of: PointsOf, travel_m: Vector, *, config: RefineConfig) -> Aligned:
         """Aligns submaps that are built by the poses of their own drives, from rounded initial guesses."""
 
-        def raised(keyframe_id: int) -> Points:
-            return geometry.raise_beams(points_of(keyframe_id), float(self.correction_deg[keyframe_id]))
-
-        submaps = Submaps(raised, self.T_own_keyframe, travel_m, config=config)
+        submaps = Submaps(corrected_by(self.corrections, points_of), self.T_own_keyframe, travel_m, config=config)
 
         def aligned(target_id: int, source_id: int, T_target_source: Transform) -> Alignment | None:
             guess = rounded(T_target_source)

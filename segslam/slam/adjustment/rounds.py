@@ -1,12 +1,12 @@
 """Adjustment of the whole map after the loops, in rounds.
 
-A round registers submaps with each other, and solves all poses. If the vertical angle of the scans is significant, its
+If the points of sweeps were not moved to one time, they are corrected by the motion of the sensor first (`sweeps`). A
+round registers submaps with each other, and solves all poses. If the vertical angle of the scans is significant, its
 result shows the angle better, and another round corrects the scans by it.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import takewhile
 from time import monotonic
 from typing import Any, NamedTuple
@@ -16,12 +16,14 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import GraphEstimate, IndexPairs, Points, Record
+from segslam.core.types import GraphEstimate, IndexPairs, Mask, Record, Vector
 from segslam.graph import Edge, PoseGraph
 from segslam.odometry.calibration import VerticalAngle, leaving_none, measure_vertical_angle
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
+from segslam.slam.adjustment.correction import Sweep, Velocities, corrected_by, corrections_of
 from segslam.slam.adjustment.known import Known
 from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, PointsOf, Submaps, all_pairs
+from segslam.slam.adjustment.sweeps import measure_sweep
 from segslam.slam.adjustment.thickness import map_thickness_m
 
 SHARE = min(1.0, EVERY / (2 * REACH + 1))
@@ -56,10 +58,23 @@ class Adjustment(Record):
     vertical_sigma_deg: float | None = None
     correction_deg: float = 0.0
     """Elevation added to all points of the keyframes, for the adjustment and for the map; 0 if not significant."""
+    sweep_s: float | None = None
+    """Duration of a sweep within which the sensor moved, and which is corrected in the points of the keyframes, for the
+    adjustment and for the map; negative if the beams turn clockwise. None if not significant."""
+    sweep_sigma_s: float | None = None
+    sweep_from_deg: float | None = None
+    """Azimuth at which such a sweep begins."""
     thickness_before_m: float | None = None
     """Thickness of surfaces in the map (`thickness`) before the adjustment; None if no surface was seen twice."""
     thickness_m: float | None = None
     """The same after it."""
+
+    @property
+    def sweep(self) -> Sweep | None:
+        """The sweep that is corrected."""
+        if self.sweep_s is None or self.sweep_sigma_s is None or self.sweep_from_deg is None:
+            return None
+        return Sweep(self.sweep_s, self.sweep_sigma_s, self.sweep_from_deg)
 
     def figures(self) -> dict[str, float]:
         """The figures of `metrics.json`; unknown ones are omitted. The vertical angle is that left in the scans."""
@@ -67,6 +82,8 @@ class Adjustment(Record):
             "vertical_deg": self.vertical_deg,
             "vertical_sigma_deg": self.vertical_sigma_deg,
             "vertical_correction_deg": self.correction_deg or None,
+            "sweep_s": self.sweep_s,
+            "sweep_sigma_s": self.sweep_sigma_s,
             "map_thickness_before_m": self.thickness_before_m,
             "map_thickness_m": self.thickness_m,
             "num_submap_pairs": self.num_registered,
@@ -105,6 +122,7 @@ def adjust(
     graph: PoseGraph,
     before: GraphEstimate,
     points_of: PointsOf,
+    velocities: Velocities,
     *,
     config: Config,
     known: Known | None = None,
@@ -112,55 +130,71 @@ def adjust(
 ) -> Adjusted | None:
     """Adjust the poses of a graph after its last optimisation, whose result is `before`.
 
-    `known`: the results of the drives' own adjustments, for several drives. Returns None, and changes nothing, if the
-    adjustment is off or no pair of submaps could be registered.
+    `velocities`: of the sensor at the keyframes. `known`: the results of the drives' own adjustments, for several
+    drives. Returns None, and changes nothing, if the adjustment is off or no pair of submaps could be registered.
     """
     started = monotonic()
     end_s = started + 60.0 * config.adjustment.max_minutes
     if started >= end_s:
         return None
-    T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
-    angle = known.angle if known else measure_vertical_angle(points_of, T_before, travel_m, config=config.refine)
-    of_drives = known.aligned(points_of, travel_m, config=config.refine) if known else None
+    refine, T_before, travel_m = config.refine, graph.T_world_keyframes.copy(), graph.travel_m
+    of_drives = known.aligned(points_of, travel_m, config=refine) if known else None
+    sweep = known.sweep if known else measure_sweep(points_of, T_before, travel_m, velocities, config=refine)
+    straight_of = corrected_by(corrections_of(0.0, sweep, velocities), points_of)
+    angle = known.angle if known else measure_vertical_angle(straight_of, T_before, travel_m, config=refine)
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
         if number > 1:
-            again = _measured_again(angle, points_of, graph, config)
+            again = _measured_again(angle, straight_of, graph, config)
             if again is angle:
                 break
             angle = again
-        corrected = partial(_raised, points_of, angle)
-        is_corrected = bool(known.correction_deg.any()) if known else _correction_deg(angle) != 0.0
-        shared_within = STEPS[-1] if is_corrected else 0
+        corrections = known.corrections if known else corrections_of(_correction_deg(angle), sweep, velocities)
+        shared_within = STEPS[-1] if any(one.raised_deg for one in corrections) else 0
         title = f"refine {number}/{config.adjustment.rounds}"
-        aligned = of_drives or _submaps(graph, corrected, config).aligned
+        corrected_of = corrected_by(corrections, points_of)
+        aligned = of_drives or Submaps(corrected_of, graph.T_world_keyframes.copy(), travel_m, config=refine).aligned
         made = _round(graph, aligned, angle, config, end_s, shared_within, progress, title)
         last = made or last
         if made is None or not made.is_complete:
             break
     if last is None:
         return None
-    T_after = graph.T_world_keyframes
-    ends = np.array([(edge.a, edge.b) for edge in last.registered])
-    is_between = np.diff(travel_m[ends], axis=1)[:, 0] >= config.proximity.min_travel_m
-    apart = np.diff(ends, axis=1)[:, 0]
-    seen_twice = ends[is_between if is_between.any() else apart == apart.max()]
+    of_map = corrected_by(corrections_of(_correction_deg(last.angle), sweep, velocities), points_of)
+    seen_twice = _seen_twice(last.registered, travel_m, config.proximity.min_travel_m)
+    moved_m = (graph.T_world_keyframes - T_before)[:, :3, 3]
     record = Adjustment(
         num_pairs=last.num_pairs,
         num_registered=len(last.registered),
-        num_between_passes=int(is_between.sum()),
+        num_between_passes=int(_is_between(last.registered, travel_m, config.proximity.min_travel_m).sum()),
         odometry_noise_factor=last.noise_factors[0],
         noise_factor=last.noise_factors[1],
-        moved_m=float(np.sqrt(np.mean(np.sum((T_after - T_before)[:, :3, 3] ** 2, axis=1)))),
+        moved_m=float(np.sqrt(np.mean(np.sum(moved_m**2, axis=1)))),
         is_complete=last.is_complete,
         seconds=monotonic() - started,
         vertical_deg=None if last.angle is None else last.angle.angle_deg,
         vertical_sigma_deg=None if last.angle is None else last.angle.sigma_deg,
         correction_deg=_correction_deg(last.angle),
+        sweep_s=None if sweep is None else sweep.seconds,
+        sweep_sigma_s=None if sweep is None else sweep.sigma_s,
+        sweep_from_deg=None if sweep is None else sweep.from_deg,
         thickness_before_m=map_thickness_m(points_of, T_before, seen_twice),
-        thickness_m=map_thickness_m(partial(_raised, points_of, last.angle), T_after, seen_twice),
+        thickness_m=map_thickness_m(of_map, graph.T_world_keyframes, seen_twice),
     )
     return Adjusted(record, before, last.estimate)
+
+
+def _is_between(registered: Sequence[Edge], travel_m: Vector, min_travel_m: float) -> Mask:
+    """(k,) True for edges between different passes of a place."""
+    return np.array([abs(travel_m[edge.b] - travel_m[edge.a]) >= min_travel_m for edge in registered])
+
+
+def _seen_twice(registered: Sequence[Edge], travel_m: Vector, min_travel_m: float) -> IndexPairs:
+    """(k, 2) keyframes that see the same surfaces from different passes, or else from farthest apart."""
+    ends = np.array([(edge.a, edge.b) for edge in registered])
+    is_between = _is_between(registered, travel_m, min_travel_m)
+    apart = np.diff(ends, axis=1)[:, 0]
+    return ends[is_between if is_between.any() else apart == apart.max()]
 
 
 def _measured_again(
@@ -179,15 +213,6 @@ def _measured_again(
 
 def _correction_deg(angle: VerticalAngle | None) -> float:
     return 0.0 if angle is None else angle.correction_deg
-
-
-def _raised(points_of: PointsOf, angle: VerticalAngle | None, keyframe_id: int) -> Points:
-    return geometry.raise_beams(points_of(keyframe_id), _correction_deg(angle))
-
-
-def _submaps(graph: PoseGraph, points_of: PointsOf, config: Config) -> Submaps:
-    """Submaps by the current poses."""
-    return Submaps(points_of, graph.T_world_keyframes.copy(), graph.travel_m, config=config.refine)
 
 
 def _round(

@@ -12,8 +12,8 @@ from segslam.cli.console import Terminal
 from segslam.cli.options import ScanOptions, Settings
 
 if TYPE_CHECKING:
-    from segslam.odometry.calibration import Calibrator, VerticalAngle
     from segslam.scans import Dataset
+    from segslam.slam.adjustment.vertical_angle import Calibrator, VerticalAngle
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ def calibrate(
     check_exists(data, "give the folder with sequences/ or with the scans")
     settings = changes.load()
     terminal.announce(f"calibrate: opening {data}")
-    from segslam.odometry.calibration import Calibrator
+    from segslam.slam.adjustment.vertical_angle import Calibrator
 
     opened = scans.source(data, vertical_angle_deg=settings.sensor.vertical_angle_deg).open()
     calibrator = Calibrator(settings)
@@ -74,7 +74,7 @@ def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, Any
 
 
 def _summary(found: "VerticalAngle | None", applied_deg: float, travel_m: float) -> str:
-    from segslam.odometry.calibration import APART_M, MIN_PAIRS, described
+    from segslam.slam.adjustment.vertical_angle import APART_M, MIN_PAIRS, described
 
     if found is None:
         return (

@@ -37,7 +37,7 @@ def finish(
 
     `stopped`: Ctrl-C ended the run, before the last scan if there is one.
     """
-    from segslam.odometry.calibration import vertical_angle_advice
+    from segslam.slam.adjustment.vertical_angle import vertical_angle_advice
 
     terminal.say(f"{'Ctrl-C: stopped' if stopped else 'all scans read'}; final optimisation ...")
     metrics, placed = run.complete(

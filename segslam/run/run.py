@@ -29,7 +29,6 @@ from segslam.core.types import (
 )
 from segslam.core.whole_files import write_whole
 from segslam.graph import PoseGraph
-from segslam.odometry.calibration import measure_vertical_angle
 from segslam.output.accuracy import accuracy
 from segslam.output.finished import read_metrics
 from segslam.output.folder import (
@@ -49,6 +48,7 @@ from segslam.output.log import LogWriter, Mirror, RunLog, read_log
 from segslam.output.log.drawing import CloudOf
 from segslam.scans import Dataset
 from segslam.slam.adjustment import Progress, no_progress
+from segslam.slam.adjustment.vertical_angle import measure_vertical_angle
 from segslam.slam.slam import Slam, SlamResult, Tracked
 
 logger = logging.getLogger(__name__)

@@ -15,6 +15,7 @@ from segslam.core.trajectory import write_kitti
 from segslam.core.types import Trajectory
 from segslam.odometry import GivenOdometry
 from segslam.output.log import read_log
+from segslam.slam.adjustment import vertical_angle
 
 PLACES_M = np.arange(-40.0, 41.0, 2.5)
 POSES = np.array([geometry.transform(np.eye(3), [x_m, 0.0, 0.0]) for x_m in PLACES_M])
@@ -34,7 +35,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def given(monkeypatch: pytest.MonkeyPatch) -> None:
     """The true poses instead of KISS-ICP, which detects no motion between smooth walls."""
     truth = Trajectory(np.arange(len(PLACES_M)), np.arange(len(PLACES_M)) * 10**8, POSES)
-    monkeypatch.setattr("segslam.odometry.calibration.KissOdometry", lambda config: GivenOdometry(truth, config))
+    monkeypatch.setattr(vertical_angle, "KissOdometry", lambda config: GivenOdometry(truth, config))
 
 
 def calibrated(data: Path, capsys: pytest.CaptureFixture[str], *options: str) -> dict:

@@ -1,19 +1,17 @@
 """A drive through a walled yard by a spinning sensor that turns, whose points are not moved to one time."""
 
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.packed_drives import opened
 from helpers.yards import seen
 
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.points import voxel_first
 from segslam.core.types import Motion, MotionState, Trajectory
-from segslam.scans import open_dataset
 from segslam.slam.adjustment import Correction, Sweep, Velocities, corrections_of, velocities_of
 from segslam.slam.adjustment.correction import common_sweep, swept
 from segslam.slam.adjustment.sweeps import measure_sweep
@@ -125,11 +123,7 @@ def test_scans_of_kitti_are_sweeps_of_its_sensor_and_those_of_nclt_are_compensat
     data_dir: Path, tmp_path: Path, drive: str, expected_s: float | None
 ) -> None:
     """KITTI's stamps are 0.1036 s apart; the scans of NCLT were compensated by those who published them."""
-    folder = data_dir / drive
-    if (folder / "unpack.py").exists():
-        folder = tmp_path / drive
-        subprocess.run([sys.executable, "unpack.py", folder], cwd=data_dir / drive, check=True)
-    scans = open_dataset(folder, labels="none")
+    scans = opened(data_dir, drive, tmp_path)
     assert scans.reference is not None
     truth = scans.reference
     rows = np.arange(len(truth))

@@ -10,9 +10,9 @@ from typing import Any
 
 from segslam.core.config import Config, Section, changed_settings
 from segslam.core.types import Rejected
-from segslam.odometry.calibration import vertical_angle_advice
 from segslam.output.finished import COMPARED, FIGURES, FinishedRun
 from segslam.output.words import REASONS, WORDS
+from segslam.slam.adjustment.vertical_angle import vertical_angle_advice
 
 FILES = {
     "map.png": "the map in top view",

@@ -20,13 +20,14 @@ from segslam.core.types import (
     Vector,
 )
 from segslam.odometry import information_of
-from segslam.odometry.calibration import MIN_PAIRS, VerticalAngle
 from segslam.output.finished import FinishedRun, read_corrections, read_run
 from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
 from segslam.slam.adjustment import Adjustment, Known
 from segslam.slam.adjustment.correction import common_sweep
+from segslam.slam.adjustment.distortion import MIN_PAIRS
 from segslam.slam.adjustment.known import Kept, nothing_kept
+from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
 GAP_NS = 1_000_000_000
 """Chosen: pause inserted before the first scan of a session that is not later than the previous session."""

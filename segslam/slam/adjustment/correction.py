@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from segslam.core import geometry
 from segslam.core.types import Indices, Motion, Points, Tangent, Trajectory, Vector
-from segslam.odometry.calibration import PointsOf
+from segslam.slam.adjustment.distortion import PointsOf
 
 
 class Velocities(NamedTuple):

@@ -15,10 +15,11 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import Transform, Vector
-from segslam.odometry.calibration import VerticalAngle
 from segslam.slam.adjustment.alignment import Alignment
 from segslam.slam.adjustment.correction import Correction, Sweep, corrected_by
-from segslam.slam.adjustment.submaps import Aligned, PointsOf, Submaps
+from segslam.slam.adjustment.distortion import PointsOf
+from segslam.slam.adjustment.submaps import Aligned, Submaps
+from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
 Guess = tuple[int, int, int, int, int, int]
 """A rounded initial guess: rotation vector and translation, in whole steps."""

@@ -18,13 +18,14 @@ from segslam.core.config import Config, RefineConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import GraphEstimate, IndexPairs, Mask, Record, Vector
 from segslam.graph import Edge, PoseGraph
-from segslam.odometry.calibration import VerticalAngle, leaving_none, measure_vertical_angle
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
 from segslam.slam.adjustment.correction import Sweep, Velocities, corrected_by, corrections_of
+from segslam.slam.adjustment.distortion import PointsOf
 from segslam.slam.adjustment.known import Known
-from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, PointsOf, Submaps, all_pairs
+from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, Submaps, all_pairs
 from segslam.slam.adjustment.sweeps import measure_sweep
 from segslam.slam.adjustment.thickness import map_thickness_m
+from segslam.slam.adjustment.vertical_angle import VerticalAngle, leaving_none, measure_vertical_angle
 
 SHARE = min(1.0, EVERY / (2 * REACH + 1))
 """Share of the information of a registration: a scan is in so many submaps."""
@@ -204,10 +205,10 @@ def _measured_again(
 
     The motions of the odometry turn with the angle, so submaps built by them show too much of it.
     """
-    if angle is None or angle.shown is None or not angle.is_significant:
+    if angle is None or not angle.is_significant:
         return angle
     T_world, travel_m = graph.T_world_keyframes, graph.travel_m
-    again = leaving_none(angle.shown, angle.angle_deg, points_of, T_world, travel_m, config=config.refine)
+    again = leaving_none(angle, points_of, T_world, travel_m, config=config.refine)
     return again if again is not None and again.is_significant else angle
 
 

@@ -96,6 +96,8 @@ class PoseGraph:
         self._measured: list[Edge] = []
         """The motions and the relative poses of the last adjustment."""
         self._noise_factors = (1.0, 1.0)
+        self._finished = gtsam.Values()
+        """Poses before the first adjustment."""
         self._T_odom_last = np.eye(4)
         self._travel_m = Rows(np.empty(0))
         self._time_s = Rows(np.empty(0))
@@ -276,9 +278,16 @@ class PoseGraph:
         kept = [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
         odometry = without_shared_rotation(self._kept_odometry(), measured, shared_within)
         found, factors = solve_adjusted(self._prior(), odometry, kept, measured, self._values, self._kernel)
+        if not self._measured:
+            self._finished = self._values
         self._take(found.values)
         self._adjusted_odometry, self._measured, self._noise_factors = odometry, list(measured), factors
         return self._estimate(found.error, self._weights), factors
+
+    def drop_adjustment(self) -> None:
+        """Return to the result of `finish`."""
+        self._take(self._finished)
+        self._adjusted_odometry, self._measured, self._noise_factors = [], [], (1.0, 1.0)
 
     def _solve_final(self) -> MotionSolution:
         claimed_bound = noise.inlier_bound(INLIER_PROBABILITY)

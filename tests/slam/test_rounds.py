@@ -11,7 +11,7 @@ from segslam.core.config import Config
 from segslam.core.points import voxel_first
 from segslam.core.types import Alignment, LoopClosure, Registration
 from segslam.graph import PoseGraph
-from segslam.slam.adjustment import Adjusted, Velocities, adjust
+from segslam.slam.adjustment import Adjusted, Velocities, adjust, rounds
 
 STEP_M = 2.0
 NUM = 40
@@ -70,6 +70,18 @@ def test_low_beams_are_measured_and_do_not_bend_the_drive() -> None:
     assert found is not None
     assert found.record.correction_deg == pytest.approx(0.2, abs=0.03)
     assert error_m(made) < 0.05
+
+
+def test_an_adjustment_after_which_surfaces_are_thicker_is_dropped(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = graph()
+    before = made.finish()
+    poses = made.T_world_keyframes.copy()
+    monkeypatch.setattr(rounds, "is_thicker", lambda *_: True)
+    assert adjust(made, before, points, STILL, config=CONFIG) is None
+    np.testing.assert_array_equal(made.T_world_keyframes, poses)
+    assert "surfaces of the map were thinner before the adjustment" in caplog.text
 
 
 @pytest.mark.slow

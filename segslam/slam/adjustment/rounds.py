@@ -5,6 +5,7 @@ round registers submaps with each other, and solves all poses. If the vertical a
 result shows the angle better, and another round corrects the scans by it.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -24,8 +25,10 @@ from segslam.slam.adjustment.distortion import PointsOf
 from segslam.slam.adjustment.known import Known
 from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, Submaps, all_pairs
 from segslam.slam.adjustment.sweeps import measure_sweep
-from segslam.slam.adjustment.thickness import map_thickness_m
+from segslam.slam.adjustment.thickness import is_thicker, map_thickness_m, median_m
 from segslam.slam.adjustment.vertical_angle import VerticalAngle, leaving_none, measure_vertical_angle
+
+logger = logging.getLogger(__name__)
 
 SHARE = min(1.0, EVERY / (2 * REACH + 1))
 """Share of the information of a registration: a scan is in so many submaps."""
@@ -132,7 +135,8 @@ def adjust(
     """Adjust the poses of a graph after its last optimisation, whose result is `before`.
 
     `velocities`: of the sensor at the keyframes. `known`: the results of the drives' own adjustments, for several
-    drives. Returns None, and changes nothing, if the adjustment is off or no pair of submaps could be registered.
+    drives. Returns None, and changes nothing, if the adjustment is off, no pair of submaps could be registered, or
+    surfaces were thinner before.
     """
     started = monotonic()
     end_s = started + 60.0 * config.adjustment.max_minutes
@@ -163,6 +167,13 @@ def adjust(
         return None
     of_map = corrected_by(corrections_of(_correction_deg(last.angle), sweep, velocities), points_of)
     seen_twice = _seen_twice(last.registered, travel_m, config.proximity.min_travel_m)
+    before_m, after_m = (map_thickness_m(of_map, T, seen_twice) for T in (T_before, graph.T_world_keyframes))
+    is_corrected = sweep is not None or _correction_deg(last.angle) != 0.0
+    raw_before_m = map_thickness_m(points_of, T_before, seen_twice) if is_corrected else before_m
+    if is_thicker(before_m, after_m):
+        graph.drop_adjustment()
+        logger.warning("surfaces of the map were thinner before the adjustment of the whole map: it is not used")
+        return None
     moved_m = (graph.T_world_keyframes - T_before)[:, :3, 3]
     record = Adjustment(
         num_pairs=last.num_pairs,
@@ -179,8 +190,8 @@ def adjust(
         sweep_s=None if sweep is None else sweep.seconds,
         sweep_sigma_s=None if sweep is None else sweep.sigma_s,
         sweep_from_deg=None if sweep is None else sweep.from_deg,
-        thickness_before_m=map_thickness_m(points_of, T_before, seen_twice),
-        thickness_m=map_thickness_m(of_map, graph.T_world_keyframes, seen_twice),
+        thickness_before_m=median_m(raw_before_m),
+        thickness_m=median_m(after_m),
     )
     return Adjusted(record, before, last.estimate)
 

@@ -4,15 +4,17 @@ Flat patches that two scans of different places, or of different passes, both ob
 are right. The patch and its normal come from one scan alone, so that a bad pose cannot change which patches count.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import wilcoxon
 
 from segslam.core import geometry
 from segslam.core.points import cell_keys, within_range
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Points, Vector
+from segslam.odometry.checked import SIGNIFICANT
 
 CELL_M = 1.0
 """Chosen: edge of the cells that hold a patch; walls and roads are flat over it."""
@@ -30,21 +32,35 @@ MIN_PATCHES = 20
 
 def map_thickness_m(
     points_of: Callable[[int], Points], T_world: Poses, pairs: IndexPairs, *, within_m: float = WITHIN_M
-) -> float | None:
-    """Median standard deviation of points about planes, over patches that both scans of a pair observe (m).
+) -> list[Vector]:
+    """Standard deviation of points about the plane of each patch that both scans of a pair observe, by pair (m).
 
-    `pairs` (k, 2): keyframes that see the same surfaces. None if there are too few patches.
+    `pairs` (k, 2): keyframes that see the same surfaces, of which at most `MOST_PAIRS` are used.
     """
     chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS)).astype(int))]
-    return _median(
+    return [
         patch_thickness_m(points_of(int(a)), points_of(int(b)), geometry.inverse(T_world[a]) @ T_world[b], within_m)
         for a, b in chosen
-    )
+    ]
 
 
-def _median(found: Iterable[Vector]) -> float | None:
-    patches = np.concatenate([np.empty(0), *found])
+def median_m(thickness_m: Sequence[Vector]) -> float | None:
+    """The median over all patches; None if there are too few."""
+    patches = np.concatenate([np.empty(0), *thickness_m])
     return float(np.median(patches)) if len(patches) >= MIN_PATCHES else None
+
+
+def is_thicker(before_m: Sequence[Vector], after_m: Sequence[Vector]) -> bool:
+    """True if the same pairs of scans show significantly thicker surfaces afterwards (signed ranks of Wilcoxon)."""
+    medians = [
+        (np.median(before), np.median(after))
+        for before, after in zip(before_m, after_m, strict=True)
+        if len(before) and len(after)
+    ]
+    if len(medians) == 0:
+        return False
+    change = np.subtract(*np.transpose(medians)[::-1])
+    return bool(change.any() and wilcoxon(change, alternative="greater").pvalue < SIGNIFICANT)
 
 
 def patch_thickness_m(points_a: Points, points_b: Points, T_a_b: np.ndarray, within_m: float = WITHIN_M) -> Vector:

@@ -142,27 +142,9 @@ def adjust(
     end_s = started + 60.0 * config.adjustment.max_minutes
     if started >= end_s:
         return None
-    refine, T_before, travel_m = config.refine, graph.T_world_keyframes.copy(), graph.travel_m
-    of_drives = known.aligned(points_of, travel_m, config=refine) if known else None
-    sweep = known.sweep if known else measure_sweep(points_of, T_before, travel_m, velocities, config=refine)
-    straight_of = corrected_by(corrections_of(0.0, sweep, velocities), points_of)
-    angle = known.angle if known else measure_vertical_angle(straight_of, T_before, travel_m, config=refine)
-    last: _Round | None = None
-    for number in range(1, config.adjustment.rounds + 1):
-        if number > 1:
-            again = _measured_again(angle, straight_of, graph, config)
-            if again is angle:
-                break
-            angle = again
-        corrections = known.corrections if known else corrections_of(_correction_deg(angle), sweep, velocities)
-        shared_within = STEPS[-1] if any(one.raised_deg for one in corrections) else 0
-        title = f"refine {number}/{config.adjustment.rounds}"
-        corrected_of = corrected_by(corrections, points_of)
-        aligned = of_drives or Submaps(corrected_of, graph.T_world_keyframes.copy(), travel_m, config=refine).aligned
-        made = _round(graph, aligned, angle, config, end_s, shared_within, progress, title)
-        last = made or last
-        if made is None or not made.is_complete:
-            break
+    T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
+    sweep = known.sweep if known else measure_sweep(points_of, T_before, travel_m, velocities, config=config.refine)
+    last = _rounds(graph, points_of, velocities, sweep, known, config, end_s, progress)
     if last is None:
         return None
     of_map = corrected_by(corrections_of(_correction_deg(last.angle), sweep, velocities), points_of)
@@ -194,6 +176,41 @@ def adjust(
         thickness_m=median_m(after_m),
     )
     return Adjusted(record, before, last.estimate)
+
+
+def _rounds(
+    graph: PoseGraph,
+    points_of: PointsOf,
+    velocities: Velocities,
+    sweep: Sweep | None,
+    known: Known | None,
+    config: Config,
+    end_s: float,
+    progress: Progress,
+) -> _Round | None:
+    """The last round in which a pair of submaps could be registered; None if there is none."""
+    refine, travel_m = config.refine, graph.travel_m
+    of_drives = known.aligned(points_of, travel_m, config=refine) if known else None
+    straight_of = corrected_by(corrections_of(0.0, sweep, velocities), points_of)
+    T_world = graph.T_world_keyframes.copy()
+    angle = known.angle if known else measure_vertical_angle(straight_of, T_world, travel_m, config=refine)
+    last: _Round | None = None
+    for number in range(1, config.adjustment.rounds + 1):
+        if number > 1:
+            again = _measured_again(angle, straight_of, graph, config)
+            if again is angle:
+                break
+            angle = again
+        corrections = known.corrections if known else corrections_of(_correction_deg(angle), sweep, velocities)
+        shared_within = STEPS[-1] if any(one.raised_deg for one in corrections) else 0
+        title = f"refine {number}/{config.adjustment.rounds}"
+        corrected_of = corrected_by(corrections, points_of)
+        aligned = of_drives or Submaps(corrected_of, graph.T_world_keyframes.copy(), travel_m, config=refine).aligned
+        made = _round(graph, aligned, angle, config, end_s, shared_within, progress, title)
+        last = made or last
+        if made is None or not made.is_complete:
+            break
+    return last
 
 
 def _is_between(registered: Sequence[Edge], travel_m: Vector, min_travel_m: float) -> Mask:

@@ -11,6 +11,7 @@ the local map; smaller corrections leave it undisturbed, and are added to its po
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -151,7 +152,7 @@ class CheckedOdometry:
         T_odom_map = self._map.T_odom_map
         T_map_odom = geometry.inverse(T_odom_map)
         T_map_proposed, T_map_last = T_map_odom @ T_odom_proposed, T_map_odom @ self._T_odom_last
-        unsure, by_chance = np.zeros((6, 6)), 0.0
+        by_chance = 0.0
         elsewhere = float(is_rejoined)  # the scan before is not in the map before a break
         starts = [T_map_proposed, T_map_odom @ T_odom_predicted]
         if not is_rejoined and not self._is_found(fits, starts, scan):
@@ -162,15 +163,14 @@ class CheckedOdometry:
             fits = self._search.around(self._map, scan, T_map_last, T_step, fits)
         if not is_rejoined and not self._is_usual(fits):
             by_chance = self._by_chance(scan, fits, gap)
-            elsewhere = max(self._search.elsewhere(scan, fits), by_chance)
+            elsewhere = max(self._search.elsewhere(scan, self._fused(fits, gap)), by_chance)
             if elsewhere * ELSEWHERE_M**2 > BREAK_M**2 or not self._motion.is_known:
                 recognised = self._search.without_guess(self._map, scan)
                 if recognised and (not fits or recognised[0].mean_log >= fits[0].mean_log):
                     fits, elsewhere, by_chance = recognised, 0.0, 0.0
-            unsure = self._search.spread(scan, fits)
         best = fits[0] if fits else self._map.fit(scan, T_map_proposed)
         self._usual_fit.note(best.mean_log)
-        unsure = unsure + elsewhere * np.diag(ANYWHERE**2)
+        unsure = self._search.spread(scan, self._fused(fits, gap)) + elsewhere * np.diag(ANYWHERE**2)
         is_unsure = bool(unsure[3:, 3:].max() > BREAK_M**2)
         if not self._inner.is_from_scans and (is_unsure or not self._contradicts(fits, T_map_proposed, scan)):
             return self._kept(T_odom_proposed, T_map_proposed, best, scan, gap, is_unsure=is_unsure)
@@ -191,6 +191,15 @@ class CheckedOdometry:
             self._inner.follow(self._map.scans, T_odom_lidar, self._motion.T_step)
             self._T_odom_inner = np.eye(4)
         return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
+
+    def _fused(self, fits: Sequence[Fit], gap: float) -> list[Fit]:
+        """The poses fused with the last motions: those along a wall are one where the scan shows no motion along it."""
+        T_last_map = geometry.inverse(self._T_odom_last) @ self._map.T_odom_map
+        fused = []
+        for fit in fits:
+            T_last_lidar = self._motion.fused(T_last_map @ fit.T_map_lidar, self._covariance(fit), gap)
+            fused.append(replace(fit, T_map_lidar=geometry.inverse(T_last_map) @ T_last_lidar))
+        return fused
 
     def _by_chance(self, scan: SeenScan, fits: Sequence[Fit], gap: float) -> float:
         """Probability that the scan is far from all poses that were tried, so that the most likely one fits by chance.
@@ -227,7 +236,7 @@ class CheckedOdometry:
     def _rejoined(
         self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, here: Sequence[Fit]
     ) -> list[Fit]:
-        """Poses in the map before a break, if it explains the scan as usual and not significantly worse than `here`.
+        """Poses in the map before a break, if it explains the scan as usual and at least as well as `here`.
 
         It is then the local map again. `here`: the poses in the present local map.
         """
@@ -238,7 +247,7 @@ class CheckedOdometry:
         starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4)]
         near = self._search.near(local, scan, starts)
         fits = self._search.around(local, scan, np.eye(4), self._motion.T_step, near)
-        is_found = self._is_usual(fits) and (not here or as_likely(fits[0], here[0]) >= SIGNIFICANT)
+        is_found = self._is_usual(fits) and (not here or fits[0].mean_log >= here[0].mean_log)
         if is_found:
             self._map = local
         self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, num_scans + 1)

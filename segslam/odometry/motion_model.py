@@ -141,7 +141,8 @@ class MotionModel:
             return T_last_lidar, np.eye(6), None
         T_predicted = self.predicted(gap)
         change = geometry.log(geometry.inverse(T_predicted) @ T_last_lidar)
-        prior = prior + np.outer(change, change)  # a change that the scans show may be larger than all before
+        # a change that the scans show may be larger than all before, in any direction: a turn tells nothing of a slide
+        prior = prior + np.diag(np.repeat([change[:3] @ change[:3], change[3:] @ change[3:]], 3))
         gain = prior @ np.linalg.inv(prior + measured)
         return geometry.nearest_transform(T_predicted @ geometry.exp(gain @ change)), gain, prior
 

@@ -462,6 +462,34 @@ def test_a_motion_may_end_far_from_the_predicted_one_after_a_gap_only() -> None:
     assert model.may_exceed(1.0, 30.0) == pytest.approx(0.8, abs=0.15), "0.04 m an interval, 30 ** 1.5 times"
 
 
+def test_a_turn_that_a_scan_shows_does_not_make_a_slide_credible_that_it_does_not_show() -> None:
+    """In front of a wall, a registration finds the turn to milliradians and ends anywhere along the wall."""
+    model = MotionModel()
+    for step_m in np.random.default_rng(0).normal(1.0, 0.02, 20):
+        model.update(geometry.transform(np.eye(3), [step_m, 0.0, 0.0]), 1e-6 * np.eye(6), 1.0)
+    measured = np.diag(np.square([0.003, 0.003, 0.003, 0.02, 50.0, 0.02]))
+    fused = model.fused(geometry.transform(geometry.yaw(0.3), [1.0, 3.0, 0.0]), measured, 1.0)
+    assert geometry.angle(fused) == pytest.approx(0.3, abs=0.01)
+    assert fused[1, 3] == pytest.approx(0.0, abs=0.2)
+    seen = model.fused(geometry.transform(geometry.yaw(0.3), [1.0, 3.0, 0.0]), 1e-6 * np.eye(6), 1.0)
+    assert seen[1, 3] == pytest.approx(3.0, abs=0.01), "a slide that the scan shows is kept, however large"
+
+
+@pytest.mark.parametrize("is_better", [True, False])
+def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_better: bool) -> None:
+    scans, truth = round_drive()
+    odometry = _checked(truth.T_world_lidar)
+    last = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
+    before, odometry._map = odometry._map, LocalMap(CONFIG.refine)
+    odometry._lost = before, 0
+    scan = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
+    T_odom_lidar = last @ geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
+    there = before.register(scan, geometry.inverse(before.T_odom_map) @ T_odom_lidar)[0]
+    here = replace(there, mean_log=there.mean_log + (-1.0 if is_better else 0.5) * there.num_patches**-0.5)
+    assert bool(odometry._rejoined(T_odom_lidar, T_odom_lidar, scan, [here])) is is_better
+    assert (odometry._map is before) is is_better
+
+
 def test_an_odometry_that_reports_no_motion_is_checked_too() -> None:
     scans, truth = round_drive()
     standing = [replace(scans[0], index=row, stamp_ns=row * 100_000_000) for row in range(21)]

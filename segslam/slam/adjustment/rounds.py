@@ -26,7 +26,7 @@ from segslam.slam.adjustment.known import Known
 from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, Submaps, all_pairs
 from segslam.slam.adjustment.sweeps import measure_sweep
 from segslam.slam.adjustment.thickness import is_thicker, map_thickness_m, median_m
-from segslam.slam.adjustment.vertical_angle import VerticalAngle, leaving_none, measure_vertical_angle
+from segslam.slam.adjustment.vertical_angle import VerticalAngle, measure_vertical_angle
 
 logger = logging.getLogger(__name__)
 
@@ -229,14 +229,14 @@ def _seen_twice(registered: Sequence[Edge], travel_m: Vector, min_travel_m: floa
 def _measured_again(
     angle: VerticalAngle | None, points_of: PointsOf, graph: PoseGraph, config: Config
 ) -> VerticalAngle | None:
-    """The angle that leaves none after an adjustment with it, if that is significant, too.
+    """The angle by the poses of an adjustment with it, if that is significant, too.
 
     The motions of the odometry turn with the angle, so submaps built by them show too much of it.
     """
     if angle is None or not angle.is_significant:
         return angle
-    T_world, travel_m = graph.T_world_keyframes, graph.travel_m
-    again = leaving_none(angle, points_of, T_world, travel_m, config=config.refine)
+    T_world, near_deg = graph.T_world_keyframes, angle.angle_deg
+    again = measure_vertical_angle(points_of, T_world, graph.travel_m, config=config.refine, near_deg=near_deg)
     return again if again is not None and again.is_significant else angle
 
 

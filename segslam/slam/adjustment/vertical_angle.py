@@ -53,8 +53,6 @@ class VerticalAngle:
     angle_deg: float
     sigma_deg: float
     num_pairs: int
-    share: float | None = None
-    """Share of an uncorrected angle that pairs show; None if it was not measured."""
 
     @property
     def is_significant(self) -> bool:
@@ -87,12 +85,12 @@ def described(found: VerticalAngle) -> str:
 
 
 def measure_vertical_angle(
-    points_of: PointsOf, T_world: Poses, travel_m: Vector, *, config: RefineConfig
+    points_of: PointsOf, T_world: Poses, travel_m: Vector, *, config: RefineConfig, near_deg: float | None = None
 ) -> VerticalAngle | None:
     """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
 
     An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
-    none, by the method of secants, from no correction and twice the angle that they show.
+    none, by the method of secants, from no correction and `near_deg`, by default twice the angle that they show.
     """
     left_of = _left_of(points_of, T_world, travel_m, config)
     found = left_of(0.0)
@@ -101,7 +99,7 @@ def measure_vertical_angle(
     left_deg = float(found.value[0])
     if abs(left_deg) < BIAS_DEG:
         return VerticalAngle(left_deg, math.hypot(float(found.sigma[0]), BIAS_DEG), found.num_pairs)
-    before_deg, correction_deg = 0.0, 2.0 * left_deg
+    before_deg, correction_deg = 0.0, 2.0 * left_deg if near_deg is None else near_deg
     for _ in range(2):
         found, last_deg = left_of(correction_deg), left_deg
         left_deg = math.nan if found is None else float(found.value[0])
@@ -111,19 +109,7 @@ def measure_vertical_angle(
         before_deg, correction_deg = correction_deg, correction_deg + left_deg / share
         if abs(left_deg) < float(found.sigma[0]):
             break
-    sigma_deg = math.hypot(float(found.sigma[0]) / share, BIAS_DEG)
-    return VerticalAngle(correction_deg, sigma_deg, found.num_pairs, share)
-
-
-def leaving_none(
-    angle: VerticalAngle, points_of: PointsOf, T_world: Poses, travel_m: Vector, *, config: RefineConfig
-) -> VerticalAngle | None:
-    """A measured angle, corrected by what pairs show beyond it with other poses; None if they do not determine it."""
-    found = _left_of(points_of, T_world, travel_m, config)(angle.angle_deg)
-    if found is None or angle.share is None:
-        return None
-    sigma_deg = math.hypot(float(found.sigma[0]) / angle.share, BIAS_DEG)
-    return VerticalAngle(angle.angle_deg + float(found.value[0]) / angle.share, sigma_deg, found.num_pairs, angle.share)
+    return VerticalAngle(correction_deg, math.hypot(float(found.sigma[0]) / share, BIAS_DEG), found.num_pairs)
 
 
 def _left_of(points_of: PointsOf, T_world: Poses, travel_m: Vector, config: RefineConfig) -> LeftOf:

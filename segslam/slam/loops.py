@@ -41,9 +41,16 @@ class LoopCloser:
         clouds: Callable[[], Clouds],
         labeller: Labeller,
         edits: LoopEdits = NO_EDITS,
+        *,
+        is_known: bool = False,
     ) -> None:
-        """`clouds` provides the points of keyframes; `labeller` computes geometric labels of gathered clouds."""
+        """`clouds` provides the points of keyframes; `labeller` computes geometric labels of gathered clouds.
+
+        If the relative poses of several drives are known, each adjusted on its own, loops are refined from the estimate
+        first.
+        """
         self._edits = edits
+        self._is_known = is_known
         self._config = config
         self._graph = graph
         self._detector = ProximityDetector(config.proximity)
@@ -76,11 +83,7 @@ class LoopCloser:
         return signature
 
     def attempt(self, keyframe_id: int, watch: Stopwatch, *, below: int | None = None) -> tuple[LoopAttempt, ...]:
-        """Propose and try loops for a keyframe.
-
-        With `below`, only with smaller ids, those of earlier sessions whose relative poses are known: such a loop is
-        refined from the estimate first.
-        """
+        """Propose and try loops for a keyframe; with `below`, only with smaller ids, those of earlier sessions."""
         with watch("propose"):
             candidates = self._detector.candidates(
                 keyframe_id,
@@ -91,7 +94,7 @@ class LoopCloser:
             )
         by_hand = [self._far.candidate(keyframe_id, target_id) for target_id in self._edits.targets(keyframe_id)]
         new = [c for c in (*by_hand, *candidates) if (c.source_id, c.target_id) not in self._tried]
-        near = self._tried_in_turn(_once_each(new), watch, is_known=below is not None)
+        near = self._tried_in_turn(_once_each(new), watch)
         is_first_time = below is None and keyframe_id in self._unsearched
         self._unsearched.discard(keyframe_id)
         return (*near, *self._far_loops(keyframe_id, watch)) if is_first_time and not _has_closure(near) else near
@@ -121,12 +124,8 @@ class LoopCloser:
         self._take(attempts)
         return attempts
 
-    def _tried_in_turn(
-        self, candidates: list[LoopCandidate], watch: Stopwatch, *, is_known: bool
-    ) -> tuple[LoopAttempt, ...]:
-        attempts = tuple(
-            attempt for candidate in candidates for attempt in self._attempts(candidate, watch, is_known=is_known)
-        )
+    def _tried_in_turn(self, candidates: list[LoopCandidate], watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+        attempts = tuple(attempt for candidate in candidates for attempt in self._attempts(candidate, watch))
         self._take(attempts)
         return attempts
 
@@ -142,7 +141,7 @@ class LoopCloser:
                 self._graph.add_closure(attempt.outcome)
                 self._detector.note_closure(attempt.outcome)
 
-    def _attempts(self, candidate: LoopCandidate, watch: Stopwatch, *, is_known: bool) -> tuple[LoopAttempt, ...]:
+    def _attempts(self, candidate: LoopCandidate, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
         own = Stopwatch()
         with own("prepare"):
             source, target = at_once(
@@ -150,7 +149,7 @@ class LoopCloser:
             )
         outcome: Alignment | Rejected | None = None
         is_by_hand = (candidate.source_id, candidate.target_id) in self._edits.added
-        if is_known:
+        if self._is_known:
             prior = candidate.T_target_source_prior
             outcome = register_near(source, target, prior, config=self._config, watch=own)
         if not isinstance(outcome, Alignment):
@@ -166,7 +165,7 @@ class LoopCloser:
         if isinstance(outcome, Rejected):
             return (LoopAttempt(candidate, outcome, own.seconds),)
         closure = LoopClosure.of(candidate.source_id, candidate.target_id, outcome)
-        if is_known or is_by_hand or self._is_certain(candidate, outcome.T_target_source):
+        if self._is_known or is_by_hand or self._is_certain(candidate, outcome.T_target_source):
             return (LoopAttempt(candidate, closure, own.seconds),)
         return self._confirmation.attempts(candidate, closure, own.seconds)
 

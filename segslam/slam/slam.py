@@ -70,7 +70,9 @@ class Slam:
         self._labels_by_shape = labeller is None
         self.graph = self._new_graph()
         self._clouds: Clouds = CloudStore(self.config.keyframes.resolution_m)
-        self._loops = LoopCloser(self.config, self.graph, lambda: self._clouds, by_shape, edits)
+        self._loops = LoopCloser(
+            self.config, self.graph, lambda: self._clouds, by_shape, edits, is_known=known is not None
+        )
         self._steps: list[tuple[int, int, Transform]] = []
         self._motions: list[Motion] = []
         self._since_keyframe: list[Motion] = []

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +34,6 @@ class OdometryApart(KissOdometry):
 
     def begin(self, config: OdometryConfig) -> None:
         """Start again with other settings, in the same process."""
-        self.alone()
         self._apart.begin(config)
         super().__init__(config, self._apart, keeps_alone=self._keeps_alone)
 
@@ -46,8 +45,6 @@ class OdometryApart(KissOdometry):
 
     def close(self) -> None:
         """End the process; no results are lost."""
-        with suppress(SegslamError):  # the process has ended already
-            self.alone()
         self._apart.close()
 
 
@@ -55,6 +52,9 @@ class _AlignerApart:
     """A `KissAligner` in another process, which handles one request at a time."""
 
     def __init__(self, config: OdometryConfig) -> None:
+        self._alone: list[Transform] = []
+        self._is_waiting = False
+        """True while an answer to `align_alone` has not been received."""
         context = multiprocessing.get_context("spawn")  # a fork would copy locks held by other threads
         self._pipe, theirs = context.Pipe()
         shared = _room_for_points(context)
@@ -79,28 +79,30 @@ class _AlignerApart:
         self._exchange("follow", list(scans), T_odom_lidar, T_before_lidar)
 
     def align_alone(self, points: Points, gap: float = 1.0) -> None:
-        """As `Aligner.align_alone`; the other process works while this one continues, until `pose_alone`."""
+        """As `Aligner.align_alone`; the other process works while this one continues."""
         sent = self._shared_or_sent(points)
         with self._reported():
             self._pipe.send(("align_alone", sent, gap))
+        self._is_waiting = True
 
-    def pose_alone(self) -> Transform:
-        """As `Aligner.pose_alone`."""
-        with self._reported():
-            return cast(Transform, self._pipe.recv())
-
-    def rejoin(self) -> None:
-        """As `Aligner.rejoin`."""
-        self._exchange("rejoin")
+    def alone(self) -> list[Transform]:
+        """As `Aligner.alone`, also after `close`."""
+        if self._is_waiting:
+            self._is_waiting = False
+            with self._reported():
+                self._alone.append(self._pipe.recv())
+        return self._alone
 
     def _shared_or_sent(self, points: Points) -> Points | int:
         """The number of the points, which are then in the shared memory, or the points if they are too many."""
+        self.alone()  # the shared memory is in use until then
         if len(points) > len(self._shared):
             return points
         self._shared[: len(points)] = points
         return len(points)
 
     def _exchange(self, *request: Any) -> Any:
+        self.alone()
         with self._reported():
             self._pipe.send(request)
             return self._pipe.recv()
@@ -115,6 +117,8 @@ class _AlignerApart:
 
     def close(self) -> None:
         """End the process."""
+        with suppress(SegslamError):  # the process has ended already
+            self.alone()
         note_peak_of(self._process.pid)
         self._pipe.close()
         self._process.join()
@@ -152,13 +156,11 @@ def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
     shared_points = _as_points(shared)
     try:
         while True:
-            name, *given = pipe.recv()
+            name, first, *rest = pipe.recv()
             if name == "begin":
-                aligner = KissAligner(*given)
+                aligner = KissAligner(first)
                 continue
-            if given and isinstance(given[0], int):
-                given[0] = shared_points[: given[0]]
-            answer = getattr(aligner, name)(*given)
-            pipe.send(aligner.pose_alone() if name == "align_alone" else answer)
+            answer = getattr(aligner, name)(shared_points[:first] if isinstance(first, int) else first, *rest)
+            pipe.send(aligner.alone().pop() if name == "align_alone" else answer)
     except (EOFError, OSError):
         return

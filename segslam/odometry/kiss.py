@@ -13,7 +13,6 @@ from kiss_icp.kiss_icp import KissICP
 from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.types import BadScan, Points, Scan, Transform
-from segslam.odometry.motion_model import WINDOW
 from segslam.odometry.sweep import OdometryResult, deskew_scan
 
 RESOLUTION = math.sqrt(1.0 / 20.0)
@@ -35,15 +34,11 @@ class Aligner(Protocol):
         ...
 
     def align_alone(self, points: Points, gap: float = 1.0) -> None:
-        """Align a sweep as well with KISS-ICP as it was before the first `follow`."""
+        """Align a sweep as well with KISS-ICP as it was before the first `follow`; `alone` returns the pose."""
         ...
 
-    def pose_alone(self) -> Transform:
-        """The pose of the last sweep passed to `align_alone`."""
-        ...
-
-    def rejoin(self) -> None:
-        """Continue with KISS-ICP as it was before the first `follow`, which has aligned all sweeps since then."""
+    def alone(self) -> list[Transform]:
+        """The pose of each sweep passed to `align_alone`."""
         ...
 
 
@@ -53,6 +48,7 @@ class KissAligner:
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
         self._kiss = self._first = KissICP(_kiss_config(config))
+        self._alone: list[Transform] = []
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
@@ -74,15 +70,11 @@ class KissAligner:
 
     def align_alone(self, points: Points, gap: float = 1.0) -> None:
         """As `Aligner.align_alone`."""
-        _registered(self._first, points, gap)
+        self._alone.append(_registered(self._first, points, gap))
 
-    def pose_alone(self) -> Transform:
-        """As `Aligner.pose_alone`."""
-        return np.array(self._first.last_pose)
-
-    def rejoin(self) -> None:
-        """As `Aligner.rejoin`."""
-        self._kiss = self._first
+    def alone(self) -> list[Transform]:
+        """As `Aligner.alone`."""
+        return self._alone
 
 
 def _registered(kiss: KissICP, points: Points, gap: float) -> Transform:
@@ -93,85 +85,59 @@ def _registered(kiss: KissICP, points: Points, gap: float) -> Transform:
 
 
 class KissOdometry:
-    """Scan-to-map odometry: deskews and crops scans and aligns them, by default with KISS-ICP in this process.
-
-    With `keeps_alone`, KISS-ICP alone aligns each scan after `follow` as well. Once its motions are those of the
-    odometry for as many scans as tell what is usual on a drive, it is the odometry again.
-    """
+    """Scan-to-map odometry: deskews and crops scans and aligns them, by default with KISS-ICP in this process."""
 
     is_from_scans = True
 
     def __init__(self, config: OdometryConfig, aligner: Aligner | None = None, *, keeps_alone: bool = False) -> None:
-        """`keeps_alone`: keep the poses of `alone`."""
+        """`keeps_alone`: keep the poses of `alone`, for which each scan is aligned twice after the first `follow`."""
         self._config = config
         self._aligner = aligner or KissAligner(config)
-        self._keeps_alone = keeps_alone
-        self._is_alone, self._is_pending = True, False
-        """Whether the odometry is KISS-ICP alone; whether the pose of the last scan by KISS-ICP alone is pending."""
-        self._alone: list[Transform] = []
-        self._num_equal = 0
-        """Number of last motions in which the odometry and KISS-ICP alone do not differ."""
-        self._few = np.empty((0, 3))
+        self._keeps_alone, self._has_followed = keeps_alone, False
+        self._before_following: list[Transform] = []
         self._last_gap = 1.0
-        self._T_odom_kiss = self._T_odom_last = self._T_last_lidar = np.eye(4)
+        self._T_odom_last = self._T_last_lidar = np.eye(4)
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
         """The pose and the cropped points of the next scan, in order of time, `gap` intervals after the previous one.
 
         Raises BadScan, and ignores the scan, if none of its points is within range.
         """
-        self._receive_alone()
         points, labels, intensities = deskew_scan(scan, self._T_last_lidar, self._config)
-        T_kiss_lidar = self._aligner.align(points, gap)
-        T_odom_lidar = self._T_odom_kiss @ T_kiss_lidar
+        T_odom_lidar = self._aligner.align(points, gap)
         if self._keeps_alone:
-            self._register_alone(scan, points, T_kiss_lidar, gap)
-        self._T_last_lidar = geometry.scaled(_since(self._T_odom_last, T_odom_lidar), 1 / gap)
-        self._T_odom_last, self._last_gap = T_odom_lidar, gap
+            self._register_alone(scan, points, T_odom_lidar, gap)
+        self._now_at(T_odom_lidar)
+        self._T_last_lidar = geometry.scaled(self._T_last_lidar, 1 / gap)
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
         """Continue from another pose of the last scan, with a local map of these scans alone."""
-        self._receive_alone()
-        self._is_alone, self._num_equal, self._T_odom_kiss = False, 0, np.eye(4)
+        self._has_followed = True
         self._aligner.follow(scans, T_odom_lidar, T_before_lidar)
         self._T_odom_last, self._T_last_lidar = T_odom_lidar, T_before_lidar
 
     def alone(self) -> Sequence[Transform]:
         """The pose of each scan by KISS-ICP alone, without corrections by `follow`; empty if they are not kept."""
-        self._receive_alone()
-        return self._alone
+        return [*self._before_following, *self._aligner.alone()]
 
-    def _register_alone(self, scan: Scan, points: Points, T_kiss_lidar: Transform, gap: float) -> None:
+    def _register_alone(self, scan: Scan, points: Points, T_odom_lidar: Transform, gap: float) -> None:
         """Keep the pose by KISS-ICP alone; `points` and the pose are those of the scan here."""
-        if self._is_alone:
-            self._alone.append(T_kiss_lidar)
-            return
-        with suppress(BadScan):
-            points = deskew_scan(scan, self._last_motion_alone(), self._config)[0]
-        self._aligner.align_alone(points, gap)
-        self._is_pending = True
-        self._few = points[:: max(1, len(points) // 500)]
+        if not self._has_followed:
+            self._before_following.append(T_odom_lidar)
+        else:
+            before, last = [np.eye(4), np.eye(4), *self.alone()][-2:]
+            T_last_lidar = geometry.scaled(_since(before, last), 1 / self._last_gap)
+            with suppress(BadScan):
+                points = deskew_scan(scan, T_last_lidar, self._config)[0]
+            self._aligner.align_alone(points, gap)
+        self._last_gap = gap
 
-    def _receive_alone(self) -> None:
-        """Keep the pending pose by KISS-ICP alone, which is the odometry again once its motions do not differ."""
-        if not self._is_pending:
-            return
-        self._is_pending = False
-        self._alone.append(self._aligner.pose_alone())
-        T_last_alone = self._last_motion_alone()
-        apart_m = geometry.displacement_m(self._few, T_last_alone, self._T_last_lidar)
-        self._num_equal = self._num_equal + 1 if apart_m < RESOLUTION * self._config.voxel_size_m else 0
-        if self._num_equal == WINDOW:
-            self._aligner.rejoin()
-            self._is_alone, self._T_last_lidar = True, T_last_alone
-            self._T_odom_kiss = geometry.nearest_transform(self._T_odom_last @ geometry.inverse(self._alone[-1]))
-
-    def _last_motion_alone(self) -> Transform:
-        before, last = [np.eye(4), np.eye(4), *self._alone[-2:]][-2:]
-        return geometry.scaled(_since(before, last), 1 / self._last_gap)
+    def _now_at(self, T_odom_lidar: Transform) -> None:
+        self._T_last_lidar = _since(self._T_odom_last, T_odom_lidar)
+        self._T_odom_last = T_odom_lidar
 
 
 def _since(T_odom_last: Transform, T_odom_lidar: Transform) -> Transform:

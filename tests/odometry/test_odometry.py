@@ -120,31 +120,6 @@ def test_the_poses_of_kiss_icp_alone_are_kept_while_the_odometry_follows_others(
     assert geometry.distance(geometry.inverse(found[-1].T_odom_lidar) @ expected[-1]) > 0.1
 
 
-@pytest.mark.parametrize("apart", [False, True])
-def test_kiss_icp_alone_is_the_odometry_again_when_their_motions_do_not_differ(
-    apart: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its motions since then are the same, in the frame of the correction."""
-    monkeypatch.setattr("segslam.odometry.kiss.WINDOW", 3)
-    scans = _street(12)
-    expected = _by_kiss_icp(scans)
-    with _keeping_alone(apart=apart) as odometry:
-        found = []
-        for number, scan in enumerate(scans):
-            found.append(odometry.register(scan))
-            if number == 3:
-                T_shift = geometry.transform(np.eye(3), [0.5, 0.1, 0.0])
-                kept = [(T_shift @ one.T_odom_lidar, one.points) for one in found]
-                T_2_3 = geometry.inverse(found[2].T_odom_lidar) @ found[3].T_odom_lidar
-                odometry.follow(kept, T_shift @ found[3].T_odom_lidar, T_2_3)
-            assert len(odometry.alone()) == number + 1
-    T_own = found[9].T_odom_lidar @ geometry.inverse(expected[9])
-    assert geometry.distance(T_own) > 0.3, "the correction stays"
-    for one, T_expected in zip(found[10:], expected[10:], strict=True):
-        np.testing.assert_allclose(one.T_odom_lidar, T_own @ T_expected, atol=1e-9)
-    np.testing.assert_allclose(odometry.alone(), expected, atol=1e-9)
-
-
 def test_a_sweep_too_large_for_the_shared_memory_is_aligned_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
     scans = _street(3)
     monkeypatch.setattr("segslam.odometry.apart.MOST_SHARED", 100)

@@ -34,9 +34,9 @@ ELSEWHERE_M = 30.0
 ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
 SIGNIFICANT = 0.001
-"""Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans; the map
-before a break is not used again; and less likely motions are not considered. The adjustment has the same share of
-chance for a sweep that scans show, and for surfaces that become thicker."""
+"""Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans, and less
+likely motions are not considered. The adjustment has the same share of chance for a sweep that scans show, and for
+surfaces that become thicker."""
 MOST_UNCHECKED = 9
 """Chosen: number of scans after which a sensor that seems to stand still is checked."""
 

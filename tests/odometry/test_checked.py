@@ -276,6 +276,26 @@ def test_a_registration_that_leads_away_from_its_start_is_compared_with_others(m
     assert geometry.distance(geometry.inverse(now) @ before @ T_before_found) < 0.1
 
 
+def test_a_motion_is_unsure_by_the_distance_of_two_poses_that_explain_the_scan_as_usual(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scans, truth = round_drive()
+    odometry = _checked(_slipped(metres=3.0))
+    _registered(odometry, scans[:SLIP_AT])
+    usual = float(np.median(odometry._usual_fit._values))
+    T_before_now = geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
+
+    def two(search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = ()) -> list[Fit]:
+        places = [T_before_now @ geometry.transform(np.eye(3), [0.0, left_m, 0.0]) for left_m in (0.0, 1.2)]
+        return [replace(local.fit(scan, T), mean_log=usual, information=1e4 * np.eye(6)) for T in places]
+
+    monkeypatch.setattr(PoseSearch, "near", two)
+    motion = odometry.register(scans[SLIP_AT]).motion
+    assert motion is not None
+    assert motion.covariance is not None
+    assert np.sqrt(np.diag(motion.covariance)[3:]) == pytest.approx([0.0, 1.2 / np.sqrt(2.0), 0.0], abs=0.1)
+
+
 def test_a_motion_has_information_of_its_own_if_it_is_less_certain_than_the_model() -> None:
     step = geometry.transform(np.eye(3), np.array([CONFIG.keyframes.distance_m, 0.0, 0.0]))
     shared = geometry.tangent(rotation_rad=np.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)

@@ -165,17 +165,20 @@ class LoopCloser:
         if isinstance(outcome, Rejected):
             return (LoopAttempt(candidate, outcome, own.seconds),)
         closure = LoopClosure.of(candidate.source_id, candidate.target_id, outcome)
-        if self._is_known or is_by_hand or self._is_certain(candidate, outcome.T_target_source):
+        if self._is_known or is_by_hand or self._is_certain(candidate, outcome):
             return (LoopAttempt(candidate, closure, own.seconds),)
         return self._confirmation.attempts(candidate, closure, own.seconds)
 
-    def _is_certain(self, candidate: LoopCandidate, T_target_source: Transform) -> bool:
-        """True for a pose that the prior does not contradict, and that is hardly that of a place that looks the same.
+    def _is_certain(self, candidate: LoopCandidate, found: Alignment) -> bool:
+        """True for a pose that the prior does not contradict, and that is hardly wrong or that of another place.
 
-        Of the places that the scans take for the same, `MISLED` only look so, and fewer where the prior is narrow.
+        By itself, a loop is accepted only with the share of wrong ones that the user accepts. Of the places that the
+        scans take for the same, `MISLED` only look so, and fewer where the prior is narrow.
         """
+        if found.probability is not None and 1.0 - found.probability > self._config.verify.max_false_share:
+            return False
         allowance = self._config.graph.error_allowance
-        if far_from_prior(T_target_source, candidate, error_allowance=allowance, slack_m=0.0) is not None:
+        if far_from_prior(found.T_target_source, candidate, error_allowance=allowance, slack_m=0.0) is not None:
             return False
         near = candidate.near_probability
         return MISLED * (1.0 - near) <= LEAST_PROBABILITY * near

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from segslam.candidates.proximity import LEAST_PROBABILITY
 from segslam.core import geometry
 from segslam.core.config import OdometryConfig, load_config
 from segslam.core.types import (
+    Alignment,
     LoopAttempt,
     LoopClosure,
     Motion,
@@ -21,8 +23,10 @@ from segslam.core.types import (
     Trajectory,
 )
 from segslam.odometry import GivenOdometry, OdometryResult
+from segslam.registration.prepared import PreparedScan
 from segslam.slam.slam import Slam
 from segslam.slam.slam_result import SlamResult
+from segslam.verification import register_prepared
 
 PLAIN = ("health.check=false", "adjustment.max_minutes=0")
 """Loops alone."""
@@ -103,6 +107,25 @@ def test_a_drive_whose_odometry_is_good_closes_by_proximity_as_before() -> None:
     assert pairs[0] == pairs[1]
     assert pairs[0]
     np.testing.assert_array_equal(before.trajectory.T_world_lidar, after.trajectory.T_world_lidar)
+
+
+def test_a_near_loop_that_is_less_probable_than_the_user_accepts_waits_for_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With the same odometry the first closes by itself (`test_a_drive_whose_odometry_is_good_closes_by_proximity`)."""
+
+    def doubtful(*clouds: PreparedScan, **given: Any) -> Alignment | Rejected:
+        found = register_prepared(*clouds, **given)
+        return found if isinstance(found, Rejected) else replace(found, probability=0.99)
+
+    monkeypatch.setattr("segslam.slam.loops.register_prepared", doubtful)
+    config = load_config(None, [*PLAIN, "retrieval.enabled=false"])
+    slam = Slam(config, odometry=GivenOdometry(drifting(round_drive()[1], turn_deg=0.15), config.odometry))
+    tried = [attempt.outcome for scan in round_drive()[0] for attempt in slam.process(scan).attempts]
+    waited = [one for one in tried if isinstance(one, Rejected) and one.reason is RejectReason.UNCONFIRMED]
+    assert len(waited) >= 2, "as many as confirm the third"
+    first = next((k for k, one in enumerate(tried) if isinstance(one, LoopClosure)), len(tried))
+    assert tried.index(waited[1]) < first
 
 
 class Carried(GivenOdometry):

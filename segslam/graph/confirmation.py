@@ -1,9 +1,9 @@
-"""Loops that the prior does not support wait until others confirm them.
+"""Loops that the prior does not support, or that are not probable enough by themselves, wait until others confirm them.
 
 A single registration may be wrong, because places repeat. Where the graph predicts the pose, the prior excludes such
 errors; after much drift, and across a break of the odometry, nothing does, and one wrong loop ruins the map. Such a
-loop, and one that contradicts its prior, is closed only if several keyframes, along some metres of travel, are
-registered, and their poses are consistent with the odometry between them.
+loop, one that contradicts its prior, and one that is less probable than the user accepts, is closed only if several
+keyframes, along some metres of travel, are registered, and their poses are consistent with the odometry between them.
 """
 
 from dataclasses import dataclass

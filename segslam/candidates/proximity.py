@@ -29,7 +29,9 @@ MIN_GAP_M = 8.0
 """Chosen: distance travelled after an accepted loop before the next search (m)."""
 
 BREAK_TRAVEL_M = 1e5
-"""Travel assigned to a break of the odometry, because the relative pose across it is unknown."""
+"""Keyframes this far apart in travel are separated by a break of the odometry."""
+BREAK_STEP_M = 2.0 * BREAK_TRAVEL_M
+"""Travel assigned to a break, because the relative pose across it is unknown; rounded, it is still a break."""
 NO_CLOSURES: IndexPairs = np.empty((0, 2), dtype=np.int64)
 
 

@@ -53,6 +53,11 @@ class AnchoredGraph:
         return self._graph.travel_m[1:] - BREAK_TRAVEL_M
 
     @property
+    def motion_variance(self) -> Vector:
+        """As that of `PoseGraph`."""
+        return self._graph.motion_variance[1:]
+
+    @property
     def T_world_keyframes(self) -> Poses:  # noqa: N802
         """(n, 4, 4) poses by id in the map's world: the last estimate, continued by odometry for newer keyframes."""
         return self._graph.T_world_keyframes[1:]

@@ -5,6 +5,7 @@ optimisation that starts far from the solution may end in a local optimum, so ea
 body to satisfy one closure.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -85,9 +86,16 @@ def segments(odometry: Sequence[Edge]) -> Indices:
 
 def is_break(edge: Edge) -> bool:
     """True if the standard deviation of a motion is above that of a break in any direction."""
-    weakest = (np.linalg.eigvalsh(edge.information[half, half])[0] for half in (slice(0, 3), slice(3, 6)))
-    rotation, translation = weakest
-    return bool(rotation < np.radians(BREAK_DEG) ** -2.0 or translation < BREAK_M**-2.0)
+    rotation, translation = largest_variances(edge)
+    return rotation > math.radians(BREAK_DEG) ** 2 or translation > BREAK_M**2
+
+
+def largest_variances(edge: Edge) -> tuple[float, float]:
+    """Variances of the rotation (rad^2) and of the translation (m^2) of an edge in their least certain directions."""
+    known, directions = np.linalg.eigh(edge.information)
+    covariance = directions / np.maximum(known, np.finfo(float).eps) @ directions.T
+    rotation, translation = (np.linalg.eigvalsh(covariance[half, half])[-1] for half in (slice(0, 3), slice(3, 6)))
+    return float(rotation), float(translation)
 
 
 def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Transforms, likely: Mask) -> Transforms:

@@ -37,6 +37,7 @@ from segslam.graph.edges import (
     factor_graph,
     is_break,
     joined,
+    largest_variances,
     poses_by_id,
     relinked,
     squared_errors,
@@ -100,6 +101,7 @@ class PoseGraph:
         """Poses before the first adjustment."""
         self._T_odom_last = np.eye(4)
         self._travel_m = Rows(np.empty(0))
+        self._motion_variance = Rows(np.empty(0))
         self._time_s = Rows(np.empty(0))
 
     @property
@@ -111,6 +113,11 @@ class PoseGraph:
     def travel_m(self) -> Vector:
         """(n,) travel of each keyframe, by id."""
         return self._travel_m.all()
+
+    @property
+    def motion_variance(self) -> Vector:
+        """(n,) largest variance of the motion that leads to each keyframe, in any direction (m^2); 0 for the first."""
+        return self._motion_variance.all()
 
     @property
     def T_world_keyframes(self) -> Transforms:  # noqa: N802
@@ -176,6 +183,7 @@ class PoseGraph:
             self._chains.add(pose.matrix(), self._odometry[-1])
         self._T_odom_last = T_odom_keyframe
         self._travel_m.append(travel_m)
+        self._motion_variance.append(largest_variances(self._odometry[-1])[1] if keyframe_id else 0.0)
         self._time_s.append(np.nan if stamp_ns is None else 1e-9 * stamp_ns)
 
     def add_closure(self, closure: LoopClosure) -> None:

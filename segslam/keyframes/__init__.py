@@ -7,7 +7,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import Config, KeyframeConfig
 from segslam.core.points import voxel_first
@@ -115,10 +114,14 @@ class Submaps:
     """Submaps of the keyframes of a drive, computed on use."""
 
     def __init__(
-        self, config: Config, clouds: Callable[[], Clouds], labeller: Labeller, travel_m: Callable[[], Vector]
+        self, config: Config, clouds: Callable[[], Clouds], labeller: Labeller, motion_variance: Callable[[], Vector]
     ) -> None:
-        """`clouds` and `travel_m` provide points and travel of keyframes by id; `labeller`: geometric labels."""
-        self._config, self._clouds, self._labeller, self._travel_m = config, clouds, labeller, travel_m
+        """`clouds` provides the points of keyframes by id, `labeller` geometric labels.
+
+        `motion_variance` (n,) is the largest variance of the motion that leads to each keyframe (m^2).
+        """
+        self._config, self._clouds, self._labeller = config, clouds, labeller
+        self._motion_variance = motion_variance
         self._by_shape: set[int] = set()
         self.T_odom: list[Transform] = []
         """Poses of the keyframes, by id, in any frame in which neighbours have the correct relative pose."""
@@ -165,9 +168,10 @@ class Submaps:
         return len(downsampled) >= DENSE_VOXELS
 
     def _neighbours(self, keyframe_id: int, newest_id: int) -> Iterator[int]:
-        """Keyframes around one, nearest first, that odometry connects to it without a break."""
-        travel_m = self._travel_m()
+        """Keyframes around one, nearest first, whose relative pose odometry knows better than the size of a voxel."""
+        variance = self._motion_variance()
         for step in range(1, MAX_GATHERED // 2 + 1):
-            for neighbour in (keyframe_id - step, keyframe_id + step):
-                if 0 <= neighbour <= newest_id and abs(travel_m[neighbour] - travel_m[keyframe_id]) < BREAK_TRAVEL_M:
-                    yield neighbour
+            for first, last in ((keyframe_id - step, keyframe_id), (keyframe_id, keyframe_id + step)):
+                is_known = sum(variance[first + 1 : last + 1]) < self._config.refine.voxel_m**2
+                if first >= 0 and last <= newest_id and is_known:
+                    yield first + last - keyframe_id

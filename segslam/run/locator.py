@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
+from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core.config import Config
 from segslam.core.points import within_range
 from segslam.core.threads import at_once
@@ -154,7 +155,8 @@ class Locator:
 def submaps_of(keyframes: list[Keyframe], clouds: Clouds, config: Config) -> Submaps:
     """The submaps of a drive; sparse keyframes are merged with their neighbours. Arguments as for `Locator`."""
     travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
-    submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: travel_m)
+    variance = np.where(np.diff(travel_m, prepend=0.0) < BREAK_TRAVEL_M, 0.0, np.inf)
+    submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: variance)
     for keyframe in keyframes:
         submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
     return submaps

@@ -54,7 +54,7 @@ class LoopCloser:
         self._config = config
         self._graph = graph
         self._detector = ProximityDetector(config.proximity)
-        self.submaps = Submaps(config, clouds, labeller, lambda: graph.travel_m)
+        self.submaps = Submaps(config, clouds, labeller, lambda: graph.motion_variance)
         self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         self._confirmation = Confirmation(graph)
         self._far = FarLoops(config, graph, self._prepared, self._confirmation, edits.forbidden)

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
+from segslam.candidates.proximity import BREAK_STEP_M, BREAK_TRAVEL_M
 from segslam.core import geometry
-from segslam.core.config import KeyframeConfig
+from segslam.core.config import Config, KeyframeConfig
 from segslam.core.types import Keyframe, Label
-from segslam.keyframes import CloudStore, KeyframeSelector, downsample_keyframe
+from segslam.keyframes import CloudStore, KeyframeSelector, Submaps, downsample_keyframe
 
 CONFIG = KeyframeConfig(distance_m=2.0)
 
@@ -42,6 +43,30 @@ def test_a_standing_sensor_that_jitters_cuts_no_keyframe() -> None:
     cut = [selector.update(_at(0.05 * (-1) ** i)) for i in range(200)]
     assert sum(cut) == 1
     assert selector.travel_m > 10.0, "else the test would not tell distance from path"
+
+
+def test_travel_across_a_break_is_at_least_that_of_a_break_however_it_is_rounded() -> None:
+    for before_m in np.random.default_rng(0).uniform(0.0, 500.0, 50):
+        selector = KeyframeSelector(CONFIG)
+        selector.update(_at(0.0))
+        selector.update(_at(before_m))
+        travel_m = selector.travel_m
+        assert selector.update(_at(before_m), break_m=BREAK_STEP_M)
+        assert selector.travel_m - travel_m >= BREAK_TRAVEL_M
+
+
+def test_a_submap_has_the_neighbours_whose_pose_is_known_to_a_voxel() -> None:
+    """Five scans of a thin ring of points a metre apart; the standard deviation of the third motion is 0.6 m."""
+    ring = np.column_stack([np.cos(np.arange(400)), np.sin(np.arange(400)), np.zeros(400)]).astype(np.float32) * 10.0
+    store = CloudStore(CONFIG.resolution_m)
+    variance = np.array([0.0, 0.01, 0.01, 0.36, 0.01])
+    submaps = Submaps(Config(), lambda: store, lambda points: np.zeros(len(points), np.uint8), lambda: variance)
+    for row in range(5):
+        store.keep(Keyframe(row, row, 0, _at(float(row)), float(row), ring, np.zeros(400, np.uint8)))
+        submaps.add(_at(float(row)), labelled_by_shape=False)
+    assert [len(submaps.gathered(row).points) // 400 for row in range(5)] == [3, 3, 3, 2, 2]
+    variance[3] = 0.01
+    assert len(submaps.gathered(2).points) == 5 * 400
 
 
 @pytest.mark.parametrize("reach_m", [90.0, 400.0], ids=["two bytes a number", "four bytes"])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
     Information,
@@ -172,6 +172,6 @@ def next_shift(before: Shift, session: Session, T_new_old: Transform, following:
         keyframe_id=before.keyframe_id + len(session.travel_m),
         scan_index=before.scan_index + int(session.run.result.trajectory.scan_index[-1]) + 1,
         stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
-        travel_m=before.travel_m + float(session.travel_m[-1]) + 2.0 * BREAK_TRAVEL_M,  # rounded, it is still a break
+        travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_STEP_M,
         T_new_old=T_new_old,
     )

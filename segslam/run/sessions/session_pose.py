@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
@@ -141,7 +141,7 @@ def _both(earlier: Session, session: Session, config: Config) -> tuple[PoseGraph
     graph = PoseGraph(config.graph)
     first_id = len(earlier.travel_m)
     for number, one in enumerate((earlier, session)):
-        shift_m = number * (float(earlier.travel_m[-1]) + BREAK_TRAVEL_M)
+        shift_m = number * (float(earlier.travel_m[-1]) + BREAK_STEP_M)
         for row, (T_world, travel_m) in enumerate(zip(one.T_world_keyframe, one.travel_m, strict=True)):
             information = FIRST_MOTION.information if number and row == 0 else one.informations[row]
             graph.add_keyframe(graph.num_keyframes, T_world, float(travel_m) + shift_m, information=information)

@@ -44,7 +44,9 @@ def rivals_of(found: Found, known: Sequence[Found], trial: Trial) -> list[Found]
         if not is_near(start.coarse.T_target_source, done, within_m=NEW_M, within_rad=NEW_RAD):
             done.append(start.coarse.T_target_source)
             starts.append(start)
-    refined = [free.refined(start.coarse, start.coarse.T_target_source) for start in starts[:MOST_RIVALS]]
+    refined = [  # where the scans let a pose slide, a rival need not converge to fit as well
+        free.refined(start.coarse, start.coarse.T_target_source, must_converge=False) for start in starts[:MOST_RIVALS]
+    ]
     return [rival for rival in refined if isinstance(rival, Found)]
 
 

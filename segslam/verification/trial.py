@@ -114,10 +114,11 @@ class Trial(NamedTuple):
         with self.watch("verify"):
             return patches.first_look(*scans, T_target_source)
 
-    def refined(self, coarse: Registration, T_begun: Transform) -> Found | Rejected:
+    def refined(self, coarse: Registration, T_begun: Transform, *, must_converge: bool = True) -> Found | Rejected:
         """A hypothesis refined with all points from `T_begun`, and what the scans show there."""
+        surfaces = self.source.surface, self.target.surface
         with self.watch("refine"):
-            fine = refinement.refine(self.source.surface, self.target.surface, T_begun, config=self.config.refine)
+            fine = refinement.refine(*surfaces, T_begun, config=self.config.refine, must_converge=must_converge)
         return fine if isinstance(fine, Rejected) else self.found(coarse, fine)
 
     def found(self, coarse: Registration, fine: Registration) -> Found:

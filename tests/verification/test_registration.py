@@ -14,8 +14,10 @@ from segslam.registration import hypotheses, refinement, segregator
 from segslam.registration.free_space import observe_free_space
 from segslam.registration.hypotheses import MAX_COARSE_FINE_M, MAX_HYPOTHESES, anywhere, coarse_poses
 from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.scans import open_dataset
 from segslam.verification import register, register_near, register_prepared, rivals, score
 from segslam.verification.trial import Found, Trial
+from tools.benchmarks.altered import ALTERATIONS
 
 CONFIG = Config()
 
@@ -198,6 +200,16 @@ def test_scans_without_usable_points_are_rejected(points: np.ndarray) -> None:
     labels = np.ones(len(points), dtype=np.uint8)
     assert isinstance(register(points, points, source_labels=labels, target_labels=labels), Rejected)
     assert isinstance(register(points, points), Rejected)
+
+
+@pytest.mark.data
+def test_a_pose_that_slides_along_a_wall_rivals_another_on_the_wall(data_dir) -> None:
+    """Two scans of a courtyard, cut to a view of 40 degrees, see one wall; a pose 6.6 m along it fits as well."""
+    drive = open_dataset(data_dir / "courtyard")
+    cut = [ALTERATIONS["view-40"][1](drive[row].points.astype(np.float64), row).astype(np.float32) for row in (85, 82)]
+    outcome = register(*cut)
+    assert isinstance(outcome, Rejected), outcome
+    assert outcome.reason == RejectReason.AMBIGUOUS
 
 
 @pytest.mark.data

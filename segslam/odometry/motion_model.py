@@ -2,7 +2,9 @@
 
 The state is the motion of the sensor per interval. It is predicted to stay the same; how much motions change is
 measured on the last ones. Where the scans constrain the pose, the prediction has no weight. Where they do not, as along
-a tunnel, the motion continues as before, and its covariance grows from scan to scan.
+a tunnel, the motion continues as before, and its covariance grows from scan to scan. A later scan may show the position
+again, relative to scans from before: the last motion, from a wrong position to the right one, is then as uncertain as
+the change is large.
 """
 
 import math
@@ -13,7 +15,8 @@ from statistics import median
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.types import Information, Motion, Transform
+from segslam.core.types import Information, Motion, Transform, Vector
+from segslam.odometry.local_map import MAP_SCANS
 
 WINDOW = 30
 """Chosen: number of scans from which the usual values of a drive are learnt."""
@@ -78,6 +81,8 @@ class MotionModel:
         self._covariance: Information | None = None
         self._accumulated = np.zeros((6, 6))
         """Covariance of the error of the position since the last observation with that of the motion."""
+        self._unseen: deque[Information] = deque(maxlen=MAP_SCANS)
+        """Covariances of the motions that the scans of the map did not show, as tangents of the last scan."""
         self._changes: deque[np.ndarray] = deque(maxlen=WINDOW)
 
     @property
@@ -92,6 +97,7 @@ class MotionModel:
     def restart(self, T_step: Transform) -> None:
         """Continue with a motion per interval that is known exactly."""
         self.T_step, self._covariance, self._accumulated = T_step, None, np.zeros((6, 6))
+        self._unseen.clear()
 
     def _predicted_covariance(self, gap: float) -> Information | None:
         """(6, 6) of the predicted motion; None while too few motions are known."""
@@ -121,16 +127,33 @@ class MotionModel:
         The covariance is the increase of that of the position: errors of predicted motions add up linearly.
         """
         T_fused, gain, prior = self._fuse(T_last_lidar, measured, gap)
+        regained = self._regained(T_fused, gap)
         if gap == 1.0:
             self._learn(geometry.log(geometry.inverse(self.T_step) @ T_last_lidar), measured, prior)
+        left = np.eye(6) - gain
         posterior, carried = measured, np.zeros((6, 6))
         if prior is not None:
-            left = np.eye(6) - gain
             posterior, carried = left @ prior, self._accumulated @ left.T
         self._covariance, self._accumulated = posterior / gap**2, carried + posterior
         self.T_step = geometry.scaled(T_fused, 1.0 / gap)
         total = posterior + carried + carried.T
-        return T_fused, (total + total.T) / 2
+        total = (total + total.T) / 2
+        self._unseen.append(left @ total @ left.T)
+        turn = np.kron(np.eye(2), T_fused[:3, :3].T)
+        self._unseen = deque([turn @ covariance @ turn.T for covariance in self._unseen], MAP_SCANS)
+        return T_fused, total + np.outer(regained, regained)
+
+    def _regained(self, T_fused: Transform, gap: float) -> Vector:
+        """(6,) the part of the change of the motion by which the scan probably corrects the last position instead.
+
+        The change has two causes, in proportion to their covariances: the motion changed, or the position was wrong.
+        """
+        expected = self._predicted_covariance(gap)
+        if expected is None or not self._unseen:
+            return np.zeros(6)
+        unseen = sum(self._unseen)
+        change = geometry.log(geometry.inverse(self.predicted(gap)) @ T_fused)
+        return unseen @ np.linalg.pinv(unseen + expected) @ change
 
     def _fuse(
         self, T_last_lidar: Transform, measured: Information, gap: float

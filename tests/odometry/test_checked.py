@@ -495,6 +495,27 @@ def test_a_turn_that_a_scan_shows_does_not_make_a_slide_credible_that_it_does_no
     assert seen[1, 3] == pytest.approx(3.0, abs=0.01), "a slide that the scan shows is kept, however large"
 
 
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_a_scan_that_shows_the_position_again_makes_the_last_motion_as_unsure_as_the_jump(is_seen: bool) -> None:
+    """Ten scans show only a wall along y; the next one shows also where along it, 2 m from the predicted place."""
+    model = MotionModel()
+    rng = np.random.default_rng(0)
+    for step_m in rng.normal(0.3, 0.02, 20):
+        model.update(geometry.transform(np.eye(3), [0.0, step_m, 0.0]), 1e-4 * np.eye(6), 1.0)
+    along_m = 0.01 if is_seen else 50.0
+    for _ in range(10):
+        T_last_lidar = geometry.transform(np.eye(3), [0.0, 0.3 if is_seen else rng.uniform(-0.7, 1.3), 0.0])
+        model.update(T_last_lidar, np.diag(np.square([0.01, 0.01, 0.01, 0.01, along_m, 0.01])), 1.0)
+    T_jump = geometry.transform(np.eye(3), [0.0, 2.3, 0.0])
+    fused, covariance = model.update(T_jump, 1e-4 * np.eye(6), 1.0)
+    assert fused[1, 3] == pytest.approx(2.3, abs=0.05)
+    if is_seen:
+        assert covariance[4, 4] ** 0.5 < 0.3, "the position was known, so the motion changed"
+    else:
+        assert covariance[4, 4] ** 0.5 == pytest.approx(2.0, abs=0.3)
+    assert covariance[3, 3] ** 0.5 < 0.05
+
+
 @pytest.mark.parametrize("is_better", [True, False])
 def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_better: bool) -> None:
     scans, truth = round_drive()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from segslam.core import geometry
-from segslam.core.types import Alignment, Registration, SegslamError
+from segslam.core.types import Alignment, LoopClosure, Registration, SegslamError
 from segslam.run.fleets.relations import (
     MOST_FAILED,
     Components,
@@ -28,22 +28,24 @@ def _registration(T: np.ndarray) -> Registration:
     return Registration(T, 30, 20, 0.1, root @ root.T + np.eye(6))
 
 
-def _alignment(T: np.ndarray) -> Alignment:
-    return Alignment(_registration(T), _registration(T), 0.8, 0.05, 0.001, observability=0.5)
+def _found(own: int, target: int) -> LoopClosure:
+    coarse, fine = _registration(_pose()), _registration(_pose())
+    return LoopClosure.of(own, target, Alignment(coarse, fine, 0.8, 0.05, 0.001, observability=0.5))
 
 
 def test_a_relation_is_read_as_it_was_written(tmp_path: Path) -> None:
     file = tmp_path / "relation.json"
-    relation = Relation(_pose(), ((3, 5, _alignment(_pose())), (7, 9, _alignment(_pose()))))
+    relation = Relation(_pose(), (_found(3, 5), _found(7, 9)))
     write_relation(file, relation)
     again = read_relation(file)
     np.testing.assert_array_equal(again.T_earlier_later, relation.T_earlier_later)
-    for (own, target, found), (own_again, target_again, found_again) in zip(relation.found, again.found, strict=True):
-        assert (own, target) == (own_again, target_again)
-        for one, other in ((found.coarse, found_again.coarse), (found.fine, found_again.fine)):
+    for found, found_again in zip(relation.found, again.found, strict=True):
+        assert found.pair == found_again.pair
+        own, read = found.alignment, found_again.alignment
+        for one, other in ((found, found_again), (own.coarse, read.coarse), (own.fine, read.fine)):
             np.testing.assert_array_equal(one.T_target_source, other.T_target_source)
             np.testing.assert_array_equal(one.information, other.information)
-        assert found.observability == found_again.observability
+        assert own.observability == read.observability
     write_relation(file, Relation(None, (), "0 of 9"))
     assert read_relation(file).reason == "0 of 9"
     file.write_text('{"found": 3}')
@@ -54,7 +56,7 @@ def test_a_relation_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_the_inverse_has_the_same_cost_for_the_same_motion() -> None:
     """A tangent of a pose, and the tangent of the inverse that stands for the same pose, have equal chi-squares."""
     pose = _registration(_pose())
-    back = inverted(Alignment(pose, pose, 0.8, 0.05, 0.001)).fine
+    back = inverted(LoopClosure.of(1, 0, Alignment(pose, pose, 0.8, 0.05, 0.001)))
     np.testing.assert_allclose(back.T_target_source @ pose.T_target_source, np.eye(4), atol=1e-12)
     tangent = 1e-4 * RNG.normal(size=6)
     moved = geometry.inverse(pose.T_target_source @ geometry.exp(tangent))
@@ -69,8 +71,8 @@ def test_each_drive_is_related_to_the_most_similar_earlier_one_first() -> None:
     similarity = {(2, 0): 9.0, (2, 1): 7.0, (3, 1): 3.0, (4, 3): 5.0}
     assert components.next_pairs(similarity) == [(2, 0), (3, 1), (4, 3)]
     T_0_2, T_1_2 = _pose(), _pose()
-    components.add(2, 0, Relation(T_0_2, ((1, 1, _alignment(_pose())),)))
-    components.add(2, 1, Relation(T_1_2, ((2, 3, _alignment(_pose())),)))
+    components.add(2, 0, Relation(T_0_2, (_found(1, 1),)))
+    components.add(2, 1, Relation(T_1_2, (_found(2, 3),)))
     components.add(4, 3, Relation(None, (), "not found"))
     assert components.members() == [[0, 1, 2], [3], [4]]
     assert components.next_pairs(similarity) == [(3, 1)]
@@ -83,7 +85,7 @@ def test_each_drive_is_related_to_the_most_similar_earlier_one_first() -> None:
     np.testing.assert_allclose(poses[1].T_earlier_world, T_0_2)
     np.testing.assert_allclose(poses[2].T_earlier_world, geometry.inverse(T_1_2))
     assert poses[2].earlier == 1, "the second of the order"
-    assert poses[2].found[0][:2] == (3, 2), "keyframe of the drive, and of the one before it"
+    assert poses[2].found[0].pair == (3, 2), "keyframe of the drive, and of the one before it"
 
 
 def test_a_drive_that_several_earlier_ones_do_not_fit_is_not_tried_with_all() -> None:

@@ -2,19 +2,17 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.types import Alignment, Registration, SegslamError, Transform
+from segslam.core.types import LoopClosure, Registration, SegslamError, Transform
 from segslam.graph.closure_pairs import adjoints
+from segslam.output.log.records import codec
 from segslam.run.sessions.session_pose import MOST_FAILED, SessionPose
-
-Found = tuple[int, int, Alignment]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,45 +20,30 @@ class Relation:
     """The pose of a drive's world frame in that of an earlier drive, or why it is unknown."""
 
     T_earlier_later: Transform | None
-    found: tuple[Found, ...]
-    """Keyframe of the later drive, of the earlier one, and the pose of the first in the second."""
+    found: tuple[LoopClosure, ...]
+    """Poses of keyframes of the later drive (sources) in keyframes of the earlier one."""
     reason: str = ""
 
 
 def write_relation(file: Path, relation: Relation) -> None:
     """As JSON, without loss."""
-    pose = None if relation.T_earlier_later is None else relation.T_earlier_later.tolist()
-    found = [(own, target, asdict(alignment)) for own, target, alignment in relation.found]
-    values = {"T_earlier_later": pose, "found": found, "reason": relation.reason}
-    file.write_text(json.dumps(values, default=np.ndarray.tolist) + "\n", encoding="utf-8")
+    file.write_text(json.dumps(codec(Relation).encode(relation)) + "\n", encoding="utf-8")
 
 
 def read_relation(file: Path) -> Relation:
     """Raises SegslamError, naming the file, if it is damaged."""
     try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-        found = tuple(
-            (
-                int(own),
-                int(target),
-                Alignment(**one | {name: _registration(one[name]) for name in ("coarse", "fine")}),
-            )
-            for own, target, one in values["found"]
-        )
-        pose = values["T_earlier_later"]
-        return Relation(None if pose is None else np.array(pose, float).reshape(4, 4), found, str(values["reason"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        relation: Relation = codec(Relation).decode(json.loads(file.read_text(encoding="utf-8")), {})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise SegslamError(f"{file}: damaged ({error!r}); remove it, and call `segslam fleet` again") from error
+    return relation
 
 
-def _registration(values: dict[str, Any]) -> Registration:
-    arrays = {"T_target_source": (4, 4), "information": (6, 6)}
-    return Registration(**values | {name: np.array(values[name], float).reshape(size) for name, size in arrays.items()})
-
-
-def inverted(alignment: Alignment) -> Alignment:
-    """The same alignment as the pose of the target in the source."""
-    return replace(alignment, coarse=_inverted(alignment.coarse), fine=_inverted(alignment.fine))
+def inverted(found: LoopClosure) -> LoopClosure:
+    """The same as the pose of the target in the source."""
+    alignment = found.alignment
+    back = replace(alignment, coarse=_inverted(alignment.coarse), fine=_inverted(alignment.fine))
+    return LoopClosure.of(found.target_id, found.source_id, back)
 
 
 def _inverted(pose: Registration) -> Registration:
@@ -130,7 +113,7 @@ class Components:
         assert relation.T_earlier_later is not None
         if (drive, before) in self._relations:
             return SessionPose(number, relation.T_earlier_later, relation.found)
-        found = tuple((target, own, inverted(alignment)) for own, target, alignment in relation.found)
+        found = tuple(inverted(one) for one in relation.found)
         return SessionPose(number, geometry.inverse(relation.T_earlier_later), found)
 
     def next_pairs(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:

@@ -160,7 +160,7 @@ def _proposed(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
 
 def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], key: str) -> Relation:
     """The pose of a drive in an earlier one, from its keyframes that look like places there."""
-    file = fleet / PAIRS / f"{later.name} in {earlier.name}-{key}.json"
+    file = fleet / PAIRS / f"{later.name} at {earlier.name}-{key}.json"
     if not file.exists():
         session, known = (read_session(one.folder(fleet)) for one in (later, earlier))
         config = known.run.config

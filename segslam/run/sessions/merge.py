@@ -21,7 +21,7 @@ from segslam.output.log import RunLog
 from segslam.run.locator import Locator
 from segslam.run.run import Run
 from segslam.run.sessions.recorded import Session, Shift, known_of, next_shift, read_sessions, shifted_steps
-from segslam.run.sessions.session_pose import SessionPose, attempt, find_session
+from segslam.run.sessions.session_pose import SessionPose, attempt, find_session, shifted
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.known import Kept, nothing_kept
 from segslam.slam.slam import Slam, SlamResult
@@ -120,7 +120,7 @@ class Merged:
         if found is None:
             return {}
         target_shift = self.shifts[found.earlier].keyframe_id
-        return {one[0]: (attempt(one, shift.keyframe_id, target_shift),) for one in found.found}
+        return {one.source_id: (attempt(shifted(one, shift.keyframe_id, target_shift)),) for one in found.found}
 
     def georeference(self, folder: Path) -> str:
         """Place the merged run on the globe by the fixes of all its sessions.

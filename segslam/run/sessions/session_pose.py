@@ -6,14 +6,14 @@ noise (`segslam.graph.closure_pairs`). A wrong location is consistent with few o
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
+from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import PoseGraph
 from segslam.run.locator import Locator, submaps_of
 from segslam.run.sessions.recorded import FIRST_MOTION, Session
@@ -43,8 +43,8 @@ class SessionPose:
     """Number of the earlier session."""
     T_earlier_world: Transform
     """Pose of the session's world frame in that of the earlier session."""
-    found: tuple[tuple[int, int, Alignment], ...]
-    """Keyframe of the session, keyframe of the earlier one, and their alignment, for each consistent location."""
+    found: tuple[LoopClosure, ...]
+    """Consistent locations of keyframes of the session (sources) at keyframes of the earlier one."""
 
 
 def find_session(
@@ -65,10 +65,12 @@ def find_session(
     """
     recorded = session.log.keyframes()
     submaps = submaps_of([recorded[number] for number in range(len(recorded))], recorded, config)
-    found: list[tuple[int, int, Alignment]] = []
+    found: list[LoopClosure] = []
     count = len(session.travel_m)
     queries = (
-        _spread(count) if likely is None else _with_neighbours(likely, count, lambda: found[-1][0] if found else None)
+        _spread(count)
+        if likely is None
+        else _with_neighbours(likely, count, lambda: found[-1].source_id if found else None)
     )
     num_tried = 0
     for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
@@ -76,17 +78,17 @@ def find_session(
         submap = submaps.submap(keyframe_id)
         place = locator.locate(submap.points, submap.labels, max_places=MAX_PLACES if likely is None else 1)
         if not isinstance(place, Rejected):
-            found.append((keyframe_id, place.keyframe_id, place.alignment))
+            found.append(LoopClosure.of(keyframe_id, place.keyframe_id, place.alignment))
         if len(found) == NUM_ENOUGH or (likely is not None and not found and num_tried == MOST_FAILED):
             break
     summary = f"{len(found)} of {num_tried} keyframes were found there"
     if len(found) < MIN_FOUND:
         return f"{summary}, {MIN_FOUND} are needed"
     graph, first_id = _both(earlier, session, config)
-    closures = [closure(one, first_id) for one in found]
+    closures = [shifted(one, first_id, 0) for one in found]
     consistent = graph.consistent(closures)
     kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
-    travel_m = session.travel_m[[one[0] for one in kept]]
+    travel_m = session.travel_m[[one.source_id for one in kept]]
     if len(kept) < MIN_FOUND or np.ptp(travel_m) < MIN_SPREAD_M:
         return f"{summary}, but no {MIN_FOUND} of them, {MIN_SPREAD_M:g} m apart, are consistent with the odometry"
     for one, keep in zip(closures, consistent, strict=True):
@@ -121,19 +123,16 @@ def _with_neighbours(likely: Sequence[int], count: int, last_found: Callable[[],
             queue.extendleft((keyframe_id - 1, keyframe_id + 1))
 
 
-def closure(found: tuple[int, int, Alignment], first_id: int, target_shift: int = 0) -> LoopClosure:
-    """A located keyframe as a loop of a graph in which the ids of the session start at `first_id`."""
-    own, target, alignment = found
-    return LoopClosure.of(own + first_id, target + target_shift, alignment)
+def shifted(closure: LoopClosure, source_shift: int, target_shift: int) -> LoopClosure:
+    """The loop in a graph in which the ids of the two sessions are larger by these numbers."""
+    return replace(closure, source_id=closure.source_id + source_shift, target_id=closure.target_id + target_shift)
 
 
-def attempt(found: tuple[int, int, Alignment], first_id: int, target_shift: int) -> LoopAttempt:
-    """The same loop as an attempt, whose prior is the found pose."""
-    made = closure(found, first_id, target_shift)
-    T_target_source = made.T_target_source
-    distance_m = geometry.distance(T_target_source)
-    candidate = LoopCandidate(made.source_id, made.target_id, T_target_source, distance_m)
-    return LoopAttempt(candidate, made, {})
+def attempt(closure: LoopClosure) -> LoopAttempt:
+    """A located keyframe as an attempt, whose prior is the found pose."""
+    T_target_source = closure.T_target_source
+    candidate = LoopCandidate(*closure.pair, T_target_source, geometry.distance(T_target_source))
+    return LoopAttempt(candidate, closure, {})
 
 
 def _both(earlier: Session, session: Session, config: Config) -> tuple[PoseGraph, int]:

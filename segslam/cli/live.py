@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from segslam.core.types import BadScan, Step
     from segslam.output.foxglove_server import FoxgloveServer
     from segslam.output.viewer import Scene
-    from segslam.run.live import Ended, Front, LiveMap, Placed, Source
+    from segslam.run.live import Front, LiveMap, Placed, Source
     from segslam.run.live.live_map import Show
     from segslam.run.live.ros import MappingPublisher
     from segslam.run.run import Run
@@ -122,7 +122,7 @@ def live(
             terminal.say(f"{source.name}: {ended.why}")
         for file in map_files:
             file.parent.mkdir(parents=True, exist_ok=True)
-        more = figures.metrics(ended, num_restarts=front.num_restarts)
+        more = figures.metrics()
         finish(
             run,
             terminal,
@@ -148,7 +148,7 @@ def _remove_if_empty(folder: Path) -> None:
 
 def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]", terminal: Terminal) -> "LiveFigures":
     """Close the loops of each scan with a pose, log it and show it."""
-    figures = LiveFigures()
+    figures = LiveFigures(front)
     with Status(terminal) as status:
         for placed in front:
             tries_loops = front.num_keyframes_waiting < MOST_BEHIND
@@ -245,34 +245,30 @@ def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublis
 class LiveFigures:
     """Latencies, delays and counts of a live run."""
 
-    def __init__(self) -> None:
+    def __init__(self, front: "Front") -> None:
+        self._front = front
         self._latency_ms: list[float] = []
         self._lag_s: list[float] = []
         self._num_unsearched = 0
         self._started = monotonic()
-        self.num_dropped = self.num_missing = 0
 
     def note(self, placed: "Placed", *, lag_s: float, tries_loops: bool) -> None:
         """Record a scan that was mapped and logged."""
-        from segslam.odometry import Tracked
-
         self._latency_ms.append(1000 * placed.latency_s)
         self._lag_s.append(lag_s)
-        is_keyframe = isinstance(placed.tracked, Tracked) and placed.tracked.registered is not None
-        self._num_unsearched += is_keyframe and not tries_loops
-        self.num_dropped, self.num_missing = placed.num_dropped, placed.gaps.num_missing
+        self._num_unsearched += placed.is_keyframe and not tries_loops
 
-    def metrics(self, ended: "Ended", *, num_restarts: int) -> dict[str, Any]:
+    def metrics(self) -> dict[str, Any]:
         """The figures of `metrics.json` that only live runs have."""
-        num_dropped = max(self.num_dropped, ended.num_dropped)
+        tally, gaps = self._front.tally, self._front.gaps
         return {
-            "num_scans_arrived": ended.num_arrived or len(self._lag_s) + num_dropped,
-            "num_scans_dropped": num_dropped,
-            "num_scans_missing": max(self.num_missing, ended.gaps.num_missing),
-            "num_gaps": ended.gaps.num_gaps,
-            "longest_gap_s": ended.gaps.longest_gap_s,
-            "num_clock_set": ended.gaps.num_clock_set,
-            "num_restarts": num_restarts,
+            "num_scans_arrived": tally.num_arrived,
+            "num_scans_dropped": tally.num_dropped,
+            "num_scans_missing": gaps.num_missing,
+            "num_gaps": gaps.num_gaps,
+            "longest_gap_s": gaps.longest_gap_s,
+            "num_clock_set": gaps.num_clock_set,
+            "num_restarts": self._front.num_restarts,
             "num_keyframes_unsearched": self._num_unsearched,
             "latency_ms": _spread(self._latency_ms),
             "loop_lag_s": _spread(self._lag_s),
@@ -287,10 +283,10 @@ class LiveFigures:
             text += f", pose {median(self._latency_ms[-20:]):.0f} ms after the scan"
             if self._lag_s[-1] > 5.0:
                 text += f", loops {self._lag_s[-1]:.1f} s behind"
-        if self.num_dropped:
-            text += f", {self.num_dropped} dropped"
-        if self.num_missing:
-            text += f", {self.num_missing} missing"
+        if num_dropped := self._front.tally.num_dropped:
+            text += f", {num_dropped} dropped"
+        if num_missing := self._front.gaps.num_missing:
+            text += f", {num_missing} missing"
         return text
 
 

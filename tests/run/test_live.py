@@ -40,7 +40,7 @@ def test_the_oldest_that_waits_is_dropped_and_counted() -> None:
         waiting.put(number * INTERVAL_NS, _scan)
     taken = [waiting.take(0.0) for _ in range(4)]
     assert [arrival.index if arrival else None for arrival in taken] == [2, 3, 4, None]
-    assert (waiting.num_arrived, waiting.num_dropped) == (5, 2)
+    assert (waiting.tally.num_arrived, waiting.tally.num_dropped) == (5, 2)
 
 
 def test_a_closed_queue_gives_what_waits_and_takes_nothing_more() -> None:
@@ -52,7 +52,7 @@ def test_a_closed_queue_gives_what_waits_and_takes_nothing_more() -> None:
     assert first is not None
     assert first.index == 0
     assert waiting.take(None) is None
-    assert waiting.num_arrived == 1
+    assert waiting.tally.num_arrived == 1
 
 
 def test_gaps_are_counted_by_stamp_with_the_scans_that_they_lack() -> None:

@@ -72,7 +72,7 @@ def test_a_file_removed_before_it_is_read_is_counted_and_changes_no_stamp(
         arrivals[1].read(1, 0)
     stamps = [arrivals[number].stamp_ns for number in (0, 2, 3)]
     assert 0 < stamps[2] - stamps[0] < 5_000_000_000
-    assert (waiting.num_arrived, waiting.rhythm.gaps.num_clock_set, waiting.rhythm.gaps.num_missing) == (4, 0, 0)
+    assert (waiting.tally.num_arrived, waiting.rhythm.gaps.num_clock_set, waiting.rhythm.gaps.num_missing) == (4, 0, 0)
 
 
 @pytest.mark.parametrize("stem", ["9999999999999900001", "9999999999999999"])
@@ -86,7 +86,7 @@ def test_a_stamp_that_no_time_has_makes_a_scan_unusable(tmp_path: Path, stem: st
     with pytest.raises(BadScan, match="no time between 1970 and 2116"):
         wild.read(0, wild.stamp_ns)
     assert good.stamp_ns == 1_700_000_000_500_000_000
-    assert waiting.num_arrived == 2
+    assert waiting.tally.num_arrived == 2
 
 
 def test_a_name_that_is_used_again_is_another_scan(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_a_source_that_is_opened_again_gives_the_scans_that_it_missed_once(tmp_p
     sleep(0.5)
     stopped.set()
     thread.join()
-    assert again.num_arrived == 2
+    assert again.tally.num_arrived == 2
 
 
 class _Published(HangingSource):

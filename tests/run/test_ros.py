@@ -242,7 +242,7 @@ def test_a_source_that_is_paused_takes_no_cloud() -> None:
     finally:
         source.close()
     assert not refused.successful
-    assert waiting.num_arrived == 1
+    assert waiting.tally.num_arrived == 1
     assert output[-2:] == ["/points: paused", "/points: running"]
 
 

@@ -3,7 +3,7 @@
 from segslam.run.live.folder import FolderSource
 from segslam.run.live.front import Front
 from segslam.run.live.live_map import LiveMap
-from segslam.run.live.serve import Ended, Placed
+from segslam.run.live.serve import Placed
 from segslam.run.live.waiting import Source
 
-__all__ = ["Ended", "FolderSource", "Front", "LiveMap", "Placed", "Source"]
+__all__ = ["FolderSource", "Front", "LiveMap", "Placed", "Source"]

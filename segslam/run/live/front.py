@@ -21,7 +21,7 @@ from segslam.core.memory import note_peak_of
 from segslam.core.types import SegslamError, Step
 from segslam.odometry import Tracked
 from segslam.run.live.serve import END_S, READY, Chosen, Ended, Past, Placed, serve
-from segslam.run.live.waiting import Source, Tally
+from segslam.run.live.waiting import Gaps, Source, Tally
 from segslam.scans.presets import Preset
 
 CLOUDS_KEPT = 20
@@ -49,7 +49,7 @@ class Front:
         self._is_ready = False
         self.is_stopping = False
         """True after `stop`."""
-        self._tally = RawValue(Tally)
+        self.tally = RawValue(Tally)
         self._past = Past([], deque(maxlen=CLOUDS_KEPT))
         self._num_placed = 0
         self._received: SimpleQueue[Any] = SimpleQueue()
@@ -61,6 +61,11 @@ class Front:
         self._start()
         self._receiver = Thread(target=self._receive, name="receive", daemon=True)
         self._receiver.start()
+
+    @property
+    def gaps(self) -> Gaps:
+        """Gaps in the stamps up to the last scan with a pose."""
+        return self._past.gaps
 
     def wait_until_ready(self) -> None:
         """Wait until arriving scans are processed. Raises SegslamError if the source cannot be opened."""
@@ -78,7 +83,7 @@ class Front:
 
     def __iter__(self) -> Iterator[Placed]:
         while not isinstance(item := self._next(), Ended):
-            if _is_keyframe(item):
+            if isinstance(item, Placed) and item.is_keyframe:
                 self.num_keyframes_waiting -= 1
             yield item
         self.ended = item
@@ -106,7 +111,7 @@ class Front:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        arguments = (theirs, *self._serving, self._past, self._tally)
+        arguments = (theirs, *self._serving, self._past, self.tally)
         self._process = context.Process(target=serve, args=arguments, name="front")
         self._process.start()
         theirs.close()
@@ -120,10 +125,10 @@ class Front:
             if died is None:
                 return
             self._process.join(timeout=1.0)
-            num_lost = self._tally.num_arrived - self._tally.num_dropped - self._num_placed
-            self._tally.num_dropped += num_lost
+            num_lost = self.tally.num_arrived - self.tally.num_dropped - self._num_placed
+            self.tally.num_dropped += num_lost
             if self.is_stopping or not self._is_ready:
-                self._received.put(self._final(died))
+                self._received.put(replace(died, failed=not self.is_stopping))  # a death while it stops is no failure
                 return
             lost = f"{num_lost} scan{'s' * (num_lost != 1)} lost" if num_lost else "no scan lost"
             self._tell(f"{died.why}: {lost}; starting it again ...")
@@ -131,16 +136,6 @@ class Front:
             self.num_restarts += 1
             self._pipe.close()
             self._start()
-
-    def _final(self, died: Ended) -> Ended:
-        """The end of the stream with the process that died; a death after the request to stop is no failure."""
-        return replace(
-            died,
-            failed=not self.is_stopping,
-            num_arrived=self._tally.num_arrived,
-            num_dropped=self._tally.num_dropped,
-            gaps=self._past.gaps,
-        )
 
     def _receive_until_dead(self) -> Ended | None:
         """None after the regular end of the stream, otherwise what the process died of."""
@@ -185,10 +180,6 @@ class Front:
             self._past.clouds.append((len(self._past.steps), tracked.registered.points))
         step = Step(tracked.scan_index, tracked.stamp_ns, tracked.T_odom_lidar, None, (), None, {}, tracked.motion)
         self._past.steps.append(step)
-
-
-def _is_keyframe(item: object) -> bool:
-    return isinstance(item, Placed) and isinstance(item.tracked, Tracked) and item.tracked.registered is not None
 
 
 def _cause(exit_code: int | None) -> str:

@@ -33,15 +33,19 @@ MOST_SHOWN = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A scan with its odometry pose, or an unusable scan, and the counts so far."""
+    """A scan with its odometry pose, or an unusable scan, and the gaps so far."""
 
     tracked: Tracked | BadScan
     latency_s: float
     """Time from the arrival of the scan to the publication of its pose."""
     placed_s: float
     """Time of the publication, by time.monotonic."""
-    num_dropped: int
     gaps: Gaps
+
+    @property
+    def is_keyframe(self) -> bool:
+        """Whether the scan becomes a keyframe."""
+        return isinstance(self.tracked, Tracked) and self.tracked.registered is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +59,13 @@ class Chosen:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """End of the stream: reason and final counts."""
+    """End of the stream, and its reason."""
 
     why: str = ""
     """Empty if the stop was requested."""
     failed: bool = False
     died: bool = False
     """True if the process can be started again."""
-    num_arrived: int = 0
-    num_dropped: int = 0
-    gaps: Gaps = field(default_factory=Gaps)
 
 
 @dataclass(slots=True, eq=False)
@@ -131,7 +132,7 @@ def serve(
     finally:
         if feeder is None or not feeder.is_alive():
             source.close()
-    to_send.put(Ended(why, failed, died, waiting.num_arrived, waiting.num_dropped, waiting.rhythm.gaps))
+    to_send.put(Ended(why, failed, died))
     to_send.put(None)
     sender.join()
 
@@ -213,7 +214,7 @@ def _place_all(
             last_ns = arrival.stamp_ns
             _publish(source, arrival, tracked, to_send)
         now = monotonic()
-        to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.num_dropped, waiting.rhythm.gaps))
+        to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.rhythm.gaps))
     return not waiting.is_closed
 
 

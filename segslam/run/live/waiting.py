@@ -26,7 +26,10 @@ SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
 
 
 class Tally(ctypes.Structure):
-    """Counts that can lie in memory shared by two processes: they survive the process that counts."""
+    """Scans that arrived, and those dropped because the queue was full.
+
+    It can lie in memory shared by two processes: the counts survive the process that counts.
+    """
 
     _fields_ = (("num_arrived", ctypes.c_int64), ("num_dropped", ctypes.c_int64))
     num_arrived: int
@@ -56,19 +59,9 @@ class Waiting:
         self._most = most
         self._arrivals: deque[Arrival] = deque()
         self._changed = Condition()
-        self._tally = tally or Tally()
+        self.tally = tally or Tally()
         self.is_closed = False
         self.rhythm = Rhythm()
-
-    @property
-    def num_arrived(self) -> int:
-        """Number of scans that arrived."""
-        return self._tally.num_arrived
-
-    @property
-    def num_dropped(self) -> int:
-        """Number of scans that were dropped, because the queue was full."""
-        return self._tally.num_dropped
 
     def put(self, sent_ns: int, read: Callable[[int, int], Scan]) -> None:
         """Add a scan; drop the oldest if the queue is full. Does not wait. Without a usable stamp it is unusable."""
@@ -91,11 +84,11 @@ class Waiting:
             if self.is_closed:
                 return
             stamp_ns = 0 if sent_ns is None else self.rhythm.note(sent_ns)
-            self._arrivals.append(Arrival(self.num_arrived, stamp_ns, sent_ns or 0, arrived_s, read))
-            self._tally.num_arrived += 1
+            self._arrivals.append(Arrival(self.tally.num_arrived, stamp_ns, sent_ns or 0, arrived_s, read))
+            self.tally.num_arrived += 1
             if len(self._arrivals) > self._most:
                 self._arrivals.popleft()
-                self._tally.num_dropped += 1
+                self.tally.num_dropped += 1
             self._changed.notify()
 
     def take(self, timeout_s: float | None) -> Arrival | None:

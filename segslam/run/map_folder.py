@@ -46,35 +46,19 @@ def map_folder(
     on_step: Callable[[Step], object] = lambda step: None,
     slam_of: SlamOf = Slam,
     options: Mapping[str, str] = MappingProxyType({}),
+    place: Callable[[Path], str] | None = None,
 ) -> FinishedRun:
     """Map a folder of scans or a recording into the new folder `out`, like `segslam map`; returns the finished run.
 
     Options are those of `open_dataset` and `Slam`; without `config`, the preset that fits the scans is used. `on_step`
-    is called with each Step, in order. `slam_of` creates the pipeline; `options` are written to the log. Scans that
-    cannot be used are skipped with a warning. Raises SegslamError, naming the file and the remedy, also if no scan
-    remains.
+    is called with each Step, in order. `slam_of` creates the pipeline; `options` are written to the log; `place`
+    georeferences the folder of the run. Scans that cannot be used are skipped with a warning. Raises SegslamError,
+    naming the file and the remedy, also if no scan remains.
     """
     source = DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic)
-    return map_source(
-        source, Path(out), config=config, odometry=odometry, on_step=on_step, slam_of=slam_of, options=options
-    )
-
-
-def map_source(
-    source: DataSource,
-    out: Path,
-    *,
-    config: Config | None = None,
-    odometry: "Odometry | None" = None,
-    on_step: Callable[[Step], object] = lambda step: None,
-    slam_of: SlamOf = Slam,
-    options: Mapping[str, str] = MappingProxyType({}),
-    place: Callable[[Path], str] | None = None,
-) -> FinishedRun:
-    """As `map_folder`; `place` georeferences the run."""
     scans = open_scans(source, config or Config())
     config = in_effect(config or preset(preset_for(extent_m(scans))), scans)
-    folder = new_folder(out)
+    folder = new_folder(Path(out))
     own = {"odometry": odometry, "slam_of": None if slam_of is Slam or "in_map" in options else slam_of}
     not_resumed = [name for name, value in own.items() if value is not None]
     recorded = {**resume_options(source), "python": ", ".join(not_resumed), **options}

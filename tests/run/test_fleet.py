@@ -24,7 +24,7 @@ from segslam.run.fleets import Drive, FleetResult, fleet, read_drives, workers
 from segslam.run.fleets.orchestrate import FILE
 from segslam.run.fleets.steps import map_drive
 from segslam.run.sessions import session_pose
-from segslam.scans import DataSource, open_dataset
+from segslam.scans import open_dataset
 from segslam.slam.adjustment import submaps
 from segslam.slam.slam import Slam
 
@@ -141,13 +141,13 @@ def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
     (folder / "runs" / ".friday.0123.part").mkdir()
     before = _made(folder)
     tried = []
-    map_source = segslam.run.fleets.steps.map_source
+    map_folder = segslam.run.fleets.steps.map_folder
 
-    def mapped(source: DataSource, *arguments: Any, **options: Any) -> Any:
-        tried.append(source.data.name)
-        return map_source(source, *arguments, **options)
+    def mapped(data: Path, *arguments: Any, **options: Any) -> Any:
+        tried.append(data.name)
+        return map_folder(data, *arguments, **options)
 
-    monkeypatch.setattr("segslam.run.fleets.steps.map_source", mapped)
+    monkeypatch.setattr("segslam.run.fleets.steps.map_folder", mapped)
     again = fleet(_drives(recordings), folder, same_reference=True, settings=SETTINGS)
     assert again.drives == joined.drives
     assert _made(folder) == before

@@ -20,7 +20,6 @@ from segslam.core.config import Config, load_config
 from segslam.core.types import SegslamError, Trajectory
 from segslam.gnss.fixes import Fixes
 from segslam.gnss.reading import read_fixes
-from segslam.labels.encodings import Encoding
 from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
@@ -29,7 +28,7 @@ from segslam.run.fleets.alignments import Alignments, part_of, write_alignments
 from segslam.run.fleets.drives import Drive
 from segslam.run.fleets.relations import Relation, read_relation, write_relation
 from segslam.run.locator import Locator
-from segslam.run.map_folder import given_odometry, map_source, open_scans
+from segslam.run.map_folder import given_odometry, map_folder, open_scans
 from segslam.run.sessions.merge import Before, arranged, write_merged
 from segslam.run.sessions.recorded import Session, read_session
 from segslam.run.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
@@ -82,22 +81,16 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
     if is_made(mapped.folder(fleet), key):
         return mapped
     part = _beside(mapped.folder(fleet))
-    source = DataSource(
-        Path(drive.data),
-        drive.sequence,
-        drive.dataset or None,
-        drive.labels,
-        cast("Encoding | None", drive.encoding or None),
-        drive.frames or None,
-        drive.topic,
-    )
+    names = ("sequence", "dataset", "labels", "encoding", "frames", "topic")
+    options = {name: given for name in names if (given := getattr(drive, name))}
+    source = DataSource(Path(drive.data), **options)
     config = _config(drive, source)
     fixes = read_fixes(drive.gnss, recording=source.data) if drive.gnss else None  # fails before the drive is mapped
     odometry = None
     if drive.odometry:
         odometry = given_odometry(Path(drive.odometry), open_scans(source, config), config.odometry)
     place = None if fixes is None else partial(_georeference, drive.name, fixes)
-    map_source(source, part, config=config, odometry=odometry, place=place)
+    map_folder(source.data, part, config=config, odometry=odometry, place=place, **options)
     _made(part, mapped.folder(fleet), key)
     return mapped
 

@@ -75,8 +75,9 @@ def _section(name: str, section: Section) -> str:
 
 
 def _row(key: str, value: Any, field: FieldInfo, *, source: bool = False) -> str:
-    found = SOURCE.search(field.description or "")
-    meaning = SOURCE.sub("", field.description or "")
+    description = " ".join((field.description or "").split())
+    found = SOURCE.search(description)
+    meaning = SOURCE.sub("", description)
     unit = TRAILING_UNITS.search(meaning)
     cells = (
         f"`{key}`",

@@ -235,7 +235,7 @@ def _setting_section(name: str, section: Section, default: Section) -> str:
     rows = ""
     for key, setting in type(section).model_fields.items():
         kind = ' class="changed"' if values[key] != usual[key] else ""
-        cells = _key(key), escape(str(values[key])), escape(setting.description or "")
+        cells = _key(key), escape(str(values[key])), escape(" ".join((setting.description or "").split()))
         rows += f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
     return f"<details{' open' if values != usual else ''}><summary>{name}</summary><table>{rows}</table></details>"
 

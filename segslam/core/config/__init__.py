@@ -11,46 +11,20 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from segslam.core.config.sections import (
-    USER_SETTINGS,
-    AdjustmentConfig,
-    Config,
-    GraphConfig,
-    HealthConfig,
-    KeyframeConfig,
-    LabelName,
-    MapConfig,
-    OdometryConfig,
-    ProximityConfig,
-    RefineConfig,
-    Section,
-    SegregatorConfig,
-    SensorCalibrationConfig,
-    VerifyConfig,
-)
+from segslam.core.config.sections import USER_SETTINGS as USER_SETTINGS
+from segslam.core.config.sections import Config
+from segslam.core.config.sections import GraphConfig as GraphConfig
+from segslam.core.config.sections import KeyframeConfig as KeyframeConfig
+from segslam.core.config.sections import LabelName as LabelName
+from segslam.core.config.sections import MapConfig as MapConfig
+from segslam.core.config.sections import OdometryConfig as OdometryConfig
+from segslam.core.config.sections import ProximityConfig as ProximityConfig
+from segslam.core.config.sections import RefineConfig as RefineConfig
+from segslam.core.config.sections import Section as Section
+from segslam.core.config.sections import SegregatorConfig as SegregatorConfig
+from segslam.core.config.sections import SensorCalibrationConfig as SensorCalibrationConfig
+from segslam.core.config.sections import VerifyConfig as VerifyConfig
 from segslam.core.errors import SegslamError, brief, unreadable
-
-__all__ = [
-    "USER_SETTINGS",
-    "AdjustmentConfig",
-    "Config",
-    "GraphConfig",
-    "HealthConfig",
-    "KeyframeConfig",
-    "LabelName",
-    "MapConfig",
-    "OdometryConfig",
-    "ProximityConfig",
-    "RefineConfig",
-    "Section",
-    "SegregatorConfig",
-    "SensorCalibrationConfig",
-    "VerifyConfig",
-    "changed_settings",
-    "config_from_yaml",
-    "config_to_yaml",
-    "load_config",
-]
 
 logger = logging.getLogger(__name__)
 Model = TypeVar("Model", bound=BaseModel)
@@ -209,20 +183,18 @@ def config_from_yaml(text: str, source: str) -> Config:
 def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
     """The values without settings of older versions that no longer exist."""
     all_gone: list[str] = []
+    kept = dict(values)
     for section, names in REMOVED.items():
         given = values.get(section)
-        if not isinstance(given, dict):
-            continue
-        gone = [name for name in given if name in names.split()]
-        all_gone += [f"{section}.{name}" for name in gone]
-        kept = {name: value for name, value in given.items() if name not in gone}
-        values = {name: value for name, value in values.items() if name != section}
-        if kept or section in Config.model_fields:
-            values[section] = kept
+        if isinstance(given, dict):
+            kept[section] = {name: value for name, value in given.items() if name not in names.split()}
+            all_gone += [f"{section}.{name}" for name in given if name not in kept[section]]
+            if not kept[section] and section not in Config.model_fields:
+                del kept[section]
     if all_gone:
         verbs = "no longer exists and is" if len(all_gone) == 1 else "no longer exist and are"
         logger.warning("%s: %s %s ignored", source, ", ".join(all_gone), verbs)
-    return values
+    return kept
 
 
 def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:

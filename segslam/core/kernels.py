@@ -10,12 +10,11 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, update_wrapper
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from queue import Queue
 from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -95,19 +94,18 @@ def are_built(modules: Sequence[str] = MODULES) -> bool:
 def build(modules: Sequence[str] = MODULES) -> Iterator[str]:
     """Compile all kernels of these modules in two processes; yields the name of each when it is done.
 
-    Raises RuntimeError, with the last lines that a process wrote, if it fails.
+    Raises RuntimeError, with the last lines that the processes wrote, if both fail.
     """
-    lines: Queue[str] = Queue()
-    processes = [_start(modules, backwards=backwards) for backwards in (False, True)]
-    threads = [threading.Thread(target=_pass_on, args=(process, lines)) for process in processes]
-    for thread in threads:
-        thread.start()
+    from_processes, pipe = os.pipe()
+    processes = [_start(modules, pipe, backwards=backwards) for backwards in (False, True)]
+    os.close(pipe)
     try:
-        yield from _names_of_done(lines, num_kernels(modules))
+        with open(from_processes, encoding="utf-8", errors="replace") as lines:
+            yield from _names_of_done(lines, num_kernels(modules))
     finally:
-        for process, thread in zip(processes, threads, strict=True):
+        for process in processes:
             process.kill()  # no effect on a process that has ended
-            thread.join()
+            process.wait()
     stamp = _stamp(modules)
     stamp.parent.mkdir(parents=True, exist_ok=True)
     stamp.touch()
@@ -184,42 +182,31 @@ def _processor() -> str:
     return "".join(line for line in text.partition("\n\n")[0].splitlines() if line.startswith(("model name", "flags")))
 
 
-def _start(modules: Sequence[str], *, backwards: bool) -> subprocess.Popen[str]:
+def _start(modules: Sequence[str], pipe: int, *, backwards: bool) -> subprocess.Popen[bytes]:
     code = f"from segslam.core.kernels import _build; _build({list(modules)}, backwards={backwards})"
     path = os.pathsep.join([str(PACKAGE.parent), *filter(None, sys.path)])
     return subprocess.Popen(
         [sys.executable, "-c", code],
-        stdout=subprocess.PIPE,
+        stdout=pipe,
         stderr=subprocess.STDOUT,
-        text=True,
         env=os.environ | {"PYTHONPATH": path},
     )
 
 
-def _names_of_done(lines: "Queue[str]", total: int) -> Iterator[str]:
+def _names_of_done(lines: Iterable[str], total: int) -> Iterator[str]:
     """Name of each kernel on its first report, until there are `total`."""
     done: set[str] = set()
     others: list[str] = []
-    while len(done) < total:
-        line = lines.get()
+    for line in map(str.strip, lines):
         name = line.removeprefix(DONE)
-        if not line:
-            raise RuntimeError(f"the kernels were not compiled: {' '.join(others[-3:]) or 'a process was stopped'}")
         if name == line:
             others.append(line)
         elif name not in done:
             done.add(name)
             yield name
-
-
-def _pass_on(process: subprocess.Popen[str], lines: "Queue[str]") -> None:
-    """Pass on each line of the process, and an empty line if it fails."""
-    assert process.stdout is not None
-    with process.stdout as output:
-        for line in output:
-            lines.put(line.strip() or "-")
-    if process.wait():
-        lines.put("")
+        if len(done) == total:
+            return
+    raise RuntimeError(f"the kernels were not compiled: {' '.join(others[-3:]) or 'a process was stopped'}")
 
 
 def _build(modules: Sequence[str], *, backwards: bool) -> None:

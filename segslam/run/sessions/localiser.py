@@ -10,7 +10,7 @@ import numpy as np
 
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
-from segslam.core.trajectory import travelled_m
+from segslam.core.trajectory import nearest_rows, travelled_m
 from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
 from segslam.graph import AnchoredGraph, Graph
 from segslam.odometry import Odometry
@@ -78,10 +78,8 @@ class Localiser(Slam):
         kept = [number for number, weight in self._anchored.weights.items() if weight >= REJECTED_WEIGHT]
         placed = np.array([self._keyframe_rows[number] for number in sorted(kept)], dtype=int)
         for number in np.unique(segment[placed]):
-            rows, own = np.flatnonzero(segment == number), placed[segment[placed] == number]
-            after = np.clip(np.searchsorted(own, rows), 0, len(own) - 1)
-            around = own[np.column_stack([np.maximum(after - 1, 0), after])]
-            distance_m[rows] = np.abs(travel_m[rows, None] - travel_m[around]).min(axis=1)
+            rows, own_m = np.flatnonzero(segment == number), travel_m[placed[segment[placed] == number]]
+            distance_m[rows] = np.abs(travel_m[rows] - own_m[nearest_rows(own_m, travel_m[rows])])
         return distance_m
 
 

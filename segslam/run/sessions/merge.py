@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import REJECTED_WEIGHT, LoopAttempt, SegslamError, Step, Trajectory
@@ -20,7 +21,7 @@ from segslam.output.georeferenced import georeference_if_possible, recorded_fixe
 from segslam.output.log import RunLog
 from segslam.run.locator import Locator
 from segslam.run.run import Run
-from segslam.run.sessions.recorded import Session, Shift, known_of, next_shift, read_sessions, shifted_steps
+from segslam.run.sessions.recorded import Session, Shift, known_of, read_sessions, shifted_steps
 from segslam.run.sessions.session_pose import SessionPose, attempt, find_session, shifted
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.known import Kept, nothing_kept
@@ -30,6 +31,8 @@ OPTIMIZE_EVERY = 25
 """Chosen: number of keyframes of a later session between two optimisations; odometry drifts little over 50 m."""
 SEARCH_EVERY_M = 12.0
 """Chosen: travel between two keyframes of a later session for which loops with earlier sessions are searched."""
+GAP_NS = 1_000_000_000
+"""Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
 StepToTake = tuple[Step, int, bool]
 """A step, and the arguments `below` and `optimize` of `Slam.take`."""
 
@@ -56,11 +59,6 @@ class Merged:
     def num_steps(self) -> int:
         """Number of scans of all sessions."""
         return sum(len(session.run.result.trajectory) for session in self.sessions)
-
-    @property
-    def dataset(self) -> str:
-        """Names of the data sets."""
-        return " + ".join(dict.fromkeys(session.run.dataset for session in self.sessions))
 
     def summary(self) -> str:
         """One line per session: the run in which it was found."""
@@ -90,7 +88,7 @@ class Merged:
         return Run(
             folder,
             Slam(config, known=known_of(self.sessions, kept)),
-            dataset=self.dataset,
+            dataset=" + ".join(dict.fromkeys(session.run.dataset for session in self.sessions)),
             T_camera_lidar=self.sessions[0].run.T_camera_lidar,
             reference=self.reference,
             options=self.options(),
@@ -164,13 +162,7 @@ def plan(
     waiting, why = list(sessions[1:]), dict[tuple[str, int], str]()
     while waiting:
         locators += [Locator.from_run(session.run.folder) for session in taken[len(locators) :]]
-        found = None
-        for session in waiting:
-            found = _find_in_any(session, taken, locators, why, config=config, progress=progress)
-            if found is not None:
-                break
-        if found is None:
-            raise SegslamError(_not_found(waiting[0], taken, why))
+        session, found = _find_any(waiting, taken, locators, why, config=config, progress=progress)
         taken.append(session)
         session_poses.append(found)
         waiting.remove(session)
@@ -222,44 +214,53 @@ def write_merged(
     return read_run(folder)
 
 
-def _find_in_any(
-    session: Session,
+def _find_any(
+    waiting: Sequence[Session],
     taken: Sequence[Session],
     locators: Sequence[Locator],
     why: dict[tuple[str, int], str],
     *,
     config: Config,
     progress: Progress,
-) -> SessionPose | None:
-    """The pose of a session in the first session in which it is found. Reasons of failures are added to `why`."""
-    for number, (earlier, locator) in enumerate(zip(taken, locators, strict=True)):
-        if (session.name, number) not in why:
-            found = find_session(session, earlier, number, locator, config=config, progress=progress)
-            if isinstance(found, SessionPose):
-                return found
-            why[session.name, number] = found
-    return None
-
-
-def _not_found(session: Session, taken: Sequence[Session], why: dict[tuple[str, int], str]) -> str:
-    tried = "; ".join(f"in {one.name}: {why[session.name, number]}" for number, one in enumerate(taken))
-    return f"{session.name}: not found in any other run ({tried}); merge runs that share places"
+) -> tuple[Session, SessionPose]:
+    """The first session that is found in one of those taken, and its pose. Reasons of failures are added to `why`."""
+    for session in waiting:
+        for number, (earlier, locator) in enumerate(zip(taken, locators, strict=True)):
+            if (session.name, number) not in why:
+                found = find_session(session, earlier, number, locator, config=config, progress=progress)
+                if isinstance(found, SessionPose):
+                    return session, found
+                why[session.name, number] = found
+    first = waiting[0].name
+    tried = "; ".join(f"in {one.name}: {why[first, number]}" for number, one in enumerate(taken))
+    raise SegslamError(f"{first}: not found in any other run ({tried}); merge runs that share places")
 
 
 def _shifts(sessions: Sequence[Session], session_poses: Sequence[SessionPose | None]) -> tuple[Shift, ...]:
-    """Offsets of the numbers of each session, and the transform of its odometry to the pose found."""
+    """Offsets of the numbers of each session, and the transform of its odometry to the pose found.
+
+    Stamps that are later than those of the previous session are unchanged.
+    """
     shifts = [Shift()]
     T_first_world = [np.eye(4)]
     for before, session, found in zip(sessions[:-1], sessions[1:], session_poses[1:], strict=True):
-        T_before_world = T_first_world[-1]
+        T_before_world, last = T_first_world[-1], shifts[-1]
         if found is not None:
             T_first_world.append(T_first_world[found.earlier] @ found.T_earlier_world)
         T_last_first = geometry.inverse(T_before_world @ before.T_world_keyframe[-1]) @ (
             T_first_world[-1] @ session.T_world_keyframe[0]
         )
-        T_new_first = shifts[-1].pose(before.T_odom_keyframe[-1]) @ T_last_first
-        T_new_old = T_new_first @ geometry.inverse(session.T_odom_keyframe[0])
-        shifts.append(next_shift(shifts[-1], before, T_new_old, session))
+        T_new_first = last.pose(before.T_odom_keyframe[-1]) @ T_last_first
+        drive, first_ns = before.run.result.trajectory, int(session.run.result.trajectory.stamp_ns[0])
+        last_ns = int(drive.stamp_ns[-1]) + last.stamp_ns
+        shift = Shift(
+            keyframe_id=last.keyframe_id + len(before.travel_m),
+            scan_index=last.scan_index + int(drive.scan_index[-1]) + 1,
+            stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
+            travel_m=last.travel_m + float(before.travel_m[-1]) + 2.0 * BREAK_TRAVEL_M,  # rounded, it is still a break
+            T_new_old=T_new_first @ geometry.inverse(session.T_odom_keyframe[0]),
+        )
+        shifts.append(shift)
     return tuple(shifts)
 
 

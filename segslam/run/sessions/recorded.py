@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
     Information,
@@ -23,14 +22,12 @@ from segslam.odometry import information_of
 from segslam.output.finished import FinishedRun, read_corrections, read_run
 from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
-from segslam.slam.adjustment import Adjustment, Known
+from segslam.slam.adjustment import Known
 from segslam.slam.adjustment.correction import common_sweep
 from segslam.slam.adjustment.distortion import MIN_PAIRS
 from segslam.slam.adjustment.known import Kept, nothing_kept
 from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
-GAP_NS = 1_000_000_000
-"""Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
 FIRST_MOTION = Motion(MotionState.BEGUN, information=1e-12 * np.eye(6))
 """The motion to the first scan of a session, which is unknown."""
 
@@ -53,17 +50,13 @@ class Session:
         """The folder of the run."""
         return str(self.run.folder)
 
-    @property
-    def adjustment(self) -> Adjustment | None:
-        """The run's own adjustment."""
-        return self.log.adjustment()
-
 
 def known_of(sessions: Sequence[Session], kept: Kept = nothing_kept) -> Known:
     """The results of the sessions' own adjustments, for all of them together."""
     poses = np.concatenate([session.T_world_keyframe for session in sessions])
     corrections = [one for each in sessions for one in read_corrections(each.log, len(each.travel_m))]
-    sweeps = [None if one.adjustment is None else one.adjustment.sweep for one in sessions]
+    adjustments = [session.log.adjustment() for session in sessions]
+    sweeps = [None if one is None else one.sweep for one in adjustments]
     return Known(poses, corrections, _angle(sessions), common_sweep(sweeps), kept)
 
 
@@ -162,16 +155,3 @@ def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopA
             step.stage_seconds,
             motion,
         )
-
-
-def next_shift(before: Shift, session: Session, T_new_old: Transform, following: Session) -> Shift:
-    """The shift of the session `following`, after `session` with the shift `before`. Later stamps are unchanged."""
-    last_ns = int(session.run.result.trajectory.stamp_ns[-1]) + before.stamp_ns
-    first_ns = int(following.run.result.trajectory.stamp_ns[0])
-    return Shift(
-        keyframe_id=before.keyframe_id + len(session.travel_m),
-        scan_index=before.scan_index + int(session.run.result.trajectory.scan_index[-1]) + 1,
-        stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
-        travel_m=before.travel_m + float(session.travel_m[-1]) + BREAK_STEP_M,
-        T_new_old=T_new_old,
-    )

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -85,7 +85,7 @@ class _Fleet:
         self._reasons: dict[str, str] = {}
 
     def run(self, drives: Sequence[Drive], same_reference: bool) -> FleetResult:
-        mapped = self._indexed(self._mapped(drives))
+        mapped = self._mapped(drives)
         if not mapped:
             first, why = next(iter(self._reasons.items()))
             raise SegslamError(f"no drive could be mapped; {first}: {why}")
@@ -123,22 +123,19 @@ class _Fleet:
                 tasks.append((self._folder, drive, drive.key(version("segslam"))))
             except SegslamError as error:
                 self._failed(drive.name, str(error))
-        outcomes = self._all("map", steps.map_drive, tasks)
-        return self._without_failed([task[1].name for task in tasks], outcomes)
+        mapped = [Mapped(drive.name, key) for _, drive, key in tasks]
+        mapped = self._done("map", steps.map_drive, tasks, mapped)
+        return self._done("index", steps.index_drive, [(self._folder, drive) for drive in mapped], mapped)
 
-    def _indexed(self, mapped: list[Mapped]) -> list[Mapped]:
-        outcomes = self._all("index", steps.index_drive, [(self._folder, drive) for drive in mapped])
-        done = [Outcome(drive, one.failure) for drive, one in zip(mapped, outcomes, strict=True)]
-        return self._without_failed([drive.name for drive in mapped], done)
-
-    def _without_failed(self, names: Iterable[str], outcomes: Iterable[Outcome]) -> list[Mapped]:
-        kept: list[Mapped] = []
-        for name, outcome in zip(names, outcomes, strict=True):
-            if outcome.failure is None:
-                kept.append(outcome.value)
-            else:
-                self._failed(name, outcome.failure)
-        return kept
+    def _done(
+        self, step: str, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], drives: Sequence[Mapped]
+    ) -> list[Mapped]:
+        """The drives whose tasks did not fail."""
+        failures = [outcome.failure for outcome in self._all(step, function, tasks)]
+        for drive, failure in zip(drives, failures, strict=True):
+            if failure is not None:
+                self._failed(drive.name, failure)
+        return [drive for drive, failure in zip(drives, failures, strict=True) if failure is None]
 
     def _proposed(self, mapped: Sequence[Mapped]) -> dict[tuple[int, int], list[tuple[int, float]]]:
         """Keyframes of a drive that look most like places of an earlier one, by the numbers of both."""
@@ -149,9 +146,7 @@ class _Fleet:
         numbers = {drive.name: number for number, drive in enumerate(mapped)}
         proposals: dict[tuple[int, int], list[tuple[int, float]]] = {}
         for later, outcome in enumerate(self._all("propose", steps.propose, tasks)):
-            if outcome.failure is not None:
-                raise WorkFailed(f"{mapped[later].name}: {outcome.failure}; call `segslam fleet` again to go on")
-            proposals |= {(later, numbers[name]): likely for name, likely in outcome.value.items()}
+            proposals |= {(later, numbers[name]): likely for name, likely in _value(outcome, mapped[later]).items()}
         return proposals
 
     def _related(
@@ -167,9 +162,7 @@ class _Fleet:
                 key = key_of(mapped[later].key, mapped[earlier].key, queries)
                 tasks.append((self._folder, mapped[later], mapped[earlier], queries, key))
             for pair, outcome in zip(pairs, self._all("relate", steps.relate, tasks), strict=True):
-                if outcome.failure is not None:
-                    raise WorkFailed(f"{mapped[pair[0]].name}: {outcome.failure}; call `segslam fleet` again to go on")
-                relation: Relation = outcome.value
+                relation: Relation = _value(outcome, mapped[pair[0]])
                 components.add(*pair, relation)
                 how = f"is not joined to {mapped[pair[1]].name}: {relation.reason}"
                 if relation.T_earlier_later is not None:
@@ -192,6 +185,13 @@ class _Fleet:
             one |= {"reason": outcome.failure} if outcome.failure else {}
         steps.remove_components(self._folder, keep=len(made))
         return made
+
+
+def _value(outcome: Outcome, drive: Mapped) -> Any:
+    """The value of a drive's task. Raises WorkFailed if it failed."""
+    if outcome.failure is not None:
+        raise WorkFailed(f"{drive.name}: {outcome.failure}; call `segslam fleet` again to go on")
+    return outcome.value
 
 
 def _key(drives: Sequence[Mapped], poses: Sequence[SessionPose | None], same: bool) -> str:

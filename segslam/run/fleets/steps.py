@@ -75,12 +75,12 @@ def is_made(folder: Path, key: str) -> bool:
     return _made_with(folder) == key
 
 
-def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
+def map_drive(fleet: Path, drive: Drive, key: str) -> None:
     """Map a drive into its run folder, as `segslam map` does. Raises SegslamError, as that does."""
-    mapped = Mapped(drive.name, key)
-    if is_made(mapped.folder(fleet), key):
-        return mapped
-    part = _beside(mapped.folder(fleet))
+    folder = Mapped(drive.name, key).folder(fleet)
+    if is_made(folder, key):
+        return
+    part = _beside(folder)
     names = ("sequence", "dataset", "labels", "encoding", "frames", "topic")
     options = {name: given for name in names if (given := getattr(drive, name))}
     source = DataSource(Path(drive.data), **options)
@@ -91,8 +91,7 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> Mapped:
         odometry = given_odometry(Path(drive.odometry), open_scans(source, config), config.odometry)
     place = None if fixes is None else partial(_georeference, drive.name, fixes)
     map_folder(source.data, part, config=config, odometry=odometry, place=place, **options)
-    _made(part, mapped.folder(fleet), key)
-    return mapped
+    _made(part, folder, key)
 
 
 def _georeference(name: str, fixes: Fixes, part: Path) -> str:
@@ -117,13 +116,12 @@ def _config(drive: Drive, source: DataSource) -> Config:
     return load_config(file, drive.set, base=load_config(None, [ONE_THREAD], base=preset(name)))
 
 
-def index_drive(fleet: Path, drive: Mapped) -> int:
-    """Write the signatures of all keyframes of a run; returns their number."""
+def index_drive(fleet: Path, drive: Mapped) -> None:
+    """Write the signatures of all keyframes of a run."""
     file = drive.signatures(fleet)
     if not file.exists():
         spectra = np.array([one.spectrum for one in _locator(fleet, drive).signatures])
         _replace(file, lambda part: np.save(part, spectra))
-    return len(np.load(file, mmap_mode="r"))
 
 
 def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped], key: str) -> Likely:
@@ -183,7 +181,7 @@ def join(
             merged = arranged(sessions, poses, same_reference=same_reference)
             config = sessions[0].run.config
             parts = [
-                part_of(drive.name, drive.key, one.T_world_keyframe, one.adjustment, config=config.refine)
+                part_of(drive.name, drive.key, one.T_world_keyframe, one.log.adjustment(), config=config.refine)
                 for drive, one in zip(drives, sessions, strict=True)
             ]
             kept = Alignments(fleet / ALIGNMENTS, parts)

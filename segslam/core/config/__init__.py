@@ -114,7 +114,10 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base
 
     Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
     """
-    values = _changed(base.model_dump(mode="json") if base else {}, _read_yaml(path) if path else {})
+    values = base.model_dump(mode="json") if base else {}
+    for name, section in (_read_yaml(path) if path else {}).items():
+        known = values.get(name)
+        values[name] = known | section if isinstance(known, dict) and isinstance(section, dict) else section
     source = " and ".join([*([str(path)] if path else []), *(["--set"] if overrides or not path else [])])
     overridden = with_overrides(values, overrides, source=source, example="keyframes.distance_m=1.5")
     return validated(Config, _without_removed(overridden, source), source)
@@ -172,7 +175,17 @@ def config_from_yaml(text: str, source: str) -> Config:
 
     Settings that no longer exist are ignored with a warning. Raises SegslamError if the text is not a Config.
     """
-    known, gone = _known(_parse_yaml(text, source))
+    known: dict[str, Any] = {}
+    gone: list[str] = []
+    for name, section in _parse_yaml(text, source).items():
+        if name not in Config.model_fields:
+            gone.append(name)
+        elif isinstance(section, dict):
+            fields = type(getattr(Config(), name)).model_fields
+            gone += [f"{name}.{key}" for key in section if key not in fields]
+            known[name] = {key: value for key, value in section.items() if key in fields}
+        else:
+            known[name] = section
     if gone:
         more = f" and {len(gone) - MOST_NAMED} more" if len(gone) > MOST_NAMED else ""
         named = ", ".join(gone[:MOST_NAMED])
@@ -195,32 +208,6 @@ def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
         verbs = "no longer exists and is" if len(all_gone) == 1 else "no longer exist and are"
         logger.warning("%s: %s %s ignored", source, ", ".join(all_gone), verbs)
     return kept
-
-
-def _known(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The settings of this version, and the names of the others."""
-    known: dict[str, Any] = {}
-    gone: list[str] = []
-    for name, section in values.items():
-        if name not in Config.model_fields:
-            gone.append(name)
-        elif isinstance(section, dict):
-            fields = type(getattr(Config(), name)).model_fields
-            gone += [f"{name}.{key}" for key in section if key not in fields]
-            known[name] = {key: value for key, value in section.items() if key in fields}
-        else:
-            known[name] = section
-    return known, gone
-
-
-def _changed(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """The values of all sections, with the changed keys replaced."""
-    keywise = {
-        name: values[name] | section
-        for name, section in changes.items()
-        if isinstance(section, dict) and isinstance(values.get(name), dict)
-    }
-    return values | changes | keywise
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -8,15 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses, travelled_m
-from segslam.core.types import IndexPairs, Points, Transform, Vector
-
-Flags = Bool[np.ndarray, "_"]
+from segslam.core.types import IndexPairs, Mask, Points, Transform, Vector
 
 Z_UP = (0.0, 0.0, 1.0)
 """Upward axis of LiDAR frames."""
@@ -25,9 +22,7 @@ CAMERA_UP = (0.0, -1.0, 0.0)
 Up = Literal["z", "-y"]
 UP: dict[Up, tuple[float, float, float]] = {"z": Z_UP, "-y": CAMERA_UP}
 """Upward axes that pose files have, by name."""
-FLAT = (
-    3.0  # chosen: a path lies in a plane if it is this much wider than high; all 20 real drives looked at are 5 times
-)
+FLAT = 3.0  # chosen: a path lies in a plane if it is this much wider than high; 20 real drives are 5 times at least
 ALONG = 0.8  # chosen: smallest component of a direction along its axis; 0.96 or more in these drives
 MIN_POSES = 3  # fewer poses are always aligned without error
 LINE_TOLERANCE = 1e-6  # smallest extent across a line, relative to that along it; above rounding
@@ -188,14 +183,14 @@ def loop_metrics(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> 
     return metrics
 
 
-def false_loops(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> Flags:
+def false_loops(T_target_source: Poses, rows: IndexPairs, reference: Poses) -> Mask:
     """True for closures with errors above 2 m or 5 degrees; `rows`: (source, target) of each in `reference`."""
     truth = np.linalg.inv(reference[rows[:, 1]]) @ reference[rows[:, 0]]
     errors = pose_errors(T_target_source, truth)
     return (errors.translation_m > SUCCESS_M) | (errors.rotation_deg > SUCCESS_DEG)
 
 
-def revisits(reference: Poses) -> Flags:
+def revisits(reference: Poses) -> Mask:
     """(n,) True for poses within 4 m of an earlier pose at least 50 m of travel before."""
     travel_m = travelled_m(reference)
     near = cKDTree(reference[:, :3, 3]).query_pairs(REVISIT_M, output_type="ndarray")  # older row first

@@ -171,17 +171,11 @@ class Scan(Record):
     ) -> None:
         """`points`: array-like with at least 3 columns; the first 3 are used."""
         xyz = as_points(points)
-        values = {
-            "points": xyz,
-            "stamp_ns": stamp_ns,
-            "index": index,
-            "labels": np.zeros(len(xyz), np.uint8) if labels is None else labels,
-            "times": np.empty(0) if times is None else times,
-            "intensities": intensities,
-            "kept": kept,
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        labels = np.zeros(len(xyz), np.uint8) if labels is None else labels
+        times = np.empty(0) if times is None else times
+        values = (xyz, stamp_ns, index, labels, times, intensities, kept)
+        for one, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, one.name, value)
 
 
 class MotionState(StrEnum):

@@ -16,10 +16,10 @@ from segslam.core.points import within_range
 from segslam.core.threads import at_once
 from segslam.core.types import (
     Alignment,
+    Found,
     Keyframe,
     Labels,
     Points,
-    Record,
     Rejected,
     RejectReason,
     Transform,
@@ -39,7 +39,7 @@ NUM_FIRST = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Located(Record):
+class Located(Found):
     """The pose of a scan in a run."""
 
     T_world_lidar: Transform
@@ -49,11 +49,6 @@ class Located(Record):
     alignment: Alignment
     """Pose of the scan in that keyframe."""
     seconds: float
-
-    @property
-    def ok(self) -> bool:
-        """True; False for `Rejected`."""
-        return True
 
     @property
     def inliers(self) -> int:

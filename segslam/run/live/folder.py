@@ -135,20 +135,11 @@ class FolderSource:
 
     def _read(self, file: Path, index: int, stamp_ns: int, content: tuple[int, int]) -> Scan:
         """The scan of a file. Raises BadScan, also if the file has another content than when it was put."""
-        scan = self._read_now(file, index, stamp_ns)
-        found = file.stat()
-        if found.st_size != content[1] or found.st_mtime_ns > content[0]:
-            raise BadScan(f"{file}: written again before it was read; give each scan a file of its own")
-        return scan
-
-    def _read_now(self, file: Path, index: int, stamp_ns: int) -> Scan:
         try:
             cloud = read_file(file)
-        except BadScan:
-            raise
         except SegslamError as error:
             raise BadScan(str(error)) from error
-        return make_scan(
+        scan = make_scan(
             file,
             index,
             stamp_ns,
@@ -157,6 +148,10 @@ class FolderSource:
             intensities=cloud.intensities if self._has_intensities else None,
             vertical_angle_deg=self._vertical_angle_deg,
         )
+        found = file.stat()
+        if found.st_size != content[1] or found.st_mtime_ns > content[0]:
+            raise BadScan(f"{file}: written again before it was read; give each scan a file of its own")
+        return scan
 
 
 def stamp_of_name(stem: str) -> int | None:

@@ -1,7 +1,7 @@
 """The map so far: drawn by a separate thread when it has changed, or written to a file."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from threading import Condition, Thread
 from time import monotonic
@@ -97,10 +97,8 @@ def save_map(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf, file: Pa
         raise SegslamError("there is no keyframe yet")
     if config.color == "intensity":
         config = config.model_copy(update={"color": "class"})
-    return write_map(_keyframes(T_world_keyframe, cloud), [file], config=config)["num_map_points"]
-
-
-def _keyframes(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf) -> Iterator[tuple[Keyframe, Transform]]:
-    for number, T_world in T_world_keyframe.items():
-        points, labels = cloud(number)
-        yield Keyframe(number, 0, 0, np.eye(4), 0.0, points, labels), T_world
+    keyframes = (
+        (Keyframe(number, 0, 0, np.eye(4), 0.0, *cloud(number)), T_world)
+        for number, T_world in T_world_keyframe.items()
+    )
+    return write_map(keyframes, [file], config=config)["num_map_points"]

@@ -169,11 +169,15 @@ class Run:
         Scans are read by the calling thread and tracked in a second; a third closes loops and logs the steps.
         """
         tracked = in_other_thread(self._read(dataset), self._track, max_waiting=1)
-        return in_other_thread(tracked, self._done, max_waiting=MOST_WAITING)
+        return in_other_thread(tracked, self.follow, max_waiting=MOST_WAITING)
 
     def follow(self, tracked: Tracked | BadScan, *, tries_loops: bool = True) -> Step | BadScan:
-        """Close loops for a scan tracked by the caller, and log the step."""
-        return self._done(tracked, tries_loops=tries_loops)
+        """Close loops for a tracked scan, and log the step; a bad scan is reported and counted."""
+        if isinstance(tracked, BadScan):
+            self.num_scans_skipped += 1
+            self._report(tracked)
+            return tracked
+        return self._logged(self._slam.close_loops(tracked, tries_loops=tries_loops))
 
     def map_so_far(self) -> tuple[dict[int, Transform], CloudOf]:
         """The current pose of each keyframe, and a function that reads its points, which is safe in other threads."""
@@ -194,14 +198,8 @@ class Run:
 
         return in_other_thread(steps, taken, max_waiting=MOST_WAITING)
 
-    def finish(
-        self, *, search_s: float = math.inf, progress: Progress = no_progress
-    ) -> tuple[SlamResult, dict[str, Any]]:
-        """Final optimisation; writes all results. Returns the result and the figures that need no reference.
-
-        `search_s` limits the last search for loops, and `progress` shows the adjustment, as in `Slam.finish`. Raises
-        SegslamError if there was no step.
-        """
+    def _finish(self, search_s: float, progress: Progress) -> tuple[SlamResult, dict[str, Any]]:
+        """Final optimisation; writes all results. Returns the result and the figures that need no reference."""
         if self.num_steps == 0:
             why = "no scan was mapped"
             if self._unreported:
@@ -276,11 +274,12 @@ class Run:
         Returns the content of `metrics.json`, and what was found when the run was placed on the globe.
 
         `more` adds figures computed from the result. `place` georeferences the folder before the maps are written, and
-        returns what it found. `search_s` and `progress` as in `finish`. A failure of place or maps leaves a report.
+        returns what it found. `search_s` limits the last search for loops, and `progress` shows the adjustment, as in
+        `Slam.finish`. Raises SegslamError if there was no step. A failure of place or maps leaves a report.
         """
         from segslam.output.report import write_report
 
-        result, metrics = self.finish(search_s=search_s, progress=progress)
+        result, metrics = self._finish(search_s, progress)
         if self._reference is not None:
             metrics |= accuracy(result, self._reference)
         metrics |= more(result)
@@ -327,13 +326,6 @@ class Run:
             return scan if isinstance(scan, BadScan) else self._slam.track(scan)
         except BadScan as error:
             return error
-
-    def _done(self, tracked: Tracked | BadScan, *, tries_loops: bool = True) -> Step | BadScan:
-        if isinstance(tracked, BadScan):
-            self.num_scans_skipped += 1
-            self._report(tracked)
-            return tracked
-        return self._logged(self._slam.close_loops(tracked, tries_loops=tries_loops))
 
     def _logged(self, step: Step) -> Step:
         started = perf_counter()

@@ -117,7 +117,7 @@ def test_an_interrupted_run_continues_with_the_printed_command(
 def test_before_the_first_scan_nothing_is_left(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("segslam.run.run.Run._done", _interrupted)
+    monkeypatch.setattr("segslam.run.run.Run.follow", _interrupted)
     assert run("map", data, "--out", tmp_path / "run", "--quiet") == 130
     assert capsys.readouterr().err == "segslam: stopped: no scan was mapped, nothing was written\n"
     assert not list(tmp_path.iterdir())

@@ -146,39 +146,27 @@ def _bounds(points, beyond_squared, within_squared):
 @kernel("float64[:, ::1](float64[:, ::1], float64, float64, float64, int64[::1], int64[::1])")
 def _voxel_means(points, beyond_squared, within_squared, voxel_m, lows, extent):
     """The mean point of each voxel; `lows` and `extent` are those of `_grid`."""
-    size = 16
-    while size < 2 * len(points):
-        size *= 2
-    table = np.full(size, EMPTY, np.int64)
-    keys = np.empty(len(points), np.int64)
-    sums = np.zeros((len(points), 4))
+    rows, keys = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     count = 0
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        if not beyond_squared < x * x + y * y + z * z < within_squared:
-            continue
-        i = int(np.floor(x / voxel_m)) - lows[0]
-        j = int(np.floor(y / voxel_m)) - lows[1]
-        key = (i * extent[1] + j) * extent[2] + int(np.floor(z / voxel_m)) - lows[2]
-        slot = _home(key, size)
-        while table[slot] != EMPTY and keys[table[slot]] != key:
-            slot = (slot + 1) & (size - 1)
-        if table[slot] == EMPTY:
-            table[slot] = count
-            keys[count] = key
+        if beyond_squared < x * x + y * y + z * z < within_squared:
+            i = int(np.floor(x / voxel_m)) - lows[0]
+            j = int(np.floor(y / voxel_m)) - lows[1]
+            keys[count] = (i * extent[1] + j) * extent[2] + int(np.floor(z / voxel_m)) - lows[2]
+            rows[count] = k
             count += 1
-        group = sums[table[slot]]
-        group[0] += x
-        group[1] += y
-        group[2] += z
-        group[3] += 1.0
-    means = np.empty((count, 3))
-    order = np.argsort(keys[:count])
+    _, first = hash_keys(keys[:count])
+    sums = np.zeros((count, 4))
     for k in range(count):
-        group = sums[order[k]]
-        for axis in range(3):
-            means[k, axis] = group[axis] / group[3]
-    return means
+        group, point = sums[first[k]], points[rows[k]]
+        group[0] += point[0]
+        group[1] += point[1]
+        group[2] += point[2]
+        group[3] += 1.0
+    occupied = np.flatnonzero(first == np.arange(count))
+    order = occupied[np.argsort(keys[occupied])]
+    return sums[order, :3] / sums[order, 3:]
 
 
 @kernel("int64(int64, int64)")

@@ -10,11 +10,11 @@ from segslam.core.types import Alignment, LoopClosure, Registration, SegslamErro
 from segslam.run.fleets.relations import (
     MOST_FAILED,
     Components,
-    Relation,
     inverted,
     read_relation,
     write_relation,
 )
+from segslam.run.sessions.session_pose import Relation
 
 RNG = np.random.default_rng(3)
 

@@ -13,10 +13,10 @@ from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import write_whole
 from segslam.run.fleets import steps
 from segslam.run.fleets.drives import Drive, drives_of, key_of, read_drives, with_settings
-from segslam.run.fleets.relations import Components, Relation
+from segslam.run.fleets.relations import Components
 from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
-from segslam.run.sessions.session_pose import MIN_FOUND, SessionPose
+from segslam.run.sessions.session_pose import MIN_FOUND, Relation, SessionPose
 from segslam.slam.adjustment import Progress, no_progress
 
 FILE = "fleet.json"

@@ -2,27 +2,17 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from heapq import heappop, heappush
 from pathlib import Path
 
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.types import LoopClosure, Registration, SegslamError, Transform
+from segslam.core.types import LoopClosure, Registration, SegslamError
 from segslam.graph.closure_pairs import adjoints
 from segslam.output.log.records import codec
-from segslam.run.sessions.session_pose import MOST_FAILED, SessionPose
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Relation:
-    """The pose of a drive's world frame in that of an earlier drive, or why it is unknown."""
-
-    T_earlier_later: Transform | None
-    found: tuple[LoopClosure, ...]
-    """Poses of keyframes of the later drive (sources) in keyframes of the earlier one."""
-    reason: str = ""
+from segslam.run.sessions.session_pose import MOST_FAILED, Relation, SessionPose
 
 
 def write_relation(file: Path, relation: Relation) -> None:
@@ -58,14 +48,11 @@ class Components:
 
     def __init__(self, num_drives: int) -> None:
         self._component = list(range(num_drives))
+        """Of each drive: the number of the first drive of its component."""
         self._relations: dict[tuple[int, int], Relation] = {}
         self._tried = set[tuple[int, int]]()
         self._num_failed = [0] * num_drives
         """By component: pairs that could not be joined since its last drive was."""
-
-    def of(self, drive: int) -> int:
-        """The component of a drive: the number of its first drive."""
-        return self._component[drive]
 
     def members(self) -> list[list[int]]:
         """The drives of each component, by their first."""
@@ -77,9 +64,9 @@ class Components:
     def add(self, later: int, earlier: int, relation: Relation) -> None:
         """Join two drives, unless they are joined already, or their relation is unknown."""
         self._tried.add((later, earlier))
-        one, other = sorted((self.of(later), self.of(earlier)))
+        one, other = sorted((self._component[later], self._component[earlier]))
         if relation.T_earlier_later is None:
-            self._num_failed[self.of(later)] += 1
+            self._num_failed[self._component[later]] += 1
         if relation.T_earlier_later is None or one == other:
             return
         self._relations[later, earlier] = relation
@@ -124,7 +111,7 @@ class Components:
         """
         best: dict[int, tuple[float, tuple[int, int]]] = {}
         for pair, value in similarity.items():
-            own, other = map(self.of, pair)
+            own, other = (self._component[drive] for drive in pair)
             if own != other and pair not in self._tried and self._num_failed[own] < MOST_FAILED:
                 best[own] = max(best.get(own, (0.0, (0, 0))), (value, (-pair[0], -pair[1])))
         return sorted((-negated[0], -negated[1]) for _, negated in best.values())

@@ -26,12 +26,12 @@ from segslam.output.georeferenced import georeference, summary
 from segslam.output.log import read_log
 from segslam.run.fleets.alignments import Alignments, part_of, write_alignments
 from segslam.run.fleets.drives import Drive
-from segslam.run.fleets.relations import Relation, read_relation, write_relation
+from segslam.run.fleets.relations import read_relation, write_relation
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_folder, open_scans
 from segslam.run.sessions.merge import Before, arranged, write_merged
 from segslam.run.sessions.recorded import Session, read_session
-from segslam.run.sessions.session_pose import NUM_ENOUGH, SessionPose, find_session
+from segslam.run.sessions.session_pose import NUM_ENOUGH, Relation, SessionPose, find_session
 from segslam.scans import DataSource
 from segslam.scans.presets import SETTINGS, Preset, extent_m, preset, preset_for
 
@@ -41,7 +41,6 @@ KEY = "fleet.key"
 """File in a run folder of a fleet: the key that it was made with."""
 UNFINISHED = ".part"
 ONE_THREAD = "odometry.max_num_threads=1"
-NUM_LOCATORS = 2
 Likely = dict[str, list[tuple[int, float]]]
 """By the name of an earlier drive: keyframes of a drive and their largest similarities to a place there, best first."""
 
@@ -154,9 +153,8 @@ def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], 
     file = fleet / PAIRS / f"{later.name} at {earlier.name}-{key}.json"
     if not file.exists():
         session, known = (read_session(one.folder(fleet)) for one in (later, earlier))
-        config = known.run.config
-        found = find_session(session, known, 0, _locator(fleet, earlier), config=config, likely=queries)
-        relation = Relation(None, (), found) if isinstance(found, str) else Relation(found.T_earlier_world, found.found)
+        locator = _locator(fleet, earlier)
+        relation = find_session(session, known, locator, config=known.run.config, likely=queries)
         _replace(file, lambda part: write_relation(part, relation))
     return read_relation(file)
 
@@ -213,7 +211,7 @@ def _write_drives(folder: Path, drives: Sequence[Mapped], sessions: Sequence[Ses
         first = rows.stop
 
 
-@lru_cache(NUM_LOCATORS)
+@lru_cache(2)
 def _locator(fleet: Path, drive: Mapped) -> Locator:
     return Locator.from_run(drive.folder(fleet))
 

@@ -227,10 +227,10 @@ def _find_any(
     for session in waiting:
         for number, (earlier, locator) in enumerate(zip(taken, locators, strict=True)):
             if (session.name, number) not in why:
-                found = find_session(session, earlier, number, locator, config=config, progress=progress)
-                if isinstance(found, SessionPose):
-                    return session, found
-                why[session.name, number] = found
+                found = find_session(session, earlier, locator, config=config, progress=progress)
+                if found.T_earlier_later is not None:
+                    return session, SessionPose(number, found.T_earlier_later, found.found)
+                why[session.name, number] = found.reason
     first = waiting[0].name
     tried = "; ".join(f"in {one.name}: {why[first, number]}" for number, one in enumerate(taken))
     raise SegslamError(f"{first}: not found in any other run ({tried}); merge runs that share places")

@@ -36,6 +36,16 @@ GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Relation:
+    """The pose of a session's world frame in that of an earlier session, or why it is unknown."""
+
+    T_earlier_later: Transform | None
+    found: tuple[LoopClosure, ...]
+    """Consistent locations of keyframes of the later session (sources) at keyframes of the earlier one."""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SessionPose:
     """Pose of a session in an earlier one."""
 
@@ -44,20 +54,19 @@ class SessionPose:
     T_earlier_world: Transform
     """Pose of the session's world frame in that of the earlier session."""
     found: tuple[LoopClosure, ...]
-    """Consistent locations of keyframes of the session (sources) at keyframes of the earlier one."""
+    """As those of `Relation`."""
 
 
 def find_session(
     session: Session,
     earlier: Session,
-    number: int,
     locator: Locator,
     *,
     config: Config,
     likely: Sequence[int] | None = None,
     progress: Progress = no_progress,
-) -> SessionPose | str:
-    """The pose of a session in the earlier session of this `number`, or the reason as text if it is unknown.
+) -> Relation:
+    """The pose of a session in an earlier one.
 
     At most `NUM_QUERIES` keyframes, spread over the session, are searched; sparse ones together with their neighbours.
     `likely`: these keyframes are searched instead, in this order, and those before and after each that is found, until
@@ -83,20 +92,21 @@ def find_session(
             break
     summary = f"{len(found)} of {num_tried} keyframes were found there"
     if len(found) < MIN_FOUND:
-        return f"{summary}, {MIN_FOUND} are needed"
+        return Relation(None, (), f"{summary}, {MIN_FOUND} are needed")
     graph, first_id = _both(earlier, session, config)
     closures = [shifted(one, first_id, 0) for one in found]
     consistent = graph.consistent(closures)
     kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
     travel_m = session.travel_m[[one.source_id for one in kept]]
     if len(kept) < MIN_FOUND or np.ptp(travel_m) < MIN_SPREAD_M:
-        return f"{summary}, but no {MIN_FOUND} of them, {MIN_SPREAD_M:g} m apart, are consistent with the odometry"
+        why = f"{summary}, but no {MIN_FOUND} of them, {MIN_SPREAD_M:g} m apart, are consistent with the odometry"
+        return Relation(None, (), why)
     for one, keep in zip(closures, consistent, strict=True):
         if keep:
             graph.add_closure(one)
     graph.optimize()
     T_earlier_first = graph.T_world_keyframes[first_id]
-    return SessionPose(number, T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))
+    return Relation(T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))
 
 
 def _spread(count: int) -> list[int]:

@@ -33,7 +33,7 @@ from segslam.run.live.live_map import DrawnMap
 from segslam.run.live.waiting import Arrival, Waiting
 from segslam.scans.bag_messages import CLOUD
 from segslam.scans.dataset import make_scan, sweep_times
-from segslam.scans.point_cloud2 import read_message
+from segslam.scans.point_cloud2 import read_message, stamp_ns_of
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -70,12 +70,7 @@ class TopicSource:
         """Raises SegslamError for an invalid topic name. A missing slash at its start is added."""
         self._topic = topic if topic.startswith("/") else f"/{topic}"
         self.name = f"live{self._topic}"
-        try:
-            validate_full_topic_name(self._topic)
-        except (InvalidTopicNameException, ValueError) as error:
-            raise SegslamError(
-                f"--topic {topic}: not a topic name ({error}); `ros2 topic list` shows the topics"
-            ) from error
+        _check_topic(self._topic, f"--topic {topic}", "`ros2 topic list` shows the topics")
         self._has_intensities = intensities
         self._vertical_angle_deg = vertical_angle_deg
         self._is_paused = False
@@ -159,8 +154,7 @@ class TopicSource:
         if self._is_paused:
             return
         self._lidar_frame = message.header.frame_id or self._lidar_frame
-        stamp = message.header.stamp
-        sent_ns = stamp.sec * 1_000_000_000 + stamp.nanosec or self._node.get_clock().now().nanoseconds
+        sent_ns = stamp_ns_of(message) or self._node.get_clock().now().nanoseconds
         waiting.put(sent_ns, lambda index, stamp_ns: self._read(message, index, stamp_ns))
 
     def _read(self, message: PointCloud2, index: int, stamp_ns: int) -> Scan:
@@ -269,13 +263,17 @@ class FixTopic(_Spun):
     def __init__(self, topic: str) -> None:
         """Raises SegslamError for an invalid topic name."""
         self.rows: list[Row] = []
-        try:
-            validate_full_topic_name(topic)
-        except (InvalidTopicNameException, ValueError) as error:
-            raise SegslamError(f"--gnss {topic}: not a topic name ({error}); give it as in --gnss /fix") from error
+        _check_topic(topic, f"--gnss {topic}", "give it as in --gnss /fix")
         super().__init__("gnss")
         profile = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)  # receives from both kinds
         self._node.create_subscription(NavSatFix, topic, lambda message: self.rows.append(row_of(message)), profile)
+
+
+def _check_topic(topic: str, option: str, remedy: str) -> None:
+    try:
+        validate_full_topic_name(topic)
+    except (InvalidTopicNameException, ValueError) as error:
+        raise SegslamError(f"{option}: not a topic name ({error}); {remedy}") from error
 
 
 def start_node(name: str) -> tuple[Any, Any]:

@@ -4,7 +4,7 @@ import signal
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from threading import Event, Thread
@@ -105,8 +105,8 @@ def serve(
     sender = Thread(target=_send, args=(pipe, to_send), daemon=True)
     sender.start()
     waiting, stopped = Waiting(tally=tally), Event()
-    why, failed, died = "", False, False
-    feeder: _Feeder | None = None
+    fed = [Ended("the source has failed", failed=True)]  # remains after an unexpected exception
+    feeder = Thread(target=_feed, args=(source, waiting, stopped, fed), name="feed", daemon=True)
     config = configs[past.preset or "driving"]
     try:
         with OdometryApart(config.odometry) as odometry:
@@ -116,23 +116,22 @@ def serve(
                 tracker = _continued(Tracker(config, odometry=odometry), past, waiting)
             source.open(to_send.put)
             to_send.put(READY)
-            feeder = _Feeder(source, waiting, stopped)
+            feeder.start()
             Thread(target=_listen, args=(pipe, waiting, stopped), daemon=True).start()
             try:
                 is_idle = _place_all(tracker, source, waiting, to_send, idle_s, past)
             finally:
                 stopped.set()
                 feeder.join(timeout=END_S)
-            why = f"no scan for {idle_s:g} s" if is_idle else feeder.why
-            failed = feeder.failed
+            ended = replace(fed[0], why=f"no scan for {idle_s:g} s") if is_idle else fed[0]
             if feeder.is_alive():
-                why, failed = f"the source did not end within {END_S:g} s", False
+                ended = Ended(f"the source did not end within {END_S:g} s")
     except (SegslamError, OdometryEnded) as error:
-        why, failed, died = str(error), True, isinstance(error, OdometryEnded)
+        ended = Ended(str(error), failed=True, died=isinstance(error, OdometryEnded))
     finally:
-        if feeder is None or not feeder.is_alive():
+        if not feeder.is_alive():
             source.close()
-    to_send.put(Ended(why, failed, died))
+    to_send.put(ended)
     to_send.put(None)
     sender.join()
 
@@ -252,24 +251,14 @@ def _publish(source: Source, arrival: Arrival, tracked: Tracked, to_send: "Simpl
         to_send.put(f"{source.name}: the pose of scan {arrival.index} was not published ({error!r})"[:MOST_SHOWN])
 
 
-class _Feeder(Thread):
-    """Thread that runs the source's `feed`."""
-
-    def __init__(self, source: Source, waiting: Waiting, stopped: Event) -> None:
-        super().__init__(name="feed", daemon=True)
-        self._source, self._waiting, self._stopped = source, waiting, stopped
-        self.why, self.failed = "", False
-        self.start()
-
-    def run(self) -> None:
-        """Run until the source ends; the queue is then closed."""
-        self.why, self.failed = "the source has failed", True  # remains after an unexpected exception
-        try:
-            self.why, self.failed = self._source.feed(self._waiting, self._stopped), False
-        except (SegslamError, OSError) as error:
-            self.why, self.failed = str(error), True
-        finally:
-            self._waiting.close()
+def _feed(source: Source, waiting: Waiting, stopped: Event, ended: list[Ended]) -> None:
+    """Feed the queue until the source ends; the queue is then closed, and the end is in `ended`."""
+    try:
+        ended[0] = Ended(source.feed(waiting, stopped))
+    except (SegslamError, OSError) as error:
+        ended[0] = Ended(str(error), failed=True)
+    finally:
+        waiting.close()
 
 
 def _listen(pipe: Connection, waiting: Waiting, stopped: Event) -> None:

@@ -14,17 +14,7 @@ from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core.config import Config
 from segslam.core.points import within_range
 from segslam.core.threads import at_once
-from segslam.core.types import (
-    Alignment,
-    Found,
-    Keyframe,
-    Labels,
-    Points,
-    Rejected,
-    RejectReason,
-    Transform,
-    as_points,
-)
+from segslam.core.types import Alignment, Found, Keyframe, Labels, Points, Rejected, RejectReason, Transform, as_points
 from segslam.keyframes import Clouds, Submaps, downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.output.finished import read_run

@@ -18,15 +18,7 @@ from segslam.core.config import config_to_yaml
 from segslam.core.memory import peak_mb
 from segslam.core.threads import in_other_thread
 from segslam.core.trajectory import travelled_m
-from segslam.core.types import (
-    BadScan,
-    MotionState,
-    Scan,
-    SegslamError,
-    Step,
-    Trajectory,
-    Transform,
-)
+from segslam.core.types import BadScan, MotionState, Scan, SegslamError, Step, Trajectory, Transform
 from segslam.core.whole_files import write_whole
 from segslam.graph import PoseGraph
 from segslam.output.accuracy import accuracy

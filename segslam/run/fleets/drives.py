@@ -6,15 +6,13 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from segslam.core.config import parse_yaml, short
 from segslam.core.errors import unreadable
 from segslam.core.types import SegslamError
-
-KEY_DIGITS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +52,7 @@ PATHS = ("data", "odometry", "config", "gnss")
 def key_of(*parts: Any) -> str:
     """A short hash of values that JSON can hold."""
     text = json.dumps(parts, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _state(path: Path) -> list[tuple[str, int, int]]:
@@ -100,7 +98,7 @@ def drives_of(data: Sequence["Drive | str | Path"], *, config: Path | None = Non
 
 def with_settings(drives: Iterable[Drive], settings: Sequence[str]) -> list[Drive]:
     """The drives with further settings, before their own."""
-    return [Drive(**{**asdict(drive), "set": (*settings, *drive.set)}) for drive in drives]
+    return [replace(drive, set=(*settings, *drive.set)) for drive in drives]
 
 
 def _drive(value: Any, where: str, folder: Path) -> Drive:
@@ -145,4 +143,4 @@ def _named(drives: list[Drive]) -> list[Drive]:
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise SegslamError(f"{twice[0]}: two drives have this name; give each its own")
-    return [Drive(**{**asdict(drive), "name": name}) for drive, name in zip(drives, names, strict=True)]
+    return [replace(drive, name=name) for drive, name in zip(drives, names, strict=True)]

@@ -16,7 +16,6 @@ from segslam.core.memory import give_back, keep_freed_memory
 from segslam.core.types import SegslamError
 
 logger = logging.getLogger(__name__)
-DIED = "every worker process that tried it died"
 IDLE_S = 0.2
 """Chosen: CPU time of a task that found its result there; it freed no memory, and a collection takes half of this."""
 
@@ -106,4 +105,4 @@ def _on_cluster(
         try:
             yield numbers[future.key], future.result()
         except KilledWorker:
-            yield numbers[future.key], Outcome(None, DIED)
+            yield numbers[future.key], Outcome(None, "every worker process that tried it died")

@@ -59,7 +59,7 @@ def examine() -> dict[str, Any]:
     from segslam.core import extras, kernels
 
     packages: dict[str, dict[str, str | None]] = defaultdict(dict)
-    for package, _, _, extra in extras.requirements():
+    for package, _, extra in extras.requirements():
         if extra != "dev":
             packages[extra or "core"][package] = extras.installed_version(package)
     libraries = {name: _loads(name) for name in LIBRARIES}

@@ -10,10 +10,8 @@ class Requirement(NamedTuple):
     """A package that segslam needs."""
 
     package: str
-    options: str
-    """Extras of the package, for example `[fastrtps]`, or nothing."""
-    versions: str
-    """As pip takes them, for example `<2,>=1.20`."""
+    text: str
+    """As pip takes it, for example `ros-rclpy[fastrtps]<10,>=7.1`."""
     extra: str | None
     """None if the package is always needed."""
 
@@ -22,17 +20,17 @@ def requirements() -> list[Requirement]:
     """All packages that this installation declares, without its own extras."""
     found = []
     for line in requires("segslam") or []:
-        name = re.match(r"([\w.-]+)(\[[^\]]*\])? *([^; ]*)", line)
+        text = line.partition(";")[0].replace(" ", "")
+        name = re.match(r"[\w.-]+", text)
         extra = re.search(r"extra == ['\"]([\w-]+)['\"]", line)
-        if name and name[1] != "segslam":
-            found.append(Requirement(name[1], name[2] or "", name[3], extra[1] if extra else None))
+        if name and name[0] != "segslam":
+            found.append(Requirement(name[0], text, extra[1] if extra else None))
     return found
 
 
 def how_to_install(extra: str) -> str:
     """The command that installs the packages of an extra, wherever segslam was installed from."""
-    packages = [f"{need.package}{need.options}{need.versions}" for need in requirements() if need.extra == extra]
-    return f"pip install {shlex.join(packages)}"
+    return f"pip install {shlex.join(need.text for need in requirements() if need.extra == extra)}"
 
 
 def installed_version(package: str) -> str | None:

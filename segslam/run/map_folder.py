@@ -5,15 +5,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from segslam.core.config import Config, OdometryConfig
 from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError, Step, Trajectory
+from segslam.labels.encodings import Encoding
 from segslam.labels.label_files import unlabelled
-from segslam.odometry import GivenOdometry, KissOdometry
+from segslam.odometry import GivenOdometry, KissOdometry, Odometry
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import new_folder
 from segslam.output.log import Mirror
@@ -21,11 +21,6 @@ from segslam.run.run import Run
 from segslam.scans import Dataset, DataSource
 from segslam.scans.presets import extent_m, preset, preset_for
 from segslam.slam.slam import Slam
-
-if TYPE_CHECKING:
-    from segslam.labels.encodings import Encoding
-    from segslam.odometry import Odometry
-
 
 SlamOf = Callable[..., Slam]
 """What makes the pipeline of a run: `Slam`, or another with the same arguments and methods."""
@@ -39,10 +34,10 @@ def map_folder(
     sequence: str = "00",
     dataset: str | None = None,
     labels: str = "auto",
-    encoding: "Encoding | None" = None,
+    encoding: Encoding | None = None,
     frames: str | None = None,
     topic: str = "",
-    odometry: "Odometry | None" = None,
+    odometry: Odometry | None = None,
     on_step: Callable[[Step], object] = lambda step: None,
     slam_of: SlamOf = Slam,
     options: Mapping[str, str] = MappingProxyType({}),
@@ -78,7 +73,7 @@ def begun(
     folder: Path,
     config: Config,
     *,
-    odometry: "Odometry",
+    odometry: Odometry,
     slam_of: SlamOf = Slam,
     options: Mapping[str, str] = MappingProxyType({}),
     resumes: bool = False,
@@ -127,7 +122,7 @@ def in_effect(settings: Config, scans: Dataset) -> Config:
     return settings.model_copy(update={"sensor": sensor})
 
 
-def given_odometry(file: Path, scans: Dataset, config: OdometryConfig) -> "Odometry":
+def given_odometry(file: Path, scans: Dataset, config: OdometryConfig) -> Odometry:
     """Odometry from a file. TUM rows are matched by stamp; KITTI rows by scan number, or position among mapped scans.
 
     Raises SegslamError unless the number of KITTI rows is that of all scans of the data or of the mapped scans.

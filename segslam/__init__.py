@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from segslam.output.georeferenced import georeference
     from segslam.output.report import write_report as report
     from segslam.run.evaluate import evaluate
-    from segslam.run.fleets import fleet
+    from segslam.run.fleets.orchestrate import fleet
     from segslam.run.locator import Located, Locator, locate
     from segslam.run.map_folder import map_folder
     from segslam.run.replay import replay
@@ -72,7 +72,7 @@ _HOMES = {
     "Slam": "slam.slam",
     "evaluate": "run.evaluate",
     "export": "output.export",
-    "fleet": "run.fleets",
+    "fleet": "run.fleets.orchestrate",
     "georeference": "output.georeferenced",
     "keep_freed_memory": "core.memory",
     "load_config": "core.config",

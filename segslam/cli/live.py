@@ -26,9 +26,11 @@ if TYPE_CHECKING:
     from segslam.core.types import BadScan, Step
     from segslam.output.foxglove_server import FoxgloveServer
     from segslam.output.viewer import Scene
-    from segslam.run.live import Front, LiveMap, Placed, Source
-    from segslam.run.live.live_map import Show
+    from segslam.run.live.front import Front
+    from segslam.run.live.live_map import LiveMap, Show
     from segslam.run.live.ros import MappingPublisher
+    from segslam.run.live.serve import Placed
+    from segslam.run.live.waiting import Source
     from segslam.run.run import Run
 
 MOST_BEHIND = 20
@@ -78,7 +80,8 @@ def live(
     configs = live_configs(preset, output)
     from segslam.labels.label_files import unlabelled
     from segslam.output.folder import new_folder
-    from segslam.run.live import Front, LiveMap
+    from segslam.run.live.front import Front
+    from segslam.run.live.live_map import LiveMap
     from segslam.run.run import Run
     from segslam.slam.slam import Slam
 
@@ -212,7 +215,7 @@ def _check_ros(option: str) -> None:
 
 def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertical_angle_deg: float) -> "Source":
     if folder is not None:
-        from segslam.run.live import FolderSource
+        from segslam.run.live.folder import FolderSource
 
         return FolderSource(folder, intensities=intensities, vertical_angle_deg=vertical_angle_deg)
     try:
@@ -226,7 +229,7 @@ def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertic
 
 def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublisher | None":
     """The publisher of path and map if the source is a topic; it also saves the map on request."""
-    from segslam.run.live import FolderSource
+    from segslam.run.live.folder import FolderSource
     from segslam.run.live.live_map import save_map
 
     if isinstance(source, FolderSource):

@@ -96,9 +96,9 @@ def fleet(
         check_exists(path, "give a list of drives in YAML, or recordings")
     check_own(out, "runs")
     terminal.announce("fleet: reading the list")
-    from segslam.run.fleets import drives_of, read_drives
-    from segslam.run.fleets import fleet as run_fleet
+    from segslam.run.fleets.drives import drives_of, read_drives
     from segslam.run.fleets.orchestrate import FILE
+    from segslam.run.fleets.orchestrate import fleet as run_fleet
 
     changes.load()  # reports a wrong setting before anything is mapped
     if len(drives) == 1 and drives[0].suffix.lower() in (".yaml", ".yml"):

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from segslam.core.types import SegslamError
-from segslam.run.fleets import Drive, drives_of, read_drives
-from segslam.run.fleets.drives import with_settings
+from segslam.run.fleets.drives import Drive, drives_of, read_drives, with_settings
 
 LIST = """
 drives:

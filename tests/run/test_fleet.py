@@ -20,8 +20,9 @@ from segslam.core.trajectory import read_poses
 from segslam.core.types import SegslamError, Step
 from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import read_run
-from segslam.run.fleets import Drive, FleetResult, fleet, read_drives, workers
-from segslam.run.fleets.orchestrate import FILE
+from segslam.run.fleets import workers
+from segslam.run.fleets.drives import Drive, read_drives
+from segslam.run.fleets.orchestrate import FILE, FleetResult, fleet
 from segslam.run.fleets.steps import map_drive
 from segslam.run.sessions import session_pose
 from segslam.scans import open_dataset

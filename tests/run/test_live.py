@@ -21,8 +21,8 @@ from segslam.core.types import BadScan, LoopClosure, Scan, SegslamError
 from segslam.odometry import KissOdometry, OdometryApart
 from segslam.output.finished import read_run
 from segslam.output.log import LogWriter, read_log
-from segslam.run.live import FolderSource, Front
-from segslam.run.live.folder import stamp_of_name
+from segslam.run.live.folder import FolderSource, stamp_of_name
+from segslam.run.live.front import Front
 from segslam.run.live.waiting import Rhythm, Waiting
 from segslam.scans.presets import SETTINGS as PRESETS
 

@@ -22,8 +22,9 @@ from segslam.core.config import Config
 from segslam.core.types import BadScan, Scan, SegslamError
 from segslam.odometry import Tracked, Tracker
 from segslam.output.log import read_log
-from segslam.run.live import FolderSource, Front, Placed
-from segslam.run.live.serve import OdometryEnded, Past, _place_all
+from segslam.run.live.folder import FolderSource
+from segslam.run.live.front import Front
+from segslam.run.live.serve import OdometryEnded, Past, Placed, _place_all
 from segslam.run.live.waiting import Arrival, Waiting
 from segslam.scans.presets import SETTINGS as PRESETS
 

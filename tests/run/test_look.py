@@ -11,7 +11,7 @@ from segslam.cli.checks import live_configs
 from segslam.cli.options import Settings
 from segslam.core.config import load_config
 from segslam.core.types import BadScan, Scan
-from segslam.run.live import Front
+from segslam.run.live.front import Front
 from segslam.scans.presets import preset
 
 

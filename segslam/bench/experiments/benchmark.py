@@ -15,10 +15,10 @@ from segslam.bench.experiments.job import LOST_WORKER, Job, failed_row, register
 from segslam.bench.experiments.rows import Row, RowFile, read_rows
 from segslam.bench.experiments.summary import grouped
 from segslam.bench.experiments.trials import ScanVariant, Trial
-from segslam.core.cluster import cluster
 from segslam.core.errors import reason
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import write_whole
+from segslam.run.fleets.workers import cluster
 
 ROWS_FILE = "details.csv"
 IDENTITY_FILE = "asked.json"

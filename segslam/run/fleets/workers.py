@@ -1,4 +1,4 @@
-"""Where the steps of a fleet run: in this process, or in the processes of a Dask cluster."""
+"""Where the steps of a fleet run: in this process, or in a Dask cluster on this machine or that of a scheduler."""
 
 import gc
 import logging
@@ -11,7 +11,7 @@ from time import process_time
 from typing import Any, NamedTuple
 from uuid import uuid4
 
-from segslam.core.cluster import cluster
+from segslam.core.extras import how_to_install
 from segslam.core.memory import give_back, keep_freed_memory
 from segslam.core.types import SegslamError
 
@@ -74,6 +74,32 @@ def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tup
     with dask.config.set({"distributed.worker.daemon": False}), cluster(workers=number, scheduler=scheduler) as client:
         _check(client, folder, scheduler)
         yield partial(_on_cluster, client), client.dashboard_link if scheduler else ""
+
+
+@contextmanager
+def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
+    """A Dask client for the scheduler at an address, or for local worker processes.
+
+    Raises SegslamError if Dask is not installed or the scheduler does not answer.
+    """
+    try:
+        from distributed import Client, LocalCluster  # optional package: extra `cluster`
+    except ImportError as error:
+        raise SegslamError(f"--workers and --scheduler need Dask: {how_to_install('cluster')}") from error
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # its info level reports each connection
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=5)
+        except (OSError, ValueError) as error:
+            raise SegslamError(f"--scheduler {scheduler}: no answer ({error}); start `dask scheduler`") from error
+        with client:
+            yield client
+        return
+    with (
+        LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as local,
+        Client(local) as client,
+    ):
+        yield client
 
 
 def _check(client: Any, folder: Path, scheduler: str | None) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from time import perf_counter
 
@@ -20,7 +20,7 @@ from segslam.labels import geometric_labels
 from segslam.output.finished import read_run
 from segslam.output.log import read_log
 from segslam.registration.prepared import PreparedScan, prepare_scan
-from segslam.slam.recognition import MAX_PLACES, Recognised, recognise
+from segslam.slam.recognition import MAX_PLACES, recognise
 
 NUM_PREPARED = 256
 """Number of keyframes prepared for alignment in memory, about 2 MB each."""
@@ -102,10 +102,13 @@ class Locator:
         scan, (own, candidates) = at_once(
             lambda: prepare_scan(kept, kept_labels, config=config), lambda: self._candidates(kept, kept_labels)
         )
-        found = self._recognised(scan, candidates, max_places=min(max_places, NUM_FIRST))
+        recognised = partial(
+            recognise, scan, places=self.prepared, T_world_place=self.T_world_keyframe.__getitem__, config=config
+        )
+        found = recognised(candidates, max_places=min(max_places, NUM_FIRST))
         if isinstance(found, Rejected) and found.reason != RejectReason.AMBIGUOUS and max_places > NUM_FIRST:
             around = signatures_around(kept, kept_labels)
-            found = self._recognised(scan, self.places.shortlist_around((own, *around)), max_places=max_places)
+            found = recognised(self.places.shortlist_around((own, *around)), max_places=max_places)
         if isinstance(found, Rejected):
             return found
         return Located(found.T_world_lidar, found.place_id, found.alignment, perf_counter() - started)
@@ -117,18 +120,6 @@ class Locator:
         if candidates:
             self.prepared(candidates[0].place_id)
         return own, candidates
-
-    def _recognised(
-        self, scan: PreparedScan, candidates: tuple[PlaceCandidate, ...], *, max_places: int
-    ) -> Recognised | Rejected:
-        return recognise(
-            scan,
-            candidates,
-            self.prepared,
-            self.T_world_keyframe.__getitem__,
-            config=self.config,
-            max_places=max_places,
-        )
 
     def _signature(self, keyframe: Keyframe) -> PlaceSignature:
         if keyframe.place is not None:

@@ -106,12 +106,8 @@ def cell_keys(points: Points, cell_m: float) -> tuple[Indices, tuple[int, int]]:
     distinct numbers.
     """
     coordinates = np.ascontiguousarray(points.T)
-    no_points = np.zeros(3)
-    lows, (_, num_y, num_z) = _grid(
-        coordinates.min(axis=1) if len(points) else no_points,
-        coordinates.max(axis=1) if len(points) else no_points,
-        cell_m,
-    )
+    bounds = coordinates if len(points) else np.zeros((3, 1))
+    lows, (_, num_y, num_z) = _grid(bounds.min(axis=1), bounds.max(axis=1), cell_m)
     x, y, z = (
         (np.floor(column / cell_m) - low).astype(np.int64) for column, low in zip(coordinates, lows, strict=True)
     )

@@ -94,12 +94,10 @@ def read_sessions(folders: list[Path]) -> list[Session]:
     """The sessions of several runs, in their order. Raises SegslamError for fewer than two, or one given twice."""
     if len(folders) < 2:
         raise SegslamError(f"{len(folders)} run given; give two or more")
-    given: dict[Path, Path] = {}
-    for folder in folders:
-        log = log_of(folder).resolve()
-        if log in given:
+    logs = [log_of(folder).resolve() for folder in folders]
+    for number, folder in enumerate(folders):
+        if logs[number] in logs[:number]:
             raise SegslamError(f"{folder}: given twice; give each run once")
-        given[log] = folder
     return [read_session(folder) for folder in folders]
 
 

@@ -67,10 +67,9 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[di
 
     A signal that was ignored, as in background jobs of a script, stays ignored. Only the main thread receives signals.
     """
-    handlers = {number: signal.getsignal(number) for number in SIGNALS}
-    before: dict[int, Any] = {number: one for number, one in handlers.items() if one is not signal.SIG_IGN}
-    if threading.current_thread() is not threading.main_thread():
-        before = {}
+    is_main = threading.current_thread() is threading.main_thread()
+    handlers: dict[int, Any] = {number: signal.getsignal(number) for number in SIGNALS if is_main}
+    before = {number: one for number, one in handlers.items() if one is not signal.SIG_IGN}
     for number in before:
         signal.signal(number, handler)
     try:

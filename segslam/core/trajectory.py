@@ -203,8 +203,7 @@ def nearest_rows(values: np.ndarray, targets: np.ndarray) -> Indices:
     """(n,) row of the value that is nearest to each target, the smaller one of two; there is a value at least."""
     order = np.argsort(values, kind="stable")
     ascending = values[order]
-    right = np.clip(np.searchsorted(ascending, targets), 1, max(len(values) - 1, 1))
-    right = np.minimum(right, len(values) - 1)
+    right = np.clip(np.searchsorted(ascending, targets), min(1, len(values) - 1), len(values) - 1)
     left = np.maximum(right - 1, 0)
     closer_left = np.abs(ascending[left] - targets) <= np.abs(ascending[right] - targets)
     return order[np.where(closer_left, left, right)]

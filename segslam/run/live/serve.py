@@ -211,7 +211,11 @@ def _place_all(
         tracked = _tracked(tracker, arrival, gap)
         if isinstance(tracked, Tracked):
             last_ns = arrival.stamp_ns
-            _publish(source, arrival, tracked, to_send)
+            try:
+                source.publish(arrival, tracked.T_odom_lidar)
+            except Exception as error:  # concerns the subscribers only
+                why = f"{source.name}: the pose of scan {arrival.index} was not published ({error!r})"
+                to_send.put(why[:MOST_SHOWN])
         now = monotonic()
         to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.rhythm.gaps))
     return not waiting.is_closed
@@ -241,14 +245,6 @@ def _tracked(tracker: Tracker | _Choosing, arrival: Arrival, gap: float) -> Trac
 def _unusable(arrival: Arrival, error: Exception) -> BadScan:
     shown = f"{type(error).__name__}: {error}".splitlines()[0][:MOST_SHOWN]
     return BadScan(f"scan {arrival.index}: cannot be used ({shown})")
-
-
-def _publish(source: Source, arrival: Arrival, tracked: Tracked, to_send: "SimpleQueue[Any]") -> None:
-    """Publish a pose; a failure concerns the subscribers only."""
-    try:
-        source.publish(arrival, tracked.T_odom_lidar)
-    except Exception as error:
-        to_send.put(f"{source.name}: the pose of scan {arrival.index} was not published ({error!r})"[:MOST_SHOWN])
 
 
 def _feed(source: Source, waiting: Waiting, stopped: Event, ended: list[Ended]) -> None:

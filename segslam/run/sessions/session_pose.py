@@ -94,16 +94,14 @@ def find_session(
     if len(found) < MIN_FOUND:
         return Relation(None, (), f"{summary}, {MIN_FOUND} are needed")
     graph, first_id = _both(earlier, session, config)
-    closures = [shifted(one, first_id, 0) for one in found]
-    consistent = graph.consistent(closures)
+    consistent = graph.consistent([shifted(one, first_id, 0) for one in found])
     kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
     travel_m = session.travel_m[[one.source_id for one in kept]]
     if len(kept) < MIN_FOUND or np.ptp(travel_m) < MIN_SPREAD_M:
         why = f"{summary}, but no {MIN_FOUND} of them, {MIN_SPREAD_M:g} m apart, are consistent with the odometry"
         return Relation(None, (), why)
-    for one, keep in zip(closures, consistent, strict=True):
-        if keep:
-            graph.add_closure(one)
+    for one in kept:
+        graph.add_closure(shifted(one, first_id, 0))
     graph.optimize()
     T_earlier_first = graph.T_world_keyframes[first_id]
     return Relation(T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))

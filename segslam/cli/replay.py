@@ -15,7 +15,7 @@ from segslam.cli.options import WITH_MAP, FoxgloveOption, LogArgument, Overwrite
 from segslam.cli.viewers import serve_foxglove
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
-from segslam.slam.loop_edits import LoopEdits, Pair, pairs_of
+from segslam.slam.loop_edits import NO_EDITS, LoopEdits, Pair, pairs_of
 
 if TYPE_CHECKING:
     from segslam.core.types import Step
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from segslam.run.run import Run
     from segslam.slam.slam_result import SlamResult
 
-NO_EDITS = LoopEdits()
 OutOption = Annotated[Path, typer.Option(help="New folder for the run.")]
 
 

@@ -17,12 +17,11 @@ from segslam.output.folder import copy_alone, new_folder
 from segslam.output.georeferenced import FILE, read_globe
 from segslam.output.log import Mirror, RunLog, read_log
 from segslam.run.run import Run
-from segslam.slam.loop_edits import LoopEdits, Pair
+from segslam.slam.loop_edits import NO_EDITS, LoopEdits, Pair
 from segslam.slam.slam import Slam
 
 BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "keyframes", "geometric")
 """Sections of the settings that a replay cannot change, because the log contains their results."""
-NO_EDITS = LoopEdits()
 
 
 def replay(

@@ -49,6 +49,9 @@ class LoopEdits:
             raise SegslamError(f"edits of the log: {brief(text)} cannot be read; map the data again") from error
 
 
+NO_EDITS = LoopEdits()
+
+
 def pairs_of(texts: Iterable[str], option: str) -> frozenset[Pair]:
     """The pairs of texts `I:J`, in either order. Raises SegslamError, naming the option, for another form."""
     pairs = set()

@@ -17,11 +17,10 @@ from segslam.keyframes import Clouds, Submaps
 from segslam.registration.hypotheses import anywhere
 from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops
-from segslam.slam.loop_edits import LoopEdits
+from segslam.slam.loop_edits import NO_EDITS, LoopEdits
 from segslam.verification import register_near, register_prepared
 from segslam.verification.score import MISLED
 
-NO_EDITS = LoopEdits()
 NUM_PREPARED = 64
 """Number of prepared keyframes in memory, about 2 MB each; preparing another takes about 40 ms."""
 ROUNDS = 3

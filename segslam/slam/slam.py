@@ -36,8 +36,8 @@ from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
 from segslam.odometry import Tracked as Tracked
 from segslam.registration.prepared import Labeller
 from segslam.slam.adjustment import Adjusted, Known, Progress, Velocities, adjust, no_progress, velocities_of
-from segslam.slam.loop_edits import LoopEdits
-from segslam.slam.loops import NO_EDITS, ROUNDS, LoopCloser
+from segslam.slam.loop_edits import NO_EDITS, LoopEdits
+from segslam.slam.loops import ROUNDS, LoopCloser
 from segslam.slam.slam_result import SlamResult as SlamResult
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import REJECTED_WEIGHT, LoopAttempt, SegslamError, Step, Trajectory
@@ -257,7 +257,7 @@ def _shifts(sessions: Sequence[Session], session_poses: Sequence[SessionPose | N
             keyframe_id=last.keyframe_id + len(before.travel_m),
             scan_index=last.scan_index + int(drive.scan_index[-1]) + 1,
             stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
-            travel_m=last.travel_m + float(before.travel_m[-1]) + 2.0 * BREAK_TRAVEL_M,  # rounded, it is still a break
+            travel_m=last.travel_m + float(before.travel_m[-1]) + BREAK_STEP_M,
             T_new_old=T_new_first @ geometry.inverse(session.T_odom_keyframe[0]),
         )
         shifts.append(shift)

@@ -47,63 +47,29 @@ Mirror = Callable[[str, bytes, int], None]
 
 
 class Output:
-    """Unbuffered stream with the methods that MCAP's writer uses: write, tell, flush.
+    """The stream of MCAP's writer, unbuffered: after a failure no data is pending.
 
-    After a failure no data is pending. While it is open, no other process can write the file.
+    While it is open, no other process can write the file.
     """
 
     def __init__(self, path: Path) -> None:
         """Raises OSError if the file cannot be written, or another process writes it."""
-        self._raw = path.open("a+b", buffering=0)
-        fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        self._raw.truncate(0)
-        self._raw.seek(0)
-
-    @property
-    def closed(self) -> bool:
-        """True after `close`."""
-        return self._raw.closed
+        self.raw = path.open("a+b", buffering=0)
+        fcntl.flock(self.raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self.raw.truncate(0)
+        self.raw.seek(0)
+        self.tell = self.raw.tell
+        self.close = self.raw.close
 
     def write(self, data: bytes) -> int:
         """Write all data; a single write to a raw file may be partial."""
         rest = memoryview(data)
         while rest:
-            rest = rest[self._raw.write(rest) :]
+            rest = rest[self.raw.write(rest) :]
         return len(data)
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Bytes written earlier."""
-        return os.pread(self._raw.fileno(), size, offset)
-
-    def tell(self) -> int:
-        """Number of bytes written."""
-        return self._raw.tell()
 
     def flush(self) -> None:
         """No effect: the stream is unbuffered."""
-
-    def close(self) -> None:
-        """Close the file."""
-        self._raw.close()
-
-    def sync(self) -> None:
-        """Wait until all data is on the disk and survives a power failure."""
-        os.fsync(self._raw.fileno())
-
-    @contextmanager
-    def whole(self) -> Iterator[None]:
-        """Context manager that writes its data completely or not at all. Ctrl-C takes effect at its end.
-
-        On any exception, such as the OSError of a full disk, the file is truncated to its previous size and closed.
-        """
-        size = self.tell()
-        with interrupts_wait():
-            try:
-                yield
-            except BaseException:
-                self._raw.truncate(size)
-                self._raw.close()
-                raise
 
 
 def is_being_written(path: Path) -> bool:
@@ -188,7 +154,7 @@ class LogWriter:
             return newest.points, newest.labels
         offset, size = self._steps_of_keyframes[keyframe_id]
         try:
-            records = self._output.read(offset, size)
+            records = os.pread(self._output.raw.fileno(), size, offset)
         except (OSError, ValueError) as error:  # ValueError: closed, perhaps just now
             raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read, the log is closed") from error
         for channel_id, data in messages_within(records):
@@ -217,7 +183,7 @@ class LogWriter:
     def move(self, path: Path) -> None:
         """Replace the file `path`, after all data written here is safely on the disk."""
         try:
-            self._output.sync()
+            os.fsync(self._output.raw.fileno())
             self._path.replace(path)
         except OSError as error:
             raise WorkFailed(f"{path}: cannot be replaced by {self._path} ({error.strerror})") from error
@@ -225,7 +191,7 @@ class LogWriter:
 
     def close(self) -> None:
         """Write the index. A log without index is readable, but slower to search."""
-        if not self._output.closed:
+        if not self._output.raw.closed:
             with self._whole():
                 self._mcap.finish()
             self._output.close()
@@ -274,12 +240,22 @@ class LogWriter:
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
-        """As `Output.whole`, with a message for a disk failure."""
-        if self._output.closed:
+        """Context manager that writes its data completely or not at all. Ctrl-C takes effect at its end.
+
+        On any exception the file is truncated to its previous size and closed; that of a full disk becomes WorkFailed.
+        """
+        raw = self._output.raw
+        if raw.closed:
             raise SegslamError(f"{self._path}: the log is closed; open another log to write more")
+        size = raw.tell()
         try:
-            with self._output.whole():
-                yield
+            with interrupts_wait():
+                try:
+                    yield
+                except BaseException:
+                    raw.truncate(size)
+                    raw.close()
+                    raise
         except OSError as error:
             raise WorkFailed(
                 f"{self._path}: cannot continue writing the log ({error.strerror}); free space on the disk; "

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,7 +31,7 @@ from segslam.output.folder import log_of
 from segslam.output.log import container, schema
 from segslam.output.log.container import CutError, Span, messages_within
 from segslam.output.log.foxglove import transforms
-from segslam.output.log.records import KeyframePoints, codec, intensities, place_of, points_and_labels
+from segslam.output.log.records import Bulk, KeyframePoints, codec, intensities, place_of, points_and_labels
 from segslam.output.log.schema import restored
 from segslam.slam.adjustment import Adjustment
 
@@ -38,7 +39,7 @@ logger = logging.getLogger(__name__)
 NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
 NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, RecursionError, DecodeError)
 """Exceptions on content of another program, or damaged in spite of a correct checksum."""
-Parts = Mapping[str, bytes]
+Parts = dict[str, container.Stored]
 """The latest message of each topic."""
 Decoded = TypeVar("Decoded")
 
@@ -118,16 +119,10 @@ class RunLog:
         Raises SegslamError if the content is not in the format of this version.
         """
         num_steps = 0
-        parts: dict[str, bytes] = {}
         try:
-            for message in self._messages():
-                parts[message.topic] = message.data
-                if message.topic == schema.STEP:
-                    if not clouds and schema.KEYFRAME in parts:
-                        parts[schema.KEYFRAME] = b""  # encodes zero points
-                    yield self._decoded(lambda: _step(parts))
-                    num_steps += 1
-                    parts.clear()
+            for parts in self._parts_until(schema.STEP):
+                yield self._decoded(_step, parts, clouds)
+                num_steps += 1
         except CutError as cut:
             size = self.path.stat().st_size
             logger.warning(
@@ -146,7 +141,7 @@ class RunLog:
         with suppress(CutError):
             for message in self._messages():
                 if message.topic == schema.REFERENCE:
-                    return self._record(Trajectory, message.data)
+                    return self._decoded(_record, Trajectory, message)
                 if message.topic == schema.STEP:
                     return None
         return None
@@ -156,46 +151,50 @@ class RunLog:
         parts = self._ending()
         if not parts:
             return None
-        return self._decoded(lambda: _estimate(parts)), self._record(Trajectory, parts[schema.RESULT])
+        return self._decoded(_estimate, parts), self._decoded(_record, Trajectory, parts[schema.RESULT])
 
     def late_loops(self) -> tuple[LoopAttempt, ...]:
         """Loops tried after the last scan; empty if the run did not finish."""
-        parts = self._ending()
-        return self._record(LateLoops, parts[schema.LATE_LOOPS]).attempts if schema.LATE_LOOPS in parts else ()
+        late = self._ending().get(schema.LATE_LOOPS)
+        return () if late is None else self._decoded(_record, LateLoops, late).attempts
 
     def adjustment(self) -> Adjustment | None:
         """The adjustment of the whole map; None without one, or if the run did not finish."""
-        parts = self._ending()
-        return self._record(Adjustment, parts[schema.ADJUSTMENT]) if schema.ADJUSTMENT in parts else None
+        made = self._ending().get(schema.ADJUSTMENT)
+        return None if made is None else self._decoded(_record, Adjustment, made)
 
     def _ending(self) -> Parts:
         """The messages of the result; empty if the run did not finish."""
-        parts: dict[str, bytes] = {}
         with suppress(CutError):
-            for message in self._messages(since_last=schema.TRAJECTORY):
-                parts[message.topic] = message.data
-                if message.topic == schema.RESULT:
-                    return parts
+            for parts in self._parts_until(schema.RESULT, since_last=schema.TRAJECTORY):
+                return parts
         return {}
 
     def keyframes(self) -> "RecordedKeyframes":
         """The keyframes of the complete steps, with access to their points. Raises SegslamError as `steps` does."""
         kept: list[RecordedKeyframe] = []
-        parts: dict[str, bytes] = {}
-        cloud: container.Stored | None = None
         with suppress(CutError):
-            for message in self._messages():
-                parts[message.topic] = message.data
-                if message.topic == schema.KEYFRAME:
-                    cloud = message
-                if message.topic == schema.STEP:
-                    if (found := cloud) is not None:
-                        kept.append(self._decoded(lambda: _recorded_keyframe(parts, found)))
-                        if kept[-1].keyframe.id != len(kept) - 1:
-                            raise SegslamError(f"{self.path}: keyframe {len(kept) - 1} is missing; map the data again")
-                    parts.clear()
-                    cloud = None
+            for parts in self._parts_until(schema.STEP):
+                if (cloud := parts.get(schema.KEYFRAME)) is None:
+                    continue
+                parts.pop(schema.ESTIMATE, None)
+                keyframe = self._decoded(_step, parts, False).keyframe
+                if keyframe is None or keyframe.id != len(kept):
+                    raise SegslamError(f"{self.path}: keyframe {len(kept)} is missing; map the data again")
+                kept.append(RecordedKeyframe(keyframe, cloud.chunk, cloud.channel_id))
         return RecordedKeyframes(self.path, kept)
+
+    def _parts_until(self, last: str, *, since_last: str | None = None) -> Iterator[Parts]:
+        """The messages of each complete step, or of another group that ends with a message of the topic `last`.
+
+        Raises CutError at the end of the readable part.
+        """
+        parts: Parts = {}
+        for message in self._messages(since_last=since_last):
+            parts[message.topic] = message
+            if message.topic == last:
+                yield parts
+                parts = {}
 
     def _messages(self, *, since_last: str | None = None) -> Iterator[container.Stored]:
         """As `container.messages`. Raises CutError, and SegslamError if the records are not those of this version."""
@@ -208,16 +207,13 @@ class RunLog:
                 )
             yield message
 
-    def _decoded(self, decode: Callable[[], Decoded]) -> Decoded:
+    def _decoded(self, decode: Callable[..., Decoded], *given: Any) -> Decoded:
         try:
-            return decode()
+            return decode(*given)
         except NOT_OURS as error:
             raise SegslamError(
                 f"{self.path}: not written by segslam ({brief(repr(error))}); map the data again"
             ) from error
-
-    def _record(self, record: Callable[..., Decoded], data: bytes) -> Decoded:
-        return self._decoded(lambda: codec(record).decode(json.loads(data), {}))
 
 
 def read_log(run: Path) -> RunLog:
@@ -257,30 +253,26 @@ def _is_readable(written: bytes, own: dict[str, Any]) -> bool:
         return False
 
 
-def _step(parts: Parts) -> Step:
+def _step(parts: Parts, clouds: bool) -> Step:
+    """The step; without `clouds`, its keyframe has no points."""
     keyframe: dict = {}
     if schema.KEYFRAME in parts:
-        message = KeyframePoints.FromString(parts[schema.KEYFRAME])
-        points, labels = points_and_labels(message)
-        keyframe = {"points": points, "labels": labels, "intensities": intensities(message), **place_of(message)}
+        message = KeyframePoints.FromString(parts[schema.KEYFRAME].data)
+        keyframe = {"points": NO_POINTS, "labels": NO_LABELS, "intensities": None, **place_of(message)}
+        if clouds:
+            points, labels = points_and_labels(message)
+            keyframe |= {"points": points, "labels": labels, "intensities": intensities(message)}
     estimate = _estimate(parts) if schema.ESTIMATE in parts else None
-    return codec(Step).decode(json.loads(parts[schema.STEP]), {Step: {"estimate": estimate}, Keyframe: keyframe})
-
-
-def _recorded_keyframe(parts: Parts, stored: container.Stored) -> RecordedKeyframe:
-    message = KeyframePoints.FromString(stored.data)
-    step = codec(Step).decode(
-        json.loads(parts[schema.STEP]),
-        {Step: {"estimate": None}, Keyframe: {"points": NO_POINTS, "labels": NO_LABELS, **place_of(message)}},
-    )
-    if step.keyframe is None:
-        raise ValueError("points without a keyframe")
-    return RecordedKeyframe(step.keyframe, stored.chunk, stored.channel_id)
+    return _record(Step, parts[schema.STEP], {Step: {"estimate": estimate}, Keyframe: keyframe})
 
 
 def _estimate(parts: Parts) -> GraphEstimate:
     """The estimate from an /estimate message and the /trajectory before it."""
-    values = json.loads(parts[schema.ESTIMATE])
-    poses = transforms(PosesInFrame.FromString(parts[schema.TRAJECTORY]))
+    values = json.loads(parts[schema.ESTIMATE].data)
+    poses = transforms(PosesInFrame.FromString(parts[schema.TRAJECTORY].data))
     T_world_keyframe = dict(zip(values["keyframe_ids"], poses, strict=True))
     return codec(GraphEstimate).decode(values, {GraphEstimate: {"T_world_keyframe": T_world_keyframe}})
+
+
+def _record(record: Callable[..., Decoded], message: container.Stored, bulk: Bulk = MappingProxyType({})) -> Decoded:
+    return codec(record).decode(json.loads(message.data), bulk)

@@ -1,6 +1,6 @@
 """Visualisation of a run, step by step, as Foxglove messages: drawings, and what happens in words."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -98,7 +98,7 @@ class Drawing:
         else:
             yield self._odom_in_world(step.stamp_ns)
         yield from self._attempts(step.attempts, step.stamp_ns)
-        for message in messages_of(step):
+        for message in _messages_of(step):
             yield schema.LOG, message
 
     def draw_estimate(self, estimate: GraphEstimate, *, stamp_ns: int, path: bool = True) -> Iterator[Topical]:
@@ -110,19 +110,6 @@ class Drawing:
         if path:
             yield schema.TRAJECTORY, foxglove.path(estimate.T_world_keyframe.values(), stamp_ns=stamp_ns)
             yield schema.GRAPH, self._graph(estimate, stamp_ns)
-
-    def draw_path(self, estimate: GraphEstimate, *, stamp_ns: int) -> Topical:
-        """The path before the adjustment of the whole map."""
-        return schema.TRAJECTORY_BEFORE, foxglove.path(estimate.T_world_keyframe.values(), stamp_ns=stamp_ns)
-
-    def draw_map(self, estimate: GraphEstimate, cloud: CloudOf, *, stamp_ns: int) -> Iterator[Topical]:
-        """One cloud of the whole drive in world.
-
-        `cloud` returns the points of a keyframe, in its frame, and their labels.
-        """
-        points, labels = map_points(estimate.T_world_keyframe, cloud)
-        if len(points):
-            yield map_message(points, labels, stamp_ns=stamp_ns)
 
     def _odom_in_world(self, stamp_ns: int) -> Topical:
         """Written at every step: viewers interpolate, and would otherwise start a correction too early."""
@@ -147,41 +134,33 @@ class Drawing:
                 yield schema.TRAJECTORY, foxglove.path(poses, stamp_ns=stamp_ns)
 
     def _attempts(self, attempts: tuple[LoopAttempt, ...], stamp_ns: int) -> Iterator[Topical]:
-        for topic, wanted in ((schema.ACCEPTED, False), (schema.REJECTED, True)):
-            entities = [
-                self._attempt(attempt, stamp_ns)
-                for attempt in attempts
-                if isinstance(attempt.outcome, Rejected) is wanted
-            ]
-            outdated = self._rejected & {entity.id for entity in entities} if topic == schema.ACCEPTED else set()
-            if entities:
-                yield topic, foxglove.scene(entities)
-            if outdated:  # loops that waited for confirmation
-                yield schema.REJECTED, foxglove.scene([], deleted=outdated)
-                self._rejected -= outdated
-            if topic == schema.REJECTED:
-                self._rejected |= {entity.id for entity in entities}
+        accepted, rejected = (
+            [self._attempt(one, stamp_ns) for one in attempts if isinstance(one.outcome, Rejected) is wanted]
+            for wanted in (False, True)
+        )
+        if accepted:
+            yield schema.ACCEPTED, foxglove.scene(accepted)
+        if outdated := self._rejected & {entity.id for entity in accepted}:  # loops that waited for confirmation
+            yield schema.REJECTED, foxglove.scene([], deleted=outdated)
+        if rejected:
+            yield schema.REJECTED, foxglove.scene(rejected)
+        self._rejected = self._rejected - outdated | {entity.id for entity in rejected}
 
     def _attempt(self, attempt: LoopAttempt, stamp_ns: int) -> foxglove.SceneEntity:
         outcome, pair = attempt.outcome, attempt.candidate.pair
         color = REJECTED_COLORS[outcome.reason] if isinstance(outcome, Rejected) else ACCEPTED_COLOR
-        return foxglove.entity(
-            f"{pair[0]} to {pair[1]}",
-            foxglove.line([self._position(keyframe_id) for keyframe_id in pair], [color]),
-            numbers_and_words(codec(LoopAttempt).encode(attempt)),
-            stamp_ns=stamp_ns,
-        )
+        about = numbers_and_words(codec(LoopAttempt).encode(attempt))
+        return foxglove.lines(f"{pair[0]} to {pair[1]}", self._ends([pair]), [color], about, stamp_ns=stamp_ns)
 
     def _graph(self, estimate: GraphEstimate, stamp_ns: int) -> foxglove.SceneUpdate:
-        ends = [self._position(keyframe_id) for pair in estimate.closure_weights for keyframe_id in pair]
         colors = [weight_color(weight) for weight in estimate.closure_weights.values()]
         about = {"error": f"{estimate.error:g}", "closures": str(len(colors))}
-        lines = foxglove.line(ends, colors)
-        return foxglove.scene([foxglove.entity("closures", lines, about, stamp_ns=stamp_ns)])
+        ends = self._ends(estimate.closure_weights)
+        return foxglove.scene([foxglove.lines("closures", ends, colors, about, stamp_ns=stamp_ns)])
 
-    def _position(self, keyframe_id: int) -> Vector:
-        """Position in world, by the last estimate and the odometry since."""
-        return self._in_world(keyframe_id)[:3, 3]
+    def _ends(self, pairs: Iterable[tuple[int, int]]) -> list[Vector]:
+        """Positions in world of the keyframes of each pair, by the last estimate and the odometry since."""
+        return [self._in_world(keyframe_id)[:3, 3] for pair in pairs for keyframe_id in pair]
 
     def _in_world(self, keyframe_id: int) -> Transform:
         if keyframe_id in self._T_world_keyframe:
@@ -248,7 +227,7 @@ def warning(text: str, *, stamp_ns: int) -> Log:
     return Log(timestamp=timestamp(stamp_ns), level=WARNING, message=text, name=NAME)
 
 
-def messages_of(step: Step) -> Iterator[Log]:
+def _messages_of(step: Step) -> Iterator[Log]:
     """Repairs and breaks of the odometry as warnings, accepted loops as information."""
     motion = step.motion
     if motion is not None and motion.state in (MotionState.REPAIRED, MotionState.REJOINED):

@@ -38,7 +38,7 @@ _IDENTITY = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 
 def frame_transform(T_parent_child: Transform, *, parent: str, child: str, stamp_ns: int) -> FrameTransform:
     """Message with the pose of frame `child` in frame `parent`."""
-    pose = _pose(T_parent_child)
+    [pose] = _poses(T_parent_child[None])
     return FrameTransform(
         timestamp=timestamp(stamp_ns),
         parent_frame_id=parent,
@@ -79,26 +79,28 @@ def transforms(poses: PosesInFrame) -> list[Transform]:
     return [geometry.transform(R, t) for R, t in zip(rotations, positions, strict=True)]
 
 
-def line(points: Sequence[Vector], colors: Sequence[str], *, width_px: float = 2.0) -> LinePrimitive:
-    """Line segments between pairs of points, with one colour (#rrggbbaa) per segment; constant width on screen."""
-    return LinePrimitive(
+def lines(
+    identity: str, points: Sequence[Vector], colors: Sequence[str], metadata: Mapping[str, str], *, stamp_ns: int
+) -> SceneEntity:
+    """Line segments in world between pairs of points, with one colour (#rrggbbaa) per segment.
+
+    Their width on the screen is constant. They remain until an entity of the same identity replaces them; a click shows
+    the metadata.
+    """
+    drawn = LinePrimitive(
         type=LinePrimitive.LINE_LIST,
-        thickness=width_px,
+        thickness=2.0,
         scale_invariant=True,
         pose=_IDENTITY,
         points=[Point3(x=x, y=y, z=z) for x, y, z in np.asarray(points).tolist()],
         colors=[_color(color) for color in colors for _ in range(2)],
     )
-
-
-def entity(identity: str, lines: LinePrimitive, metadata: Mapping[str, str], *, stamp_ns: int) -> SceneEntity:
-    """Lines in world that remain until an entity of the same identity replaces them; a click shows the metadata."""
     return SceneEntity(
         timestamp=timestamp(stamp_ns),
         frame_id=WORLD,
         id=identity,
         metadata=[KeyValuePair(key=key, value=value) for key, value in metadata.items()],
-        lines=[lines],
+        lines=[drawn],
     )
 
 
@@ -117,12 +119,6 @@ def _poses(T_frame_each: np.ndarray) -> list[Pose]:
         Pose(position=Vector3(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
         for (tx, ty, tz), (x, y, z, w) in zip(T_frame_each[:, :3, 3].tolist(), quaternions, strict=True)
     ]
-
-
-def _pose(T_frame_body: Transform) -> Pose:
-    tx, ty, tz = T_frame_body[:3, 3].tolist()
-    x, y, z, w = ScipyRotation.from_matrix(T_frame_body[:3, :3]).as_quat().tolist()
-    return Pose(position=Vector3(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 
 def timestamp(stamp_ns: int) -> Timestamp:

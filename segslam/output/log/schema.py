@@ -160,13 +160,10 @@ class Channel(NamedTuple):
 
 def channels() -> list[Channel]:
     """Every topic of a log."""
-    descriptions = {
-        message: build_file_descriptor_set(message).SerializeToString()
-        for message in dict.fromkeys(PROTOBUF_TOPICS.values())
-    }
+    described = ((topic, build_file_descriptor_set(kind), kind.DESCRIPTOR) for topic, kind in PROTOBUF_TOPICS.items())
     protobuf = [
-        Channel(topic, "protobuf", message.DESCRIPTOR.full_name, "protobuf", descriptions[message])
-        for topic, message in PROTOBUF_TOPICS.items()
+        Channel(topic, "protobuf", descriptor.full_name, "protobuf", files.SerializeToString())
+        for topic, files, descriptor in described
     ]
     own = [
         Channel(topic, "json", values["title"], "jsonschema", json.dumps(values).encode())

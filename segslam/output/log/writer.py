@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Any, cast
 
+from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
 from segslam.core.config import Config
@@ -28,9 +29,9 @@ from segslam.core.types import (
     Transform,
     WorkFailed,
 )
-from segslam.output.log import schema
+from segslam.output.log import foxglove, schema
 from segslam.output.log.container import messages_within
-from segslam.output.log.drawing import Drawing, Topical, ground_truth, warning
+from segslam.output.log.drawing import Drawing, ground_truth, map_message, map_points, warning
 from segslam.output.log.records import KeyframePoints, codec, keyframe_points, points_and_labels
 from segslam.output.log.schema import channels, metadata
 from segslam.slam.adjustment import Adjusted, Adjustment
@@ -40,8 +41,8 @@ POSES_PER_KEYFRAME = 50
 only. All estimates are logged until the limit is reached; then every second estimate, and so on."""
 CHUNK_BYTES = 4 * 2**20
 """Larger than any step: a chunk ends with its step, so that a step is complete or missing."""
-Encoded = tuple[str, bytes]
-"""Topic and data of a message."""
+Unwritten = tuple[str, bytes | Message]
+"""Topic and content of a message, which may not be serialised yet."""
 Mirror = Callable[[str, bytes, int], None]
 """Called with topic, data and stamp (ns) of each message after it is written."""
 
@@ -127,8 +128,8 @@ class LogWriter:
             self._channels = _register_channels(self._mcap)
         if reference is not None and len(reference):
             first_ns = int(reference.stamp_ns[0])
-            drawn = _serialised([ground_truth(reference, stamp_ns=first_ns)])
-            self._write([*drawn, (schema.REFERENCE, _json(Trajectory, reference))], stamp_ns=first_ns)
+            given = schema.REFERENCE, _json(Trajectory, reference)
+            self._write([ground_truth(reference, stamp_ns=first_ns), given], stamp_ns=first_ns)
 
     def write(self, step: Step) -> None:
         """Add a step."""
@@ -138,7 +139,7 @@ class LogWriter:
 
     def warn(self, text: str) -> None:
         """Add a warning to `/log`, at the time of the last step."""
-        self._write(_serialised([(schema.LOG, warning(text, stamp_ns=self._stamp_ns))]), stamp_ns=self._stamp_ns)
+        self._write([(schema.LOG, warning(text, stamp_ns=self._stamp_ns))], stamp_ns=self._stamp_ns)
 
     def keep(self, keyframe: Keyframe) -> None:
         """Keep the newest keyframe in memory until its step is written: `Clouds` of segslam.keyframes."""
@@ -170,15 +171,17 @@ class LogWriter:
         adjusted: Adjusted | None = None,
     ) -> None:
         """Write the final estimate, the pose of every scan, loops tried after the last scan, and the adjustment."""
-        drawn = self._drawing.draw_estimate(estimate, stamp_ns=self._stamp_ns)
-        whole_map = self._drawing.draw_map(estimate, self.cloud, stamp_ns=self._stamp_ns)
-        messages = [*_serialised(whole_map), *_serialised(drawn), _estimate_message(estimate)]
+        stamp_ns = self._stamp_ns
+        points, labels = map_points(estimate.T_world_keyframe, self.cloud)
+        messages: list[Unwritten] = [map_message(points, labels, stamp_ns=stamp_ns)] if len(points) else []
+        messages += [*self._drawing.draw_estimate(estimate, stamp_ns=stamp_ns), _estimate_message(estimate)]
         if late_loops:
             messages.append((schema.LATE_LOOPS, _json(LateLoops, LateLoops(late_loops))))
         if adjusted is not None:
-            path = self._drawing.draw_path(adjusted.before, stamp_ns=self._stamp_ns)
-            messages += [*_serialised([path]), (schema.ADJUSTMENT, _json(Adjustment, adjusted.record))]
-        self._write([*messages, (schema.RESULT, _json(Trajectory, trajectory))], stamp_ns=self._stamp_ns)
+            before = foxglove.path(adjusted.before.T_world_keyframe.values(), stamp_ns=stamp_ns)
+            record = _json(Adjustment, adjusted.record)
+            messages += [(schema.TRAJECTORY_BEFORE, before), (schema.ADJUSTMENT, record)]
+        self._write([*messages, (schema.RESULT, _json(Trajectory, trajectory))], stamp_ns=stamp_ns)
 
     def move(self, path: Path) -> None:
         """Replace the file `path`, after all data written here is safely on the disk."""
@@ -202,14 +205,14 @@ class LogWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _step_messages(self, step: Step) -> Iterator[Encoded]:
+    def _step_messages(self, step: Step) -> Iterator[Unwritten]:
         """The messages of a step. The step itself is last: it marks the others as complete."""
         logs_estimate = step.estimate is not None and self._affords(len(step.estimate.T_world_keyframe))
-        yield from _serialised(self._drawing.draw(step, path=logs_estimate))
+        yield from self._drawing.draw(step, path=logs_estimate)
         if (rss_mb := status_mb("VmRSS")) is not None:
             yield schema.MEMORY, json.dumps({"rss_mb": round(rss_mb, 1)}).encode()
         if step.keyframe is not None:
-            yield schema.KEYFRAME, keyframe_points(step.keyframe, resolution_m=self._resolution_m).SerializeToString()
+            yield schema.KEYFRAME, keyframe_points(step.keyframe, resolution_m=self._resolution_m)
         if step.estimate is not None and logs_estimate:
             yield _estimate_message(step.estimate)
         yield schema.STEP, _json(Step, step)
@@ -221,11 +224,14 @@ class LogWriter:
         self._num_poses += num_poses
         return True
 
-    def _write(self, messages: Iterable[Encoded], *, stamp_ns: int) -> tuple[int, int]:
+    def _write(self, messages: Iterable[Unwritten], *, stamp_ns: int) -> tuple[int, int]:
         """Position in the file, and size."""
         if stamp_ns < 0:
             raise SegslamError(f"{self._path}: stamp {stamp_ns} ns is negative; shift the stamps of the scans")
-        encoded = list(messages)  # before writing: an encoding error must not leave half a step
+        encoded = [  # before writing: an encoding error must not leave half a step
+            (topic, content if isinstance(content, bytes) else content.SerializeToString())
+            for topic, content in messages
+        ]
         self._stamp_ns = stamp_ns
         with self._whole():
             offset = self._output.tell()
@@ -274,12 +280,7 @@ def _register_channels(mcap: Writer) -> dict[str, int]:
     return found
 
 
-def _serialised(drawn: Iterable[Topical]) -> Iterator[Encoded]:
-    for topic, message in drawn:
-        yield topic, message.SerializeToString()
-
-
-def _estimate_message(estimate: GraphEstimate) -> Encoded:
+def _estimate_message(estimate: GraphEstimate) -> Unwritten:
     return schema.ESTIMATE, _json(GraphEstimate, estimate, keyframe_ids=list(estimate.T_world_keyframe))
 
 

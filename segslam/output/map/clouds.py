@@ -34,69 +34,68 @@ class _BinaryCloud:
     """A header, then a row of a fixed layout for each point; the header is written last."""
 
     row: ClassVar[tuple[Any, ...]]
+    color_order: ClassVar[tuple[int, int, int]]
+    """Bytes of red, green and blue in the field `color`."""
+    filler: ClassVar[str]
+    last_line: ClassVar[str]
 
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._stream = file.open("wb")
         self._stream.write(bytes(HEADER_BYTES))
-        self._has_intensities = extent.brightest is not None
-        self._row = np.dtype([*self.row, *[("intensity", "<f4")] * self._has_intensities])
+        self._intensity = [] if extent.brightest is None else ["intensity"]
+        self._row = np.dtype([*self.row, *((name, "<f4") for name in self._intensity)])
         self._num_points = 0
 
     def add(self, part: Part) -> None:
         """Append the points of a part."""
         rows = np.zeros(len(part.points), self._row)
         rows["xyz"], rows["label"] = part.points, part.labels
-        self._color(rows, part)
-        if self._has_intensities:
+        rows["color"][:, self.color_order] = part.colors
+        if self._intensity:
             rows["intensity"] = part.intensities
         rows.tofile(self._stream)
         self._num_points += len(rows)
 
-    def _color(self, rows: np.ndarray, part: Part) -> None:
-        raise NotImplementedError
-
-    def _close(self, lines: list[str], *, filler: str, last: str) -> None:
+    def close(self) -> None:
         """Write the header into the reserved bytes, padded with a comment, and close the file."""
-        text = "".join(f"{line}\n" for line in lines)
-        spaces = HEADER_BYTES - len(text) - len(filler) - len(last) - 2
+        text = "".join(f"{line}\n" for line in self._header())
+        spaces = HEADER_BYTES - len(text) - len(self.filler) - len(self.last_line) - 2
         self._stream.seek(0)
-        self._stream.write(f"{text}{filler}{' ' * spaces}\n{last}\n".encode("ascii"))
+        self._stream.write(f"{text}{self.filler}{' ' * spaces}\n{self.last_line}\n".encode("ascii"))
         self._stream.close()
+
+    def _header(self) -> list[str]:
+        raise NotImplementedError
 
 
 class PlyCloud(_BinaryCloud):
     """Binary PLY: x y z (float32, m), red green blue, label (SemanticKITTI learning id), intensity if known."""
 
-    row = (("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1"))
+    row = (("xyz", "<f4", 3), ("color", "u1", 3), ("label", "u1"))
+    color_order = 0, 1, 2
+    filler, last_line = "comment", "end_header"
 
-    def _color(self, rows: np.ndarray, part: Part) -> None:
-        rows["rgb"] = part.colors
-
-    def close(self) -> None:
-        """Complete the file."""
-        lines = [
+    def _header(self) -> list[str]:
+        return [
             "ply",
             "format binary_little_endian 1.0",
             f"element vertex {self._num_points}",
             *(f"property float {name}" for name in "xyz"),
             *(f"property uchar {name}" for name in ("red", "green", "blue", "label")),
-            *(["property float intensity"] if self._has_intensities else []),
+            *(f"property float {name}" for name in self._intensity),
         ]
-        self._close(lines, filler="comment", last="end_header")
 
 
 class PcdCloud(_BinaryCloud):
     """Binary PCD 0.7: x y z (float32, m), rgb packed as in PCL, label, intensity if known."""
 
-    row = (("xyz", "<f4", 3), ("bgra", "u1", 4), ("label", "<u4"))
+    row = (("xyz", "<f4", 3), ("color", "u1", 4), ("label", "<u4"))
+    color_order = 2, 1, 0
+    filler, last_line = "#", "DATA binary"
 
-    def _color(self, rows: np.ndarray, part: Part) -> None:
-        rows["bgra"][:, :3] = part.colors[:, ::-1]
-
-    def close(self) -> None:
-        """Complete the file."""
-        names = ["x", "y", "z", "rgb", "label", *(["intensity"] if self._has_intensities else [])]
-        lines = [
+    def _header(self) -> list[str]:
+        names = ["x", "y", "z", "rgb", "label", *self._intensity]
+        return [
             "VERSION 0.7",
             f"FIELDS {' '.join(names)}",
             f"SIZE{' 4' * len(names)}",
@@ -107,7 +106,6 @@ class PcdCloud(_BinaryCloud):
             "VIEWPOINT 0 0 0 1 0 0 0",
             f"POINTS {self._num_points}",
         ]
-        self._close(lines, filler="#", last="DATA binary")
 
 
 class LasCloud:

@@ -171,11 +171,11 @@ def test_the_ground_is_free_between_rings_up_to_the_last_and_up_to_what_stands_b
     rings = [np.column_stack([r * np.cos(turn), r * np.sin(turn), np.full(len(turn), -1.7)]) for r in (5.0, 12.0, 25.0)]
     wall = np.column_stack([np.full(200, 8.0), np.linspace(-1.0, 1.0, 200), np.full(200, -0.7)])
     labels = np.repeat([int(Label.ROAD), int(Label.BUILDING)], [3 * len(turn), len(wall)]).astype(np.uint8)
-    free_m = free_range_m(np.concatenate([*rings, wall]), labels, low_m=0.3, high_m=2.0)
+    free_m = free_range_m(np.concatenate([*rings, wall]), labels)
     assert free_m[NUM_DIRECTIONS // 4] == pytest.approx(25.0)
     assert free_m[0] == pytest.approx(8.0, abs=0.1)
     moving = np.where(labels == Label.BUILDING, Label.MOVING_CAR, labels).astype(np.uint8)
-    assert free_range_m(np.concatenate([*rings, wall]), moving, low_m=0.3, high_m=2.0)[0] == pytest.approx(25.0)
+    assert free_range_m(np.concatenate([*rings, wall]), moving)[0] == pytest.approx(25.0)
 
 
 def test_the_grid_is_free_where_only_rays_passed(tmp_path: Path) -> None:

@@ -3,13 +3,11 @@
 Beams hit the ground in rings. There are no points between two rings, but the ray to the outer ring passed over the gap.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
-from segslam.core.types import GROUND_LABELS, Label, Labels, Points, Vector
+from segslam.core.types import GROUND_LABELS, Label, Labels, Mask, Points, Vector
 from segslam.output.map.tiles import Tile, distance_m
 
 OBSTACLE_M = (0.3, 2.0)
@@ -31,34 +29,31 @@ class FreeRanges:
     def add(self, points: Points, labels: Labels, place: Vector) -> None:
         """Add a keyframe: its points (n, 3) in the world, and its position."""
         self._places.append(place[:2])
-        self._free_m.append(free_range_m(points - place, labels, low_m=OBSTACLE_M[0], high_m=OBSTACLE_M[1]))
+        self._free_m.append(free_range_m(points - place, labels))
 
-    def free(self, tile: Tile, places: Float[np.ndarray, "_ 2"]) -> Iterator[np.ndarray]:
-        """For each keyframe near a tile: whether each of the places (n, 2) is within its free range."""
+    def is_free(self, tile: Tile, places: Float[np.ndarray, "_ 2"]) -> Mask:
+        """Whether each of the places (n, 2) of a tile is within the free range of a keyframe."""
+        free = np.zeros(len(places), bool)
         for place, free_m in zip(self._places, self._free_m, strict=True):
-            if distance_m(tile, place) >= REACH_M:
-                continue
-            x, y = (places - place).T
-            yield np.hypot(x, y) < free_m[_direction(x, y)]
+            if distance_m(tile, place) < REACH_M:
+                x, y = (places - place).T
+                free |= np.hypot(x, y) < free_m[_direction(x, y)]
+        return free
 
 
-def free_range_m(points: Points, labels: Labels, *, low_m: float, high_m: float) -> Vector:
+def free_range_m(points: Points, labels: Labels) -> Vector:
     """(NUM_DIRECTIONS,) free range (m) in each direction. Points (n, 3) are relative to the sensor.
 
-    An obstacle has points from `low_m` to `high_m` above the ground; points of moving classes do not count.
+    Points of moving classes do not count.
     """
     near = np.abs(points[:, :2]).max(axis=1, initial=0.0) < REACH_M
     near &= labels < Label.MOVING_CAR
     points, labels = points[near], labels[near]
     if not len(points):
         return np.zeros(NUM_DIRECTIONS)
-    is_ground = np.isin(labels, np.array(GROUND_LABELS, np.uint8))
-    within = points + np.array([REACH_M, REACH_M, 0.0])
-    height_m = points[:, 2] - lowest_ground(within, within[is_ground] if is_ground.any() else within, 2 * REACH_M)
-    stands = (height_m >= low_m) & (height_m <= high_m) & ~is_ground
+    stands, flat = obstacles_and_ground(points + np.array([REACH_M, REACH_M, 0.0]), labels, 2 * REACH_M)
     range_m, direction = np.hypot(points[:, 0], points[:, 1]), _direction(points[:, 0], points[:, 1])
     farthest, nearest = np.zeros(NUM_DIRECTIONS), np.full(NUM_DIRECTIONS, np.inf)
-    flat = is_ground | (height_m < low_m)
     np.maximum.at(farthest, direction[flat], range_m[flat])
     np.minimum.at(nearest, direction[stands], range_m[stands])
     return np.minimum(farthest, nearest)
@@ -67,6 +62,14 @@ def free_range_m(points: Points, labels: Labels, *, low_m: float, high_m: float)
 def _direction(x: Vector, y: Vector) -> np.ndarray:
     turn = (np.arctan2(y, x) / (2 * np.pi)) % 1.0
     return (turn * NUM_DIRECTIONS).astype(np.int64) % NUM_DIRECTIONS
+
+
+def obstacles_and_ground(points: Points, labels: Labels, side_m: float) -> tuple[Mask, Mask]:
+    """Whether each point is an obstacle, and whether it shows that the ground is flat. Points as in `lowest_ground`."""
+    is_ground = np.isin(labels, np.array(GROUND_LABELS, np.uint8))
+    height_m = points[:, 2] - lowest_ground(points, points[is_ground] if is_ground.any() else points, side_m)
+    low_m, high_m = OBSTACLE_M
+    return (height_m >= low_m) & (height_m <= high_m) & ~is_ground, is_ground | (height_m < low_m)
 
 
 def lowest_ground(points: Points, ground: Points, side_m: float) -> Vector:

@@ -11,8 +11,7 @@ import numpy as np
 import yaml
 
 from segslam.core.config import MapConfig
-from segslam.core.types import GROUND_LABELS
-from segslam.output.map.free_ranges import OBSTACLE_M, lowest_ground
+from segslam.output.map.free_ranges import obstacles_and_ground
 from segslam.output.map.part import Extent, Part
 from segslam.output.map.tiles import TILE_M, corner
 
@@ -32,7 +31,6 @@ class Grid:
     def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
         self._file = file
         self._extent = extent
-        self._config = config
         self._cells = round(TILE_M / CELL_M)  # along the edge of a tile
         columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
         self._band = np.full((self._cells, columns * self._cells), UNKNOWN, np.uint8)
@@ -69,25 +67,16 @@ class Grid:
     def _occupancy(self, part: Part) -> np.ndarray:
         """(cells, cells) uint8, the southernmost row first."""
         within = part.points - corner(part.tile)
-        is_ground = np.isin(part.labels, np.array(GROUND_LABELS, np.uint8))
-        height_m = within[:, 2] - lowest_ground(within, within[is_ground] if is_ground.any() else within, TILE_M)
         column, row = np.clip((within[:, :2] / TILE_M * self._cells).astype(np.int64), 0, self._cells - 1).T
-        low_m, high_m = OBSTACLE_M
         cell = row * self._cells + column
         obstacles, ground = (
             np.bincount(cell[chosen], minlength=self._cells**2).reshape(self._cells, self._cells)
-            for chosen in ((height_m >= low_m) & (height_m <= high_m) & ~is_ground, is_ground | (height_m < low_m))
+            for chosen in obstacles_and_ground(within, part.labels, TILE_M)
         )
         occupied = obstacles >= MIN_OBSTACLE_VOXELS
-        seen = np.select([occupied, ground > 0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
-        return self._filled_along_rays(seen, part)
-
-    def _filled_along_rays(self, cells: np.ndarray, part: Part) -> np.ndarray:
-        """Set unknown cells to free if a keyframe's ray to the ground passed over them."""
+        cells = np.select([occupied, ground > 0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
         rows, columns = np.nonzero(cells == UNKNOWN)
         centres = corner(part.tile)[:2] + (np.column_stack([columns, rows]) + 0.5) * (TILE_M / self._cells)
-        free = np.zeros(len(centres), bool)
-        for passed in self._extent.free_ranges.free(part.tile, centres):
-            free |= passed
+        free = self._extent.free_ranges.is_free(part.tile, centres)
         cells[rows[free], columns[free]] = FREE
         return cells

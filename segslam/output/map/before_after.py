@@ -43,8 +43,10 @@ class BeforeAfter:
         self._maps = (poses, estimate.T_world_keyframe)
         self._path_m = np.array([T[:3, 3] for _, T in sorted(estimate.T_world_keyframe.items())])
         self._cut_m = cut_heights(self._path_m, (self._placed(keyframe) for keyframe in keyframes))
-        whole = _around(np.array([T[:2, 3] for poses in self._maps for T in poses.values()]), REACH_M / 2)
-        self._whole = [_Density(whole) for _ in self._maps]
+        places = np.array([T[:2, 3] for poses in self._maps for T in poses.values()])
+        corners = np.array([places.min(axis=0) - REACH_M / 2, places.max(axis=0) + REACH_M / 2])
+        (west, south), (east, north) = corners.tolist()
+        self._whole = [_Density((west, east, south, north)) for _ in self._maps]
         self._loops = [pair for pair, weight in estimate.closure_weights.items() if weight >= REJECTED_WEIGHT]
         detail = most_changed(*self._maps, self._loops)
         self._detail = [] if detail is None else [_Density(window) for window in _details(self._maps, detail)]
@@ -67,8 +69,6 @@ class BeforeAfter:
         return replace(keyframe, points=keyframe.points[seen], labels=keyframe.labels[seen], intensities=None)
 
     def _is_visible(self, keyframe: Keyframe) -> Mask:
-        if not np.isfinite(self._cut_m).any():
-            return np.ones(len(keyframe.points), bool)
         return visible(self._placed(keyframe), self._path_m, self._cut_m)
 
     def _placed(self, keyframe: Keyframe) -> Points:
@@ -87,9 +87,7 @@ class BeforeAfter:
         for row, panels in zip(grid, rows, strict=True):
             brightest = max(panel.brightest() for panel in panels)
             for axes, panel, poses, color in zip(row, panels, self._maps, (BEFORE, AFTER), strict=True):
-                panel.show(axes, brightest)
-                draw_path(axes, np.array([T[:3, 3] for T in poses.values()]), color=color, width=1.4)
-                panel.frame(axes)
+                panel.draw(axes, brightest, np.array([T[:3, 3] for T in poses.values()]), color)
         for axes, title in zip(grid[0], titles, strict=True):
             axes.set_title(title, color="white", fontsize=15)
         return png(figure)
@@ -117,16 +115,14 @@ class _Density:
         counted = self._counts[self._counts > 0]
         return float(np.percentile(counted, 99)) if len(counted) else 1.0
 
-    def show(self, axes: Axes, brightest: float) -> None:
-        """Draw the logarithm of the counts."""
+    def draw(self, axes: Axes, brightest: float, path_m: Points, color: str) -> None:
+        """Draw the logarithm of the counts, a path in a colour, and a scale bar; no ticks."""
         west, east, south, north = self._window
         image = np.log1p(self._counts) / np.log1p(brightest)
-        extent = (west, east, south, north)
-        axes.imshow(image, origin="lower", extent=extent, cmap="bone", vmin=0.0, vmax=1.0, interpolation="antialiased")
-
-    def frame(self, axes: Axes) -> None:
-        """Set the axis limits and add a scale bar; no ticks."""
-        west, east, south, north = self._window
+        axes.imshow(
+            image, origin="lower", extent=self._window, cmap="bone", vmin=0.0, vmax=1.0, interpolation="antialiased"
+        )
+        draw_path(axes, path_m, color=color, width=1.4)
         axes.set(xlim=(west, east), ylim=(south, north), xticks=[], yticks=[], facecolor=BACKGROUND)
         scale_bar(axes, east - west, color="white")
 
@@ -141,11 +137,6 @@ def most_changed(
         return geometry.distance(geometry.inverse(T_after) @ T_before)
 
     return max(loops, key=moved_m, default=None)
-
-
-def _around(xy: np.ndarray, margin_m: float) -> Window:
-    (west, south), (east, north) = xy.min(axis=0) - margin_m, xy.max(axis=0) + margin_m
-    return float(west), float(east), float(south), float(north)
 
 
 def _details(maps: Iterable[Mapping[int, Transform]], loop: tuple[int, int]) -> list[Window]:

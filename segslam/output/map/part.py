@@ -63,15 +63,6 @@ class MapFile(Protocol):
         """Complete the file."""
 
 
-def scale_of(span: tuple[float, float], *, steps: int = 6) -> list[tuple[float, str]]:
-    """(text, colour) of evenly spaced values from the end of a span to its start, as `of_numbers` colours them."""
-    values = np.linspace(span[1], span[0], steps)
-    return [
-        (float(value), f"#{r:02x}{g:02x}{b:02x}")
-        for value, (r, g, b) in zip(values, of_numbers(values, span=span), strict=True)
-    ]
-
-
 def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:
     """Colours (n, 3) from dark violet, at the start of the span and below, to yellow, at its end and above."""
     from matplotlib import colormaps

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 from segslam.core.config import MapConfig
 from segslam.labels.encodings import COLORS
 from segslam.output.map.from_above import Window, visible
-from segslam.output.map.part import Extent, Part, scale_of
+from segslam.output.map.part import Extent, Part, of_numbers
 from segslam.output.map.tiles import TILE_M, corner
 
 MAX_SIDE = 4000
@@ -66,40 +66,29 @@ class Picture:
         self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=titles[self._color], marks=self._marks()))
 
     def _finished(self) -> tuple[np.ndarray, Window, float]:
-        """The shaded image (rows, columns, 3), its window, and the median height of its pixels (m)."""
-        rows, columns = self._seen()
-        image, height_m = closed_and_shaded(
-            self._image[rows, columns], self._height_m[rows, columns], max(round(SHADED_M * self._pixels / TILE_M), 3)
+        """The shaded image (rows, columns, 3) of what has points, its window, and the median height of its pixels."""
+        known, margin = np.isfinite(self._height_m), round(MARGIN_M * self._pixels / TILE_M)
+        ends = (np.flatnonzero(known.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
+        (top, bottom), (left, right) = (
+            (max(first - margin, 0), min(last + 1 + margin, size))
+            for (first, last), size in zip(ends, known.shape, strict=True)
         )
-        return image, self._window(rows, columns), float(np.nanmedian(height_m))
-
-    def _seen(self) -> tuple[slice, slice]:
-        """Rows and columns of the image that have points, with a margin."""
-        margin = round(MARGIN_M * self._pixels / TILE_M)
-        known = np.isfinite(self._height_m)
-        ends = []
-        for axis in (1, 0):
-            places = np.flatnonzero(known.any(axis=axis))
-            ends.append(slice(max(places[0] - margin, 0), places[-1] + 1 + margin))
-        return ends[0], ends[1]
-
-    def _window(self, rows: slice, columns: slice) -> Window:
-        west, south = corner((self._extent.west, self._extent.south))[:2].tolist()
-        pixel_m = TILE_M / self._pixels
-        height, width = self._height_m.shape
-        last_column, last_row = min(columns.stop, width), min(rows.stop, height)
-        return (
-            west + columns.start * pixel_m,
-            west + last_column * pixel_m,
-            south + (height - last_row) * pixel_m,
-            south + (height - rows.start) * pixel_m,
-        )
+        area = np.s_[top:bottom, left:right]
+        shading_px = max(round(SHADED_M * self._pixels / TILE_M), 3)
+        image, height_m = closed_and_shaded(self._image[area], self._height_m[area], shading_px)
+        west, south, _ = corner((self._extent.west, self._extent.south)).tolist()
+        pixel_m, height = TILE_M / self._pixels, len(known)
+        east_west = west + left * pixel_m, west + right * pixel_m
+        window = (*east_west, south + (height - bottom) * pixel_m, south + (height - top) * pixel_m)
+        return image, window, float(np.nanmedian(height_m))
 
     def _marks(self) -> list[tuple[str, str]]:
         """Text and colour of each class in the map, or of values along the colour scale."""
         if self._color == "class":
             return [(label.name.lower().replace("_", " "), COLORS[label]) for label in COLORS if label in self._labels]
-        return [(f"{value:.3g}", color) for value, color in scale_of(self._extent.span)]
+        values = np.linspace(*self._extent.span[::-1], 6)
+        colors = of_numbers(values, span=self._extent.span)
+        return [(f"{value:.3g}", f"#{bytes(color).hex()}") for value, color in zip(values, colors, strict=True)]
 
 
 def closed_and_shaded(image: np.ndarray, height_m: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:

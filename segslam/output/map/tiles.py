@@ -27,9 +27,6 @@ GATHERED = 1_000_000
 HEIGHTS_M = np.arange(-MAX_HEIGHT_M, MAX_HEIGHT_M + 0.5, 0.5)
 INTENSITIES = np.append(0.0, 2.0 ** np.arange(-10.0, 16.1, 0.125))
 """Steps of 9 % from 0.001 to the largest value of 16 bits, for intensities in any unit."""
-SHARES = 0.01, 0.99
-"""Share of the voxels, at both ends, that the colour scale ignores as outliers."""
-
 Tile = tuple[int, int]
 """Column (along x) and row (along y)."""
 
@@ -64,7 +61,8 @@ class Tiles:
         self._gathered: list[tuple[Points, Labels, Vector]] = []
         self._num_gathered = 0
         self._known: set[Tile] = set()
-        self._heights, self._intensities = Histogram(HEIGHTS_M), Histogram(INTENSITIES)
+        self.heights, self.intensities = Histogram(HEIGHTS_M), Histogram(INTENSITIES)
+        """Of the written voxels: to 0.5 m, and to 9 %."""
         self.brightest = 0.0
         """Upper bound of the intensities of the voxels."""
 
@@ -106,17 +104,9 @@ class Tiles:
                 voxels = merged(np.concatenate([voxels, piece]), self._voxel_m)
         return voxels
 
-    def height_span_m(self) -> tuple[float, float]:
-        """Heights (m) below which 1 and 99 % of the written voxels lie, to 0.5 m."""
-        return self._heights.span(*SHARES)
-
-    def intensity_span(self) -> tuple[float, float]:
-        """Intensities below which those of 1 and 99 % of the written voxels lie, to 9 %."""
-        return self._intensities.span(*SHARES)
-
     def _append(self, tile: Tile, voxels: np.ndarray) -> None:
-        self._heights.add(voxels["point"][:, 2])
-        self._intensities.add(voxels["intensity"])
+        self.heights.add(voxels["point"][:, 2])
+        self.intensities.add(voxels["intensity"])
         self.brightest = max(self.brightest, float(voxels["intensity"].max()))
         self._known.add(tile)
         with self._file(tile).open("ab") as stream:

@@ -48,6 +48,8 @@ KINDS: dict[str, type[MapFile]] = {
     ".tiff": GeoTiff,
 }
 """Writers by file extension."""
+SHARES = 0.01, 0.99
+"""Share of the voxels, at both ends, that the colour scale ignores as outliers."""
 
 
 def check_names(files: Sequence[Path], *, origin: "Origin | None" = None) -> None:
@@ -208,17 +210,13 @@ class MapStore:
             yield Part(tile, world, kept["label"], kept["intensity"], paint)
 
     def _colors(self, labels: Labels, heights: Vector, intensities: Vector) -> Colors:
-        match self._config.color:
-            case "class":
-                return of_classes(labels)
-            case "height":
-                return of_numbers(heights, span=self._span())
-            case "intensity":
-                return of_numbers(intensities, span=self._span())
+        if self._config.color == "class":
+            return of_classes(labels)
+        return of_numbers(intensities if self._config.color == "intensity" else heights, span=self._span())
 
     def _span(self) -> tuple[float, float]:
         """Values at both ends of the colour scale."""
-        return self._tiles.intensity_span() if self._config.color == "intensity" else self._tiles.height_span_m()
+        return (self._tiles.intensities if self._config.color == "intensity" else self._tiles.heights).span(*SHARES)
 
     def _views_of(self, tile: Tile) -> Iterator[tuple[np.ndarray, Transform]]:
         """The range image of each keyframe near a tile, and T_keyframe_tile."""

@@ -258,11 +258,11 @@ def test_plots_have_whole_legends_and_plain_numbers(monkeypatch: pytest.MonkeyPa
     states = cycle((MotionState.REPAIRED, MotionState.BROKEN, MotionState.CONFIRMED))
     motions = tuple(replace(motion, state=state) for motion, state in zip(run.result.motions, states, strict=False))
     run = replace(run, result=replace(run.result, motions=motions, alone=run.result.odometry))
-    poses = figures.compared(run)
-    assert poses is not None
     with matplotlib.rc_context(figures.STYLE):
         plots = [figures.draw_paths(run), figures.draw_loops(run), figures.draw_loops_over_time(run)]
-        plots.append(figures.draw_errors(poses))
+        errors = figures.draw_errors(run)
+        assert errors is not None
+        plots.append(errors)
         for longest_ms in (2.0, 100.0, 1e5):
             stages = {"a": {"median": 0.5, "p95": 1.0}, "b": {"median": 1.0, "p95": longest_ms}}
             plots.append(figures.draw_stages(stages))

@@ -14,7 +14,6 @@ from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, loops
-from segslam.output.report.figures import draw_fixes
 from segslam.output.report.page import Pictures, number, page
 
 __all__ = ["BEFORE_AFTER", "draw_before_after", "write_report"]
@@ -50,10 +49,9 @@ def draw_before_after(folder: Path) -> bytes:
 def _plots(run: FinishedRun) -> dict[str, str]:
     """The plots by caption, as far as the run contains the data."""
     plots = {"Trajectory, top view and height": figures.draw_paths(run)}
-    true = figures.compared(run)
-    if true is not None:
-        plots["Error along the drive, after alignment"] = figures.draw_errors(true)
-    if (fixes := draw_fixes(run.folder)) is not None:
+    if (errors := figures.draw_errors(run)) is not None:
+        plots["Error along the drive, after alignment"] = errors
+    if (fixes := figures.draw_fixes(run.folder)) is not None:
         plots["Position fixes, top view and residuals"] = fixes
     plots["Loops by outcome"] = figures.draw_loops(run)
     if run.result.attempts:

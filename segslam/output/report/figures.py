@@ -4,7 +4,6 @@ import csv
 import io
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from matplotlib.ticker import LogFormatter
 
 from segslam.core.evaluation import align_positions, false_loops, pose_errors
 from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
-from segslam.core.types import MotionState, Rejected, RejectReason
+from segslam.core.types import Indices, MotionState, Rejected, RejectReason
 from segslam.output.accuracy import judged_closures
 from segslam.output.finished import FinishedRun
 
@@ -38,17 +37,6 @@ WIDTH_IN = 5.4
 """Text of 11 points is then 10 pixels high on a phone."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Compared:
-    """The scans with ground truth, one row each."""
-
-    truth: Poses
-    corrected: Poses
-    odometry: Poses
-    alone: Poses | None = None
-    """By KISS-ICP alone; None if they are unknown."""
-
-
 class Line(NamedTuple):
     """A path and its style."""
 
@@ -59,35 +47,32 @@ class Line(NamedTuple):
     width: float
 
 
-def compared(run: FinishedRun) -> Compared | None:
-    """The scans of a run with ground truth; None if there are none."""
+def true_scans(run: FinishedRun) -> tuple[Indices, Poses] | None:
+    """Rows of the scans with ground truth, and their true poses; None if there are none."""
     if run.reference is None:
         return None
     rows = rows_of_same_scan(run.result.trajectory.scan_index, run.reference.scan_index)
-    if len(rows) == 0:
-        return None
-    return Compared(
-        run.reference.T_world_lidar[rows[:, 1]],
-        run.result.trajectory.T_world_lidar[rows[:, 0]],
-        run.result.odometry.T_world_lidar[rows[:, 0]],
-        None if run.result.alone is None else run.result.alone.T_world_lidar[rows[:, 0]],
-    )
+    return (rows[:, 0], run.reference.T_world_lidar[rows[:, 1]]) if len(rows) else None
+
+
+def _estimates_of(run: FinishedRun) -> list[Line]:
+    """The trajectories of a run, of which the last is the corrected one."""
+    alone = run.result.alone
+    return [
+        *([] if alone is None else [Line("KISS-ICP alone", alone.T_world_lidar, ALONE, ":", 1.5)]),
+        Line("odometry", run.result.odometry.T_world_lidar, ODOMETRY, "--", 1.5),
+        Line("corrected", run.result.trajectory.T_world_lidar, CORRECTED, "-", 1.2),
+    ]
 
 
 def paths_of(run: FinishedRun) -> list[Line]:
     """The paths to draw, in the frame of the run, as all other plots and the map."""
-    true = compared(run)
-    paths = []
-    if true is not None:
-        T_world_truth = align_positions(true.truth[:, :3, 3], true.corrected[:, :3, 3])
-        paths.append(Line("truth", T_world_truth @ true.truth, TRUTH, "-", 4.0))
-    if run.result.alone is not None:
-        paths.append(Line("KISS-ICP alone", run.result.alone.T_world_lidar, ALONE, ":", 1.5))
-    return [
-        *paths,
-        Line("odometry", run.result.odometry.T_world_lidar, ODOMETRY, "--", 1.5),
-        Line("corrected", run.result.trajectory.T_world_lidar, CORRECTED, "-", 1.2),
-    ]
+    paths = _estimates_of(run)
+    if (true := true_scans(run)) is not None:
+        rows, truth = true
+        T_world_truth = align_positions(truth[:, :3, 3], paths[-1].poses[rows, :3, 3])
+        paths.insert(0, Line("truth", T_world_truth @ truth, TRUTH, "-", 4.0))
+    return paths
 
 
 def draw_paths(run: FinishedRun) -> str:
@@ -138,18 +123,22 @@ def draw_loops_over_time(run: FinishedRun) -> str:
     return svg(figure, "times")
 
 
-def draw_errors(poses: Compared) -> str:
-    """Position error and height error against the distance travelled, after the alignment of the ATE."""
+def draw_errors(run: FinishedRun) -> str | None:
+    """Position error and height error against the distance travelled, after the alignment of the ATE.
+
+    None for a run without ground truth.
+    """
+    if (true := true_scans(run)) is None:
+        return None
+    rows, truth = true
     figure = Figure(figsize=(WIDTH_IN, 5.4), layout="constrained")
     whole, height = figure.subplots(2, 1, sharex=True)
-    along_m = travelled_m(poses.truth)
-    drives = [("odometry", poses.odometry, ODOMETRY), ("corrected", poses.corrected, CORRECTED)]
-    if poses.alone is not None:
-        drives = [("KISS-ICP alone", poses.alone, ALONE), ("odometry after repairs", *drives[0][1:]), drives[1]]
-    for name, estimate, color in drives:
-        aligned = align_positions(estimate[:, :3, 3], poses.truth[:, :3, 3]) @ estimate
-        plot_error(whole, name, aligned, poses.truth, color)
-        height.plot(along_m, (aligned - poses.truth)[:, 2, 3], color=color, linewidth=1.4)
+    for line in _estimates_of(run):
+        estimate = line.poses[rows]
+        aligned = align_positions(estimate[:, :3, 3], truth[:, :3, 3]) @ estimate
+        is_repaired = line.name == "odometry" and run.result.alone is not None
+        plot_error(whole, f"{line.name}{' after repairs' * is_repaired}", aligned, truth, line.color)
+        height.plot(travelled_m(truth), (aligned - truth)[:, 2, 3], color=line.color, linewidth=1.4)
     whole.set(ylabel="error (m)")
     whole.set_ylim(bottom=0)
     height.set(xlabel="distance travelled (m)", ylabel="height error (m)")
@@ -282,40 +271,29 @@ def svg(figure: Figure, name: str) -> str:
 def draw_fixes(folder: Path) -> str | None:
     """SVG text: fixes over the path in top view, and residuals over time; None for a run without fixes."""
     file = folder / "gnss.csv"
-    if not file.is_file():
-        return None
     from segslam.output.georeferenced import read_globe
 
-    globe = read_globe(folder)
+    globe = read_globe(folder) if file.is_file() else None
     if globe is None:
         return None
     with file.open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if row["residual_east_m"]]
-    enu_m, residual_m = (_columns(rows, f"{name}east_m", f"{name}north_m") for name in ("", "residual_"))
+    names = ("east_m", "north_m", "residual_east_m", "residual_north_m")
+    values = np.array([[float(row[name]) for name in names] for row in rows]).reshape(-1, len(names))
+    enu_m, residual_m = values[:, :2], values[:, 2:]
     minutes = np.array([int(row["stamp_ns"]) for row in rows], float) / 60e9
     kept = np.array([row["kept"] == "1" for row in rows], bool)
     figure = Figure(figsize=(WIDTH_IN, 1.5 * WIDTH_IN), layout="constrained")
     above, over_time = figure.subplots(2, 1, height_ratios=(2, 1))
     above.plot(*globe.T_enu_lidar[:, :2, 3].T, color=CORRECTED, linewidth=1.2, label="trajectory", zorder=3)
     for chosen, color, name in ((kept, ACCEPTED, "kept"), (~kept, FALSE, "not kept")):
-        above.plot(
-            *enu_m[chosen].T,
-            ".",
-            color=color,
-            markersize=4,
-            label=f"{name}: {chosen.sum()}",
-            scalex=False,
-            scaley=False,
-        )
+        style: Any = {"color": color, "markersize": 4}
+        above.plot(*enu_m[chosen].T, ".", label=f"{name}: {chosen.sum()}", scalex=False, scaley=False, **style)
         distance_m = np.hypot(*residual_m[chosen].T)
-        over_time.plot(minutes[chosen] - minutes.min(initial=np.inf), distance_m, ".", color=color, markersize=4)
+        over_time.plot(minutes[chosen] - minutes.min(initial=np.inf), distance_m, ".", **style)
     above.set(xlabel="east (m)", ylabel="north (m)")
     above.set_aspect("equal", adjustable="datalim")
     figure.legend(loc="outside upper center", ncols=3)
     over_time.set(xlabel="time (minutes)", ylabel="residual (m)", yscale="log")
     plain_powers(over_time.yaxis)
     return svg(figure, "fixes")
-
-
-def _columns(rows: list[dict[str, str]], *names: str) -> np.ndarray:
-    return np.array([[float(row[name]) for name in names] for row in rows]).reshape(-1, len(names))

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from segslam.core import geometry
 from segslam.core.evaluation import align_positions, pose_errors
-from segslam.core.trajectory import Poses, rows_of_same_scan
+from segslam.core.trajectory import Poses
 from segslam.core.types import (
     GROUND_LABELS,
     REJECTED_WEIGHT,
@@ -32,7 +32,7 @@ from segslam.core.types import (
     Transform,
 )
 from segslam.output.finished import FinishedRun
-from segslam.output.report.figures import paths_of
+from segslam.output.report.figures import paths_of, true_scans
 from segslam.slam.slam_result import outcome_text
 
 MOST_SCANS = 3000
@@ -103,12 +103,11 @@ def _values(run: FinishedRun) -> dict[str, list[float]]:
         "time (s)": (trajectory.stamp_ns - trajectory.stamp_ns[0]) / 1e9,
         "height (m)": trajectory.T_world_lidar[:, 2, 3],
     }
-    if run.reference is not None:
-        rows = rows_of_same_scan(trajectory.scan_index, run.reference.scan_index)
-        made, true = trajectory.T_world_lidar[rows[:, 0]], run.reference.T_world_lidar[rows[:, 1]]
-        if len(rows) == len(trajectory):
-            T_true_made = align_positions(made[:, :3, 3], true[:, :3, 3])
-            values["error (m)"] = pose_errors(T_true_made @ made, true).translation_m
+    true = true_scans(run)
+    if true is not None and len(true[0]) == len(trajectory):
+        made, truth = trajectory.T_world_lidar[true[0]], true[1]
+        T_true_made = align_positions(made[:, :3, 3], truth[:, :3, 3])
+        values["error (m)"] = pose_errors(T_true_made @ made, truth).translation_m
     return {name: _rounded(_thinned(of_scans)) for name, of_scans in values.items()}
 
 

@@ -14,7 +14,7 @@ from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, loops
-from segslam.output.report.page import Pictures, number, page
+from segslam.output.report.page import loops_section, number, page, png_section, section
 
 __all__ = ["BEFORE_AFTER", "draw_before_after", "write_report"]
 
@@ -36,7 +36,9 @@ def write_report(folder: str | Path) -> Path:
         plots = _plots(run)
     about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
     file = folder / "report.html"
-    write_whole(file, page(run, plots, _pictures(run), about=about).encode(errors="backslashreplace"))
+    top, gallery = _pictures(run)
+    html = page(run, plots, top=top, gallery=gallery, about=about)
+    write_whole(file, html.encode(errors="backslashreplace"))
     return file
 
 
@@ -62,18 +64,18 @@ def _plots(run: FinishedRun) -> dict[str, str]:
     return plots
 
 
-def _pictures(run: FinishedRun) -> Pictures:
-    """Pictures that need the clouds of the log: the map before and after, and pairs of keyframes."""
+def _pictures(run: FinishedRun) -> tuple[str, str]:
+    """HTML with pictures of the map, and of pairs of keyframes; most need the clouds of the log."""
     chosen, shown = loops.choose(run.result.attempts), loops.with_clouds(run)
     before_after, kept = _drawn(run, _keyframes_of([*chosen, *shown]))
     of_view = {number: kept[number] for number in sorted(_keyframes_of(shown)) if number in kept}
+    top = section("Top view", loops.top_view(run, of_view))
+    note = "Left: before, by odometry. Right: after, as mapped."
+    top += png_section("Map by odometry, and corrected", before_after, note=note)
     map_file = run.folder / "map.png"
-    return Pictures(
-        before_after=before_after,
-        map=small_png(map_file) if map_file.is_file() else None,
-        loops=loops.draw(run, chosen, kept),
-        top_view=loops.top_view(run, of_view),
-    )
+    if map_file.is_file():
+        top += png_section("Map in top view", small_png(map_file))
+    return top, loops_section(loops.draw(run, chosen, kept))
 
 
 def _keyframes_of(attempts: Iterable[LoopAttempt]) -> set[int]:

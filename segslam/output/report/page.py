@@ -3,12 +3,11 @@
 import base64
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from html import escape
 from types import MappingProxyType
 from typing import Any
 
-from segslam.core.config import Config, Section, changed_settings
+from segslam.core.config import Config, changed_settings
 from segslam.core.types import Rejected
 from segslam.output.finished import COMPARED, FIGURES, FinishedRun
 from segslam.output.words import REASONS, WORDS
@@ -72,37 +71,20 @@ details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Pictures:
-    """PNGs, and the interactive view."""
-
-    before_after: bytes | None = None
-    """The map by odometry alone beside the corrected map."""
-    map: bytes | None = None
-    """Top view of the map, if the run has one."""
-    loops: Mapping[str, bytes] = field(default_factory=dict)
-    """Pairs of scans, by caption."""
-    top_view: str = ""
-    """HTML of the interactive top view."""
-
-
 def page(
     run: FinishedRun,
     plots: Mapping[str, str],
-    pictures: Pictures | None = None,
     *,
+    top: str = "",
+    gallery: str = "",
     about: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """The page of a run; `plots`: caption -> SVG text. `about`: metadata of the run from the log."""
-    pictures = pictures or Pictures()
+    """The page of a run; `plots`: caption -> SVG text. `about`: metadata of the run from the log.
+
+    `top` and `gallery` are HTML before and after the plots.
+    """
     name = run.folder.resolve().name
     title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
-    top = section("Top view", pictures.top_view) if pictures.top_view else ""
-    if pictures.before_after is not None:
-        note = "Left: before, by odometry. Right: after, as mapped."
-        top += png_section("Map by odometry, and corrected", pictures.before_after, note=note)
-    if pictures.map is not None:
-        top += png_section("Map in top view", pictures.map)
     sections = [plot_section(caption, svg) for caption, svg in plots.items()]
     sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
     sections += [section("Files", _files(run)), section("Conditions", _conditions(run, about))]
@@ -112,11 +94,12 @@ def page(
         title,
         f'<div class="soft">segslam run <code>{escape(name)}</code></div>\n'
         f'<div class="tiles">{_tiles(run.metrics)}</div>\n{top}<div class="plots">{"".join(sections)}</div>\n'
-        f"{_gallery(pictures.loops)}{section('Settings', settings_tables(run.config))}",
+        f"{gallery}{section('Settings', settings_tables(run.config))}",
     )
 
 
-def _gallery(loops: Mapping[str, bytes]) -> str:
+def loops_section(loops: Mapping[str, bytes]) -> str:
+    """PNGs of pairs of scans, by caption; empty without any."""
     if not loops:
         return ""
     shown = "".join(f"<figure>{_picture(caption, png, 'png')}</figure>" for caption, png in loops.items())
@@ -226,18 +209,17 @@ def _outcomes(run: FinishedRun) -> str:
 def settings_tables(config: Config) -> str:
     """All settings by section. Changed settings are marked; their sections come first and are open."""
     default = Config()
-    names = sorted(Config.model_fields, key=lambda name: getattr(config, name) == getattr(default, name))
-    return "".join(_setting_section(name, getattr(config, name), getattr(default, name)) for name in names)
-
-
-def _setting_section(name: str, section: Section, default: Section) -> str:
-    values, usual = section.model_dump(mode="json"), default.model_dump(mode="json")
-    rows = ""
-    for key, setting in type(section).model_fields.items():
-        kind = ' class="changed"' if values[key] != usual[key] else ""
-        cells = _key(key), escape(str(values[key])), escape(" ".join((setting.description or "").split()))
-        rows += f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
-    return f"<details{' open' if values != usual else ''}><summary>{name}</summary><table>{rows}</table></details>"
+    tables = ""
+    for name in sorted(Config.model_fields, key=lambda name: getattr(config, name) == getattr(default, name)):
+        values, usual = (getattr(one, name).model_dump(mode="json") for one in (config, default))
+        rows = ""
+        for key, setting in type(getattr(config, name)).model_fields.items():
+            kind = ' class="changed"' if values[key] != usual[key] else ""
+            cells = _key(key), escape(str(values[key])), escape(" ".join((setting.description or "").split()))
+            rows += f"<tr{kind}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        is_open = " open" if values != usual else ""
+        tables += f"<details{is_open}><summary>{name}</summary><table>{rows}</table></details>"
+    return tables
 
 
 def section(title: str, body: str) -> str:

@@ -125,22 +125,16 @@ def _loop(run: FinishedRun, attempt: LoopAttempt, ids: set[int]) -> dict[str, An
         "text": outcome_text(attempt, estimate.closure_weights),
     }
     if ids.issuperset(pair):
-        loop |= {
-            "pair": list(pair),
-            "before": _top_rows(geometry.inverse(T_odom[target_id]) @ T_odom[source_id]),
-            "after": _top_rows(geometry.inverse(T_world[target_id]) @ T_world[source_id]),
-        }
+        loop["pair"] = list(pair)
+        for name, poses in (("before", T_odom), ("after", T_world)):
+            T_target_source = geometry.inverse(poses[target_id]) @ poses[source_id]
+            loop[name] = _rounded(T_target_source[:2].ravel(), 5)  # what gives x and y in the target
     return loop
-
-
-def _top_rows(T_target_source: Transform) -> list[float]:
-    """The first two rows, which give x and y in the target."""
-    return [round(float(value), 5) for value in T_target_source[:2].ravel()]
 
 
 def _cloud(keyframe: Keyframe) -> str:
     """Points above ground in steps of `STEP_M`: 16-bit x, y, z of each, little endian, in base64."""
-    points: Points = keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))]
+    points = _standing(keyframe)
     points = points if len(points) else keyframe.points
     near = points[np.abs(points).max(axis=1, initial=0.0) < NEAR_M]
     kept = near[np.linspace(0, len(near) - 1, min(len(near), CLOUD_POINTS)).astype(int)] if len(near) else near
@@ -151,8 +145,8 @@ def _thinned(rows: np.ndarray) -> np.ndarray:
     return rows[:: 1 + (len(rows) - 1) // MOST_SCANS]
 
 
-def _rounded(values: np.ndarray) -> list[float]:
-    return [round(float(value), 2) for value in values]
+def _rounded(values: np.ndarray, digits: int = 2) -> list[float]:
+    return [round(float(value), digits) for value in values]
 
 
 def _spread(attempts: list[LoopAttempt], most: int) -> list[LoopAttempt]:
@@ -164,9 +158,14 @@ def _spread(attempts: list[LoopAttempt], most: int) -> list[LoopAttempt]:
 def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
     """Accepted candidates by overlap; then rejected ones, those that failed last first, by distance."""
     attempts = list(attempts)
-    accepted = [a for a in attempts if isinstance(a.outcome, LoopClosure)]
-    rejected = [a for a in attempts if isinstance(a.outcome, Rejected)]
-    return _apart(sorted(accepted, key=_overlap, reverse=True)) + _apart(sorted(rejected, key=_miss))
+    reasons = list(RejectReason)
+    accepted = [(-one.outcome.alignment.overlap, one) for one in attempts if isinstance(one.outcome, LoopClosure)]
+    rejected = [
+        ((-reasons.index(one.outcome.reason), one.candidate.distance_m), one)
+        for one in attempts
+        if isinstance(one.outcome, Rejected)
+    ]
+    return _apart(accepted) + _apart(rejected)
 
 
 def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int, Keyframe]) -> dict[str, bytes]:
@@ -180,33 +179,25 @@ def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int
             poses["registered"] = attempt.outcome.T_target_source
         else:
             poses["final map"] = geometry.inverse(T_world[target_id]) @ T_world[source_id]
-        source, target = (_standing(keyframes[number]) for number in (source_id, target_id))
+        source, target = (_standing(keyframes[number]).astype(np.float64) for number in (source_id, target_id))
         caption = f"{source_id} to {target_id}: {outcome_text(attempt, run.result.estimate.closure_weights)}"
         pictures[caption] = draw_pair(source, target, poses=poses, title=f"keyframes {caption}")
     return pictures
 
 
-def _apart(attempts: list[LoopAttempt]) -> list[LoopAttempt]:
+def _apart(ranked: Iterable[tuple[Any, LoopAttempt]]) -> list[LoopAttempt]:
+    """The attempts of lowest rank, each some keyframes from the others."""
     chosen: list[LoopAttempt] = []
-    for attempt in attempts:
+    for _, attempt in sorted(ranked, key=lambda pair: pair[0]):
         source_id = attempt.candidate.source_id
         if len(chosen) < NUM_EACH and all(abs(source_id - one.candidate.source_id) >= APART for one in chosen):
             chosen.append(attempt)
     return chosen
 
 
-def _overlap(attempt: LoopAttempt) -> float:
-    return attempt.outcome.alignment.overlap if isinstance(attempt.outcome, LoopClosure) else 0.0
-
-
-def _miss(attempt: LoopAttempt) -> tuple[int, float]:
-    reason = attempt.outcome.reason if isinstance(attempt.outcome, Rejected) else RejectReason.TOO_FEW_POINTS
-    return -list(RejectReason).index(reason), attempt.candidate.distance_m
-
-
 def _standing(keyframe: Keyframe) -> Points:
     """The points above ground; all points if none is labelled as ground."""
-    return keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))].astype(np.float64)
+    return keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))]
 
 
 def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform], title: str) -> bytes:

@@ -3,7 +3,8 @@
 import csv
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from segslam.core.trajectory import Poses, corrected_poses, read_poses, write_tum
-from segslam.core.types import Indices, SegslamError
+from segslam.core.types import SegslamError
 from segslam.core.whole_files import whole_file, write_whole
 from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
 from segslam.gnss import georeference as georeference_drive
@@ -42,11 +43,6 @@ class Globe:
     origin: Origin
     T_enu_lidar: Poses
     """(n, 4, 4) poses of all scans in the local frame (east, north, up) at the origin."""
-
-    @property
-    def epsg(self) -> int:
-        """EPSG code of the UTM zone of the origin."""
-        return utm_epsg(self.origin.latitude_deg, self.origin.longitude_deg)
 
 
 def georeference(
@@ -77,12 +73,19 @@ def read_globe(folder: Path) -> Globe | None:
     file = folder / FILE
     if not file.exists():
         return None
+    with _not_damaged(file):
+        values = json.loads(file.read_text(encoding="utf-8"))
+        origin = Origin(*(float(values[name]) for name in DEGREES_AND_HEIGHT))
+    return Globe(origin, read_poses(folder / ENU, format="tum").T_a_b)
+
+
+@contextmanager
+def _not_damaged(file: Path) -> Iterator[None]:
+    """Context manager that raises SegslamError if the file cannot be read within it, or has other content."""
     try:
-        origin = json.loads(file.read_text(encoding="utf-8"))
-        found = Origin(*(float(origin[name]) for name in DEGREES_AND_HEIGHT))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        yield
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
-    return Globe(found, read_poses(folder / ENU, format="tum").T_a_b)
 
 
 def georeference_if_possible(
@@ -130,10 +133,8 @@ def take_over(run: str | Path, map_run: str | Path) -> bool:
 def use_of(folder: Path) -> str:
     """How the fixes of a run were used; empty without fixes. Raises SegslamError for a damaged file."""
     file = folder / FILE
-    try:
+    with _not_damaged(file):
         return str(json.loads(file.read_text(encoding="utf-8")).get("use", "")) if file.exists() else ""
-    except (OSError, ValueError, AttributeError) as error:
-        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
 
 
 def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
@@ -144,7 +145,7 @@ def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
     file = folder / FIXES
     if not file.exists():
         return []
-    try:
+    with _not_damaged(file):
         values = json.loads((folder / FILE).read_text(encoding="utf-8"))
         offset_ns = round(1e9 * (values["given_offset_s"] + values["clock_offset_s"])) + stamp_shift_ns
         with file.open(newline="", encoding="utf-8") as stream:
@@ -154,29 +155,43 @@ def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
             latitude, longitude, height_m = (float(row[name] or "nan") for name in DEGREES_AND_HEIGHT)
             found.append(Row(int(row["stamp_ns"]) + offset_ns, latitude, longitude, height_m))
         return found
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
 
 
 def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) -> None:
-    trajectory = run.result.trajectory
+    trajectory, fixes = run.result.trajectory, placed.fixes
     T_enu_lidar = corrected_poses(trajectory.T_world_lidar, run.result.keyframe_rows, placed.T_enu_keyframe)
+    within = np.isfinite(placed.residual_m[:, 0])  # the drive
+    measured_ns = fixes.stamp_ns[within] + round(1e9 * (offset_s + placed.measured_offset_s))
     with room_for(run.folder):
         places = _write_poses(run, placed.origin, T_enu_lidar)
-        write_locations(log_of(run.folder), _locations(placed, trajectory.stamp_ns, places, offset_s))
+        shown = {
+            schema.FIXES: Locations(schema.ANTENNA, measured_ns, fixes.places[within], placed.fix_sigma_m),
+            schema.POSITIONS: Locations(schema.LIDAR, trajectory.stamp_ns, places, placed.position_sigma_m),
+        }
+        write_locations(log_of(run.folder), shown)
         _write_fixes(run.folder, placed)
         values = figures(placed) | {"use": str(use), "given_offset_s": offset_s}
         write_whole(run.folder / FILE, json.dumps(values, indent=2) + "\n")
         num_kept = placed.num_kept
-        write_metrics(run.folder, run.metrics | {"gnss_kept": num_kept, "gnss_dropped": len(placed.fixes) - num_kept})
+        write_metrics(run.folder, run.metrics | {"gnss_kept": num_kept, "gnss_dropped": len(fixes) - num_kept})
 
 
 def _write_poses(run: FinishedRun, origin: Origin, T_enu_lidar: Poses) -> Geodetic:
-    """The two files with poses; returns the geodetic positions of all scans."""
+    """The two files with poses; returns the geodetic positions of all scans.
+
+    `GEODETIC` has a row for each localised scan, with the heading of its x axis clockwise from north.
+    """
+    trajectory = run.result.trajectory
     places = geodetic_from_enu(T_enu_lidar[:, :3, 3], origin)
     with whole_file(run.folder / ENU) as part:
-        write_tum(part, run.result.trajectory.stamp_ns, T_enu_lidar)
-    _write_geodetic(run, places, T_enu_lidar)
+        write_tum(part, trajectory.stamp_ns, T_enu_lidar)
+    heading_deg = np.degrees(np.arctan2(T_enu_lidar[:, 0, 0], T_enu_lidar[:, 1, 0])) % 360.0
+    localised = (values[run.result.localised()] for values in (trajectory.stamp_ns, places, heading_deg))
+    rows = (
+        (f"{Decimal(int(ns)).scaleb(-9):f}", f"{latitude:.10f}", f"{longitude:.10f}", f"{height:.4f}", f"{heading:.4f}")
+        for ns, (latitude, longitude, height), heading in zip(*localised, strict=True)
+    )
+    write_csv(run.folder / GEODETIC, ("seconds", "latitude", "longitude", "height", "heading"), rows)
     return places
 
 
@@ -210,45 +225,9 @@ def _known(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-def _locations(placed: Georeference, stamp_ns: Indices, places: Geodetic, offset_s: float) -> dict[str, Locations]:
-    """What the Map panel of Foxglove shows: the fixes within the drive, and the scans."""
-    within = np.isfinite(placed.residual_m[:, 0])
-    measured_ns = placed.fixes.stamp_ns[within] + round(1e9 * (offset_s + placed.measured_offset_s))
-    return {
-        schema.FIXES: Locations(schema.ANTENNA, measured_ns, placed.fixes.places[within], placed.fix_sigma_m),
-        schema.POSITIONS: Locations(schema.LIDAR, stamp_ns, places, placed.position_sigma_m),
-    }
-
-
-def _write_geodetic(run: FinishedRun, places: Geodetic, T_enu_lidar: Poses) -> None:
-    """A row a localised scan: time, latitude, longitude, height, and heading of the x axis clockwise from north."""
-    trajectory = run.result.trajectory
-    heading_deg = np.degrees(np.arctan2(T_enu_lidar[:, 0, 0], T_enu_lidar[:, 1, 0])) % 360.0
-    localised = (values[run.result.localised()] for values in (trajectory.stamp_ns, places, heading_deg))
-    rows = (
-        (
-            f"{Decimal(int(stamp_ns)).scaleb(-9):f}",
-            f"{latitude:.10f}",
-            f"{longitude:.10f}",
-            f"{height:.4f}",
-            f"{head:.4f}",
-        )
-        for stamp_ns, (latitude, longitude, height), head in zip(*localised, strict=True)
-    )
-    write_csv(run.folder / GEODETIC, ("seconds", "latitude", "longitude", "height", "heading"), rows)
-
-
 def _write_fixes(folder: Path, placed: Georeference) -> None:
     """A row a fix: what was measured, by how much it differs from the drive, and whether it was kept or why not."""
-    known = (
-        *DEGREES_AND_HEIGHT,
-        *SIGMAS,
-        "residual_east_m",
-        "residual_north_m",
-        "residual_up_m",
-        "weight",
-        "weight_up",
-    )
+    known = (*DEGREES_AND_HEIGHT, *SIGMAS, *(f"residual_{name}" for name in SIGMAS), "weight", "weight_up")
     values = np.column_stack([placed.fixes.places, placed.measured_enu_m, placed.residual_m, placed.weights])
     digits = [10, 10, *[4] * (len(known) - 2)]  # of degrees, and of all others
     rows = (

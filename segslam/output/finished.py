@@ -10,7 +10,7 @@ import numpy as np
 
 from segslam.core.config import Config
 from segslam.core.errors import unreadable
-from segslam.core.trajectory import PoseFile, lidar_from_camera, read_poses, rows_of_same_stamp
+from segslam.core.trajectory import lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log
@@ -19,7 +19,6 @@ from segslam.slam.slam import SlamResult
 
 STAMP_TOLERANCE_NS = 10_000_000
 """Largest time difference between a scan and its ground-truth pose."""
-
 
 FIGURES = {
     "ate_m": "absolute trajectory error after alignment, rms (m)",
@@ -74,12 +73,10 @@ FIGURES = {
 
 COMPARED = ("odometry_", f"{ALONE}_")
 """Prefixes of the figures of the odometry after repairs, and of KISS-ICP alone."""
-ACCURACY = frozenset(
-    (
-        *("ate_m", "are_deg", "height_m", "rpe_m", "rpe_deg", "kitti_translation_percent"),
-        *("kitti_rotation_deg_per_100m", "num_loops_false", "loop_precision", "loop_recall"),
-    )
-)
+ACCURACY = {
+    *("ate_m", "are_deg", "height_m", "rpe_m", "rpe_deg", "kitti_translation_percent"),
+    *("kitti_rotation_deg_per_100m", "num_loops_false", "loop_precision", "loop_recall"),
+}
 """Figures that need a reference; another reference replaces all of them."""
 
 
@@ -167,16 +164,17 @@ def true_poses(file: Path, run: FinishedRun) -> Trajectory:
     KITTI rows are matched by scan number; they are camera poses if the data of the run is KITTI's. TUM rows are matched
     by stamp. Raises SegslamError if no scan has a pose, or if the number of KITTI rows does not match the run.
     """
-    poses = read_poses(file)
-    scans = run.result.trajectory
+    poses, scans = read_poses(file), run.result.trajectory
+    T_world_lidar = poses.T_a_b
     if poses.stamp_ns is None:
         _check_length(file, len(poses), run)
-    rows, numbers = _rows_and_scans(poses, scans)
+        rows, numbers = scans.scan_index, np.arange(len(scans))
+        if run.T_camera_lidar is not None:
+            T_world_lidar = lidar_from_camera(T_world_lidar, run.T_camera_lidar)
+    else:
+        rows, numbers = rows_of_same_stamp(poses.stamp_ns, scans.stamp_ns, max_difference_ns=STAMP_TOLERANCE_NS).T
     if len(rows) == 0:
         raise SegslamError(f"{file}: none of its {len(poses)} poses belongs to a scan of {run.folder}")
-    T_world_lidar = poses.T_a_b
-    if poses.stamp_ns is None and run.T_camera_lidar is not None:
-        T_world_lidar = lidar_from_camera(T_world_lidar, run.T_camera_lidar)
     return Trajectory(scans.scan_index[numbers], scans.stamp_ns[numbers], T_world_lidar[rows])
 
 
@@ -189,14 +187,6 @@ def _check_length(file: Path, num_poses: int, run: FinishedRun) -> None:
             f"{file}: {num_poses} poses, but the run has scans up to number {last}; KITTI format needs one line per "
             "scan, line n + 1 for scan n. TUM format is matched by stamp and may omit scans"
         )
-
-
-def _rows_and_scans(poses: PoseFile, scans: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Matching rows of a pose file and of the scans."""
-    if poses.stamp_ns is None:
-        return scans.scan_index, np.arange(len(scans))
-    pairs = rows_of_same_stamp(poses.stamp_ns, scans.stamp_ns, max_difference_ns=STAMP_TOLERANCE_NS)
-    return pairs[:, 0], pairs[:, 1]
 
 
 def _result(log: RunLog) -> SlamResult:

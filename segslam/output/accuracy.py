@@ -6,7 +6,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.evaluation import MIN_POSES, Z_UP, align_positions, loop_metrics, pose_errors, rms, trajectory_metrics
-from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
+from segslam.core.trajectory import Poses, nearest_rows, rows_of_same_scan, travelled_m
 from segslam.core.types import IndexPairs, LoopClosure, Points, Trajectory
 from segslam.output.folder import ALONE
 from segslam.slam.slam import SlamResult
@@ -118,8 +118,7 @@ def pairs_at_distance(reference: Poses, distance_m: float) -> IndexPairs:
     """Rows (i, j) of all poses and the later pose nearest to this distance along the path, if within 10 % of it."""
     travel_m = travelled_m(reference)
     wanted = travel_m + distance_m
-    after = np.clip(np.searchsorted(travel_m, wanted), 1, len(travel_m) - 1)
-    nearer = np.where(np.abs(travel_m[after - 1] - wanted) <= np.abs(travel_m[after] - wanted), after - 1, after)
+    nearer = nearest_rows(travel_m, wanted)
     rows = np.arange(len(travel_m))
     close = np.abs(travel_m[nearer] - wanted) <= MOST_OFF * distance_m
     return np.column_stack([rows, nearer])[close & (nearer > rows)]

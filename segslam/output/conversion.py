@@ -64,15 +64,14 @@ def convert(
 def write_csv(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
     """Write a line of column names, then the columns of TUM format with commas; stamps to the nanosecond."""
     write_tum(path, stamp_ns, T_a_b)
-    lines = path.read_text(encoding="ascii").splitlines()
-    path.write_text("".join(f"{line}\n" for line in (HEADER, *(line.replace(" ", ",") for line in lines))))
+    path.write_text(f"{HEADER}\n{path.read_text(encoding='ascii').replace(' ', ',')}", encoding="ascii")
 
 
 def _read(source: Path, kind: FileFormat | None) -> PoseFile:
     """The poses of a file; a line of column names at the start of a CSV file is not read."""
     if kind == "csv" or (kind is None and source.suffix.lower() == ".csv"):
         return read_poses(source, format="tum", skips_names=True)
-    return read_poses(source, format="tum" if kind == "tum" else "kitti" if kind == "kitti" else None)
+    return read_poses(source, format=kind)
 
 
 def _with_stamps(poses: PoseFile, source: Path, times: Path | None) -> PoseFile:

@@ -6,9 +6,9 @@ and is readable all the same.
 
 import struct
 import zlib
-from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import ChunkIndex, DataEnd, Footer, McapRecord, Statistics
+from mcap.records import DataEnd, Footer, McapRecord, Statistics
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -50,28 +50,41 @@ def write_locations(log: Path, locations: Mapping[str, Locations]) -> None:
         summary = summary_of(stream)
         if summary is None or summary.statistics is None:
             raise SegslamError(f"{log}: has no index; `segslam replay` it into a new folder first")
-        _remove(summary, set(locations))
-        kept = summary.chunk_indexes
+        replaced = {channel.id for channel in summary.channels.values() if channel.topic in locations}
+        kept = [chunk for chunk in summary.chunk_indexes if not replaced & chunk.message_index_offsets.keys()]
         end = max(chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length for chunk in kept)
-        added = _records(summary, locations, offset=end)
+        added, made = _records(summary, locations, offset=end)
+        chunks = [*kept, *made.chunk_indexes]
+        assert made.statistics is not None
+        statistics = _joined(summary.statistics, made.statistics, replaced)
+        statistics.chunk_count = len(chunks)
+        records = [*made.schemas.values(), *made.channels.values(), statistics, *chunks, *summary.metadata_indexes]
         with interrupts_wait():
             stream.seek(end)
             stream.truncate()
-            stream.write(added + _ending(summary, offset=end + len(added)))
+            stream.write(added + _ending(records, offset=end + len(added)))
 
 
-def _remove(summary: Summary, topics: set[str]) -> None:
-    """Remove the chunks with some topics, which are the last ones of a log, from its index."""
-    statistics = _statistics(summary)
-    ids = {channel.id for channel in summary.channels.values() if channel.topic in topics}
-    for number in ids:
-        statistics.message_count -= statistics.channel_message_counts.pop(number, 0)
-    summary.chunk_indexes = [chunk for chunk in summary.chunk_indexes if not ids & chunk.message_index_offsets.keys()]
-    statistics.chunk_count = len(summary.chunk_indexes)
+def _joined(log: Statistics, added: Statistics, replaced: set[int]) -> Statistics:
+    """The statistics of a log with added chunks, without the messages of the channels that are replaced."""
+    counts = Counter({number: n for number, n in log.channel_message_counts.items() if number not in replaced})
+    counts.update(added.channel_message_counts)
+    return replace(
+        log,
+        schema_count=added.schema_count,
+        channel_count=added.channel_count,
+        channel_message_counts=dict(counts),
+        message_count=counts.total(),
+        message_start_time=min(log.message_start_time, added.message_start_time),
+        message_end_time=max(log.message_end_time, added.message_end_time),
+    )
 
 
-def _records(summary: Summary, locations: Mapping[str, Locations], *, offset: int) -> bytes:
-    """The chunks with the messages for a place in the file; the index gets them, too."""
+def _records(summary: Summary, locations: Mapping[str, Locations], *, offset: int) -> tuple[bytes, Summary]:
+    """The chunks with the messages for a place in the file, and their index with all schemas and channels of the log.
+
+    Chunks of an earlier call are the last ones of a log.
+    """
     stream = BytesIO()
     writer = Writer(stream, compression=CompressionType.ZSTD)
     writer.start()
@@ -93,47 +106,21 @@ def _records(summary: Summary, locations: Mapping[str, Locations], *, offset: in
     writer.finish()
     made = SeekingReader(BytesIO(stream.getvalue())).get_summary()
     assert made is not None
-    return stream.getvalue()[_merge(summary, made, offset=offset)]
-
-
-def _merge(summary: Summary, made: Summary, *, offset: int) -> slice:
-    """Take the index of new chunks over; returns where their records are. They are moved to `offset`."""
     first, last = made.chunk_indexes[0], made.chunk_indexes[-1]
-    begin = first.chunk_start_offset
-    end = last.chunk_start_offset + last.chunk_length + last.message_index_length
-    summary.schemas, summary.channels = made.schemas, made.channels
-    statistics, more = _statistics(summary), _statistics(made)
-    summary.chunk_indexes += [_moved(chunk, offset - begin) for chunk in made.chunk_indexes]
-    counts = defaultdict(int, statistics.channel_message_counts)
-    for number, count in more.channel_message_counts.items():
-        counts[number] += count
-    statistics.channel_message_counts = dict(counts)
-    statistics.message_count += more.message_count
-    statistics.message_start_time = min(statistics.message_start_time, more.message_start_time)
-    statistics.message_end_time = max(statistics.message_end_time, more.message_end_time)
-    statistics.schema_count, statistics.channel_count = len(made.schemas), len(made.channels)
-    statistics.chunk_count = len(summary.chunk_indexes)
-    return slice(begin, end)
+    begin, end = first.chunk_start_offset, last.chunk_start_offset + last.chunk_length + last.message_index_length
+    for chunk in made.chunk_indexes:
+        chunk.chunk_start_offset += offset - begin
+        places = {number: place + offset - begin for number, place in chunk.message_index_offsets.items()}
+        chunk.message_index_offsets = places
+    return stream.getvalue()[begin:end], made
 
 
-def _moved(chunk: ChunkIndex, shift: int) -> ChunkIndex:
-    chunk.chunk_start_offset += shift
-    chunk.message_index_offsets = {number: place + shift for number, place in chunk.message_index_offsets.items()}
-    return chunk
-
-
-def _statistics(summary: Summary) -> Statistics:
-    assert summary.statistics is not None
-    return summary.statistics
-
-
-def _ending(summary: Summary, *, offset: int) -> bytes:
+def _ending(records: Iterable[McapRecord], *, offset: int) -> bytes:
     """The end of the data and the index, for a place in the file."""
     builder = RecordBuilder()
     DataEnd(0).write(builder)
     data_end = builder.end()
-    records: list[McapRecord] = [*summary.schemas.values(), *summary.channels.values(), _statistics(summary)]
-    for record in (*records, *summary.chunk_indexes, *summary.metadata_indexes):
+    for record in records:
         record.write(builder)
     index, start = builder.end(), offset + len(data_end)
     checksum = zlib.crc32(index + struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0))

@@ -131,17 +131,15 @@ class Scene:
         self._draw_paths()
 
     def _add_attempt(self, attempt: LoopAttempt) -> None:
-        outcome, ids = attempt.outcome, attempt.candidate.pair
-        rejected = isinstance(outcome, Rejected)
-        color = REJECTED_COLORS[outcome.reason] if isinstance(outcome, Rejected) else ACCEPTED_COLOR
-        shown = f"{outcome.reason}: {outcome.detail}" if isinstance(outcome, Rejected) else "accepted"
-        ends = [self._T_world_keyframe[keyframe_id][:3, 3] for keyframe_id in ids]
-        if not rejected:  # it may have waited for confirmation
-            self._viewer.log(f"{WORLD}/loops/rejected/{ids[0]}-{ids[1]}", rr.Clear(recursive=False))
-        self._viewer.log(
-            f"{WORLD}/loops/{'rejected' if rejected else 'accepted'}/{ids[0]}-{ids[1]}",
-            rr.LineStrips3D([ends], colors=[_rgb(color)], labels=[shown], show_labels=False),
-        )
+        outcome, (source, target) = attempt.outcome, attempt.candidate.pair
+        kind, color, shown = "accepted", ACCEPTED_COLOR, "accepted"
+        if isinstance(outcome, Rejected):
+            kind, color, shown = "rejected", REJECTED_COLORS[outcome.reason], f"{outcome.reason}: {outcome.detail}"
+        else:  # it may have waited for confirmation
+            self._viewer.log(f"{WORLD}/loops/rejected/{source}-{target}", rr.Clear(recursive=False))
+        ends = [self._T_world_keyframe[number][:3, 3] for number in (source, target)]
+        line = rr.LineStrips3D([ends], colors=[_rgb(color)], labels=[shown], show_labels=False)
+        self._viewer.log(f"{WORLD}/loops/{kind}/{source}-{target}", line)
 
 
 def _layout() -> rrb.Blueprint:

@@ -114,7 +114,7 @@ def moved(points: Points, labels: Labels, views: Iterable[tuple[np.ndarray, Tran
 
     `views`: range images of keyframes, each with its T_view_points. A point has moved if at least `min_views`
     keyframes, and more than observed it, see through it; or if most of its neighbours have moved. Points of the ground
-    never move: rays at grazing incidence pass close above them.
+    never move, and do not count as neighbours: rays at grazing incidence pass close above them.
     """
     stays = np.isin(labels, np.array(GROUND_LABELS, np.uint8))
     votes = np.zeros((len(points), 2), np.uint32)
@@ -123,19 +123,12 @@ def moved(points: Points, labels: Labels, views: Iterable[tuple[np.ndarray, Tran
         count_votes(points, T_view_points, nearest, limits, votes)
     confirmed, seen_through = votes.T
     has_moved = (seen_through >= MIN_VIEWS) & (seen_through > confirmed) & ~stays
-    return has_moved | _among_moved(points, has_moved, stays, MOVED_RADIUS_M)
-
-
-def _among_moved(points: Points, has_moved: Mask, stays: Mask, radius_m: float) -> Mask:
-    """Points that may move and have more moved than other neighbours; points of the ground do not count."""
     doubtful = np.flatnonzero(~stays & ~has_moved)
-    among = np.zeros(len(points), bool)
     if not has_moved.any() or not len(doubtful):
-        return among
-    moved_tree = cKDTree(points[has_moved])
-    nearest_m, _ = moved_tree.query(points[doubtful], distance_upper_bound=radius_m)
-    doubtful = doubtful[np.isfinite(nearest_m)]
-    num_moved = moved_tree.query_ball_point(points[doubtful], radius_m, return_length=True)
-    others = cKDTree(points[~stays & ~has_moved]).query_ball_point(points[doubtful], radius_m, return_length=True)
-    among[doubtful] = num_moved > others - 1  # a point is not its own neighbour
-    return among
+        return has_moved
+    trees = cKDTree(points[has_moved]), cKDTree(points[doubtful])
+    nearest_m, _ = trees[0].query(points[doubtful], distance_upper_bound=MOVED_RADIUS_M)
+    near = doubtful[np.isfinite(nearest_m)]
+    num_moved, num_others = (tree.query_ball_point(points[near], MOVED_RADIUS_M, return_length=True) for tree in trees)
+    has_moved[near] = num_moved > num_others - 1  # a point is not its own neighbour
+    return has_moved

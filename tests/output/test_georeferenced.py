@@ -27,7 +27,7 @@ from segslam.output.export import track
 from segslam.output.georeferenced import Globe, read_globe
 from segslam.output.log import read_log, schema
 from segslam.output.log.locations import write_locations
-from segslam.output.map.projected import Utm, _affine
+from segslam.output.map.projected import _affine, utm
 from segslam.output.report.figures import STYLE, draw_fixes
 from segslam.scans import open_dataset
 
@@ -204,13 +204,13 @@ def test_a_track_across_the_date_line_is_cut_there(tmp_path: Path) -> None:
 def test_a_pixel_of_the_geotiff_is_where_the_point_is() -> None:
     """Up to the edge of a UTM zone, 500 m from the origin."""
     for longitude in (8.39, 11.9999, 179.9999):
-        utm = Utm(Origin(48.98, longitude, 115.0))
+        epsg, projected = utm(Origin(48.98, longitude, 115.0))
         window, pixels = (-500.0, 500.0, -300.0, 300.0), np.array([[0.0, 0.0], [321.0, 55.0], [1000.0, 600.0]])
-        affine = _affine(utm, window, 600, 1000, 0.0)
+        affine = _affine(projected, window, 600, 1000, 0.0)
         east_north = np.column_stack([-500.0 + pixels[:, 0], 300.0 - pixels[:, 1], np.zeros(3)])
         expected = geodetic_from_enu(east_north, Origin(48.98, longitude, 115.0))
         there = np.column_stack([pixels, np.ones(3)]) @ affine.T
-        back = Transformer.from_crs(utm.epsg, 4979, always_xy=True).transform(*there.T)
+        back = Transformer.from_crs(epsg, 4979, always_xy=True).transform(*there.T)
         off_deg = (np.column_stack(back) - expected[:, [1, 0]] + 180.0) % 360.0 - 180.0
         assert np.abs(off_deg).max() < SAME_DEG
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -11,9 +11,7 @@ from segslam.core.config import MapConfig
 from segslam.core.extras import how_to_install
 from segslam.core.types import Label, Points, SegslamError
 from segslam.output.map.part import Extent, Part
-
-if TYPE_CHECKING:
-    from segslam.gnss.geodesy import Origin
+from segslam.output.map.projected import utm
 
 HEADER_BYTES = 512
 """Bytes reserved for the header, which is written last because it contains the number of points."""
@@ -124,7 +122,11 @@ class LasCloud:
         self._intensity_step = None if extent.brightest is None else (extent.brightest or 1.0) / 65535
         self._projected: Callable[[Points], Points] = np.asarray
         if extent.origin is not None:
-            self._projected = _utm(extent.origin, header)
+            from pyproj import CRS
+
+            epsg, self._projected = utm(extent.origin)
+            header.offsets = np.floor(self._projected(np.zeros((1, 3)))[0])
+            header.add_crs(CRS.from_epsg(epsg))
         self._writer = laspy.open(file, mode="w", header=header)
         self._class_of_label = np.array([ASPRS_OF_LABEL.get(label, 1) for label in Label], np.uint8)
 
@@ -141,18 +143,6 @@ class LasCloud:
     def close(self) -> None:
         """Complete the file."""
         self._writer.close()
-
-
-def _utm(origin: "Origin", header: Any) -> Callable[[Points], Points]:
-    """UTM coordinates of points, whose zone and offsets are written into the header of a LAS file."""
-    from pyproj import CRS
-
-    from segslam.output.map.projected import Utm
-
-    utm = Utm(origin)
-    header.offsets = np.floor(utm(np.zeros((1, 3)))[0])
-    header.add_crs(CRS.from_epsg(utm.epsg))
-    return utm
 
 
 def check_las(file: Path, *, is_projected: bool) -> None:

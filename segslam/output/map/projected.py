@@ -1,5 +1,6 @@
 """Map files in a coordinate system of the Earth: UTM coordinates of points, and the top view as GeoTIFF."""
 
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,25 +18,23 @@ if TYPE_CHECKING:
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
 
-class Utm:
-    """Coordinates in the UTM zone of an origin; heights stay ellipsoidal."""
+def utm(origin: "Origin") -> tuple[int, Callable[[Points], Points]]:
+    """EPSG code of the UTM zone of an origin, and a function that projects points (n, 3) of its local frame.
 
-    def __init__(self, origin: "Origin") -> None:
-        from pyproj import Transformer
+    The function returns easting, northing and ellipsoidal height (m).
+    """
+    from pyproj import Transformer
 
-        from segslam.gnss.geodesy import WGS84_3D, utm_epsg
+    from segslam.gnss.geodesy import WGS84_3D, geodetic_from_enu, utm_epsg
 
-        self._origin = origin
-        self.epsg = utm_epsg(origin.latitude_deg, origin.longitude_deg)
-        self._transformer = Transformer.from_crs(WGS84_3D, self.epsg, always_xy=True)
+    epsg = utm_epsg(origin.latitude_deg, origin.longitude_deg)
+    transformer = Transformer.from_crs(WGS84_3D, epsg, always_xy=True)
 
-    def __call__(self, enu_m: Points) -> Points:
-        """(n, 3) easting, northing, height (m) of points (n, 3) in the local frame of the origin."""
-        from segslam.gnss.geodesy import geodetic_from_enu
+    def projected(enu_m: Points) -> Points:
+        latitude, longitude, height_m = geodetic_from_enu(enu_m, origin).T
+        return np.column_stack([*transformer.transform(longitude, latitude), height_m])
 
-        latitude, longitude, height_m = geodetic_from_enu(enu_m, self._origin).T
-        easting, northing = self._transformer.transform(longitude, latitude)
-        return np.column_stack([easting, northing, height_m])
+    return epsg, projected
 
 
 class GeoTiff(Picture):
@@ -48,7 +47,7 @@ class GeoTiff(Picture):
 
         origin = self._extent.origin
         assert origin is not None, "checked before the map is made"
-        utm = Utm(origin)
+        epsg, projected = utm(origin)
         image, window, height_m = self._finished()
         rows, columns = image.shape[:2]
         with rasterio.open(
@@ -59,15 +58,15 @@ class GeoTiff(Picture):
             width=columns,
             count=3,
             dtype="uint8",
-            crs=f"EPSG:{utm.epsg}",
-            transform=Affine(*_affine(utm, window, rows, columns, height_m).ravel()),
+            crs=f"EPSG:{epsg}",
+            transform=Affine(*_affine(projected, window, rows, columns, height_m).ravel()),
             compress="deflate",
             photometric="RGB",
         ) as file:
             file.write(image.transpose(2, 0, 1))
 
 
-def _affine(utm: Utm, window: Window, rows: int, columns: int, height_m: float) -> Points:
+def _affine(projected: Callable[[Points], Points], window: Window, rows: int, columns: int, height_m: float) -> Points:
     """(2, 3) map from column and row to UTM: exact to a centimetre within a few kilometres.
 
     UTM turns and scales the local frame; its curvature is 4 mm over a kilometre, far from the central meridian.
@@ -77,7 +76,7 @@ def _affine(utm: Utm, window: Window, rows: int, columns: int, height_m: float) 
         [west + CORNERS[:, 0] * (east - west), north - CORNERS[:, 1] * (north - south), np.full(4, height_m)]
     )
     pixels = np.column_stack([CORNERS * [columns, rows], np.ones(4)])
-    solution, *_ = np.linalg.lstsq(pixels, utm(places)[:, :2], rcond=None)
+    solution, *_ = np.linalg.lstsq(pixels, projected(places)[:, :2], rcond=None)
     return solution.T
 
 

@@ -8,7 +8,6 @@ and one tile, whatever the length of the drive.
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -95,11 +94,11 @@ def write_map(
         for keyframe, T_world_keyframe in placed:
             store.add(keyframe, T_world_keyframe)
         has_picture = any(issubclass(KINDS[file.suffix.lower()], Picture) for file in files)
-        extent = store.extent(for_picture=has_picture)
+        extent = store.extent(origin, for_picture=has_picture)
         if extent is None:
             raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
-        parts = show(store.parts(), store.num_tiles, "clean")
-        num_points = _write(parts, replace(extent, origin=origin), files, scratch=scratch / "files", config=config)
+        parts = show(store.parts(), len(store.tiles), "clean")
+        num_points = _write(parts, extent, files, scratch=scratch / "files", config=config)
     return {
         "num_map_points": num_points,
         "num_map_moving_points": store.num_moving_points,
@@ -109,13 +108,11 @@ def write_map(
 
 def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scratch: Path, config: MapConfig) -> int:
     """Write the parts to all files, in a scratch folder until they are complete; returns the number of points."""
-    folders = [scratch / str(number) for number in range(len(files))]
-    for folder in folders:
+    writers = []
+    for number, file in enumerate(files):
+        folder = scratch / str(number)
         folder.mkdir(parents=True)
-    writers = [
-        KINDS[file.suffix.lower()](folder / file.name, extent, config=config)
-        for file, folder in zip(files, folders, strict=True)
-    ]
+        writers.append(KINDS[file.suffix.lower()](folder / file.name, extent, config=config))
     num_points = 0
     for part in parts:
         num_points += len(part.points)
@@ -124,8 +121,8 @@ def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scra
     for writer in writers:
         writer.close()
     with ExitStack() as complete:
-        for file, folder in zip(files, folders, strict=True):
-            for made in folder.iterdir():  # a grid is two files
+        for number, file in enumerate(files):
+            for made in (scratch / str(number)).iterdir():  # a grid is two files
                 shutil.move(made, complete.enter_context(whole_file(file.parent / made.name)))
     return num_points
 
@@ -136,7 +133,7 @@ class MapStore:
     def __init__(self, scratch: Path, config: MapConfig) -> None:
         """`scratch`: an empty folder, which the caller removes."""
         self._config = config
-        self._tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
+        self.tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
         self._views = Views(scratch / "views", spread_m=config.voxel_m)
         self._free_ranges = FreeRanges()
         self._T_keyframe_world: list[Transform] = []
@@ -144,11 +141,6 @@ class MapStore:
         self._has_intensities = True
         self.num_moving_points = 0
         self.num_voxels_seen_through = 0
-
-    @property
-    def num_tiles(self) -> int:
-        """Number of parts that `parts` yields."""
-        return len(self._tiles)
 
     def add(self, keyframe: Keyframe, T_world_keyframe: Transform) -> None:
         """Add a keyframe: the near points of static classes as voxels, and all points as a range image.
@@ -166,42 +158,42 @@ class MapStore:
         self.num_moving_points += int(moves.sum())
         intensities = np.zeros(len(kept), np.float32) if keyframe.intensities is None else keyframe.intensities
         points = geometry.apply(T_world_keyframe, keyframe.points[kept].astype(np.float64))
-        self._tiles.add(points, keyframe.labels[kept], intensities[kept])
+        self.tiles.add(points, keyframe.labels[kept], intensities[kept])
         self._free_ranges.add(points, keyframe.labels[kept], T_world_keyframe[:3, 3])
         self._views.add(keyframe.points)
         self._T_keyframe_world.append(geometry.inverse(T_world_keyframe))
         self._places.append(T_world_keyframe[:3, 3])
 
-    def extent(self, *, for_picture: bool) -> Extent | None:
+    def extent(self, origin: "Origin | None", *, for_picture: bool) -> Extent | None:
         """Extent of the tiles that have voxels; None if there are none. Heights to cut are found for pictures only."""
-        tiles = list(self._tiles)
+        tiles = list(self.tiles)
         if not tiles:
             return None
         (west, south), (east, north) = np.min(tiles, axis=0).tolist(), np.max(tiles, axis=0).tolist()
-        brightest = self._tiles.brightest if self._has_intensities else None
         path_m = np.array(self._places)
         return Extent(
             west,
             east,
             south,
             north,
-            brightest=brightest,
+            brightest=self.tiles.brightest if self._has_intensities else None,
             path_m=path_m,
             span=self._span(),
             free_ranges=self._free_ranges,
             cut_m=cut_heights(path_m, self._near_path()) if for_picture else None,
+            origin=origin,
         )
 
     def _near_path(self) -> Iterator[Points]:
         """The voxels of each tile through which the path leads, in the world."""
-        for tile in self._tiles:
+        for tile in self.tiles:
             if any(distance_m(tile, place) < BESIDE_M for place in self._places):
-                yield self._tiles.voxels(tile)["point"] + corner(tile)
+                yield self.tiles.voxels(tile)["point"] + corner(tile)
 
     def parts(self) -> Iterator[Part]:
         """The clean voxels of each tile, in the order that `MapFile` requires."""
-        for tile in self._tiles:
-            voxels = self._tiles.voxels(tile)
+        for tile in self.tiles:
+            voxels = self.tiles.voxels(tile)
             gone = moved(voxels["point"], voxels["label"], self._views_of(tile), config=self._config)
             self.num_voxels_seen_through += int(gone.sum())
             kept = voxels[~gone]
@@ -216,7 +208,7 @@ class MapStore:
 
     def _span(self) -> tuple[float, float]:
         """Values at both ends of the colour scale."""
-        return (self._tiles.intensities if self._config.color == "intensity" else self._tiles.heights).span(*SHARES)
+        return (self.tiles.intensities if self._config.color == "intensity" else self.tiles.heights).span(*SHARES)
 
     def _views_of(self, tile: Tile) -> Iterator[tuple[np.ndarray, Transform]]:
         """The range image of each keyframe near a tile, and T_keyframe_tile."""

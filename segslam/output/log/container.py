@@ -58,7 +58,7 @@ class Stored(NamedTuple):
     schema: Schema
     data: bytes
     channel_id: int
-    chunk: "Span"
+    chunk: Span
     """Position of the chunk that contains the message."""
 
 
@@ -127,22 +127,16 @@ def count(path: Path, topic: str) -> int:
 def summary_of(stream: IO[bytes]) -> Summary | None:
     """The index at the end of a file; None if it is missing or damaged."""
     with suppress(OSError, *_DAMAGE):
-        if _has_whole_summary(stream):
-            most = _size(stream)
-            stream.seek(0)
-            return SeekingReader(stream, record_size_limit=most).get_summary()
+        size = _size(stream)
+        end = size - len(MCAP0_MAGIC)
+        stream.seek(end - _FOOTER_BYTES)
+        footer = Footer.read(ReadDataStream(BytesIO(stream.read(_FOOTER_BYTES)[_RECORD_HEAD.size :])))
+        if len(MCAP0_MAGIC) <= footer.summary_start < end:
+            stream.seek(footer.summary_start)
+            if zlib.crc32(stream.read(end - footer.summary_start)[:-4]) == footer.summary_crc:  # the index has no other
+                stream.seek(0)
+                return SeekingReader(stream, record_size_limit=size).get_summary()
     return None
-
-
-def _has_whole_summary(stream: IO[bytes]) -> bool:
-    """True if the checksum of the index is correct; the index has no other."""
-    end = _size(stream) - len(MCAP0_MAGIC)
-    stream.seek(end - _FOOTER_BYTES)
-    footer = Footer.read(ReadDataStream(BytesIO(stream.read(_FOOTER_BYTES)[_RECORD_HEAD.size :])))
-    if not len(MCAP0_MAGIC) <= footer.summary_start < end:
-        return False
-    stream.seek(footer.summary_start)
-    return zlib.crc32(stream.read(end - footer.summary_start)[:-4]) == footer.summary_crc
 
 
 def _size(stream: IO[bytes] | BytesIO) -> int:

@@ -177,6 +177,7 @@ def metadata(
 ) -> dict[str, dict[str, str]]:
     """Metadata records by name, as documented in `schema`."""
     calibration = {} if T_camera_lidar is None else {"T_camera_lidar": json.dumps(T_camera_lidar.tolist())}
+    program = Path(sys.argv[0]).name
     written = {
         RUN_METADATA: {
             "schema_version": str(VERSION),
@@ -184,7 +185,7 @@ def metadata(
             "python": platform.python_version(),
             "platform": platform.platform(),
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
-            "command": _command(),
+            "command": shlex.join(["segslam" if program == "__main__.py" else program, *sys.argv[1:]]),
             "processor": f"{processor()}, {os.cpu_count()} cores",
             **calibration,
         },
@@ -207,11 +208,6 @@ def restored(values: Mapping[str, str]) -> dict[str, str]:
         key: ESCAPED.sub(lambda found: chr(int(found[1], 16)), text).replace(r"\x5cudc", r"\udc")
         for key, text in values.items()
     }
-
-
-def _command() -> str:
-    name = Path(sys.argv[0]).name
-    return shlex.join(["segslam" if name == "__main__.py" else name, *sys.argv[1:]])
 
 
 def processor() -> str:

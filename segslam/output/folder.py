@@ -175,32 +175,29 @@ def room_for(folder: Path) -> Iterator[None]:
 
 
 def _loop_cells(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> dict[str, object]:
-    """Column -> content, where it is known."""
+    """Column -> content, where it is known; `evidence` as JSON (nats by name)."""
     candidate, outcome = attempt.candidate, attempt.outcome
     cells: dict[str, object] = {
         **{"source": candidate.source_id, "target": candidate.target_id, "distance_m": candidate.distance_m},
         **{f"{stage}_s": f"{seconds:.6f}" for stage, seconds in attempt.seconds.items()},
     }
+    judged: Alignment | Rejected
     if isinstance(outcome, Rejected):
-        return cells | {"outcome": outcome.reason.value, "detail": outcome.detail} | _judged_cells(outcome)
-    found = outcome.alignment
-    return {
-        **cells,
-        "outcome": "accepted",
-        "correspondences": found.coarse.num_correspondences,
-        "inliers": found.coarse.num_inliers,
-        "overlap": found.overlap,
-        "rms_m": found.rms_m,
-        "free_space_violation": found.free_space_violation,
-        **_judged_cells(found),
-        "weight": weights[candidate.pair],
-        **dict(zip(POSE_COLUMNS, outcome.T_target_source.ravel(), strict=True)),
-    }
-
-
-def _judged_cells(outcome: Alignment | Rejected) -> dict[str, object]:
-    """Probability that the pose is right, and its evidence (nats by name, as JSON), if it was judged."""
-    if outcome.probability is None:
-        return {}
-    evidence = json.dumps({name: round(value, 2) for name, value in outcome.evidence.items()})
-    return {"probability": f"{outcome.probability:.6f}", "evidence": evidence}
+        judged = outcome
+        cells |= {"outcome": outcome.reason.value, "detail": outcome.detail}
+    else:
+        judged = found = outcome.alignment
+        cells |= {
+            "outcome": "accepted",
+            "correspondences": found.coarse.num_correspondences,
+            "inliers": found.coarse.num_inliers,
+            "overlap": found.overlap,
+            "rms_m": found.rms_m,
+            "free_space_violation": found.free_space_violation,
+            "weight": weights[candidate.pair],
+            **dict(zip(POSE_COLUMNS, outcome.T_target_source.ravel(), strict=True)),
+        }
+    if judged.probability is not None:
+        evidence = {name: round(value, 2) for name, value in judged.evidence.items()}
+        cells |= {"probability": f"{judged.probability:.6f}", "evidence": json.dumps(evidence)}
+    return cells

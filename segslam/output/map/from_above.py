@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -97,9 +97,9 @@ def round_length_m(longest_m: float) -> float:
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= longest_m * (1 + 1e-9))
 
 
-def draw_path(axes: Axes, path_m: Points | Sequence[Points], *, color: str, width: float) -> None:
+def draw_path(axes: Axes, path_m: Points, *, color: str, width: float) -> None:
     """Draw a trajectory, (n, 3) positions in order, and its start."""
-    xy = np.asarray(path_m)[:, :2]
+    xy = path_m[:, :2]
     axes.plot(*xy.T, color=color, linewidth=width, solid_joinstyle="round")
     axes.plot(*xy[0], "o", color=color, markersize=3 + 2 * width, markeredgecolor="white", markeredgewidth=0.8)
 

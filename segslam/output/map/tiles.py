@@ -85,7 +85,13 @@ class Tiles:
             voxels = np.zeros(len(rows), VOXEL)
             voxels["point"] = points[rows] - corner(tile)
             voxels["count"], voxels["label"], voxels["intensity"] = 1, labels[rows], intensities[rows]
-            self._append(tile, merged(voxels, self._voxel_m))
+            voxels = merged(voxels, self._voxel_m)
+            self.heights.add(voxels["point"][:, 2])
+            self.intensities.add(voxels["intensity"])
+            self.brightest = max(self.brightest, float(voxels["intensity"].max()))
+            self._known.add(tile)
+            with self._file(tile).open("ab") as stream:
+                voxels.tofile(stream)
 
     def __len__(self) -> int:
         self.flush()
@@ -103,14 +109,6 @@ class Tiles:
             while len(piece := np.fromfile(stream, VOXEL, GATHERED)):
                 voxels = merged(np.concatenate([voxels, piece]), self._voxel_m)
         return voxels
-
-    def _append(self, tile: Tile, voxels: np.ndarray) -> None:
-        self.heights.add(voxels["point"][:, 2])
-        self.intensities.add(voxels["intensity"])
-        self.brightest = max(self.brightest, float(voxels["intensity"].max()))
-        self._known.add(tile)
-        with self._file(tile).open("ab") as stream:
-            voxels.tofile(stream)
 
     def _file(self, tile: Tile) -> Path:
         return self._folder / f"{tile[0]}_{tile[1]}.voxels"

@@ -18,7 +18,7 @@ from segslam.core import geometry
 from segslam.core.config import MapConfig
 from segslam.core.interrupts import removed_when_stopped
 from segslam.core.points import within_range
-from segslam.core.types import Keyframe, Label, Labels, Points, SegslamError, Transform, Vector
+from segslam.core.types import Keyframe, Label, Labels, SegslamError, Transform, Vector
 from segslam.core.whole_files import check_target, whole_file
 from segslam.labels.encodings import Colors, of_classes
 from segslam.output.map.clouds import LasCloud, PcdCloud, PlyCloud, check_las
@@ -171,6 +171,11 @@ class MapStore:
             return None
         (west, south), (east, north) = np.min(tiles, axis=0).tolist(), np.max(tiles, axis=0).tolist()
         path_m = np.array(self._places)
+        near_path = (
+            self.tiles.voxels(tile)["point"] + corner(tile)
+            for tile in tiles
+            if any(distance_m(tile, place) < BESIDE_M for place in self._places)
+        )
         return Extent(
             west,
             east,
@@ -180,15 +185,9 @@ class MapStore:
             path_m=path_m,
             span=self._span(),
             free_ranges=self._free_ranges,
-            cut_m=cut_heights(path_m, self._near_path()) if for_picture else None,
+            cut_m=cut_heights(path_m, near_path) if for_picture else None,
             origin=origin,
         )
-
-    def _near_path(self) -> Iterator[Points]:
-        """The voxels of each tile through which the path leads, in the world."""
-        for tile in self.tiles:
-            if any(distance_m(tile, place) < BESIDE_M for place in self._places):
-                yield self.tiles.voxels(tile)["point"] + corner(tile)
 
     def parts(self) -> Iterator[Part]:
         """The clean voxels of each tile, in the order that `MapFile` requires."""

@@ -71,8 +71,8 @@ FIGURES = {
 }
 """Meaning of the figures of `metrics.json`, the most important first."""
 
-COMPARED = ("odometry_", f"{ALONE}_")
-"""Prefixes of the figures of the odometry after repairs, and of KISS-ICP alone."""
+COMPARED = {"odometry_": "odometry, after repairs", f"{ALONE}_": "KISS-ICP alone"}
+"""Prefixes of figures -> the trajectory that they measure, instead of the corrected one."""
 ACCURACY = {
     *("ate_m", "are_deg", "height_m", "rpe_m", "rpe_deg", "kitti_translation_percent"),
     *("kitti_rotation_deg_per_100m", "num_loops_false", "loop_precision", "loop_recall"),

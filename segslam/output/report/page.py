@@ -9,7 +9,7 @@ from typing import Any
 
 from segslam.core.config import Config, changed_settings
 from segslam.core.types import Rejected
-from segslam.output.finished import COMPARED, FIGURES, FinishedRun
+from segslam.output.finished import COMPARED, FIGURES, FinishedRun, plain_name
 from segslam.output.words import REASONS, WORDS
 from segslam.slam.adjustment.vertical_angle import vertical_angle_advice
 
@@ -169,18 +169,10 @@ def _figures(metrics: dict[str, Any]) -> str:
     """Figures with a description first, in their order, then the others; each beside those of the odometry."""
     known = [key for key in FIGURES if key in metrics]
     rest = [key for key, value in metrics.items() if key not in FIGURES and isinstance(value, int | float)]
-    of_run = [key for key in known + rest if not key.startswith(COMPARED)]
-    titles = {
-        prefix: title
-        for prefix, title in zip(COMPARED, ("odometry, after repairs", "KISS-ICP alone"), strict=True)
-        if prefix + "ate_m" in metrics
-    }
+    of_run = [key for key in known + rest if plain_name(key) == key]
+    titles = {prefix: title for prefix, title in COMPARED.items() if f"{prefix}ate_m" in metrics}
     rows = [
-        (
-            f"{FIGURES.get(key, '')} {_key(key)}",
-            metrics[key],
-            *(metrics.get(prefix + key) for prefix in titles),
-        )
+        (f"{FIGURES.get(key, '')} {_key(key)}", metrics[key], *(metrics.get(prefix + key) for prefix in titles))
         for key in of_run
     ]
     return table(rows, head=("", "run", *titles.values()))

@@ -66,11 +66,10 @@ def by_data(runs: Mapping[str, FinishedRun]) -> list[list[str]]:
     """The names of runs, grouped by the data that they have mapped."""
     groups: list[list[str]] = []
     for name, run in runs.items():
-        group = next((names for names in groups if _same_data(runs[names[0]], run)), None)
-        if group is None:
-            groups.append([name])
-        else:
-            group.append(name)
+        group = next((names for names in groups if _same_data(runs[names[0]], run)), [])
+        if not group:
+            groups.append(group)
+        group.append(name)
     return groups
 
 

@@ -18,8 +18,8 @@ from segslam.core.config import MapConfig
 from segslam.core.types import GraphEstimate, Label, SegslamError
 from segslam.labels.encodings import COLORS
 from segslam.output.map.before_after import BeforeAfter, _details, most_changed
-from segslam.output.map.free_ranges import NUM_DIRECTIONS, free_range_m
 from segslam.output.map.from_above import LEAST_PX, LEGEND_PX, PATH, drawn_map, round_length_m
+from segslam.output.map.grid import NUM_DIRECTIONS, free_range_m
 from segslam.output.map.picture import MARGIN_M
 from segslam.output.map.write import write_map
 

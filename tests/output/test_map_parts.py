@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from segslam.core.types import Label
-from segslam.output.map.free_ranges import lowest_ground
+from segslam.output.map.grid import lowest_ground
 from segslam.output.map.tiles import TILE_M, VOXEL, Histogram, Tiles, corner, distance_m, merged
 from segslam.output.map.views import CELL_RAD, NOTHING, NUM_COLUMNS, NUM_ROWS, STEP_M, Views, count_votes
 

@@ -9,11 +9,11 @@ import numpy as np
 from segslam.core.config import MapConfig
 from segslam.core.types import Labels, Points, Vector
 from segslam.labels.encodings import Colors
-from segslam.output.map.free_ranges import FreeRanges
 from segslam.output.map.tiles import Tile
 
 if TYPE_CHECKING:
     from segslam.gnss.geodesy import Origin
+    from segslam.output.map.grid import FreeRanges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,7 @@ class Extent:
     """Positions of the keyframes in the world, in order (m)."""
     span: tuple[float, float]
     """Both ends of the colour scale, for heights or intensities."""
-    free_ranges: FreeRanges
+    free_ranges: "FreeRanges"
     """Free space observed by the keyframes."""
     cut_m: Vector | None = None
     """Heights (n,) of `from_above.cut_heights` for each position of the path; None if no picture is drawn."""

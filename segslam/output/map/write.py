@@ -22,9 +22,8 @@ from segslam.core.types import Keyframe, Label, Labels, SegslamError, Transform,
 from segslam.core.whole_files import check_target, whole_file
 from segslam.labels.encodings import Colors, of_classes
 from segslam.output.map.clouds import LasCloud, PcdCloud, PlyCloud, check_las
-from segslam.output.map.free_ranges import FreeRanges
 from segslam.output.map.from_above import BESIDE_M, cut_heights
-from segslam.output.map.grid import Grid
+from segslam.output.map.grid import FreeRanges, Grid
 from segslam.output.map.part import Extent, MapFile, Part, of_numbers
 from segslam.output.map.picture import Picture
 from segslam.output.map.projected import GeoTiff, check_projected

@@ -44,28 +44,20 @@ Parts = dict[str, container.Stored]
 Decoded = TypeVar("Decoded")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedKeyframe:
-    """A keyframe without its points, and their position in the file."""
-
-    keyframe: Keyframe
-    chunk: Span
-    channel_id: int
-
-
 class RecordedKeyframes:
     """Keyframes by id; the `segslam.keyframes.Clouds` of a finished run."""
 
-    def __init__(self, path: Path, kept: Sequence[RecordedKeyframe]) -> None:
+    def __init__(self, path: Path, kept: Sequence[tuple[Keyframe, Span, int]]) -> None:
+        """`kept`: each keyframe without its points; the chunk of the file that has them, and their channel."""
         self._path = path
-        self._kept = {one.keyframe.id: one for one in kept}
+        self._kept = kept
 
     def __len__(self) -> int:
         return len(self._kept)
 
     def __getitem__(self, keyframe_id: int) -> Keyframe:
         """A keyframe, without points."""
-        return self._kept[keyframe_id].keyframe
+        return self._kept[keyframe_id][0]
 
     def keep(self, keyframe: Keyframe) -> None:
         """Raises TypeError: keyframes cannot be added to a recorded drive."""
@@ -73,13 +65,13 @@ class RecordedKeyframes:
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
         """Points and labels of a keyframe. Raises SegslamError if the file has changed since it was opened."""
-        one = self._kept[keyframe_id]
+        _, chunk, channel_id = self._kept[keyframe_id]
         try:
             with self._path.open("rb") as stream:
-                stream.seek(one.chunk.offset)
-                records = stream.read(one.chunk.size)
-            for channel_id, data in messages_within(records):
-                if channel_id == one.channel_id:
+                stream.seek(chunk.offset)
+                records = stream.read(chunk.size)
+            for number, data in messages_within(records):
+                if number == channel_id:
                     return points_and_labels(KeyframePoints.FromString(data))
         except (OSError, CutError, ValueError, DecodeError) as error:
             raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
@@ -172,7 +164,7 @@ class RunLog:
 
     def keyframes(self) -> "RecordedKeyframes":
         """The keyframes of the complete steps, with access to their points. Raises SegslamError as `steps` does."""
-        kept: list[RecordedKeyframe] = []
+        kept: list[tuple[Keyframe, Span, int]] = []
         with suppress(CutError):
             for parts in self._parts_until(schema.STEP):
                 if (cloud := parts.get(schema.KEYFRAME)) is None:
@@ -181,7 +173,7 @@ class RunLog:
                 keyframe = self._decoded(_step, parts, False).keyframe
                 if keyframe is None or keyframe.id != len(kept):
                     raise SegslamError(f"{self.path}: keyframe {len(kept)} is missing; map the data again")
-                kept.append(RecordedKeyframe(keyframe, cloud.chunk, cloud.channel_id))
+                kept.append((keyframe, cloud.chunk, cloud.channel_id))
         return RecordedKeyframes(self.path, kept)
 
     def _parts_until(self, last: str, *, since_last: str | None = None) -> Iterator[Parts]:

@@ -65,11 +65,14 @@ def codec(hint: Any) -> Codec:
     if origin is UnionType:
         return _one_of(arguments)
     if origin is tuple:
-        return _tuple(codec(arguments[0]))
-    if origin is dict and get_origin(arguments[0]) is tuple:
-        return _mapping_by_tuples(codec(arguments[0]), codec(arguments[1]))
+        item = codec(arguments[0])
+        return Codec(
+            lambda values: [item.encode(value) for value in values],
+            lambda values, bulk: tuple(item.decode(value, bulk) for value in values),
+            {"type": "array", "items": item.schema},
+        )
     if origin is dict:
-        return _mapping_by_names(codec(arguments[1]))
+        return _mapping(*map(codec, arguments), has_names=get_origin(arguments[0]) is not tuple)
     if issubclass(hint, Enum):
         values = {"type": "string", "enum": [member.value for member in hint]}
         return Codec(lambda member: member.value, lambda value, _: hint(value), values)
@@ -133,28 +136,18 @@ def _one_of(hints: tuple[Any, ...]) -> Codec:
     return Codec(encode, decode, {"type": "object", "properties": properties})
 
 
-def _tuple(item: Codec) -> Codec:
-    return Codec(
-        lambda values: [item.encode(value) for value in values],
-        lambda values, bulk: tuple(item.decode(value, bulk) for value in values),
-        {"type": "array", "items": item.schema},
-    )
-
-
-def _mapping_by_tuples(key: Codec, value: Codec) -> Codec:
+def _mapping(key: Codec, value: Codec, *, has_names: bool) -> Codec:
+    if has_names:
+        return Codec(
+            lambda items: {name: value.encode(item) for name, item in items.items()},
+            lambda items, bulk: {name: value.decode(item, bulk) for name, item in items.items()},
+            {"type": "object", "properties": {}, "additionalProperties": value.schema},
+        )
     properties = {"key": key.schema, "value": value.schema}
     return Codec(
         lambda items: [{"key": key.encode(k), "value": value.encode(v)} for k, v in items.items()],
         lambda rows, bulk: {key.decode(row["key"], bulk): value.decode(row["value"], bulk) for row in rows},
         {"type": "array", "items": {"type": "object", "properties": properties}},
-    )
-
-
-def _mapping_by_names(value: Codec) -> Codec:
-    return Codec(
-        lambda items: {name: value.encode(item) for name, item in items.items()},
-        lambda items, bulk: {name: value.decode(item, bulk) for name, item in items.items()},
-        {"type": "object", "properties": {}, "additionalProperties": value.schema},
     )
 
 

@@ -197,18 +197,11 @@ def _finish_map(axes: Axes) -> None:
     legend_on_top(axes, num_columns=2)
 
 
-class _Outcome(NamedTuple):
-    """The loop candidates with one outcome, of which there is one at least."""
+def _by_outcome(run: FinishedRun) -> list[tuple[str, str, bool, list[tuple[int, int]]]]:
+    """Label, colour, whether it closed a loop, and the pairs (new, old keyframe) of each outcome that occurred.
 
-    label: str
-    color: str
-    is_closed: bool
-    pairs: list[tuple[int, int]]
-    """New and old keyframe of each."""
-
-
-def _by_outcome(run: FinishedRun) -> list[_Outcome]:
-    """Rejected candidates by reason, in the order of the pipeline; then closures: accepted, rejected later, false."""
+    Rejected candidates come by reason, in the order of the pipeline; then closures: accepted, rejected later, false.
+    """
     rejected = defaultdict[RejectReason, list[tuple[int, int]]](list)
     for attempt in run.result.attempts:
         if isinstance(attempt.outcome, Rejected):
@@ -226,9 +219,7 @@ def _by_outcome(run: FinishedRun) -> list[_Outcome]:
         ("rejected by the optimiser", OPTIMISED_AWAY, True, [pair for pair in closed if pair in off]),
         ("false", FALSE, True, [pair for pair in closed if pair in false]),
     ]
-    return [
-        _Outcome(f"{name} ({len(pairs)})", color, is_closed, pairs) for name, color, is_closed, pairs in groups if pairs
-    ]
+    return [(f"{name} ({len(pairs)})", color, is_closed, pairs) for name, color, is_closed, pairs in groups if pairs]
 
 
 def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:

@@ -112,11 +112,10 @@ def take_over(run: str | Path, map_run: str | Path) -> bool:
     if globe is None:
         return False
     made, mapped = read_run(run), read_run(source).result
-    T_enu_map = globe.T_enu_lidar[mapped.keyframe_rows] @ np.linalg.inv(
-        mapped.trajectory.T_world_lidar[mapped.keyframe_rows]
-    )
+    T_world_keyframe = mapped.trajectory.T_world_lidar[mapped.keyframe_rows]
+    T_enu_map = globe.T_enu_lidar[mapped.keyframe_rows] @ np.linalg.inv(T_world_keyframe)
     poses = made.result.trajectory.T_world_lidar
-    _, nearest = cKDTree(mapped.trajectory.T_world_lidar[mapped.keyframe_rows, :3, 3]).query(poses[:, :3, 3])
+    _, nearest = cKDTree(T_world_keyframe[:, :3, 3]).query(poses[:, :3, 3])
     of_map = json.loads((source / FILE).read_text(encoding="utf-8"))
     values = {name: of_map[name] for name in PLACE if name in of_map} | {"in_map": str(source.resolve())}
     with room_for(made.folder):

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from segslam.core.config import MapConfig
 from segslam.core.extras import how_to_install
 from segslam.core.types import Label, Points, SegslamError
 from segslam.output.map.part import Extent, Part
@@ -28,7 +27,7 @@ ASPRS_OF_LABEL = {
 """Classes of the LAS 1.4 specification, table 17: 2 ground, 5 high vegetation, 6 building, 11 road; else 1."""
 
 
-class _BinaryCloud:
+class BinaryCloud:
     """A header, then a row of a fixed layout for each point; the header is written last."""
 
     row: ClassVar[tuple[Any, ...]]
@@ -37,7 +36,7 @@ class _BinaryCloud:
     filler: ClassVar[str]
     last_line: ClassVar[str]
 
-    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+    def __init__(self, file: Path, extent: Extent) -> None:
         self._stream = file.open("wb")
         self._stream.write(bytes(HEADER_BYTES))
         self._intensity = [] if extent.brightest is None else ["intensity"]
@@ -66,7 +65,7 @@ class _BinaryCloud:
         raise NotImplementedError
 
 
-class PlyCloud(_BinaryCloud):
+class PlyCloud(BinaryCloud):
     """Binary PLY: x y z (float32, m), red green blue, label (SemanticKITTI learning id), intensity if known."""
 
     row = (("xyz", "<f4", 3), ("color", "u1", 3), ("label", "u1"))
@@ -84,7 +83,7 @@ class PlyCloud(_BinaryCloud):
         ]
 
 
-class PcdCloud(_BinaryCloud):
+class PcdCloud(BinaryCloud):
     """Binary PCD 0.7: x y z (float32, m), rgb packed as in PCL, label, intensity if known."""
 
     row = (("xyz", "<f4", 3), ("color", "u1", 4), ("label", "<u4"))
@@ -113,7 +112,7 @@ class LasCloud:
     the label (SemanticKITTI learning id). Intensities are scaled to 16 bits, as LAS requires.
     """
 
-    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+    def __init__(self, file: Path, extent: Extent) -> None:
         import laspy  # type: ignore[import-untyped]  # an optional package
 
         self._laspy = laspy

@@ -12,7 +12,6 @@ import yaml
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
-from segslam.core.config import MapConfig
 from segslam.core.types import GROUND_LABELS, Label, Labels, Mask, Points, Vector
 from segslam.output.map.part import Extent, Part
 from segslam.output.map.tiles import TILE_M, Tile, corner, distance_m
@@ -37,7 +36,7 @@ REACH_M = 40.0
 class Grid:
     """Writes the grid; `file` is the .yaml file."""
 
-    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+    def __init__(self, file: Path, extent: Extent) -> None:
         self._file = file
         self._extent = extent
         self._cells = round(TILE_M / CELL_M)  # along the edge of a tile

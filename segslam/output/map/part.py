@@ -1,8 +1,7 @@
 """Input of the map writers: the extent of the map, then its parts; and colours by height or intensity."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,6 +27,7 @@ class Extent:
     """Upper bound of the intensities; None if intensities are unknown."""
     path_m: Points
     """Positions of the keyframes in the world, in order (m)."""
+    config: MapConfig
     span: tuple[float, float]
     """Both ends of the colour scale, for heights or intensities."""
     free_ranges: "FreeRanges"
@@ -40,7 +40,10 @@ class Extent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """The clean voxels of one tile; `points` (n, 3) float64 in the world (m)."""
+    """The clean voxels of one tile; `points` (n, 3) float64 in the world (m).
+
+    Parts come by rows from north to south, each row from west to east.
+    """
 
     tile: Tile
     points: Points
@@ -48,19 +51,6 @@ class Part:
     intensities: Vector
     """Mean intensity in the sensor's unit; 0 if unknown."""
     colors: Colors
-
-
-class MapFile(Protocol):
-    """A map file while it is written. Parts come by rows from north to south, each row from west to east."""
-
-    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
-        """Open the file."""
-
-    def add(self, part: Part) -> None:
-        """Write the points of a part, or store the data needed of them."""
-
-    def close(self) -> None:
-        """Complete the file."""
 
 
 def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from segslam.core.config import MapConfig
 from segslam.labels.encodings import COLORS
 from segslam.output.map.from_above import Window, visible
 from segslam.output.map.part import Extent, Part, of_numbers
@@ -28,12 +27,11 @@ RELIEF_M, CONTRAST = 1.5, 0.35
 class Picture:
     """Top view with north (y) up; the highest point of a pixel is visible, below ceilings: see `cut_heights`."""
 
-    def __init__(self, file: Path, extent: Extent, *, config: MapConfig) -> None:
+    def __init__(self, file: Path, extent: Extent) -> None:
         self._file = file
         self._extent = extent
-        self._color = config.color
         columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
-        self._pixels = max(min(round(TILE_M / config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
+        self._pixels = max(min(round(TILE_M / extent.config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
         size = rows * self._pixels, columns * self._pixels
         self._image = np.full((*size, 3), 255, np.uint8)  # white
         self._height_m = np.full(size, np.nan, np.float32)
@@ -63,7 +61,9 @@ class Picture:
 
         titles = {"class": "class", "height": "height (m)", "intensity": "intensity"}
         path_m = self._extent.path_m
-        self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=titles[self._color], marks=self._marks()))
+        self._file.write_bytes(
+            drawn_map(image, window, path_m=path_m, title=titles[self._extent.config.color], marks=self._marks())
+        )
 
     def _finished(self) -> tuple[np.ndarray, Window, float]:
         """The shaded image (rows, columns, 3) of what has points, its window, and the median height of its pixels."""
@@ -84,7 +84,7 @@ class Picture:
 
     def _marks(self) -> list[tuple[str, str]]:
         """Text and colour of each class in the map, or of values along the colour scale."""
-        if self._color == "class":
+        if self._extent.config.color == "class":
             return [(label.name.lower().replace("_", " "), COLORS[label]) for label in COLORS if label in self._labels]
         values = np.linspace(*self._extent.span[::-1], 6)
         colors = of_numbers(values, span=self._extent.span)

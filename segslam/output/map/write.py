@@ -21,10 +21,10 @@ from segslam.core.points import within_range
 from segslam.core.types import Keyframe, Label, Labels, SegslamError, Transform, Vector
 from segslam.core.whole_files import check_target, whole_file
 from segslam.labels.encodings import Colors, of_classes
-from segslam.output.map.clouds import LasCloud, PcdCloud, PlyCloud, check_las
+from segslam.output.map.clouds import BinaryCloud, LasCloud, PcdCloud, PlyCloud, check_las
 from segslam.output.map.from_above import BESIDE_M, cut_heights
 from segslam.output.map.grid import FreeRanges, Grid
-from segslam.output.map.part import Extent, MapFile, Part, of_numbers
+from segslam.output.map.part import Extent, Part, of_numbers
 from segslam.output.map.picture import Picture
 from segslam.output.map.projected import GeoTiff, check_projected
 from segslam.output.map.tiles import Tile, Tiles, corner, distance_m
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from segslam.gnss.geodesy import Origin
 
 
+MapFile = BinaryCloud | LasCloud | Picture | Grid
+"""Made from a path and the extent; `add` takes the parts in their order, and `close` completes the file."""
 KINDS: dict[str, type[MapFile]] = {
     ".ply": PlyCloud,
     ".pcd": PcdCloud,
@@ -97,7 +99,7 @@ def write_map(
         if extent is None:
             raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
         parts = show(store.parts(), len(store.tiles), "clean")
-        num_points = _write(parts, extent, files, scratch=scratch / "files", config=config)
+        num_points = _write(parts, extent, files, scratch=scratch / "files")
     return {
         "num_map_points": num_points,
         "num_map_moving_points": store.num_moving_points,
@@ -105,13 +107,13 @@ def write_map(
     }
 
 
-def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scratch: Path, config: MapConfig) -> int:
+def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scratch: Path) -> int:
     """Write the parts to all files, in a scratch folder until they are complete; returns the number of points."""
     writers = []
     for number, file in enumerate(files):
         folder = scratch / str(number)
         folder.mkdir(parents=True)
-        writers.append(KINDS[file.suffix.lower()](folder / file.name, extent, config=config))
+        writers.append(KINDS[file.suffix.lower()](folder / file.name, extent))
     num_points = 0
     for part in parts:
         num_points += len(part.points)
@@ -182,6 +184,7 @@ class MapStore:
             north,
             brightest=self.tiles.brightest if self._has_intensities else None,
             path_m=path_m,
+            config=self._config,
             span=self._span(),
             free_ranges=self._free_ranges,
             cut_m=cut_heights(path_m, near_path) if for_picture else None,
@@ -189,7 +192,7 @@ class MapStore:
         )
 
     def parts(self) -> Iterator[Part]:
-        """The clean voxels of each tile, in the order that `MapFile` requires."""
+        """The clean voxels of each tile, in the order that `Part` names."""
         for tile in self.tiles:
             voxels = self.tiles.voxels(tile)
             gone = moved(voxels["point"], voxels["label"], self._views_of(tile), config=self._config)

@@ -68,7 +68,6 @@ Topical = tuple[str, Message]
 CloudOf = Callable[[int], tuple[Points, Labels]]
 """Function from the id of a keyframe to its points, in its frame, and their labels."""
 INFO, WARNING = Log.Level.Value("INFO"), Log.Level.Value("WARNING")
-NAME = "segslam"
 
 
 class Drawing:
@@ -98,8 +97,7 @@ class Drawing:
         else:
             yield self._odom_in_world(step.stamp_ns)
         yield from self._attempts(step.attempts, step.stamp_ns)
-        for message in _messages_of(step):
-            yield schema.LOG, message
+        yield from _words_of(step)
 
     def draw_estimate(self, estimate: GraphEstimate, *, stamp_ns: int, path: bool = True) -> Iterator[Topical]:
         """Pose of odom in world and, if `path`, the corrected path and the closures."""
@@ -222,19 +220,19 @@ def numbers_and_words(values: Mapping[str, Any], prefix: str = "") -> dict[str, 
     return flat
 
 
-def warning(text: str, *, stamp_ns: int) -> Log:
-    """A warning, for example about a scan that was skipped."""
-    return Log(timestamp=timestamp(stamp_ns), level=WARNING, message=text, name=NAME)
+def words(text: str, *, stamp_ns: int, level: Any = WARNING) -> Topical:
+    """A message in words, for example about a scan that was skipped."""
+    return schema.LOG, Log(timestamp=timestamp(stamp_ns), level=level, message=text, name="segslam")
 
 
-def _messages_of(step: Step) -> Iterator[Log]:
+def _words_of(step: Step) -> Iterator[Topical]:
     """Repairs and breaks of the odometry as warnings, accepted loops as information."""
     motion = step.motion
     if motion is not None and motion.state in (MotionState.REPAIRED, MotionState.REJOINED):
         by = "" if motion.moved_m is None else f", by {motion.moved_m:.2f} m"
-        yield warning(f"scan {step.scan_index}: motion of the odometry repaired{by}", stamp_ns=step.stamp_ns)
+        yield words(f"scan {step.scan_index}: motion of the odometry repaired{by}", stamp_ns=step.stamp_ns)
     elif motion is not None and motion.state is MotionState.BROKEN:
-        yield warning(f"scan {step.scan_index}: break, the scans do not support the motion", stamp_ns=step.stamp_ns)
+        yield words(f"scan {step.scan_index}: break, the scans do not support the motion", stamp_ns=step.stamp_ns)
     for attempt in step.attempts:
         if isinstance(attempt.outcome, LoopClosure):
             closure, found = attempt.outcome, attempt.outcome.alignment
@@ -243,4 +241,4 @@ def _messages_of(step: Step) -> Iterator[Log]:
                 f"loop from keyframe {closure.source_id} to {closure.target_id}: {probable}"
                 f"overlap {found.overlap:.2f}, residual {found.rms_m:.2f} m"
             )
-            yield Log(timestamp=timestamp(step.stamp_ns), level=INFO, message=text, name=NAME)
+            yield words(text, stamp_ns=step.stamp_ns, level=INFO)

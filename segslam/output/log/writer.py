@@ -31,7 +31,7 @@ from segslam.core.types import (
 )
 from segslam.output.log import foxglove, schema
 from segslam.output.log.container import messages_within
-from segslam.output.log.drawing import Drawing, ground_truth, map_message, map_points, warning
+from segslam.output.log.drawing import Drawing, ground_truth, map_message, map_points, words
 from segslam.output.log.records import KeyframePoints, codec, keyframe_points, points_and_labels
 from segslam.output.log.schema import channels, metadata
 from segslam.slam.adjustment import Adjusted, Adjustment
@@ -139,7 +139,7 @@ class LogWriter:
 
     def warn(self, text: str) -> None:
         """Add a warning to `/log`, at the time of the last step."""
-        self._write([(schema.LOG, warning(text, stamp_ns=self._stamp_ns))], stamp_ns=self._stamp_ns)
+        self._write([words(text, stamp_ns=self._stamp_ns)], stamp_ns=self._stamp_ns)
 
     def keep(self, keyframe: Keyframe) -> None:
         """Keep the newest keyframe in memory until its step is written: `Clouds` of segslam.keyframes."""

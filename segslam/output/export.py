@@ -52,7 +52,6 @@ def write_maps(
     """Write the map of a finished run to each of the files, or to none. Returns figures of the map.
 
     `show` passes items on, and shows their number and a title.
-
     Raises SegslamError if the run did not finish or a name has an unknown extension, WorkFailed if the disk is full.
     """
     from segslam.output.report import BEFORE_AFTER, draw_before_after
@@ -93,10 +92,7 @@ def _finished(log: RunLog) -> tuple[GraphEstimate, Trajectory]:
 
 
 def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tuple[Keyframe, Transform]]:
-    """Each keyframe, its points corrected as in the adjustment of the run, with its final T_world_keyframe.
-
-    The world of a georeferenced run is its local frame.
-    """
+    """Each keyframe, its points corrected as in the adjustment, with its final pose in the world, or on the globe."""
     estimate, _ = _finished(log)
     corrections = read_corrections(log, len(estimate.T_world_keyframe))
     num_gathered = 0

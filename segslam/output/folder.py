@@ -103,10 +103,7 @@ def copy_alone(source: Path, target: Path) -> None:
 
 
 def read_alone(folder: Path, scans: Trajectory) -> Trajectory | None:
-    """The poses of all scans by KISS-ICP alone; None if the folder does not contain them.
-
-    Raises SegslamError if the file is not one of these scans.
-    """
+    """The poses of all scans by KISS-ICP alone, if known. Raises SegslamError if the file is not one of these scans."""
     file = folder / f"{ALONE}_tum.txt"
     if not file.is_file():
         return None

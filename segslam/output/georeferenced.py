@@ -137,10 +137,7 @@ def use_of(folder: Path) -> str:
 
 
 def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
-    """The fixes of a georeferenced run in the clock of its scans, shifted; none for another run.
-
-    Raises SegslamError for damaged files.
-    """
+    """The fixes of a run, if any, in the clock of its scans, shifted. Raises SegslamError for damaged files."""
     file = folder / FIXES
     if not file.exists():
         return []

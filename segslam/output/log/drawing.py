@@ -82,10 +82,7 @@ class Drawing:
         """Identities of the drawn rejected loops."""
 
     def draw(self, step: Step, *, path: bool = True) -> Iterator[Topical]:
-        """The messages of the next step.
-
-        Those of an estimate whose size grows with the drive are omitted without `path`.
-        """
+        """The messages of the next step; without `path`, not those of an estimate whose size grows with the drive."""
         yield (
             schema.TRANSFORMS,
             foxglove.frame_transform(step.T_odom_lidar, parent=schema.ODOM, child=schema.LIDAR, stamp_ns=step.stamp_ns),
@@ -167,10 +164,7 @@ class Drawing:
 
 
 def map_points(T_world_keyframe: Mapping[int, Transform], cloud: CloudOf) -> tuple[Points, Labels]:
-    """Some points (n, 3), in world, of between `MAP_KEYFRAMES` and twice as many keyframes, and their labels.
-
-    Moving classes are omitted.
-    """
+    """Some points (n, 3) of static classes, in world, of `MAP_KEYFRAMES` to twice as many keyframes; their labels."""
     every = 1 + len(T_world_keyframe) // MAP_KEYFRAMES
     some = slice(None, None, VIEW_EVERY)
     ids = list(T_world_keyframe)[::every]

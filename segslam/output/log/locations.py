@@ -52,6 +52,7 @@ def write_locations(log: Path, locations: Mapping[str, Locations]) -> None:
             raise SegslamError(f"{log}: has no index; `segslam replay` it into a new folder first")
         replaced = {channel.id for channel in summary.channels.values() if channel.topic in locations}
         kept = [chunk for chunk in summary.chunk_indexes if not replaced & chunk.message_index_offsets.keys()]
+        # chunks of an earlier call are the last ones
         end = max(chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length for chunk in kept)
         added, made = _records(summary, locations, offset=end)
         chunks = [*kept, *made.chunk_indexes]
@@ -81,10 +82,7 @@ def _joined(log: Statistics, added: Statistics, replaced: set[int]) -> Statistic
 
 
 def _records(summary: Summary, locations: Mapping[str, Locations], *, offset: int) -> tuple[bytes, Summary]:
-    """The chunks with the messages for a place in the file, and their index with all schemas and channels of the log.
-
-    Chunks of an earlier call are the last ones of a log.
-    """
+    """The chunks with the messages for a place in the file, and their index, with all channels of the log."""
     stream = BytesIO()
     writer = Writer(stream, compression=CompressionType.ZSTD)
     writer.start()

@@ -177,10 +177,7 @@ class RunLog:
         return RecordedKeyframes(self.path, kept)
 
     def _parts_until(self, last: str, *, since_last: str | None = None) -> Iterator[Parts]:
-        """The messages of each complete step, or of another group that ends with a message of the topic `last`.
-
-        Raises CutError at the end of the readable part.
-        """
+        """The messages of each step, or of other groups that end with the topic `last`. Raises CutError at a cut."""
         parts: Parts = {}
         for message in self._messages(since_last=since_last):
             parts[message.topic] = message

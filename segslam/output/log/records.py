@@ -46,10 +46,7 @@ class Codec:
     encode: Callable[[Any], Any]
     """Converts a value to objects that `json` can write."""
     decode: Callable[[Any, Bulk], Any]
-    """Converts objects that `json` read to a value.
-
-    Raises ValueError, TypeError or KeyError for invalid or missing data.
-    """
+    """Converts objects that `json` read to a value. Raises ValueError, TypeError or KeyError for invalid data."""
     schema: Json
     """JSON Schema of the encoded values."""
 

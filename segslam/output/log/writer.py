@@ -48,10 +48,7 @@ Mirror = Callable[[str, bytes, int], None]
 
 
 class Output:
-    """The stream of MCAP's writer, unbuffered: after a failure no data is pending.
-
-    While it is open, no other process can write the file.
-    """
+    """The stream of MCAP's writer: nothing is pending after a failure, and no other process can write the file."""
 
     def __init__(self, path: Path) -> None:
         """Raises OSError if the file cannot be written, or another process writes it."""
@@ -146,10 +143,7 @@ class LogWriter:
         self._newest = keyframe
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
-        """Points and labels of a keyframe, read from the file. Raises SegslamError if the log is closed.
-
-        Another thread may write the next step meanwhile.
-        """
+        """Points and labels of a keyframe, in any thread. Raises SegslamError if the log is closed."""
         newest = self._newest
         if newest is not None and newest.id == keyframe_id:
             return newest.points, newest.labels

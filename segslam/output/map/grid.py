@@ -113,10 +113,7 @@ class FreeRanges:
 
 
 def free_range_m(points: Points, labels: Labels) -> Vector:
-    """(NUM_DIRECTIONS,) free range (m) in each direction. Points (n, 3) are relative to the sensor.
-
-    Points of moving classes do not count.
-    """
+    """(NUM_DIRECTIONS,) free range (m) in each direction, by points (n, 3) of static classes relative to the sensor."""
     near = np.abs(points[:, :2]).max(axis=1, initial=0.0) < REACH_M
     near &= labels < Label.MOVING_CAR
     points, labels = points[near], labels[near]

@@ -19,10 +19,7 @@ CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
 
 def utm(origin: "Origin") -> tuple[int, Callable[[Points], Points]]:
-    """EPSG code of the UTM zone of an origin, and a function that projects points (n, 3) of its local frame.
-
-    The function returns easting, northing and ellipsoidal height (m).
-    """
+    """EPSG code of the UTM zone of an origin; its local frame (n, 3) to easting, northing, ellipsoidal height (m)."""
     from pyproj import Transformer
 
     from segslam.gnss.geodesy import WGS84_3D, geodetic_from_enu, utm_epsg

@@ -84,9 +84,8 @@ def write_map(
 
     The extension selects the format: .ply, .pcd, .las, .laz: point cloud; .png: top view; .yaml, with a .pgm beside it:
     occupancy grid; .tif: the top view as GeoTIFF. With the `origin` of the world frame (east, north, up) on the globe,
-    .las and .laz are in UTM. Files are written atomically. `show` passes the parts on while they are
-    written, to show progress. Raises SegslamError for another extension, a missing folder, or if no keyframe has a
-    point; raises OSError if the disk is full.
+    .las and .laz are in UTM. Files are written atomically. `show` passes the parts on, to show progress. Raises
+    SegslamError for another extension, a missing folder, or if no keyframe has a point, OSError if the disk is full.
     """
     check_files(files, origin=origin)
     with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name, removed_when_stopped(Path(name)):

@@ -30,10 +30,7 @@ def check_picture(file: Path) -> None:
 
 
 def draw_scored(file: Path, estimate: Poses, reference: Poses, *, up: Up = "z") -> None:
-    """Draw matched poses in top view, the estimate aligned with the reference, and the error against travel.
-
-    `up`: upward axis of the reference frame.
-    """
+    """Draw matched poses in top view, aligned, and the error against travel; `up`: upward axis of the reference."""
     aligned = align_positions(estimate[:, :3, 3], reference[:, :3, 3]) @ estimate
     with matplotlib.rc_context(figures.STYLE):
         figure = Figure(figsize=(12.8, 6.0), layout="constrained")

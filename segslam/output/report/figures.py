@@ -124,10 +124,7 @@ def draw_loops_over_time(run: FinishedRun) -> str:
 
 
 def draw_errors(run: FinishedRun) -> str | None:
-    """Position error and height error against the distance travelled, after the alignment of the ATE.
-
-    None for a run without ground truth.
-    """
+    """Errors of position and height against travel, after the alignment of the ATE; None without ground truth."""
     if (true := true_scans(run)) is None:
         return None
     rows, truth = true

@@ -79,10 +79,7 @@ def page(
     gallery: str = "",
     about: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """The page of a run; `plots`: caption -> SVG text. `about`: metadata of the run from the log.
-
-    `top` and `gallery` are HTML before and after the plots.
-    """
+    """The page; `plots`: caption -> SVG, between the HTML `top` and `gallery`; `about`: metadata of its log."""
     name = run.folder.resolve().name
     title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
     sections = [plot_section(caption, svg) for caption, svg in plots.items()]

@@ -3,7 +3,6 @@
 import csv
 import io
 from collections import defaultdict
-from collections.abc import Iterable
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -81,10 +80,12 @@ def draw_paths(run: FinishedRun) -> str:
     above, height = figure.subplots(2, 1, height_ratios=(3, 1))
     paths = paths_of(run)
     _plot_motions(above, run, paths[-1].poses)
-    _plot_from_above(above, paths)
     for line in paths:
-        along_m = travelled_m(line.poses)
-        height.plot(along_m, line.poses[:, 2, 3], line.style, color=line.color, linewidth=line.width)
+        style: Any = {"color": line.color, "linewidth": line.width}
+        above.plot(*line.poses[:, :2, 3].T, line.style, label=line.name, **style)
+        above.plot(*line.poses[0, :2, 3], "o", color=line.color, markersize=5)
+        height.plot(travelled_m(line.poses), line.poses[:, 2, 3], line.style, **style)
+    _finish_map(above)
     height.set(xlabel="distance travelled (m)", ylabel="height (m)")
     return svg(figure, "paths")
 
@@ -162,14 +163,6 @@ def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:
     plain_powers(axes.xaxis)
     legend_on_top(axes, num_columns=2)
     return svg(figure, "stages")
-
-
-def _plot_from_above(axes: Axes, paths: Iterable[Line]) -> None:
-    for line in paths:
-        xy = line.poses[:, :2, 3]
-        axes.plot(*xy.T, line.style, color=line.color, label=line.name, linewidth=line.width)
-        axes.plot(*xy[0], "o", color=line.color, markersize=5)
-    _finish_map(axes)
 
 
 def _plot_motions(axes: Axes, run: FinishedRun, T_corrected: Poses) -> None:

@@ -73,7 +73,9 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
     with path.open("rb") as stream:
         if since_last is not None and (summary := summary_of(stream)) is not None:
             schemas, channels = dict(summary.schemas), dict(summary.channels)
-            start = _last_chunk_with(since_last, summary)
+            ids = {channel.id for channel in channels.values() if channel.topic == since_last}
+            holding = (chunk for chunk in summary.chunk_indexes if ids & chunk.message_index_offsets.keys())
+            start = max((chunk.chunk_start_offset for chunk in holding), default=0)
         for offset, size, outer in _records(stream, start):
             for record in _records_of_chunk(offset, outer) if isinstance(outer, Chunk) else ():
                 if isinstance(record, Schema):
@@ -141,13 +143,6 @@ def summary_of(stream: IO[bytes]) -> Summary | None:
 
 def _size(stream: IO[bytes] | BytesIO) -> int:
     return stream.seek(0, os.SEEK_END)
-
-
-def _last_chunk_with(topic: str, summary: Summary) -> int:
-    """Offset of the last chunk with a message of a topic; 0 if there is none."""
-    ids = {channel.id for channel in summary.channels.values() if channel.topic == topic}
-    holding = (chunk for chunk in summary.chunk_indexes if ids & chunk.message_index_offsets.keys())
-    return max((chunk.chunk_start_offset for chunk in holding), default=0)
 
 
 def _records(stream: IO[bytes] | BytesIO, start: int = 0, *, within: bool = False) -> Iterator[tuple[int, int, object]]:

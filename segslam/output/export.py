@@ -178,12 +178,11 @@ def _xml(root: Xml.Element) -> bytes:
 
 def _projector_info(origin: "Origin") -> bytes:
     """A local frame tangent to the ellipsoid, in which exported clouds other than LAS and LAZ are."""
-    lines = (
-        *("projector_type: LocalCartesian", "vertical_datum: WGS84", "map_origin:"),
-        *(f"  latitude: {origin.latitude_deg:.10f}", f"  longitude: {origin.longitude_deg:.10f}"),
-        f"  altitude: {origin.height_m:.4f}",
-    )
-    return "".join(line + "\n" for line in lines).encode()
+    return (
+        "projector_type: LocalCartesian\nvertical_datum: WGS84\nmap_origin:\n"
+        f"  latitude: {origin.latitude_deg:.10f}\n  longitude: {origin.longitude_deg:.10f}\n"
+        f"  altitude: {origin.height_m:.4f}\n"
+    ).encode()
 
 
 KINDS: dict[str, Callable[[Rows, Indices, str], bytes]] = {".geojson": _geojson, ".kml": _kml, ".gpx": _gpx}

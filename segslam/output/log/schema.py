@@ -138,14 +138,12 @@ def is_readable(written: dict[str, Any], own: dict[str, Any]) -> bool:
     """
     if any(written.get(key) != own.get(key) for key in ("type", "description")):
         return False
-    parts = [(written, own, key) for key in ("items", "additionalProperties") if key in own]
-    given = written.get("properties", {})
-    for name in own.get("properties", {}):
-        if name in given:
-            parts.append((given, own["properties"], name))
-        elif name in own.get("required", ()):
-            return False
-    return all(key in theirs and is_readable(theirs[key], ours[key]) for theirs, ours, key in parts)
+    given, wanted = written.get("properties", {}), own.get("properties", {})
+    if any(name not in given for name in own.get("required", ())):
+        return False
+    pairs = [(written.get(key, {}), own[key]) for key in ("items", "additionalProperties") if key in own]
+    pairs += [(given[name], wanted[name]) for name in wanted if name in given]
+    return all(is_readable(theirs, ours) for theirs, ours in pairs)
 
 
 class Channel(NamedTuple):

@@ -9,8 +9,8 @@ import numpy as np
 
 from segslam.core.extras import how_to_install
 from segslam.core.types import Label, Points, SegslamError
-from segslam.output.map.part import Extent, Part
 from segslam.output.map.projected import utm
+from segslam.output.map.tiles import Extent, Part
 
 HEADER_BYTES = 512
 """Bytes reserved for the header, which is written last because it contains the number of points."""

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
 from segslam.core.types import GROUND_LABELS, Label, Labels, Mask, Points, Vector
-from segslam.output.map.part import Extent, Part
-from segslam.output.map.tiles import TILE_M, Tile, corner, distance_m
+from segslam.output.map.tiles import TILE_M, Extent, Part, Tile, corner, distance_m
 
 CELL_M = 0.2
 """Chosen: cell size of the occupancy grid (m)."""

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from segslam.labels.encodings import COLORS
+from segslam.core.types import Vector
+from segslam.labels.encodings import COLORS, Colors
 from segslam.output.map.from_above import Window, visible
-from segslam.output.map.part import Extent, Part, of_numbers
-from segslam.output.map.tiles import TILE_M, corner
+from segslam.output.map.tiles import TILE_M, Extent, Part, corner
 
 MAX_SIDE = 4000
 """Largest number of pixels along the longer side; limits the memory."""
@@ -124,3 +124,13 @@ def shaded(image: np.ndarray, height_m: np.ndarray, window: int) -> np.ndarray:
     relief = np.tanh(np.where(known, height_m - mean, 0.0) / RELIEF_M)
     factor = np.where(known, 1.0 + CONTRAST * relief, 1.0)[..., None]
     return np.clip(image * factor, 0, 255).astype(np.uint8)
+
+
+def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:
+    """Colours (n, 3) from dark violet, at the start of the span and below, to yellow, at its end and above."""
+    from matplotlib import colormaps
+
+    low, high = span
+    table = (255 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+    share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
+    return table[(share * (len(table) - 1)).astype(np.int64)]

@@ -24,10 +24,9 @@ from segslam.labels.encodings import Colors, of_classes
 from segslam.output.map.clouds import BinaryCloud, LasCloud, PcdCloud, PlyCloud, check_las
 from segslam.output.map.from_above import BESIDE_M, cut_heights
 from segslam.output.map.grid import FreeRanges, Grid
-from segslam.output.map.part import Extent, Part, of_numbers
-from segslam.output.map.picture import Picture
+from segslam.output.map.picture import Picture, of_numbers
 from segslam.output.map.projected import GeoTiff, check_projected
-from segslam.output.map.tiles import Tile, Tiles, corner, distance_m
+from segslam.output.map.tiles import Extent, Part, Tile, Tiles, corner, distance_m
 from segslam.output.map.views import Views, moved
 from segslam.slam.adjustment import Progress, no_progress
 

@@ -9,7 +9,8 @@ from packaging.requirements import Requirement
 
 from segslam.core.extras import how_to_install, requirements
 from segslam.core.types import SegslamError
-from segslam.output.map import clouds
+from segslam.gnss import Origin
+from segslam.output.map import write
 from segslam.scans.mcap_messages import McapMessages
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -35,13 +36,13 @@ def test_requirements_are_those_of_the_project() -> None:
 
 
 def test_las_and_ros_messages_have_the_install_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clouds, "find_spec", lambda _: None)
+    monkeypatch.setattr(write, "find_spec", lambda _: None)
     with pytest.raises(SegslamError, match=r"pip install 'laspy<.*' 'lazrs<"):
-        clouds.check_las(tmp_path / "map.laz", is_projected=False)
+        write.check_names([tmp_path / "map.laz"])
     with monkeypatch.context() as patch:
-        patch.setattr(clouds, "find_spec", lambda name: None if name == "pyproj" else object())
+        patch.setattr(write, "find_spec", lambda name: None if name == "pyproj" else object())
         with pytest.raises(SegslamError, match=r"pip install 'pyproj<.*' 'rasterio<"):
-            clouds.check_las(tmp_path / "map.laz", is_projected=True)
+            write.check_names([tmp_path / "map.laz"], origin=Origin(48.98, 8.39, 115.0))
     monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
     with pytest.raises(ImportError, match="pip install 'mcap-ros2-support<"):
         McapMessages(tmp_path / "drive.mcap", "")

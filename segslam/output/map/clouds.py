@@ -1,14 +1,12 @@
 """Point cloud files written piece by piece: PLY, PCD, LAS and LAZ."""
 
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from segslam.core.extras import how_to_install
-from segslam.core.types import Label, Points, SegslamError
+from segslam.core.types import Label, Points
 from segslam.output.map.projected import utm
 from segslam.output.map.tiles import Extent, Part
 
@@ -142,12 +140,3 @@ class LasCloud:
     def close(self) -> None:
         """Complete the file."""
         self._writer.close()
-
-
-def check_las(file: Path, *, is_projected: bool) -> None:
-    """Raises SegslamError if the packages for LAS and LAZ, and those for coordinate systems, are missing."""
-    missing = [name for name in ("laspy", "lazrs") if find_spec(name) is None]
-    if missing:
-        raise SegslamError(f"{file}: LAS and LAZ need extra packages: {how_to_install('las')}; .ply and .pcd do not")
-    if is_projected and find_spec("pyproj") is None:
-        raise SegslamError(f"{file}: a coordinate system needs extra packages: {how_to_install('geo')}; .ply does not")

@@ -1,14 +1,11 @@
 """Map files in a coordinate system of the Earth: UTM coordinates of points, and the top view as GeoTIFF."""
 
 from collections.abc import Callable
-from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from segslam.core.extras import how_to_install
-from segslam.core.types import Points, SegslamError
+from segslam.core.types import Points
 from segslam.output.map.from_above import Window
 from segslam.output.map.picture import Picture
 
@@ -75,12 +72,3 @@ def _affine(projected: Callable[[Points], Points], window: Window, rows: int, co
     pixels = np.column_stack([CORNERS * [columns, rows], np.ones(4)])
     solution, *_ = np.linalg.lstsq(pixels, projected(places)[:, :2], rcond=None)
     return solution.T
-
-
-def check_projected(file: Path, origin: "Origin | None") -> None:
-    """Raises SegslamError if packages are missing, or if the run was not georeferenced."""
-    missing = [name for name in ("pyproj", "rasterio") if find_spec(name) is None]
-    if missing:
-        raise SegslamError(f"{file}: GeoTIFF needs extra packages: {how_to_install('geo')}; .png does not")
-    if origin is None:
-        raise SegslamError(f"{file}: the run has no place on the globe; `segslam georeference RUN --gnss FIXES` first")

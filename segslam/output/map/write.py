@@ -8,6 +8,7 @@ and one tile, whatever the length of the drive.
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -16,16 +17,17 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import MapConfig
+from segslam.core.extras import how_to_install
 from segslam.core.interrupts import removed_when_stopped
 from segslam.core.points import within_range
 from segslam.core.types import Keyframe, Label, Labels, SegslamError, Transform, Vector
 from segslam.core.whole_files import check_target, whole_file
 from segslam.labels.encodings import Colors, of_classes
-from segslam.output.map.clouds import BinaryCloud, LasCloud, PcdCloud, PlyCloud, check_las
+from segslam.output.map.clouds import BinaryCloud, LasCloud, PcdCloud, PlyCloud
 from segslam.output.map.from_above import BESIDE_M, cut_heights
 from segslam.output.map.grid import FreeRanges, Grid
 from segslam.output.map.picture import Picture, of_numbers
-from segslam.output.map.projected import GeoTiff, check_projected
+from segslam.output.map.projected import GeoTiff
 from segslam.output.map.tiles import Extent, Part, Tile, Tiles, corner, distance_m
 from segslam.output.map.views import Views, moved
 from segslam.slam.adjustment import Progress, no_progress
@@ -54,12 +56,24 @@ SHARES = 0.01, 0.99
 def check_names(files: Sequence[Path], *, origin: "Origin | None" = None) -> None:
     """Raises SegslamError for a file with an unknown extension, or one that needs a missing package or the origin."""
     for file in files:
-        if file.suffix.lower() not in KINDS:
+        kind = KINDS.get(file.suffix.lower())
+        if kind is None:
             raise SegslamError(f"{file}: unknown kind of map; its name must end in {', '.join(KINDS)}")
-        if KINDS[file.suffix.lower()] is LasCloud:
-            check_las(file, is_projected=origin is not None)
-        if KINDS[file.suffix.lower()] is GeoTiff:
-            check_projected(file, origin)
+        if kind is LasCloud:
+            _check_packages(file, "LAS and LAZ need", ("laspy", "lazrs"), extra="las", others=".ply and .pcd do not")
+        if kind is LasCloud and origin is not None:
+            _check_packages(file, "a coordinate system needs", ("pyproj",), extra="geo", others=".ply does not")
+        if kind is GeoTiff:
+            _check_packages(file, "GeoTIFF needs", ("pyproj", "rasterio"), extra="geo", others=".png does not")
+            if origin is None:
+                raise SegslamError(
+                    f"{file}: the run has no place on the globe; `segslam georeference RUN --gnss FIXES` first"
+                )
+
+
+def _check_packages(file: Path, needs: str, packages: Sequence[str], *, extra: str, others: str) -> None:
+    if any(find_spec(name) is None for name in packages):
+        raise SegslamError(f"{file}: {needs} extra packages: {how_to_install(extra)}; {others}")
 
 
 def check_files(files: Sequence[Path], *, origin: "Origin | None" = None) -> None:

@@ -206,12 +206,9 @@ def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform],
     figure.suptitle(fill(title, 31 * len(poses)), fontsize=11)
     panels = figure.subplots(1, len(poses), squeeze=False)[0]
     for axes, (name, T_target_source) in zip(panels, poses.items(), strict=True):
-        for points, color, label in (
-            (target, TARGET, "target"),
-            (geometry.apply(T_target_source, source), SOURCE, "source"),
-        ):
+        for points, color in ((target, TARGET), (geometry.apply(T_target_source, source), SOURCE)):
             near = points[np.abs(points[:, :2]).max(axis=1) < VIEW_M]
-            axes.plot(near[:, 0], near[:, 1], ",", color=color, label=label, rasterized=True)
+            axes.plot(near[:, 0], near[:, 1], ",", color=color, rasterized=True)
         axes.set(title=name, xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), aspect="equal", xlabel="x (m)")
     image = io.BytesIO()
     figure.savefig(image, format="png", dpi=140)

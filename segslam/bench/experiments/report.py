@@ -18,8 +18,7 @@ from segslam.output.report import figures
 from segslam.output.report.figures import plain_powers, svg
 from segslam.output.report.page import (
     document,
-    plot_section,
-    png_section,
+    picture_section,
     section,
     settings_not_default,
     settings_tables,
@@ -138,8 +137,8 @@ def _page(report: dict[str, Any], plots: Mapping[str, str], pictures: Mapping[st
     facts = "".join(f"<tr><td>{escape(k)}</td><td>{escape(str(v))}</td></tr>" for k, v in _facts(report).items())
     boxes = [section("How to read this", notes)]
     boxes += [section(table.caption, html(table)) for table in tables(report)]
-    columns = [plot_section(caption, svg) for caption, svg in plots.items()]
-    columns += [png_section(caption, png) for caption, png in pictures.items()]
+    columns = [picture_section(caption, svg) for caption, svg in plots.items()]
+    columns += [picture_section(caption, png) for caption, png in pictures.items()]
     settings = settings_tables(Config.model_validate(report["settings"]))
     return document(
         _title(report),

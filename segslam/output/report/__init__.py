@@ -14,7 +14,7 @@ from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, loops
-from segslam.output.report.page import loops_section, number, page, png_section, section
+from segslam.output.report.page import loops_section, number, page, picture_section, section
 
 __all__ = ["BEFORE_AFTER", "draw_before_after", "write_report"]
 
@@ -71,10 +71,10 @@ def _pictures(run: FinishedRun) -> tuple[str, str]:
     of_view = {number: kept[number] for number in sorted(_keyframes_of(shown)) if number in kept}
     top = section("Top view", loops.top_view(run, of_view))
     note = "Left: before, by odometry. Right: after, as mapped."
-    top += png_section("Map by odometry, and corrected", before_after, note=note)
+    top += picture_section("Map by odometry, and corrected", before_after, note=note)
     map_file = run.folder / "map.png"
     if map_file.is_file():
-        top += png_section("Map in top view", small_png(map_file))
+        top += picture_section("Map in top view", small_png(map_file))
     return top, loops_section(loops.draw(run, chosen, kept))
 
 

@@ -82,7 +82,7 @@ def page(
     """The page; `plots`: caption -> SVG, between the HTML `top` and `gallery`; `about`: metadata of its log."""
     name = run.folder.resolve().name
     title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
-    sections = [plot_section(caption, svg) for caption, svg in plots.items()]
+    sections = [picture_section(caption, svg) for caption, svg in plots.items()]
     sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
     sections += [section("Files", _files(run)), section("Conditions", _conditions(run, about))]
     if advice := vertical_angle_advice(run.metrics, run.config.sensor):
@@ -99,7 +99,7 @@ def loops_section(loops: Mapping[str, bytes]) -> str:
     """PNGs of pairs of scans, by caption; empty without any."""
     if not loops:
         return ""
-    shown = "".join(f"<figure>{_picture(caption, png, 'png')}</figure>" for caption, png in loops.items())
+    shown = "".join(f"<figure>{_picture(caption, png)}</figure>" for caption, png in loops.items())
     note = "Target in grey, source in orange, top view without ground. Left: initial guess of the loop."
     return section("Loops: best accepted, and nearest missed", f'<p>{note}</p><div class="gallery">{shown}</div>')
 
@@ -147,18 +147,14 @@ def _tiles(metrics: dict[str, Any]) -> str:
     return "".join(f"<div><b>{number(metrics[key])}{unit}</b>{text}</div>" for key, unit, text in known)
 
 
-def plot_section(caption: str, svg: str) -> str:
-    """A plot and its caption."""
-    return section(caption, _picture(caption, svg.encode(), "svg+xml"))
+def picture_section(caption: str, picture: str | bytes, *, note: str = "") -> str:
+    """An SVG or PNG and its caption; between them a note."""
+    return section(caption, (f"<p>{note}</p>" if note else "") + _picture(caption, picture))
 
 
-def png_section(caption: str, png: bytes, *, note: str = "") -> str:
-    """A picture and its caption; between them a note."""
-    return section(caption, f"<p>{note}</p>{_picture(caption, png, 'png')}" if note else _picture(caption, png, "png"))
-
-
-def _picture(caption: str, picture: bytes, kind: str) -> str:
-    data = base64.b64encode(picture).decode()
+def _picture(caption: str, picture: str | bytes) -> str:
+    kind, content = ("svg+xml", picture.encode()) if isinstance(picture, str) else ("png", picture)
+    data = base64.b64encode(content).decode()
     return f'<img alt="{escape(caption)}" src="data:image/{kind};base64,{data}">'
 
 

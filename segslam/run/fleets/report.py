@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from segslam.core.trajectory import Poses, read_poses
 from segslam.core.whole_files import write_whole
 from segslam.output.report import figures
-from segslam.output.report.page import document, plot_section, section, table
+from segslam.output.report.page import document, picture_section, section, table
 
 if TYPE_CHECKING:
     from segslam.run.fleets.orchestrate import FleetResult
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def write_report(result: "FleetResult") -> Path:
     """Write `report.html` into the folder of a fleet; returns its path."""
     plots = "".join(
-        plot_section(
+        picture_section(
             f"Component {number}: {', '.join(component['drives'])}",
             _drawn(result.folder / component["folder"], component["drives"]),
         )

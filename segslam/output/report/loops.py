@@ -8,7 +8,7 @@ import base64
 import gzip
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from textwrap import fill
@@ -56,8 +56,8 @@ def with_clouds(run: FinishedRun) -> list[LoopAttempt]:
     attempts = run.result.attempts
     accepted = [one for one in attempts if isinstance(one.outcome, LoopClosure)]
     rejected = [one for one in attempts if not isinstance(one.outcome, LoopClosure)]
-    kept = _spread(accepted, MOST_PAIRS)
-    return kept + _spread(rejected, MOST_PAIRS - len(kept))
+    kept = [accepted[row] for row in _spread(len(accepted), MOST_PAIRS)]
+    return kept + [rejected[row] for row in _spread(len(rejected), MOST_PAIRS - len(kept))]
 
 
 def top_view(run: FinishedRun, keyframes: Mapping[int, Keyframe]) -> str:
@@ -137,7 +137,7 @@ def _cloud(keyframe: Keyframe) -> str:
     points = _standing(keyframe)
     points = points if len(points) else keyframe.points
     near = points[np.abs(points).max(axis=1, initial=0.0) < NEAR_M]
-    kept = near[np.linspace(0, len(near) - 1, min(len(near), CLOUD_POINTS)).astype(int)] if len(near) else near
+    kept = near[_spread(len(near), CLOUD_POINTS)]
     return base64.b64encode(np.round(kept / STEP_M).astype("<i2").tobytes()).decode("ascii")
 
 
@@ -149,15 +149,13 @@ def _rounded(values: np.ndarray, digits: int = 2) -> list[float]:
     return [round(float(value), digits) for value in values]
 
 
-def _spread(attempts: list[LoopAttempt], most: int) -> list[LoopAttempt]:
-    if len(attempts) <= most:
-        return attempts
-    return [attempts[row] for row in np.linspace(0, len(attempts) - 1, most).astype(int)] if most else []
+def _spread(num: int, most: int) -> list[int]:
+    """Rows of at most so many of a number of items, evenly spread."""
+    return np.linspace(0, num - 1, min(num, most)).astype(int).tolist()
 
 
-def choose(attempts: Iterable[LoopAttempt]) -> list[LoopAttempt]:
+def choose(attempts: Sequence[LoopAttempt]) -> list[LoopAttempt]:
     """Accepted candidates by overlap; then rejected ones, those that failed last first, by distance."""
-    attempts = list(attempts)
     reasons = list(RejectReason)
     accepted = [(-one.outcome.alignment.overlap, one) for one in attempts if isinstance(one.outcome, LoopClosure)]
     rejected = [
@@ -196,7 +194,7 @@ def _apart(ranked: Iterable[tuple[Any, LoopAttempt]]) -> list[LoopAttempt]:
 
 
 def _standing(keyframe: Keyframe) -> Points:
-    """The points above ground; all points if none is labelled as ground."""
+    """The points that are not labelled as ground."""
     return keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))]
 
 

@@ -111,5 +111,4 @@ def as_html(run: FinishedRun) -> str:
         picture = figures.draw_paths(run)
     known = [key for key in SHOWN if key in run.metrics]
     rows = "".join(f"<tr><td>{FIGURES[key]}</td><td>{number(run.metrics[key])}</td></tr>" for key in known)
-    start = picture.find("<svg")
-    return f"<b>{escape(str(run.folder))}</b><table>{rows}</table>{picture[max(start, 0) :]}"
+    return f"<b>{escape(str(run.folder))}</b><table>{rows}</table>{picture[picture.index('<svg') :]}"

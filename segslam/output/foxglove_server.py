@@ -22,10 +22,7 @@ class FoxgloveServer(ServerListener):
     """A WebSocket server; a context manager. A slow viewer loses messages and does not delay the run."""
 
     def __init__(self, address: str) -> None:
-        """Listen on `PORT` of the loopback address, or on `HOST:PORT`; port 0 selects a free port.
-
-        Raises SegslamError for another form, and if the port is not available.
-        """
+        """Listen on `PORT` (loopback) or `HOST:PORT`; 0 is a free port. Raises SegslamError if that is not possible."""
         host, port = parse_address(address)
         self._context = context = foxglove.Context()  # its channels close with it
         self._channels = {

@@ -91,10 +91,7 @@ def _not_damaged(file: Path) -> Iterator[None]:
 def georeference_if_possible(
     folder: Path, source: str, rows: Sequence[Row], *, use: Use | str = Use.FUSE, offset_s: float = 0.0
 ) -> str:
-    """As `georeference`, at the end of a run that has results without it, too; a failure is a warning.
-
-    `source` names the fixes `rows` in messages. Returns what was found; empty after a failure.
-    """
+    """As `georeference`, with fixes called `source` in messages; returns what was found. Failures are warnings."""
     try:
         return summary(georeference(folder, make_fixes(source, rows), use=use, offset_s=offset_s))
     except SegslamError as error:

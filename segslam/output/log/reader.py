@@ -206,10 +206,7 @@ class RunLog:
 
 
 def read_log(run: Path) -> RunLog:
-    """Open the log of a run, complete or not, given its folder or the log.
-
-    Raises SegslamError if it is missing or has another schema version.
-    """
+    """The log of a run, complete or not, given it or its folder. Raises SegslamError if it is missing or unreadable."""
     path = log_of(run)
     remedy = "give the log.mcap of a run"
     try:

@@ -33,10 +33,7 @@ class BeforeAfter:
     def __init__(
         self, T_odom_keyframe: Mapping[int, Transform], estimate: GraphEstimate, keyframes: Iterable[Keyframe] = ()
     ) -> None:
-        """Takes the poses of all keyframes by odometry, and the last estimate.
-
-        `keyframes`: those whose points show where ceilings hang over the path, which are not drawn; see `cut_heights`.
-        """
+        """Poses of all keyframes by odometry, and the last estimate; `keyframes` show ceilings, which are not drawn."""
         first = min(T_odom_keyframe)
         T_world_odom = estimate.T_world_keyframe[first] @ geometry.inverse(T_odom_keyframe[first])
         poses = {keyframe_id: T_world_odom @ T for keyframe_id, T in T_odom_keyframe.items()}

@@ -129,8 +129,8 @@ def cut_heights(path_m: Points, clouds: Iterable[Points]) -> Vector:
     The sensor has passed through free space, and the lowest point above a position ends this space. Where most of the
     neighbouring positions have such a point, the sensor drove below a ceiling, and points higher than half way up to it
     are cut. Below the open sky, trees and wires hang over few positions: over 1 % of the real KITTI 00, so that nothing
-    is cut; over 100 % of a roofed courtyard. An avenue whose trees meet above the path (17 keyframes of
-    NCLT) is cut like a ceiling. `clouds`: the points (k, 3) of the map in the world, in any pieces.
+    is cut; over 100 % of a roofed courtyard. An avenue whose trees meet above the path (17 keyframes of NCLT) is cut
+    like a ceiling. `clouds`: the points (k, 3) of the map in the world, in any pieces.
     """
     tree = cKDTree(path_m[:, :2])
     free_m = np.full(len(path_m), np.inf)

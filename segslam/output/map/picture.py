@@ -114,10 +114,7 @@ def closed(image: np.ndarray, height_m: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def shaded(image: np.ndarray, height_m: np.ndarray, window: int) -> np.ndarray:
-    """Colours (rows, columns, 3), brighter above and darker below the mean height of the surroundings.
-
-    `height_m` is NaN for unknown pixels; `window` is the size of the surroundings in pixels.
-    """
+    """Colours (rows, columns, 3), brighter above and darker below the mean of known heights within `window` pixels."""
     known = np.isfinite(height_m)
     weight = uniform_filter(known.astype(np.float32), window)
     mean = uniform_filter(np.where(known, height_m, 0.0).astype(np.float32), window) / np.maximum(weight, 1e-6)

@@ -20,9 +20,9 @@ from segslam.core.config import MapConfig
 from segslam.core.extras import how_to_install
 from segslam.core.interrupts import removed_when_stopped
 from segslam.core.points import within_range
-from segslam.core.types import Keyframe, Label, Labels, SegslamError, Transform, Vector
+from segslam.core.types import Keyframe, Label, SegslamError, Transform
 from segslam.core.whole_files import check_target, whole_file
-from segslam.labels.encodings import Colors, of_classes
+from segslam.labels.encodings import of_classes
 from segslam.output.map.clouds import BinaryCloud, LasCloud, PcdCloud, PlyCloud
 from segslam.output.map.from_above import BESIDE_M, cut_heights
 from segslam.output.map.grid import FreeRanges, Grid
@@ -205,19 +205,16 @@ class MapStore:
 
     def parts(self) -> Iterator[Part]:
         """The clean voxels of each tile, in the order that `Part` names."""
+        color = self._config.color
         for tile in self.tiles:
             voxels = self.tiles.voxels(tile)
             gone = moved(voxels["point"], voxels["label"], self._views_of(tile), config=self._config)
             self.num_voxels_seen_through += int(gone.sum())
             kept = voxels[~gone]
             world = kept["point"] + corner(tile)
-            paint = self._colors(kept["label"], world[:, 2], kept["intensity"])
+            values = kept["intensity"] if color == "intensity" else world[:, 2]
+            paint = of_classes(kept["label"]) if color == "class" else of_numbers(values, span=self._span())
             yield Part(tile, world, kept["label"], kept["intensity"], paint)
-
-    def _colors(self, labels: Labels, heights: Vector, intensities: Vector) -> Colors:
-        if self._config.color == "class":
-            return of_classes(labels)
-        return of_numbers(intensities if self._config.color == "intensity" else heights, span=self._span())
 
     def _span(self) -> tuple[float, float]:
         """Values at both ends of the colour scale."""

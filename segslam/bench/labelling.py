@@ -1,20 +1,24 @@
-"""Labels of the scans of a drive: written to files, drawn, counted, and compared with true ones."""
+"""Labels of the scans of a drive: written to files, drawn, counted, and compared with true ones.
+
+Scores are intersections over unions (IoU) as in SemanticKITTI (Behley et al., ICCV 2019): only points with a known true
+class count; moving classes count as their static class.
+"""
 
 import io
 import logging
+from collections.abc import Iterable
 from pathlib import Path
 from statistics import median_low
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from segslam.bench.label_scores import NUM_CLASSES, STILL, class_scores, confusion, group_scores, largest_confusions
 from segslam.core import geometry
-from segslam.core.types import BadScan, Label, Labels, Points, Scan
+from segslam.core.types import GROUND_LABELS, BadScan, Label, Labels, Points, Scan
 from segslam.core.whole_files import write_whole
 from segslam.labels import geometric_labels
 from segslam.labels.encodings import Colors, Encoding, of_classes
@@ -29,8 +33,23 @@ REACH_M = 50.0
 CELL_M = 0.2
 BACKGROUND, WRONG, RIGHT, MOVING = (24, 24, 24), (255, 60, 40), (110, 110, 110), (255, 42, 42)
 """Red, green, blue."""
+NUM_CLASSES = 20
+STILL = np.arange(len(Label), dtype=np.uint8)
+"""Class of each label; moving classes map to their static class."""
+for _label in list(Label)[NUM_CLASSES:]:
+    STILL[_label] = Label[_label.name.removeprefix("MOVING_")]
+GROUPS = {
+    "ground": GROUND_LABELS,
+    "car": (Label.CAR,),
+    "building": (Label.BUILDING,),
+    "vegetation": (Label.VEGETATION,),
+    "trunk_or_pole": (Label.TRUNK, Label.POLE),
+}
+"""Groups of classes that matter for loop closing."""
 
 Image = UInt8[np.ndarray, "_ _ 3"]
+Confusion = Int[np.ndarray, "20 20"]
+"""Number of points by true class (row) and label (column), as learning ids 0 to 19; row 0 is empty."""
 
 
 class Tally:
@@ -165,4 +184,45 @@ def _legend(labels: Labels, truth: Labels | None) -> list[Patch]:
     return [
         Patch(color=color, label=f"{Label(label).name.lower()} {shares[label]:.1%}")
         for label, color in zip(drawn, colors, strict=True)
+    ]
+
+
+def confusion(labels: Labels, truth: Labels) -> Confusion:
+    """Number of points for each pair of true class and label."""
+    known = truth != Label.UNLABELLED
+    pairs = STILL[truth[known]].astype(np.int64) * NUM_CLASSES + STILL[labels[known]]
+    return np.bincount(pairs, minlength=NUM_CLASSES**2).reshape(NUM_CLASSES, NUM_CLASSES)
+
+
+def class_scores(counts: Confusion) -> dict[str, float]:
+    """IoU of each class that occurs in the ground truth or in the labels, the most frequent first."""
+    classes = sorted(list(Label)[1:NUM_CLASSES], key=lambda label: -counts[label].sum())
+    return _scores(counts, ((label.name.lower(), (label,)) for label in classes))
+
+
+def group_scores(counts: Confusion) -> dict[str, float]:
+    """IoU of the groups of classes that matter for loop closing."""
+    return _scores(counts, GROUPS.items())
+
+
+def _scores(counts: Confusion, groups: Iterable[tuple[str, tuple[Label, ...]]]) -> dict[str, float]:
+    """IoU of each of these groups that occurs."""
+    scores = {}
+    for name, members in groups:
+        chosen = list(members)
+        both = counts[np.ix_(chosen, chosen)].sum()
+        if either := counts[chosen].sum() + counts[:, chosen].sum() - both:
+            scores[name] = float(both / either)
+    return scores
+
+
+def largest_confusions(counts: Confusion, count: int) -> list[tuple[Label, Label, float]]:
+    """(true class, label, share of all points) of the most frequent confusions."""
+    wrong = counts * (1 - np.eye(NUM_CLASSES, dtype=np.int64))
+    largest = np.argsort(-wrong, axis=None, kind="stable")[:count]
+    rows, columns = np.unravel_index(largest, wrong.shape)
+    return [
+        (Label(row), Label(column), float(wrong[row, column] / counts.sum()))
+        for row, column in zip(rows, columns, strict=True)
+        if wrong[row, column]
     ]

@@ -10,7 +10,7 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.made_networks import class_network
 
-from segslam.bench.label_scores import STILL, class_scores, confusion, group_scores, largest_confusions
+from segslam.bench.labelling import STILL, class_scores, confusion, group_scores, largest_confusions
 from segslam.core.types import Label
 from segslam.labels.encodings import RAW_OF_LABEL, Encoding, of_classes, to_labels
 from segslam.labels.label_files import read_ids, read_labels

@@ -8,7 +8,7 @@ import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
 from helpers.made_networks import save_network
-from segslam.bench.label_scores import NUM_CLASSES, STILL
+from segslam.bench.labelling import NUM_CLASSES, STILL
 from segslam.bench.simulation.files import uncorrected
 from segslam.bench.simulation.sensor import Sweep
 from segslam.labels.network_settings import NetworkSettings

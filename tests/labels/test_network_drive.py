@@ -15,7 +15,7 @@ from helpers.made_logs import boundaries
 from helpers.made_networks import class_network
 from helpers.trained_network import train_network
 
-from segslam.bench.label_scores import confusion
+from segslam.bench.labelling import confusion
 from segslam.bench.simulation.files import uncorrected
 from segslam.core.trajectory import write_kitti
 from segslam.core.types import LoopClosure

@@ -9,7 +9,7 @@ import numpy as np
 
 from segslam.bench.experiments.rows import Row
 from segslam.bench.experiments.summary import figures, grouped
-from segslam.bench.label_scores import confusion, group_scores
+from segslam.bench.labelling import confusion, group_scores
 from segslam.core.config import Config
 from segslam.core.types import Points
 from segslam.labels import geometric_labels

@@ -3,7 +3,7 @@
 import numpy as np
 from pydantic import Field
 
-from segslam.bench.label_scores import STILL
+from segslam.bench.labelling import STILL
 from segslam.core import geometry
 from segslam.core.config import Section
 from segslam.core.types import Label, Labels, Points

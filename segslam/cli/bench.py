@@ -1,10 +1,10 @@
 """`segslam bench`: the experiments of the paper, with all methods on the same scans."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -105,7 +105,7 @@ def pairs(data: DataArgument, options: Options, changes: Settings, terminal: Ter
 
     Example: segslam bench pairs kitti --sequence 06 --pairs kitti06_3to5.txt --sample 100 --workers 4 --out bench06
     """
-    _experiment("pairs", data, options, changes, terminal, lambda variations: variations.pair_trials, by="list")
+    _experiment("pairs", data, options, changes, terminal, by="list")
 
 
 @app.command(short_help="Measure times, errors and graph sizes.")
@@ -115,7 +115,7 @@ def timing(data: DataArgument, options: Options, changes: Settings, terminal: Te
 
     Example: segslam bench timing kitti --sequence 06 --pairs kitti06_3to5.txt --pairs kitti06_8to10.txt --sample 50
     """
-    _experiment("timing", data, options, changes, terminal, lambda variations: variations.pair_trials, by="list")
+    _experiment("timing", data, options, changes, terminal, by="list")
 
 
 @app.command(short_help="Measure the error against the yaw of the source.")
@@ -134,11 +134,8 @@ def yaw(
 
     Example: segslam bench yaw kitti --sequence 05 --step-deg 5 --out yaw05
     """
-
-    def vary(variations: Any) -> Callable[..., Iterable["Trial"]]:
-        return partial(variations.turned_trials, step_deg=step_deg)
-
-    _experiment("yaw", data, options, changes, terminal, vary, by="yaw_deg", of_paper=True, step_deg=step_deg)
+    varied = {"step_deg": step_deg}
+    _experiment("yaw", data, options, changes, terminal, by="yaw_deg", varied=varied, asked=varied)
 
 
 @app.command(short_help="Measure the success while labels are removed.")
@@ -161,13 +158,9 @@ def deterioration(
 
     Example: segslam bench deterioration kitti --sequence 05 --labels predictions --clouds one --out lost05
     """
-
-    def vary(variations: Any) -> Callable[..., Iterable["Trial"]]:
-        drawn = {"num_draws": draws, "seed": options.seed}
-        return partial(variations.unlabelled_trials, lost_percent=lost_percent, both=clouds == "both", **drawn)
-
+    varied = {"lost_percent": lost_percent, "num_draws": draws, "seed": options.seed, "both": clouds == "both"}
     asked = {"clouds": clouds, "draws": draws}
-    _experiment("deterioration", data, options, changes, terminal, vary, by="lost_percent", of_paper=True, **asked)
+    _experiment("deterioration", data, options, changes, terminal, by="lost_percent", varied=varied, asked=asked)
 
 
 @app.command()
@@ -311,34 +304,33 @@ def _experiment(
     options: Options,
     changes: Settings,
     terminal: Terminal,
-    vary: Callable[[Any], Callable[..., Iterable["Trial"]]],
     *,
     by: str,
-    of_paper: bool = False,
-    **asked: Any,
+    varied: Mapping[str, Any] = MappingProxyType({}),
+    asked: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Register the pairs, print the results, and write the report if a folder is given.
 
-    `vary` returns the function of the module `trials` that makes the trials of a list; the module loads scipy and
-    is imported after the first message. `of_paper`: the default is the pair of the paper. `asked` is for the report.
+    `varied`: arguments of `pair_trials`; if there are some, the default is the pair of the paper. `asked` is for the
+    report.
     """
     job = _make_job(data, options, changes, terminal)
-    from segslam.bench.experiments import trials as variations
     from segslam.bench.experiments.job import open_once
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
     from segslam.bench.experiments.report_tables import overall, plain
     from segslam.bench.experiments.summary import results
+    from segslam.bench.experiments.trials import PAPER_PAIR, pair_trials
 
     reference = open_once(job.source)[0].reference
-    lists = _read_lists(options, reference, default=variations.PAPER_PAIR if of_paper else None)
-    trials = [trial for one in lists for trial in vary(variations)(one, reference)]
+    lists = _read_lists(options, reference, default=PAPER_PAIR if varied else None)
+    trials = [trial for one in lists for trial in pair_trials(one, reference, **varied)]
     rows = _run_trials(job, trials, options, terminal)
     found = with_paper_values(results(rows, by=by), experiment=name, sequence=options.sequence, lists=lists)
     if options.out is not None:
         workers = "of a Dask cluster" if options.scheduler else options.workers
-        asked = {"sample": options.sample, "seed": options.seed, "workers": workers, **asked}
-        report = account(name, job, lists, found, options=asked)
+        shared = {"sample": options.sample, "seed": options.seed, "workers": workers}
+        report = account(name, job, lists, found, options={**shared, **asked})
         _write_report(options.out, report, _pictures(job, trials, rows, options.draw), terminal)
     terminal.answer(found, plain(overall(found)))
 

@@ -14,14 +14,7 @@ from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.bench.experiments.pairs import PairList, cut_pairs, read_pairs, sample_pairs, true_poses
 from segslam.bench.experiments.rows import Row, read_rows, write_rows
 from segslam.bench.experiments.summary import figures, results, worst_failures
-from segslam.bench.experiments.trials import (
-    PAPER_PAIR,
-    ScanVariant,
-    pair_trials,
-    trial,
-    turned_trials,
-    unlabelled_trials,
-)
+from segslam.bench.experiments.trials import PAPER_PAIR, ScanVariant, pair_trials, trial
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import SegslamError, Trajectory
@@ -119,7 +112,7 @@ def test_a_scan_that_is_missing_is_named() -> None:
 def test_the_truth_of_a_turned_source_carries_its_points_where_they_were() -> None:
     points = np.random.default_rng(0).normal(size=(50, 3)) * 10
     reference = drive()
-    turned = turned_trials(PAPER_PAIR, reference, step_deg=30)
+    turned = pair_trials(PAPER_PAIR, reference, step_deg=30)
     assert len(turned) == 12
     assert len({one.key for one in turned}) == 12
     for one in turned:
@@ -135,8 +128,8 @@ def test_labels_are_removed_in_the_given_share_independently_at_each_draw() -> N
     np.testing.assert_array_equal(lost[0], lost[1])
     assert (lost[0] != lost[2]).mean() > 0.3
     kinds = {"lost_percent": [10.0, 90.0], "num_draws": 3, "seed": 1}
-    both = unlabelled_trials(PAPER_PAIR, drive(), **kinds, both=True)
-    one = unlabelled_trials(PAPER_PAIR, drive(), **kinds, both=False)
+    both = pair_trials(PAPER_PAIR, drive(), **kinds, both=True)
+    one = pair_trials(PAPER_PAIR, drive(), **kinds, both=False)
     assert len(both) == len(one) == 6
     assert {t.target.lost for t in both} == {0.1, 0.9}
     assert {t.target for t in one} == {ScanVariant(10)}

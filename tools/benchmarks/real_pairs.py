@@ -10,7 +10,7 @@ from segslam.bench.experiments import benchmark
 from segslam.bench.experiments.job import Job
 from segslam.bench.experiments.pairs import PairList, read_pairs
 from segslam.bench.experiments.rows import Row
-from segslam.bench.experiments.trials import Trial, turned_trials
+from segslam.bench.experiments.trials import Trial, pair_trials
 from segslam.core.config import Config
 from segslam.scans import DataSource
 
@@ -43,5 +43,5 @@ def register(source: DataSource, trials: Sequence[Trial], methods: Sequence[str]
 
 def register_turned(data: Path, pairs: PairList, labels: str, config: Config, *, num_yaws: int) -> list[Row]:
     """Pairs of KITTI 00, the source turned by each yaw of a full circle, coarse and refined."""
-    trials = turned_trials(pairs, None, step_deg=360.0 / num_yaws)
+    trials = pair_trials(pairs, None, step_deg=360.0 / num_yaws)
     return register(kitti(data, labels), trials, (COARSE, REFINED), config)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -66,40 +65,31 @@ def trial(pairs: str, source: ScanVariant, target: ScanVariant, T_target_source:
     return Trial(pairs, source, target, T_true)
 
 
-def pair_trials(pairs: PairList, reference: Trajectory | None) -> list[Trial]:
-    """One trial per pair of unchanged scans. Raises SegslamError for a pair without known true pose."""
-    return [
-        trial(pairs.name, ScanVariant(source), ScanVariant(target), T_target_source)
-        for (source, target), T_target_source in true_poses(pairs, reference).items()
-    ]
-
-
-def turned_trials(pairs: PairList, reference: Trajectory | None, *, step_deg: float) -> list[Trial]:
-    """Each pair with the source rotated about z in steps. Raises SegslamError as `pair_trials`."""
-    return [
-        trial(pairs.name, ScanVariant(source, yaw_deg=float(yaw_deg)), ScanVariant(target), T_target_source)
-        for (source, target), T_target_source in true_poses(pairs, reference).items()
-        for yaw_deg in np.arange(0.0, 360.0, step_deg)
-    ]
-
-
-def unlabelled_trials(
+def pair_trials(
     pairs: PairList,
     reference: Trajectory | None,
     *,
-    lost_percent: Sequence[float],
-    num_draws: int,
-    seed: int,
-    both: bool,
+    step_deg: float = 360.0,
+    lost_percent: Sequence[float] = (0.0,),
+    num_draws: int = 1,
+    seed: int = 0,
+    both: bool = False,
 ) -> list[Trial]:
-    """Each pair with a random share of its labels removed, from both scans or from the source; a new draw per trial.
+    """The trials of each pair; by default one, of the unchanged scans.
 
-    Raises SegslamError as `pair_trials`.
+    The source is rotated about z in steps of `step_deg`. Each of the shares `lost_percent` of its labels is removed
+    `num_draws` times at random, with `both` also from the target. Raises SegslamError for a pair without known true
+    pose.
     """
-    trials = []
-    for ((source, target), T_target_source), percent in product(true_poses(pairs, reference).items(), lost_percent):
-        for draw in range(seed * num_draws, (seed + 1) * num_draws):
-            reduced = [ScanVariant(index, lost=percent / 100, draw=draw) for index in (source, target)]
-            kept = reduced[1] if both else ScanVariant(target)
-            trials.append(trial(pairs.name, reduced[0], kept, T_target_source))
-    return trials
+    return [
+        trial(
+            pairs.name,
+            ScanVariant(source, float(yaw_deg), percent / 100, draw),
+            ScanVariant(target, lost=percent / 100, draw=draw) if both else ScanVariant(target),
+            T_target_source,
+        )
+        for (source, target), T_target_source in true_poses(pairs, reference).items()
+        for yaw_deg in np.arange(0.0, 360.0, step_deg)
+        for percent in lost_percent
+        for draw in range(seed * num_draws, (seed + 1) * num_draws)
+    ]

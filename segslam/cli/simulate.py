@@ -141,8 +141,7 @@ def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]
     from segslam.bench.experiments.pairs import read_pairs, sample_pairs, scans_named
     from segslam.core.types import SegslamError
 
-    lists = [read_pairs(file) for file in files]
-    only = scans_named(lists if sample is None else [sample_pairs(one, num_pairs=sample, seed=0) for one in lists])
+    only = scans_named([sample_pairs(read_pairs(file), num_pairs=sample, seed=0) for file in files])
     if max(only) >= num_scans:
         raise SegslamError(
             f"--pairs: the list contains scan {max(only)}, but the drive has {num_scans}; use the list of this drive"

@@ -40,7 +40,10 @@ def read_pairs(file: Path) -> PairList:
         raise SegslamError(
             f"{unreadable(file, 'pairs', error)}; give a file with `source target` on each line"
         ) from error
-    return _from_json(file, text) if file.suffix == ".json" else _from_text(file, text)
+    pairs = _from_json(file, text) if file.suffix == ".json" else _from_text(file, text)
+    if len(pairs.pairs) == 0:
+        raise SegslamError(f"{file}: contains no pairs; write `source target` on each line")
+    return pairs
 
 
 def cut_pairs(reference: Trajectory, *, name: str, min_m: float, max_m: float, min_gap: int = MIN_GAP) -> PairList:
@@ -56,9 +59,9 @@ def cut_pairs(reference: Trajectory, *, name: str, min_m: float, max_m: float, m
     return PairList(name, pairs, len(pairs))
 
 
-def sample_pairs(whole: PairList, *, num_pairs: int, seed: int) -> PairList:
-    """A random sample of `num_pairs` pairs, in the order of the list; the whole list if it is not longer."""
-    if num_pairs >= len(whole.pairs):
+def sample_pairs(whole: PairList, *, num_pairs: int | None, seed: int) -> PairList:
+    """A random sample of `num_pairs` pairs, in the order of the list; the whole list if it is not longer, or for None."""
+    if num_pairs is None or num_pairs >= len(whole.pairs):
         return whole
     rows = np.random.default_rng(seed).choice(len(whole.pairs), num_pairs, replace=False)
     return replace(whole, pairs=whole.pairs[np.sort(rows)])
@@ -99,25 +102,20 @@ def _from_text(file: Path, text: str) -> PairList:
         if len(words) < 2 or not all(word.isdecimal() for word in words[:2]):
             raise SegslamError(f"{file}:{number}: expected two scan numbers, source and target, found {line.strip()!r}")
         pairs.append((int(words[0]), int(words[1])))
-    return _checked(file, PairList(file.stem, np.array(pairs, dtype=int).reshape(-1, 2), len(pairs)))
+    return PairList(file.stem, np.array(pairs, dtype=int).reshape(-1, 2), len(pairs))
 
 
 def _from_json(file: Path, text: str) -> PairList:
     try:
-        truth = {(int(row["source"]), int(row["target"])): _rigid(row["T_target_source"]) for row in json.loads(text)}
+        truth = {
+            (int(row["source"]), int(row["target"])): geometry.nearest_transform(
+                np.array(row["T_target_source"], dtype=float).reshape(4, 4)
+            )
+            for row in json.loads(text)
+        }
     except (ValueError, KeyError, TypeError) as error:
         raise SegslamError(
             f"{file}: expected a list of objects with source, target and T_target_source (4x4): {error}"
         ) from error
     pairs = np.array(list(truth), dtype=int).reshape(-1, 2)
-    return _checked(file, PairList(file.stem, pairs, len(pairs), truth))
-
-
-def _rigid(rows: object) -> Transform:
-    return geometry.nearest_transform(np.array(rows, dtype=float).reshape(4, 4))
-
-
-def _checked(file: Path, pairs: PairList) -> PairList:
-    if len(pairs.pairs) == 0:
-        raise SegslamError(f"{file}: contains no pairs; write `source target` on each line")
-    return pairs
+    return PairList(file.stem, pairs, len(pairs), truth)

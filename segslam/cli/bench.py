@@ -257,22 +257,19 @@ def _read_lists(
         lists = [default]
     else:
         raise SegslamError("--pairs: give a list of pairs, or make one from the true poses with --min-m and --max-m")
-    if options.sample is None:
-        return lists
     return [sample_pairs(one, num_pairs=options.sample, seed=options.seed) for one in lists]
 
 
 def _run_trials(job: "Job", trials: list["Trial"], options: Options, terminal: Terminal) -> list["Row"]:
     """All rows in the order of the trials. After Ctrl-C, finished rows remain in the folder of `--out`."""
-    from segslam.bench.experiments.benchmark import Pool, in_order, run
+    from segslam.bench.experiments.benchmark import in_order, run
     from segslam.bench.experiments.rows import write_rows
 
     terminal.compile_kernels()
     rows: list[Row] = []
-    pool = Pool(options.workers, options.scheduler)
     kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
     when_stopped(f"the finished registrations {kept}")
-    work = run(job, trials, pool=pool, folder=options.out)
+    work = run(job, trials, workers=options.workers, scheduler=options.scheduler, folder=options.out)
     try:
         for some in terminal.progress(work, len(trials), "bench"):
             rows += some

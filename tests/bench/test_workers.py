@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.drives import round_drive, write_kitti_sequence
 
-from segslam.bench.experiments.benchmark import Pool, in_order, run
+from segslam.bench.experiments.benchmark import in_order, run
 from segslam.bench.experiments.job import Job
 from segslam.bench.experiments.pairs import PairList, cut_pairs
 from segslam.bench.experiments.rows import Row, read_rows
@@ -56,7 +56,7 @@ def test_a_worker_that_is_killed_changes_nothing_in_the_table(
 ) -> None:
     """The cluster is one that was there before, found by its address."""
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        work = run(job, trials, pool=Pool(scheduler=cluster.scheduler_address), folder=tmp_path)
+        work = run(job, trials, scheduler=cluster.scheduler_address, folder=tmp_path)
         rows = list(next(work))
         with distributed.Client(cluster) as client:
             victim = worker_pids(client)[0]
@@ -71,7 +71,7 @@ def test_a_worker_that_is_killed_changes_nothing_in_the_table(
 @pytest.mark.slow
 def test_a_missing_cluster_is_reported(job: Job, trials: list[Trial]) -> None:
     with pytest.raises(SegslamError, match="no answer"):
-        next(run(job, trials, pool=Pool(scheduler="tcp://127.0.0.1:9")))
+        next(run(job, trials, scheduler="tcp://127.0.0.1:9"))
 
 
 def test_without_dask_the_message_has_the_install_command(
@@ -79,4 +79,4 @@ def test_without_dask_the_message_has_the_install_command(
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)  # as if it were not installed
     with pytest.raises(SegslamError, match=r"pip install 'dask>.*' 'distributed>"):
-        next(run(job, trials, pool=Pool(workers=2)))
+        next(run(job, trials, workers=2))

@@ -4,15 +4,13 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from segslam.bench.experiments.job import LOST_WORKER, Job, failed_row, register_trial, shared_scan
-from segslam.bench.experiments.rows import Row, RowFile, read_rows
+from segslam.bench.experiments.rows import Row, append_rows, read_rows, write_rows
 from segslam.bench.experiments.summary import grouped
 from segslam.bench.experiments.trials import ScanVariant, Trial
 from segslam.core.errors import reason
@@ -28,29 +26,30 @@ PAIRS_AHEAD = 8
 """Pairs submitted per worker: enough that no worker idles, few enough that their scans fit in memory."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pool:
-    """The workers: this process, several processes of this machine, or a Dask cluster."""
-
-    workers: int = 1
-    scheduler: str | None = None
-
-
-def run(job: Job, trials: Sequence[Trial], *, pool: Pool = Pool(), folder: Path | None = None) -> Iterator[list[Row]]:
+def run(
+    job: Job,
+    trials: Sequence[Trial],
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    folder: Path | None = None,
+) -> Iterator[list[Row]]:
     """Yields the rows of each trial when it is finished, starting with those already in the folder.
 
+    One worker is this process, several are processes of this machine, those of a scheduler a Dask cluster.
     With a folder, the rows of a trial are on the disk before the next trial is yielded. The same benchmark in the same
     folder continues where it stopped; raises SegslamError if the folder contains another benchmark.
     """
     done = _rows_before(folder, job, trials) if folder else []
     tried = grouped(done, lambda row: row.key[:3])
     left = [trial for trial in trials if trial.key not in tried]
-    with RowFile(folder / ROWS_FILE, done) if folder else nullcontext() as file:
-        yield from tried.values()
-        for rows in _work(job, left, pool):
-            if file is not None:
-                file.write(rows)
-            yield rows
+    if folder:
+        write_rows(folder / ROWS_FILE, done)
+    yield from tried.values()
+    for rows in _work(job, left, workers, scheduler):
+        if folder:
+            append_rows(folder / ROWS_FILE, rows)
+        yield rows
 
 
 def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row]:
@@ -59,13 +58,13 @@ def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row
     return sorted(rows, key=lambda row: (place[row.key[:3]], job.methods.index(row.method)))
 
 
-def _work(job: Job, trials: Sequence[Trial], pool: Pool) -> Iterator[list[Row]]:
-    if pool.workers == 1 and pool.scheduler is None:
+def _work(job: Job, trials: Sequence[Trial], workers: int, scheduler: str | None) -> Iterator[list[Row]]:
+    if workers == 1 and scheduler is None:
         prepared = lru_cache(NUM_SCANS_KEPT)(partial(shared_scan, job))
         for trial in trials:
             yield register_trial(job, trial, prepared(trial.source), prepared(trial.target))
     elif trials:
-        with cluster(workers=pool.workers, scheduler=pool.scheduler) as client:
+        with cluster(workers=workers, scheduler=scheduler) as client:
             yield from _run_on(client, job, trials)
 
 

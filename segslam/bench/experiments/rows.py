@@ -3,7 +3,7 @@
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TextIO
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
@@ -79,45 +79,28 @@ class Row(BaseModel):
 COLUMNS = [*Row.model_fields, "success"]
 
 
-def _cells(row: Row) -> dict[str, object]:
-    return row.model_dump() | {"success": row.success}
-
-
-class RowFile:
-    """A CSV file of rows; a context manager. All rows of one call are on the disk before the call returns.
-
-    The previous content of the file remains until the first rows are written. Raises WorkFailed on a write error.
-    """
-
-    def __init__(self, file: Path, rows: Sequence[Row]) -> None:
-        write_rows(file, rows)
-        self._file, self._stream = file, file.open("a", newline="", encoding="utf-8")
-
-    def __enter__(self) -> "RowFile":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stream.close()
-
-    def write(self, rows: Sequence[Row]) -> None:
-        """Append rows."""
-        try:
-            csv.DictWriter(self._stream, COLUMNS).writerows(_cells(row) for row in rows)
-            self._stream.flush()
-        except OSError as error:
-            raise cannot_write(self._file, error) from error
-
-
 def write_rows(file: Path, rows: Sequence[Row]) -> None:
     """Write a file with these rows. Raises SegslamError if it cannot be written."""
     with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
-        table = csv.DictWriter(stream, COLUMNS)
-        table.writeheader()
-        table.writerows(_cells(row) for row in rows)
+        csv.writer(stream).writerow(COLUMNS)
+        _write(stream, rows)
+
+
+def append_rows(file: Path, rows: Sequence[Row]) -> None:
+    """Append rows to a file; they are on the disk when this returns. Raises WorkFailed on a write error."""
+    try:
+        with file.open("a", newline="", encoding="utf-8") as stream:
+            _write(stream, rows)
+    except OSError as error:
+        raise cannot_write(file, error) from error
+
+
+def _write(stream: TextIO, rows: Sequence[Row]) -> None:
+    csv.DictWriter(stream, COLUMNS).writerows(row.model_dump() | {"success": row.success} for row in rows)
 
 
 def read_rows(file: Path) -> list[Row]:
-    """The rows of a file written by `RowFile`. An incomplete last line is ignored.
+    """The rows of a file with rows. An incomplete last line is ignored.
 
     Raises SegslamError, naming the line, for an invalid row.
     """

@@ -60,7 +60,7 @@ def cut_pairs(reference: Trajectory, *, name: str, min_m: float, max_m: float, m
 
 
 def sample_pairs(whole: PairList, *, num_pairs: int | None, seed: int) -> PairList:
-    """A random sample of `num_pairs` pairs, in the order of the list; the whole list if it is not longer, or for None."""
+    """A random sample of `num_pairs` pairs, in the order of the list; all if there are not more, or for None."""
     if num_pairs is None or num_pairs >= len(whole.pairs):
         return whole
     rows = np.random.default_rng(seed).choice(len(whole.pairs), num_pairs, replace=False)

@@ -22,7 +22,7 @@ SOURCE, TARGET = 1, 0
 
 def installed(name: str) -> str:
     if METHODS[name].package is not None:
-        pytest.importorskip(METHODS[name].package[0])
+        pytest.importorskip(METHODS[name].package)
     return name
 
 

@@ -36,8 +36,8 @@ class Method:
 
     parts: tuple[str, ...]
     align: Callable[[Values, Values, Config, Stopwatch], Estimate | Rejected]
-    package: tuple[str, str] | None = None
-    """Module and extra, if the package is optional or slow to import."""
+    package: str | None = None
+    """Module of the extra `bench`, if the package is optional or slow to import."""
 
 
 class SurfaceScan:
@@ -63,17 +63,12 @@ def _description(method: str) -> Callable[[Points, Labels, Config], Description]
     )
 
 
-def _open3d(name: str) -> Callable[..., Any]:
-    """A function of `open3d_methods`, imported on the first call."""
-    return lambda *scans: getattr(importlib.import_module("segslam.bench.experiments.open3d_methods"), name)(*scans)
-
-
 PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
     "description": _description("segregator"),
     "fpfh_description": _description("teaser"),
     "surface": _surface,
     "gicp": lambda points, *_: baselines.prepare_gicp(points),
-    "fpfh": lambda points, *_: _open3d("prepare_fpfh")(points),
+    "fpfh": lambda points, *_: baselines.prepare_fpfh(points),
     "points": lambda points, *_: points.astype("float32"),
 }
 """The parts by name, from points, labels and configuration."""
@@ -94,11 +89,10 @@ def find_method(name: str) -> Method:
     check_method(name)
     method = METHODS[name]
     if method.package is not None:
-        module, extra = method.package
         try:
-            importlib.import_module(module)
+            importlib.import_module(method.package)
         except ImportError as error:
-            raise SegslamError(f"--method {name}: needs {module}: {how_to_install(extra)}") from error
+            raise SegslamError(f"--method {name}: needs {method.package}: {how_to_install('bench')}") from error
     return method
 
 
@@ -129,9 +123,7 @@ def _estimate(coarse: Registration, fine: Registration) -> Estimate:
     return Estimate(fine.T_target_source, coarse.num_correspondences, coarse.num_inliers, coarse.num_edges)
 
 
-def _baseline(
-    part: str, align: Callable[[Any, Any], Estimate | Rejected], package: tuple[str, str] | None = None
-) -> Method:
+def _baseline(part: str, align: Callable[[Any, Any], Estimate | Rejected], package: str | None = None) -> Method:
     def run(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:
         with watch("match"):
             return align(source[part], target[part])
@@ -147,7 +139,7 @@ METHODS: dict[str, Method] = {
     "quatro": _segregator("quatro", "fpfh_description"),
     "vgicp": _baseline("gicp", baselines.align_vgicp),
     "gicp": _baseline("gicp", baselines.align_gicp),
-    "kiss-matcher": _baseline("points", baselines.align_kiss_matcher, ("kiss_matcher", "bench")),
-    "ransac": _baseline("fpfh", _open3d("align_ransac"), ("open3d", "bench")),
-    "fgr": _baseline("fpfh", _open3d("align_fgr"), ("open3d", "bench")),
+    "kiss-matcher": _baseline("points", baselines.align_kiss_matcher, "kiss_matcher"),
+    "ransac": _baseline("fpfh", baselines.align_ransac, "open3d"),
+    "fgr": _baseline("fpfh", baselines.align_fgr, "open3d"),
 }

@@ -20,24 +20,13 @@ SUCCESS_PERCENT = {
 }  # fmt: skip
 """Success rate (error below 2 m and 5 degrees) on those lists."""
 TIMING_SEQUENCE = "06"
+TIMING_KEYS = ("success_percent", "translation_m", "rotation_deg", "mean_ms", "mean_edges")
 TIMING = {
-    "vgicp": {"success_percent": 55.4, "translation_m": 0.07, "rotation_deg": 0.10, "mean_ms": 90.0},
-    "teaser": {
-        "success_percent": 89.0,
-        "translation_m": 0.36,
-        "rotation_deg": 0.67,
-        "mean_ms": 150.0,
-        "mean_edges": 3025.0,
-    },
-    "quatro": {"success_percent": 89.0, "translation_m": 0.36, "rotation_deg": 0.66, "mean_ms": 150.0},
-    "segregator": {
-        "success_percent": 99.0,
-        "translation_m": 0.09,
-        "rotation_deg": 0.27,
-        "mean_ms": 100.0,
-        "mean_edges": 2687.0,
-    },
-    "segregator-c2f": {"success_percent": 99.0, "translation_m": 0.07, "rotation_deg": 0.12, "mean_ms": 150.0},
+    "vgicp": (55.4, 0.07, 0.10, 90.0),
+    "teaser": (89.0, 0.36, 0.67, 150.0, 3025.0),
+    "quatro": (89.0, 0.36, 0.66, 150.0),
+    "segregator": (99.0, 0.09, 0.27, 100.0, 2687.0),
+    "segregator-c2f": (99.0, 0.07, 0.12, 150.0),
 }
 """Values over all three lists of 06; `mean_edges` is the paper's average inlier count, AIC."""
 DETERIORATION = {10: (0.09, 0.20), 30: (0.04, 0.22), 50: (0.31, 0.21), 70: (0.06, 1.70), 90: (0.27, 1.70)}
@@ -46,13 +35,11 @@ DETERIORATION = {10: (0.09, 0.20), 30: (0.04, 0.22), 50: (0.31, 0.21), 70: (0.06
 
 def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
     """The paper's value for a list of this name (kittiSS_LOtoHI) and number of pairs; None if the paper has none."""
-    name, _, band = pairs.removeprefix("kitti").partition("_")
-    if not pairs.startswith("kitti") or name not in SEQUENCES or band not in LISTS.values():
-        return None
-    row, place = SEQUENCES.index(name), list(LISTS.values()).index(band)
-    if NUM_PAIRS[row][place] != num_pairs or method not in SUCCESS_PERCENT:
-        return None
-    return SUCCESS_PERCENT[method][row][place]
+    for sequence, counts, row in zip(SEQUENCES, NUM_PAIRS, SUCCESS_PERCENT.get(method, ()), strict=False):
+        for band, count, value in zip(LISTS.values(), counts, row, strict=True):
+            if (f"kitti{sequence}_{band}", count) == (pairs, num_pairs):
+                return value
+    return None
 
 
 def with_paper_values(
@@ -64,26 +51,22 @@ def with_paper_values(
     errors if the pair is scans 0 and 10 of 05. The comparison also applies to lists that were sampled.
     """
     whole = {one.name: one.num_whole for one in lists}
-    all_lists = {
-        f"kitti{TIMING_SEQUENCE}_{band}": number
-        for band, number in zip(LISTS.values(), NUM_PAIRS[SEQUENCES.index(TIMING_SEQUENCE)], strict=True)
-    }
+    numbers = zip(LISTS.values(), NUM_PAIRS[SEQUENCES.index(TIMING_SEQUENCE)], strict=True)
+    all_lists = {f"kitti{TIMING_SEQUENCE}_{band}": number for band, number in numbers}
     is_paper_pair = len(lists) == 1 and lists[0].pairs.tolist() == [[0, 10]]
-    timed = experiment == "timing" and sequence.zfill(2) == TIMING_SEQUENCE and whole == all_lists
-    reduced = experiment == "deterioration" and sequence.zfill(2) == "05" and is_paper_pair
+    timing = TIMING if (experiment, sequence.zfill(2), whole) == ("timing", TIMING_SEQUENCE, all_lists) else {}
+    reduced = is_paper_pair and (experiment, sequence.zfill(2)) == ("deterioration", "05")
+
+    def paper_of(method: str, one: dict[str, Any]) -> dict[str, Any]:
+        """`paper` for one value of the varied quantity, or an empty mapping."""
+        if reduced and method == "segregator" and one["lost_percent"] in DETERIORATION:
+            return {"paper": dict(zip(TIMING_KEYS[1:], DETERIORATION[one["lost_percent"]], strict=False))}
+        value = success_percent(method, one["list"], whole[one["list"]]) if "list" in one else None
+        return {} if value is None else {"paper": {"success_percent": value}}
+
     return {
         method: own
-        | ({"paper": TIMING[method]} if timed and method in TIMING else {})
-        | {"by": [one | _paper_of(method, one, whole, reduced=reduced) for one in own["by"]]}
+        | ({"paper": dict(zip(TIMING_KEYS, timing[method], strict=False))} if method in timing else {})
+        | {"by": [one | paper_of(method, one) for one in own["by"]]}
         for method, own in results.items()
     }
-
-
-def _paper_of(method: str, one: dict[str, Any], whole: dict[str, int], *, reduced: bool) -> dict[str, Any]:
-    """`paper` for one value of the varied quantity, or an empty mapping."""
-    if reduced and method == "segregator" and one["lost_percent"] in DETERIORATION:
-        return {"paper": dict(zip(("translation_m", "rotation_deg"), DETERIORATION[one["lost_percent"]], strict=True))}
-    if "list" not in one:
-        return {}
-    value = success_percent(method, one["list"], whole[one["list"]])
-    return {} if value is None else {"paper": {"success_percent": value}}

@@ -180,19 +180,17 @@ def places(
 
     Example: segslam bench places kitti_00.npz --database 0:3000 --queries 3200:
     """
-    from segslam.bench.experiments.places import PlacesBench, parse_range, read_places
+    from segslam.bench.experiments.places import measure, parse_range, read_places
 
     terminal.announce(f"bench places: reading {file}")
     seen = read_places(file)
-    bench = PlacesBench(
+    figures = measure(
         seen,
         parse_range(database, "--database", len(seen)),
         parse_range(queries, "--queries", len(seen)),
         turned_seed=seed if turned else None,
+        progress=terminal.progress,
     )
-    for _ in terminal.progress(bench.run(), bench.num_steps, "bench places"):
-        pass
-    figures = bench.figures()
     terminal.answer(
         figures,
         f"{figures['num_queries']} queries of {figures['num_places']} places: recall@1 {figures['recall_at_1']:.3f}, "

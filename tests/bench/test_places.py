@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.commands import run
 
-from segslam.bench.experiments.places import PlacesBench, parse_range, read_places
+from segslam.bench.experiments.places import measure, parse_range, read_places
 from segslam.core.types import SegslamError
 
 
@@ -24,9 +24,7 @@ def write_places(file: Path, num: int = 8) -> Path:
 @pytest.mark.parametrize("turned_seed", [None, 0])
 def test_places_seen_again_are_recognised(tmp_path: Path, turned_seed: int | None) -> None:
     places = read_places(write_places(tmp_path / "places.npz"))
-    bench = PlacesBench(places, range(8), range(8, 16), turned_seed=turned_seed)
-    assert len(list(bench.run())) == bench.num_steps == 16
-    figures = bench.figures()
+    figures = measure(places, range(8), range(8, 16), turned_seed=turned_seed)
     assert figures["num_queries"] == 8
     assert figures["recall_at_1"] == 1.0
     assert figures["index_bytes"] <= 3000
@@ -34,13 +32,9 @@ def test_places_seen_again_are_recognised(tmp_path: Path, turned_seed: int | Non
 
 def test_queries_without_a_place_do_not_count(tmp_path: Path) -> None:
     places = read_places(write_places(tmp_path / "places.npz"))
-    bench = PlacesBench(places, range(4), range(8, 16), turned_seed=None)
-    list(bench.run())
-    assert bench.figures()["num_queries"] == 4
-    none = PlacesBench(places, range(4), range(12, 16), turned_seed=None)
-    list(none.run())
+    assert measure(places, range(4), range(8, 16))["num_queries"] == 4
     with pytest.raises(SegslamError, match="no query"):
-        none.figures()
+        measure(places, range(4), range(12, 16))
 
 
 def test_columns_become_a_point_a_voxel(tmp_path: Path) -> None:
@@ -78,9 +72,7 @@ def test_a_file_without_places_is_refused_by_name(tmp_path: Path) -> None:
 def test_real_places_are_recognised_as_measured(
     data_dir: Path, name: str, database: range, queries: range, least: float, turned_seed: int | None
 ) -> None:
-    bench = PlacesBench(read_places(data_dir / "places" / f"{name}.npz"), database, queries, turned_seed=turned_seed)
-    list(bench.run())
-    figures = bench.figures()
+    figures = measure(read_places(data_dir / "places" / f"{name}.npz"), database, queries, turned_seed=turned_seed)
     assert figures["recall_at_1"] >= least  # 0.993 to 0.999
     assert figures["recall_at_20"] >= 0.995
 

@@ -1,7 +1,6 @@
 """Benchmark of place recognition: how often a query finds its place in a database of scans, in top view."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -14,6 +13,7 @@ from segslam.candidates import Places, signature_of_standing
 from segslam.core import geometry
 from segslam.core.errors import unreadable
 from segslam.core.types import Points, SegslamError
+from segslam.slam.adjustment import Progress, no_progress
 
 CELL_M = 0.4
 """Size of a cell of the columns, and height of its voxels."""
@@ -69,55 +69,45 @@ def parse_range(text: str, option: str, num_places: int) -> range:
     return rows
 
 
-class PlacesBench:
-    """Scores queries from one range of places against a database of another range."""
+def measure(
+    places: SeenPlaces,
+    database: range,
+    queries: range,
+    *,
+    turned_seed: int | None = None,
+    progress: Progress = no_progress,
+) -> dict[str, float]:
+    """Recall of the queries, median time of a query, bytes per place of the database.
 
-    def __init__(self, places: SeenPlaces, database: range, queries: range, *, turned_seed: int | None) -> None:
-        """`turned_seed`: seed of random yaws of the queries; None for no rotation."""
-        self._places, self._database, self._queries = places, database, queries
-        self._yaws = (
-            np.zeros(len(queries))
-            if turned_seed is None
-            else np.random.default_rng(turned_seed).uniform(0.0, math.tau, len(queries))
-        )
-        self._index = Places()
-        self._ranks: list[int | None] = []
-        self._query_seconds: list[float] = []
-
-    @property
-    def num_steps(self) -> int:
-        """Number of steps of `run`."""
-        return len(self._database) + len(self._queries)
-
-    def run(self) -> Iterator[None]:
-        """Fill the database, then query each place that is within 5 m of one in the database, step by step."""
-        for row in self._database:
-            self._index.add(row, signature_of_standing(self._places.points(row)))
-            yield
-        at = self._places.T_world_lidar[:, :, 3]
-        database_at = at[list(self._database)]
-        for row, yaw_rad in zip(self._queries, self._yaws.tolist(), strict=True):
-            if np.linalg.norm(database_at - at[row], axis=1).min() <= HIT_M:
-                signature = signature_of_standing(self._places.points(row, yaw_rad=yaw_rad))
-                started = perf_counter()
-                listed = self._index.shortlist(signature, most=SHORTLIST)
-                self._query_seconds.append(perf_counter() - started)
-                hits = (k for k, one in enumerate(listed) if np.linalg.norm(at[one.place_id] - at[row]) <= HIT_M)
-                self._ranks.append(next(hits, None))
-            yield
-
-    def figures(self) -> dict[str, float]:
-        """Recall of the scored queries, median time of a query, bytes per place.
-
-        Raises SegslamError if no query is within 5 m of a place in the database.
-        """
-        if not self._ranks:
-            raise SegslamError(f"no query is within {HIT_M:g} m of a place in the database; give other rows")
-        return {
-            "num_places": len(self._database),
-            "num_queries": len(self._ranks),
-            "recall_at_1": float(np.mean([rank == 0 for rank in self._ranks])),
-            "recall_at_20": float(np.mean([rank is not None for rank in self._ranks])),
-            "query_ms": 1000 * float(np.median(self._query_seconds)),
-            "index_bytes": self._index.bytes_per_place,
-        }
+    A query counts if it is within 5 m of a place in the database; it is a hit if the found place is. `turned_seed`:
+    seed of random yaws of the queries; None for no rotation. Raises SegslamError if no query counts.
+    """
+    index = Places()
+    ranks: list[int | None] = []
+    query_s: list[float] = []
+    at = places.T_world_lidar[:, :, 3]
+    database_at = at[list(database)]
+    rng = None if turned_seed is None else np.random.default_rng(turned_seed)
+    yaws = np.zeros(len(queries)) if rng is None else rng.uniform(0.0, math.tau, len(queries))
+    yaw_of = dict(zip(queries, yaws.tolist(), strict=True))
+    steps = [(row, False) for row in database] + [(row, True) for row in queries]
+    for row, is_query in progress(steps, len(steps), "bench places"):
+        if not is_query:
+            index.add(row, signature_of_standing(places.points(row)))
+        elif np.linalg.norm(database_at - at[row], axis=1).min() <= HIT_M:
+            signature = signature_of_standing(places.points(row, yaw_rad=yaw_of[row]))
+            started = perf_counter()
+            listed = index.shortlist(signature, most=SHORTLIST)
+            query_s.append(perf_counter() - started)
+            hits = (k for k, one in enumerate(listed) if np.linalg.norm(at[one.place_id] - at[row]) <= HIT_M)
+            ranks.append(next(hits, None))
+    if not ranks:
+        raise SegslamError(f"no query is within {HIT_M:g} m of a place in the database; give other rows")
+    return {
+        "num_places": len(database),
+        "num_queries": len(ranks),
+        "recall_at_1": float(np.mean([rank == 0 for rank in ranks])),
+        "recall_at_20": float(np.mean([rank is not None for rank in ranks])),
+        "query_ms": 1000 * float(np.median(query_s)),
+        "index_bytes": index.bytes_per_place,
+    }

@@ -17,18 +17,6 @@ from segslam.output.log.schema import processor
 PACKAGES = ("segslam", "numpy", "scipy", "numba", "open3d", "small-gicp", "kiss-matcher", "dask", "distributed")
 
 
-def conditions(job: Job) -> dict[str, Any]:
-    """The conditions needed to judge or to repeat the measurement."""
-    return {
-        "machine": machine(),
-        "commit": commit(),
-        "packages": {name: found for name in PACKAGES if (found := installed_version(name))},
-        "methods": list(job.methods),
-        "labels": Path(job.source.labels).name,
-        "settings": job.config.model_dump(mode="json"),
-    }
-
-
 def machine() -> dict[str, Any]:
     """Processor, cores, system, and the load average over 15 minutes (1: one busy core)."""
     return {
@@ -56,16 +44,6 @@ def commit() -> str | None:
     return found.stdout.strip()
 
 
-def simulation_of(job: Job) -> dict[str, Any] | None:
-    """Seed and settings of the simulator that made the scans; None if they are real."""
-    data = job.source.data
-    for folder in (data, data / "sequences" / job.source.sequence.zfill(2)):
-        file = folder / SETTINGS_FILE
-        if file.is_file():
-            return json.loads(file.read_text(encoding="utf-8"))
-    return None
-
-
 def _system() -> str:
     """Name of the distribution on Linux."""
     try:
@@ -78,28 +56,34 @@ def account(
     experiment: str, job: Job, lists: Sequence[PairList], results: dict[str, Any], *, options: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Content of `report.json`: what was measured, under which conditions, and the results."""
-    simulation = simulation_of(job)
-    sampled = [one for one in lists if len(one.pairs) < one.num_whole]
+    simulation = _simulation(job)
     return {
         "experiment": experiment,
         "data": f"{job.source.dataset or 'kitti'} {job.source.sequence}",
         "simulation": simulation,
         "lists": [{"name": one.name, "pairs": len(one.pairs), "of": one.num_whole} for one in lists],
-        "notes": [*_notes(simulation, sampled, lists), *TIME_NOTES],
+        "notes": _notes(simulation, lists),
         "options": dict(options),
-        **conditions(job),
+        "machine": machine(),
+        "commit": commit(),
+        "packages": {name: found for name in PACKAGES if (found := installed_version(name))},
+        "methods": list(job.methods),
+        "labels": Path(job.source.labels).name,
+        "settings": job.config.model_dump(mode="json"),
         "results": results,
     }
 
 
-TIME_NOTES = (
-    "Success: error of T_estimate inv(T_true) below 2 m and 5 degrees. Errors are means over successes.",
-    "Times are those of a single registration: labels by geometry if used, preparation of both scans, alignment; "
-    "reading of files is excluded. CPU time is summed over all threads; MB is the peak of additional memory.",
-)
+def _simulation(job: Job) -> dict[str, Any] | None:
+    """Seed and settings of the simulator that made the scans; None if they are real."""
+    data = job.source.data
+    for folder in (data, data / "sequences" / job.source.sequence.zfill(2)):
+        if (folder / SETTINGS_FILE).is_file():
+            return json.loads((folder / SETTINGS_FILE).read_text(encoding="utf-8"))
+    return None
 
 
-def _notes(simulation: dict[str, Any] | None, sampled: Sequence[PairList], lists: Sequence[PairList]) -> list[str]:
+def _notes(simulation: dict[str, Any] | None, lists: Sequence[PairList]) -> list[str]:
     """Notes needed to compare the results with those of the paper."""
     notes = []
     if simulation is not None:
@@ -107,9 +91,14 @@ def _notes(simulation: dict[str, Any] | None, sampled: Sequence[PairList], lists
             f"The scans were SIMULATED (seed {simulation['seed']}), at the real poses if they are KITTI's, with true "
             "labels. No result here was measured on KITTI's own scans."
         )
-    if sampled:
+    if sampled := [one for one in lists if len(one.pairs) < one.num_whole]:
         counts = ", ".join(f"{one.name} {len(one.pairs)} of {one.num_whole}" for one in sampled)
         notes.append(f"The lists were SAMPLED: {counts}.")
     if any(one.truth is None for one in lists) and simulation is None:
         notes.append("True poses are those of KITTI; they have errors of up to 1.6 m on some pairs of 00.")
-    return notes
+    return [
+        *notes,
+        "Success: error of T_estimate inv(T_true) below 2 m and 5 degrees. Errors are means over successes.",
+        "Times are those of a single registration: labels by geometry if used, preparation of both scans, alignment; "
+        "reading of files is excluded. CPU time is summed over all threads; MB is the peak of additional memory.",
+    ]

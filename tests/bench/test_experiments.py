@@ -9,7 +9,7 @@ import pytest
 
 from segslam.bench.experiments import paper, provenance
 from segslam.bench.experiments.benchmark import run
-from segslam.bench.experiments.job import Job, SharedScan
+from segslam.bench.experiments.job import Job
 from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.bench.experiments.pairs import PairList, cut_pairs, read_pairs, sample_pairs, true_poses
 from segslam.bench.experiments.rows import Row, read_rows, write_rows
@@ -212,9 +212,8 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[ScanVariant]:
     """Registrations without scans: which of them were prepared."""
     prepared: list[ScanVariant] = []
 
-    def shared_scan(job: Job, variant: ScanVariant) -> SharedScan:
+    def shared_scan(job: Job, variant: ScanVariant) -> None:
         prepared.append(variant)
-        return SharedScan({}, unusable=True)
 
     monkeypatch.setattr("segslam.bench.experiments.benchmark.shared_scan", shared_scan)
     return prepared

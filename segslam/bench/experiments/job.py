@@ -37,22 +37,24 @@ class Job:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedScan:
-    """The data of one scan that the methods share; empty if the scan cannot be used."""
+    """The data of one scan that the methods share."""
 
     parts: Mapping[str, Part]
     labelling: Cost | None = None
     """Cost of labels by geometry or network; None for labels from files."""
-    unusable: bool = False
 
 
-def shared_scan(job: Job, variant: ScanVariant) -> SharedScan:
-    """Read, rotate, label and prepare a scan, and remove some labels. Geometric labels are those of rotated points."""
+def shared_scan(job: Job, variant: ScanVariant) -> SharedScan | None:
+    """Read, rotate, label and prepare a scan, and remove some labels; None if the scan cannot be used.
+
+    Geometric labels are those of rotated points.
+    """
     dataset, row_of_scan = open_once(job.source)
     try:
         scan = dataset[row_of_scan[variant.index]]
     except BadScan as error:
         logger.warning("scan %d skipped: %s", variant.index, error)
-        return SharedScan({}, unusable=True)
+        return None
     points, labels, labelling = variant.turned(scan.points), scan.labels, None
     if callable(labels):
         with measured() as labelling:
@@ -71,9 +73,11 @@ def points_of(source: DataSource, variant: ScanVariant) -> Points:
     return variant.turned(scan.points)
 
 
-def register_trial(job: Job, trial: Trial, source: SharedScan, target: SharedScan) -> list[Row]:
+def register_trial(job: Job, trial: Trial, source: SharedScan | None, target: SharedScan | None) -> list[Row]:
     """Rows of all methods of the job for one pair, from the same prepared scans."""
-    return [_register(method, job.config, trial, source, target) for method in job.methods]
+    if source is None or target is None:
+        return [failed_row(method, trial, BAD_SCAN) for method in job.methods]
+    return [_register(method, job.config, trial, (source, target)) for method in job.methods]
 
 
 @lru_cache(maxsize=4)
@@ -83,17 +87,15 @@ def open_once(source: DataSource) -> tuple[Dataset, dict[int, int]]:
     return dataset, {int(index): row for row, index in enumerate(dataset.scan_index)}
 
 
-def _register(method: str, config: Config, trial: Trial, source: SharedScan, target: SharedScan) -> Row:
-    if source.unusable or target.unusable:
-        return failed_row(method, trial, BAD_SCAN)
-    scans = [{name: shared.parts[name] for name in METHODS[method].parts} for shared in (source, target)]
+def _register(method: str, config: Config, trial: Trial, both: tuple[SharedScan, SharedScan]) -> Row:
+    scans = [{name: shared.parts[name] for name in METHODS[method].parts} for shared in both]
     values = [{name: part.value for name, part in parts.items()} for parts in scans]
     watch = Stopwatch()
     with measured() as cost:
         outcome = METHODS[method].align(values[0], values[1], config, watch)
     costs = [part.cost for parts in scans for part in parts.values()]
     uses_labels = any(part.endswith("description") for part in METHODS[method].parts)
-    labelled = [shared.labelling for shared in (source, target) if shared.labelling and uses_labels]
+    labelled = [shared.labelling for shared in both if shared.labelling and uses_labels]
     reason = outcome.reason.value if isinstance(outcome, Rejected) else ""
     return failed_row(method, trial, reason).model_copy(
         update=_times(cost, costs, labelled, watch) | ({} if isinstance(outcome, Rejected) else _found(outcome, trial))

@@ -314,7 +314,7 @@ def _experiment(
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
     from segslam.bench.experiments.report_tables import overall, plain
-    from segslam.bench.experiments.summary import results
+    from segslam.bench.experiments.rows import results
     from segslam.bench.experiments.trials import PAPER_PAIR, pair_trials
 
     reference = open_once(job.source)[0].reference
@@ -344,7 +344,7 @@ def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes],
 def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) -> dict[str, bytes]:
     """Pictures of the worst failures, by caption."""
     from segslam.bench.experiments.job import BAD_SCAN, points_of
-    from segslam.bench.experiments.summary import worst_failures
+    from segslam.bench.experiments.rows import worst_failures
     from segslam.output.report.loops import draw_pair
 
     trial_of = {trial.key: trial for trial in trials}

@@ -9,9 +9,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from segslam.bench.experiments.job import LOST_WORKER, Job, failed_row, register_trial, shared_scan
-from segslam.bench.experiments.rows import Row, append_rows, read_rows, write_rows
-from segslam.bench.experiments.summary import grouped
+from segslam.bench.experiments.job import Job, failed_row, register_trial, shared_scan
+from segslam.bench.experiments.rows import LOST_WORKER, Row, append_rows, grouped, read_rows, write_rows
 from segslam.bench.experiments.trials import ScanVariant, Trial
 from segslam.core.errors import reason
 from segslam.core.types import SegslamError

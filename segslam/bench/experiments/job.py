@@ -22,8 +22,6 @@ logger = logging.getLogger(__name__)
 
 BAD_SCAN = "bad_scan"
 """Reject reason of a row whose scan cannot be read."""
-LOST_WORKER = "worker_lost"
-"""Reject reason of a row whose pair terminated every worker that tried it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

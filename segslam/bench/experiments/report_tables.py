@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from html import escape
 from typing import Any, NamedTuple
 
+from segslam.bench.experiments.rows import STAGES
 from segslam.output.report.page import number
 
 FIGURES = {
@@ -26,14 +27,6 @@ PAPER_FIGURES = {
     "mean_ms": "mean ms",
     "mean_edges": "edges (AIC)",
 }
-STAGES = {
-    "label_ms": "label",
-    "prepare_ms": "prepare both",
-    "match_ms": "match",
-    "refine_ms": "refine",
-    "verify_ms": "verify",
-}
-UNKNOWN = "-"
 TITLES = {"list": "list", "yaw_deg": "yaw (deg)", "lost_percent": "labels lost (%)"}
 
 
@@ -94,7 +87,7 @@ def plain(table: Table) -> str:
 
 def text(value: float | None) -> str:
     """A number as text; a dash for None."""
-    return UNKNOWN if value is None else number(value)
+    return "-" if value is None else number(value)
 
 
 def percent(value: float) -> str:

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from segslam.bench.experiments.rows import Row
-from segslam.bench.experiments.summary import figures, grouped
+from segslam.bench.experiments.rows import Row, figures, grouped
 from segslam.bench.labelling import confusion, group_scores
 from segslam.core.config import Config
 from segslam.core.types import Points

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam.bench.experiments import rows
-from segslam.bench.experiments.summary import grouped
+from segslam.bench.experiments.rows import grouped
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import PoseError

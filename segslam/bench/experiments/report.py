@@ -22,12 +22,13 @@ from segslam.output.report.page import (
     section,
     settings_not_default,
     settings_tables,
+    table,
 )
 
 COLORS = ["#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C564B", "#7F7F7F", "#1F3A93", "#BCBD22"]
-"""First those of Okabe and Ito."""
-LEAST_M, LEAST_DEG = 1e-3, 1e-3
-"""Lower limit of the logarithmic plots."""
+"""A colour for each method; first those of Okabe and Ito."""
+LEAST = 1e-3
+"""Lower limit of the logarithmic plots (m, degrees)."""
 
 
 def draw_success(results: dict[str, Any]) -> str:
@@ -38,7 +39,7 @@ def draw_success(results: dict[str, Any]) -> str:
     places = np.arange(len(lists)) * (len(results) + 1.0)
     for number, (method, own) in enumerate(results.items()):
         at = places + number
-        axes.barh(at, [one["success_percent"] for one in own["by"]], color=_color(number), label=method)
+        axes.barh(at, [one["success_percent"] for one in own["by"]], color=COLORS[number], label=method)
         for y, one in zip(at, own["by"], strict=True):
             if "paper" in one:
                 axes.plot(one["paper"]["success_percent"], y, "D", color="black", markersize=4)
@@ -74,10 +75,10 @@ def draw_along(results: dict[str, Any], by: str) -> str:
     success, metres, degrees = figure.subplots(3, 1, sharex=True)
     for place, (method, own) in enumerate(results.items()):
         x = [one[by] for one in own["by"]]
-        style: dict[str, Any] = {"color": _color(place), "marker": ".", "linewidth": 1.3}
+        style: dict[str, Any] = {"color": COLORS[place], "marker": ".", "linewidth": 1.3}
         success.plot(x, [one["success_percent"] for one in own["by"]], label=method, **style)
-        metres.plot(x, _logarithmic(own["by"], "accepted_m", LEAST_M), **style)
-        degrees.plot(x, _logarithmic(own["by"], "accepted_deg", LEAST_DEG), **style)
+        metres.plot(x, _logarithmic(own["by"], "accepted_m"), **style)
+        degrees.plot(x, _logarithmic(own["by"], "accepted_deg"), **style)
     success.set(ylabel="success (%)", ylim=(-3, 103))
     metres.set(ylabel="mean error (m)", yscale="log")
     degrees.set(ylabel="mean error (deg)", yscale="log", xlabel=TITLES[by])
@@ -87,13 +88,9 @@ def draw_along(results: dict[str, Any], by: str) -> str:
     return svg(figure, by)
 
 
-def _logarithmic(by: list[dict[str, Any]], key: str, least: float) -> list[float]:
+def _logarithmic(by: list[dict[str, Any]], key: str) -> list[float]:
     """Values for a logarithmic plot; NaN where no pose was returned."""
-    return [np.nan if one[key] is None else max(one[key], least) for one in by]
-
-
-def _color(number: int) -> str:
-    return COLORS[number % len(COLORS)]
+    return [np.nan if one[key] is None else max(one[key], LEAST) for one in by]
 
 
 def _legend(axes: Axes) -> None:
@@ -127,23 +124,23 @@ def _title(report: dict[str, Any]) -> str:
 
 def _markdown(report: dict[str, Any]) -> str:
     parts = [f"# {_title(report)}\n", "\n".join(f"- {note}" for note in report["notes"]) + "\n"]
-    parts += [markdown(table) for table in tables(report)]
+    parts += [markdown(one) for one in tables(report)]
     facts = "\n".join(f"- {name}: {value}" for name, value in _facts(report).items())
     return "\n".join([*parts, f"**Conditions**\n\n{facts}\n"])
 
 
 def _page(report: dict[str, Any], plots: Mapping[str, str], pictures: Mapping[str, bytes]) -> str:
     notes = "".join(f"<p>{escape(note)}</p>" for note in report["notes"])
-    facts = "".join(f"<tr><td>{escape(k)}</td><td>{escape(str(v))}</td></tr>" for k, v in _facts(report).items())
+    facts = table((escape(name), escape(str(value))) for name, value in _facts(report).items())
     boxes = [section("How to read this", notes)]
-    boxes += [section(table.caption, html(table)) for table in tables(report)]
+    boxes += [section(one.caption, html(one)) for one in tables(report)]
     columns = [picture_section(caption, svg) for caption, svg in plots.items()]
     columns += [picture_section(caption, png) for caption, png in pictures.items()]
     settings = settings_tables(Config.model_validate(report["settings"]))
     return document(
         _title(report),
         f'{"".join(boxes)}<div class="plots">{"".join(columns)}</div>'
-        f"{section('Conditions', f'<table>{facts}</table>')}{section('Settings', settings)}",
+        f"{section('Conditions', facts)}{section('Settings', settings)}",
     )
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from html import escape
 from typing import Any, NamedTuple
 
+from segslam.bench.experiments.paper import TIMING_KEYS
 from segslam.bench.experiments.rows import STAGES
 from segslam.output.report.page import number
 
@@ -19,13 +20,6 @@ FIGURES = {
     "median_cpu_ms": "CPU ms",
     "mean_edges": "edges (AIC)",
     "p95_mb": "p95 MB",
-}
-PAPER_FIGURES = {
-    "success_percent": "success %",
-    "translation_m": "error m",
-    "rotation_deg": "error deg",
-    "mean_ms": "mean ms",
-    "mean_edges": "edges (AIC)",
 }
 TITLES = {"list": "list", "yaw_deg": "yaw (deg)", "lost_percent": "labels lost (%)"}
 
@@ -46,7 +40,7 @@ def tables(report: dict[str, Any]) -> list[Table]:
         made = [_success(results)]
     else:
         caption = f"Success (%) by {TITLES[by]}"
-        made = [_table_by(results, by, caption, lambda one: percent(one["success_percent"]))]
+        made = [_table_by(results, by, caption, lambda one: f"{one['success_percent']:.1f}")]
     if by == "lost_percent":
         caption = f"Mean error of successes (m / deg; paper's in brackets) by {TITLES[by]}"
         made.append(_table_by(results, by, caption, _error_pair))
@@ -90,11 +84,6 @@ def text(value: float | None) -> str:
     return "-" if value is None else number(value)
 
 
-def percent(value: float) -> str:
-    """A percentage with one decimal, as in the paper."""
-    return f"{value:.1f}"
-
-
 def _success(results: dict[str, Any]) -> Table:
     """Success rate of each method by list, with the paper's value and the difference if known."""
     lists = [one["list"] for one in next(iter(results.values()))["by"]]
@@ -104,7 +93,7 @@ def _success(results: dict[str, Any]) -> Table:
 
 
 def _compared(one: dict[str, Any]) -> str:
-    measured = percent(one["success_percent"])
+    measured = f"{one['success_percent']:.1f}"
     if "paper" not in one:
         return measured
     theirs = one["paper"]["success_percent"]
@@ -132,7 +121,7 @@ def overall(results: dict[str, Any]) -> Table:
 
 def _figures_table(caption: str, titles: dict[str, str], results: dict[str, Any]) -> Table:
     rows = [
-        (method, *(percent(own[key]) if key == "success_percent" else text(own[key]) for key in titles))
+        (method, *(f"{own[key]:.1f}" if key == "success_percent" else text(own[key]) for key in titles))
         for method, own in results.items()
     ]
     return Table(caption, ("method", *titles.values()), rows)
@@ -141,9 +130,10 @@ def _figures_table(caption: str, titles: dict[str, str], results: dict[str, Any]
 def _paper_comparison(results: dict[str, Any]) -> Table:
     rows: list[tuple[str, ...]] = []
     for method, own in results.items():
-        for key, title in PAPER_FIGURES.items():
+        for key in TIMING_KEYS:
             if key in own.get("paper", {}) and own[key] is not None:
                 theirs = own["paper"][key]
+                title = FIGURES.get(key, "mean ms")
                 rows.append((f"{method}, {title}", text(own[key]), f"{theirs:g}", f"{own[key] - theirs:+.2f}"))
     return Table("Comparison with the paper's timing table", ("", "measured", "paper", "difference"), rows)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from segslam.bench.simulation.drift import NO_ERROR, SweepError, distorted, sweep_errors
+from segslam.bench.simulation.sensor import NO_ERROR, SweepError, distorted, sweep_errors
 from segslam.bench.simulation.world_settings import SensorConfig
 from segslam.core import geometry
 

@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.bench.simulation.levelling import MAX_SLOPE, level_revisits, level_world
-from segslam.bench.simulation.tracks import read_drive
+from segslam.bench.simulation.tracks import MAX_SLOPE, level_revisits, level_world, read_drive
 
 
 def driven(xy: np.ndarray, heights: np.ndarray) -> np.ndarray:

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from segslam.bench.simulation import SensorConfig, WorldConfig, build_world, make_sensor, sweep
-from segslam.bench.simulation.drift import NO_ERROR, SweepError
-from segslam.bench.simulation.sensor import PATTERNS
+from segslam.bench.simulation.sensor import NO_ERROR, PATTERNS, SweepError
 from segslam.core.types import GROUND_LABELS, Label
 
 PERFECT = {

@@ -7,7 +7,7 @@ from helpers.drives import simulate_drive
 from segslam.bench.simulation import (
     WorldConfig,
     build_world,
-    example_loop,
+    example_drive,
     make_sensor,
     read_drive,
     sweep,
@@ -21,7 +21,8 @@ CAR_HALF_WIDTH_M = 0.95
 
 @pytest.fixture(scope="module")
 def loop():
-    return example_loop()
+    drive = example_drive()
+    return drive.T_world_lidar, drive.time_s
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +200,7 @@ def test_the_example_loop_drives_a_street_in_both_directions_and_again(loop):
     assert (later & (away < 4.0) & (heading > 0.95)).any()
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert steps.max() < 1.5
-    assert len(example_loop(900)[0]) == 900
+    assert len(example_drive(900).time_s) == 900
 
 
 @pytest.mark.data

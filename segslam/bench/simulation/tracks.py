@@ -1,12 +1,15 @@
-"""Trajectories of the simulated car: a levelled KITTI trajectory, or a generated loop."""
+"""Trajectories of the simulated car: a KITTI trajectory in which each place gets one height, or a generated loop."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.bench.simulation.levelling import level_revisits, level_world
 from segslam.core import geometry
 from segslam.core.trajectory import Poses, lidar_from_camera, read_poses
 from segslam.core.types import SegslamError, Vector
@@ -30,6 +33,12 @@ STEP_M = 0.25
 LANE_M = 1.4  # chosen: offset of the car to the right of the street's centre line
 TURN_M = 5.0  # chosen: width of the Gaussian that rounds the corners
 SPEED_M_S, TURN_M_S2, PERIOD_S = 14.0, 5.0, 0.1  # chosen: top speed; lateral acceleration that limits speed in turns
+STATION_M = 1.0  # chosen: spacing along the path at which heights are solved for
+REVISIT_M = 4.0  # chosen: two visits nearer than this are on one road
+REVISIT_GAP_M = 30.0  # chosen: least travel between two visits of one place
+TIE_WEIGHT = 0.03  # chosen: the visits in the 11 KITTI sequences then agree to a few centimetres
+TENSION_M = 10.0  # chosen: prevents the correction from overshooting the differences it removes
+MAX_SLOPE = 0.2  # chosen: steeper than any street of the data
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,11 +51,24 @@ class Drive:
 
 
 def example_drive(num_frames: int = 0, *, scale: float = 1.0) -> Drive:
-    """The generated loop with KITTI's nominal calibration: one round, or several if `num_frames` needs more.
+    """A generated drive at 10 Hz with KITTI's nominal calibration that revisits a street in both directions.
 
-    `scale` enlarges the blocks.
+    The drive is one round and the shared street again, about 300 scans, or `num_frames` scans if that is more. `scale`
+    enlarges the blocks.
     """
-    return Drive(*example_loop(num_frames, scale=scale), NOMINAL_CALIB)
+    corners = scale * np.array(CORNERS_M, dtype=float)
+    ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    stations = np.arange(0.0, ends[-1], STEP_M)
+    lane = _rounded(np.column_stack([np.interp(stations, ends, corners[:, axis]) for axis in (0, 1)]))
+    shared = int(scale * SHARED_M / STEP_M)
+    rounds = 1 + int(np.ceil(num_frames * SPEED_M_S * PERIOD_S / ends[-1]))
+    path = np.tile(lane, (rounds + 1, 1))
+    time = np.concatenate([[0.0], np.cumsum(_seconds(path))])
+    moments = np.arange(0.0, max(time[len(lane) + shared], num_frames * PERIOD_S), PERIOD_S)
+    xy, ahead = (
+        np.column_stack([np.interp(moments + later, time, path[:, axis]) for axis in (0, 1)]) for later in (0.0, 0.02)
+    )
+    return Drive(_poses(xy, ahead - xy), moments, NOMINAL_CALIB)
 
 
 def in_lane(drive: Drive, *, left_m: float = 0.0, reverse: bool = False) -> Drive:
@@ -87,28 +109,6 @@ def _beside(poses_file: Path, name: str, sequence: str) -> Path | None:
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
-def example_loop(num_frames: int = 0, *, scale: float = 1.0) -> tuple[Poses, Vector]:
-    """Poses T_world_lidar (n, 4, 4) and times (n,) (s) of a drive at 10 Hz that revisits a street in both directions.
-
-    The drive is one round and the shared street again, about 300 scans, or `num_frames` scans if that is more. `scale`
-    enlarges the blocks.
-    """
-    corners = scale * np.array(CORNERS_M, dtype=float)
-    ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    stations = np.arange(0.0, ends[-1], STEP_M)
-    lane = _rounded(np.column_stack([np.interp(stations, ends, corners[:, axis]) for axis in (0, 1)]))
-    shared = int(scale * SHARED_M / STEP_M)
-    rounds = 1 + int(np.ceil(num_frames * SPEED_M_S * PERIOD_S / ends[-1]))
-    path = np.tile(lane, (rounds + 1, 1))
-    time = np.concatenate([[0.0], np.cumsum(_seconds(path))])
-    enough = max(time[len(lane) + shared], num_frames * PERIOD_S) if num_frames else time[len(lane) + shared]
-    moments = np.arange(0.0, enough, PERIOD_S)
-    xy, ahead = (
-        np.column_stack([np.interp(moments + later, time, path[:, axis]) for axis in (0, 1)]) for later in (0.0, 0.02)
-    )
-    return _poses(xy, ahead - xy), moments
-
-
 def _seconds(path: np.ndarray) -> Vector:
     """(n - 1,) time (s) from point to point, longer in turns."""
     steps = np.diff(path, axis=0)
@@ -141,4 +141,73 @@ def _poses(xy: np.ndarray, forward: np.ndarray) -> Poses:
     poses = np.tile(np.eye(4), (len(x), 1, 1))
     poses[:, :3, :3] = np.stack([x, y, np.cross(x, y)], axis=-1)
     poses[:, :3, 3] = np.column_stack([xy, _height_m(xy)])
+    return poses
+
+
+def level_world(T_world_lidar: Poses) -> Poses:
+    """The drive in a frame with z along the mean up direction of the sensor. It starts at the origin; yaw is kept."""
+    up = T_world_lidar[:, :3, 2].mean(axis=0)
+    up /= np.linalg.norm(up)
+    turn = geometry.level(up)
+    poses = T_world_lidar.copy()
+    poses[:, :3, :3] = turn @ T_world_lidar[:, :3, :3]
+    poses[:, :3, 3] = (T_world_lidar[:, :3, 3] - T_world_lidar[0, :3, 3]) @ turn.T
+    return poses
+
+
+def level_revisits(T_world_lidar: Poses) -> Poses:
+    """The drive with one height for each place; x, y and yaw are unchanged. z must point up."""
+    positions = T_world_lidar[:, :3, 3]
+    steps = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
+    travel = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-6))])  # ascends strictly, also where the car stands
+    bound = MAX_SLOPE * np.diff(travel)
+    climb = np.concatenate([[0.0], np.cumsum(np.clip(np.diff(positions[:, 2]), -bound, bound))])
+    stations = np.arange(0.0, travel[-1] + STATION_M, STATION_M)
+    path = np.column_stack([np.interp(stations, travel, values) for values in (*positions[:, :2].T, climb)])
+    raise_m = _smoothest_raise(path)
+    slope = np.gradient(raise_m, STATION_M) if len(stations) > 1 else np.zeros(1)
+    heights = climb + np.interp(travel, stations, raise_m)
+    return _raised(T_world_lidar, heights, np.interp(travel, stations, slope))
+
+
+def _smoothest_raise(path: np.ndarray) -> Vector:
+    """(n,) correction r of the heights h of a path with rows STATION_M apart; each revisited place gets one height.
+
+    Minimises sum (r'' s^2)^2 + sum (r' s^2 / TENSION_M)^2 + TIE_WEIGHT sum (h_i + r_i - h_j - r_j)^2, where s is
+    STATION_M, and j is a point, interpolated between two rows, of an earlier visit.
+    """
+    count = len(path)
+    ties = _ties(path[:, :2])
+    if ties.shape[0] == 0:
+        return np.zeros(count)
+    curvature = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(count - 2, count))
+    tension = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(count - 1, count)) * (STATION_M / TENSION_M)
+    normal = curvature.T @ curvature + tension.T @ tension + TIE_WEIGHT * (ties.T @ ties)
+    anchored = normal + 1e-12 * diags_array(np.ones(count))  # the cost ignores a common offset: keep it near zero
+    return spsolve(anchored.tocsc(), -TIE_WEIGHT * (ties.T @ (ties @ path[:, 2])))
+
+
+def _ties(path_xy: np.ndarray) -> csr_array:
+    """(k, n) sparse matrix: each row subtracts the point of an earlier visit from the point of the path beside it."""
+    pairs = cKDTree(path_xy).query_pairs(REVISIT_M, output_type="ndarray").reshape(-1, 2)
+    early, late = pairs[pairs[:, 1] - pairs[:, 0] > REVISIT_GAP_M / STATION_M].T
+    step = path_xy[early + 1] - path_xy[early]
+    share = np.einsum("ij,ij->i", path_xy[late] - path_xy[early], step) / np.einsum("ij,ij->i", step, step)
+    beside = (share >= 0.0) & (share < 1.0)
+    early, late, share = early[beside], late[beside], share[beside]
+    row = np.arange(len(share))
+    columns = np.concatenate([late, early, early + 1])
+    values = np.concatenate([np.ones(len(share)), share - 1.0, -share])
+    return csr_array((values, (np.tile(row, 3), columns)), shape=(len(share), len(path_xy)))
+
+
+def _raised(T_world_lidar: Poses, heights: Vector, slope: Vector) -> Poses:
+    """Each pose moved to its height and pitched about its left axis, so that the slope increases by `slope`."""
+    forward = T_world_lidar[:, :3, 0]
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    turns = ScipyRotation.from_rotvec(-np.arctan(slope)[:, None] * left).as_matrix()
+    poses = T_world_lidar.copy()
+    poses[:, :3, :3] = turns @ T_world_lidar[:, :3, :3]
+    poses[:, 2, 3] = heights
     return poses

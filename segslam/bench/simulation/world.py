@@ -6,13 +6,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import open3d as o3d
 
+from segslam.bench.simulation.cars import MovingCar, ParkedCar, meshes_at, moving_cars, parked_cars
 from segslam.bench.simulation.mesh import Flags, Instances, Mesh, as_instance, join_meshes
-from segslam.bench.simulation.parking import ParkedCar, parked_cars
-from segslam.bench.simulation.path import Route, route_of, street_of
-from segslam.bench.simulation.site import Site, frontages
+from segslam.bench.simulation.site import Route, Site, frontages, route_of, street_of
 from segslam.bench.simulation.streets import furnish
 from segslam.bench.simulation.terrain import Terrain, ground_mesh, ground_of
-from segslam.bench.simulation.traffic import MovingCar, meshes_at, moving_cars
 from segslam.bench.simulation.world_settings import WorldConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import Label, Labels, Points, Transform, Vector
@@ -66,7 +64,7 @@ class World:
 
 
 def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> World:
-    """Streets along a drive with level poses (`levelling.level_revisits`), z up; `time_s` (n,) ascending.
+    """Streets along a drive with level poses (`level_revisits`), z up; `time_s` (n,) ascending.
 
     Every pose is `config.sensor_height_m` above the road, and no static object stands on the path. On another
     `config.day` the streets are the same, but parked and moving cars differ.

@@ -1,9 +1,8 @@
 """`segslam eval`."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -16,7 +15,31 @@ from segslam.core.errors import SegslamError
 if TYPE_CHECKING:
     from segslam.core.evaluation import Up
     from segslam.core.trajectory import Poses
-    from segslam.output.accuracy import Align
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """How poses are read, matched and aligned."""
+
+    format: Annotated[
+        Literal["kitti", "tum"] | None,
+        typer.Option(help="Format of both files; detected from the number of columns by default."),
+    ] = None
+    up: Annotated[
+        Literal["z", "-y"] | None,
+        typer.Option(help="Upward axis of the two files: z, or -y for cameras; by default found from the path."),
+    ] = None
+    max_difference: Annotated[
+        float, typer.Option(help="Largest time difference between a pose and its reference (s).")
+    ] = 0.01
+    align: Annotated[
+        Literal["se3", "sim3", "first", "none"],
+        typer.Option(help="Alignment: rigid (se3), with scale (sim3), of the first pose (first), or none."),
+    ] = "se3"
+    rpe_distance: Annotated[
+        float | None,
+        typer.Option(min=0.01, metavar="METRES", help="Also measure the error of the motion over this distance."),
+    ] = None
 
 
 def evaluate(
@@ -30,25 +53,7 @@ def evaluate(
     estimate: Annotated[
         Path | None, typer.Option(help="Estimated poses, or a folder with poses NAME.txt of several drives.")
     ] = None,
-    format: Annotated[
-        Literal["kitti", "tum"] | None,
-        typer.Option(help="Format of both files; detected from the number of columns by default."),
-    ] = None,
-    up: Annotated[
-        Literal["z", "-y"] | None,
-        typer.Option(help="Upward axis of the two files: z, or -y for cameras; by default found from the path."),
-    ] = None,
-    max_difference: Annotated[
-        float, typer.Option(help="Largest time difference between a pose and its reference (s).")
-    ] = 0.01,
-    align: Annotated[
-        Literal["se3", "sim3", "first", "none"],
-        typer.Option(help="Alignment: rigid (se3), with scale (sim3), of the first pose (first), or none."),
-    ] = "se3",
-    rpe_distance: Annotated[
-        float | None,
-        typer.Option(min=0.01, metavar="METRES", help="Also measure the error of the motion over this distance."),
-    ] = None,
+    how: Scoring,
     tables: TableFiles,
     plot: Annotated[
         Path | None, typer.Option(help="Draw both trajectories and the error to this file: .png, .svg or .pdf.")
@@ -67,25 +72,19 @@ def evaluate(
     check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
     if run is not None or estimate is not None:
         terminal.announce(f"eval: reading {run or estimate}")
-    how = _How(align, rpe_distance, plot, terminal)
     if run is not None and estimate is None:
-        figures = _score_run(run, reference, how)
+        figures = _score_run(run, reference, how, plot, terminal)
         rows = {run.resolve().name: figures}
     elif run is None and estimate is not None and reference is not None:
-
-        def score(made: Path, true: Path, how: _How) -> dict[str, Any]:
-            return _score_files(made, true, format, up, max_difference, how)
-
         if estimate.is_dir():
             if plot is not None:
                 raise SegslamError("--plot: draws one drive; give two files")
-            silent = how._replace(terminal=replace(terminal, quiet=True))
-            rows = _score_folders(estimate, reference, lambda made, true: score(made, true, silent))
+            rows = _score_folders(estimate, reference, how)
             axes = ", ".join(sorted({str(row["up"]) for row in rows.values() if "up" in row}))
-            terminal.say(f"{reference}: upward axis {axes}" + ("" if up else "; for another: --up"))
+            terminal.say(f"{reference}: upward axis {axes}" + ("" if how.up else "; for another: --up"))
             figures = {"drives": rows}
         else:
-            figures = score(estimate, reference, how)
+            figures = _score_files(estimate, reference, how, plot, terminal)
             rows = {estimate.stem: figures}
     else:
         raise SegslamError("give either a run folder, or two files with --estimate and --reference")
@@ -106,16 +105,9 @@ def _table(figures: dict[str, Any]) -> str:
     )
 
 
-class _How(NamedTuple):
-    """Alignment, distance of the relative error, file of the figure, and where messages go."""
-
-    align: "Align"
-    rpe_distance_m: float | None
-    plot: Path | None
-    terminal: Terminal
-
-
-def _score_run(folder: Path, reference_file: Path | None, how: _How) -> dict[str, Any]:
+def _score_run(
+    folder: Path, reference_file: Path | None, how: Scoring, plot: Path | None, terminal: Terminal
+) -> dict[str, Any]:
     from segslam.core.trajectory import rows_of_same_scan
     from segslam.output.accuracy import accuracy, scores
     from segslam.output.finished import ACCURACY, plain_name, read_run, true_poses
@@ -128,29 +120,27 @@ def _score_run(folder: Path, reference_file: Path | None, how: _How) -> dict[str
     if reference is None:
         raise SegslamError(f"{folder}: the data has no ground-truth poses; give a file with --reference")
     figures = accuracy(run.result, reference)
-    num_scans = len(run.result.trajectory)
+    trajectory = run.result.trajectory
+    num_scans = len(trajectory)
     if "ate_m" not in figures:
         raise SegslamError(
             f"{reference_file or folder}: only {len(reference)} of {num_scans} scans have a pose; three are needed"
         )
     if len(reference) < num_scans:
-        how.terminal.say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose")
+        terminal.say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose")
     metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY}
     metrics |= figures
-    trajectory = run.result.trajectory
     rows = rows_of_same_scan(trajectory.scan_index, reference.scan_index)
     matched, truth = trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]]
     if how.align == "se3":
         write_metrics(folder, metrics)
-    if how.plot is not None:
-        _draw(how.plot, matched, truth, "z")
-    more = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance_m)
+    if plot is not None:
+        _draw(plot, matched, truth, "z")
+    more = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance)
     return more | metrics if how.align == "se3" else metrics | more
 
 
-def _score_folders(
-    estimates: Path, references: Path, score: Callable[[Path, Path], dict[str, Any]]
-) -> dict[str, dict[str, Any]]:
+def _score_folders(estimates: Path, references: Path, how: Scoring) -> dict[str, dict[str, Any]]:
     """The figures of each drive by name, in order, then their means over the drives, called `mean`.
 
     A drive has a file `NAME.txt` in both folders, or `NAME/poses_kitti.txt` in the first, as run folders have. Raises
@@ -159,7 +149,7 @@ def _score_folders(
     rows: dict[str, dict[str, Any]] = {}
     for true in sorted(references.glob("*.txt")):
         made = [file for file in (estimates / true.name, estimates / true.stem / "poses_kitti.txt") if file.is_file()]
-        rows |= {true.stem: score(made[0], true)} if made else {}
+        rows |= {true.stem: _score_files(made[0], true, how, None, Terminal(quiet=True))} if made else {}
     if not rows:
         raise SegslamError(
             f"{estimates}: no drive has poses here and in {references}; give both files one name, 00.txt, or the "
@@ -179,19 +169,14 @@ def _draw(file: Path, estimate: "Poses", reference: "Poses", up: "Up") -> None:
 
 
 def _score_files(
-    estimate_file: Path,
-    reference_file: Path,
-    format: Literal["kitti", "tum"] | None,
-    up: "Up | None",
-    max_difference_s: float,
-    how: _How,
+    estimate_file: Path, reference_file: Path, how: Scoring, plot: Path | None, terminal: Terminal
 ) -> dict[str, Any]:
     from segslam.core.evaluation import UP
     from segslam.core.trajectory import read_poses
     from segslam.output.accuracy import scores
     from segslam.run.evaluate import matching_rows
 
-    estimate, reference = (read_poses(file, format=format) for file in (estimate_file, reference_file))
+    estimate, reference = (read_poses(file, format=how.format) for file in (estimate_file, reference_file))
     if (estimate.stamp_ns is None) != (reference.stamp_ns is None):
         raise SegslamError(
             f"{estimate_file}: another format than {reference_file} (KITTI rows, TUM stamps); convert one of them"
@@ -201,21 +186,21 @@ def _score_files(
             f"{estimate_file}: {len(estimate)} poses, but {reference_file} has {len(reference)}; in KITTI format "
             "line n + 1 is scan n in both. Score the run folder instead, or use TUM format, which is matched by stamp"
         )
-    rows = matching_rows(estimate, reference, max_difference_ns=round(max_difference_s * 1e9))
+    rows = matching_rows(estimate, reference, max_difference_ns=round(how.max_difference * 1e9))
     matched, truth = estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]]
-    direction, why = (up, "") if up or not len(rows) else _up(truth, camera=estimate.stamp_ns is None)
-    figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance_m, up=UP[direction or "z"])
+    direction, why = (how.up, "") if how.up or not len(rows) else _up(truth, camera=estimate.stamp_ns is None)
+    figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance, up=UP[direction or "z"])
     if not figures:
         raise SegslamError(
             f"{estimate_file}: only {len(rows)} of its {len(estimate)} poses match one of the {len(reference)} "
             f"poses of {reference_file}; at least three are needed. Check the files, or raise --max-difference"
         )
     if why:
-        how.terminal.say(f"{reference_file}: upward axis {direction} ({why}); for another: --up")
-    if how.plot is not None:
-        _draw(how.plot, matched, truth, direction or "z")
+        terminal.say(f"{reference_file}: upward axis {direction} ({why}); for another: --up")
+    if plot is not None:
+        _draw(plot, matched, truth, direction or "z")
     if not len(rows) == len(estimate) == len(reference):
-        how.terminal.say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}")
+        terminal.say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}")
     return figures | {"num_poses": len(rows), "up": direction}
 
 

@@ -3,8 +3,8 @@
 import json as json_text
 import shlex
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
@@ -152,12 +152,15 @@ def _remove_if_empty(folder: Path) -> None:
 def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]", terminal: Terminal) -> "LiveFigures":
     """Close the loops of each scan with a pose, log it and show it."""
     figures = LiveFigures(front)
-    with Status(terminal) as status:
+    shown = monotonic()
+    with _status(terminal) as (show, every_s):
         for placed in front:
             tries_loops = front.num_keyframes_waiting < MOST_BEHIND
             watch(run.follow(placed.tracked, tries_loops=tries_loops))
             figures.note(placed, lag_s=monotonic() - placed.placed_s, tries_loops=tries_loops)
-            status.show(figures)
+            if monotonic() - shown >= every_s:
+                shown = monotonic()
+                show(figures.line())
     return figures
 
 
@@ -304,38 +307,19 @@ def too_slow(metrics: Mapping[str, Any], voxel_size_m: float) -> str:
     )
 
 
-class Status:
-    """Status line that is updated on a terminal, printed every ten seconds elsewhere; a context manager."""
+@contextmanager
+def _status(terminal: Terminal) -> Iterator[tuple[Callable[[str], object], float]]:
+    """Context manager that yields what shows the status, and how often (s): a line that changes, or further lines."""
+    if terminal.quiet or not sys.stderr.isatty():
+        yield terminal.say, LINE_EVERY_S
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn
 
-    def __init__(self, terminal: Terminal) -> None:
-        self._terminal = terminal
-        self._shown = monotonic()
-        self._bar: Any = None
-
-    def __enter__(self) -> "Status":
-        if not self._terminal.quiet and sys.stderr.isatty():
-            from rich.console import Console
-            from rich.progress import Progress, SpinnerColumn, TextColumn
-
-            columns = (SpinnerColumn(), TextColumn("{task.description}"))
-            self._bar = Progress(*columns, console=Console(stderr=True)).__enter__()
-            self._task = self._bar.add_task("live: no scan yet", total=None)
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        if self._bar is not None:
-            self._bar.__exit__(*failure)
-
-    def show(self, figures: LiveFigures) -> None:
-        """Show the status if it is due."""
-        now = monotonic()
-        if now - self._shown < (LINE_EVERY_S if self._bar is None else BAR_EVERY_S):
-            return
-        self._shown = now
-        if self._bar is None:
-            self._terminal.say(figures.line())
-        else:
-            self._bar.update(self._task, description=figures.line())
+    columns = (SpinnerColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("live: no scan yet", total=None)
+        yield lambda line: bar.update(task, description=line), BAR_EVERY_S
 
 
 def _spread(values: list[float]) -> dict[str, float]:

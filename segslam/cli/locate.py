@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from segslam.run.locator import Located, Locator
 
 LABEL_WORDS = ("geometric", "none")
+PLACE_KEYS = ("T_world_lidar", "keyframe", "inliers", "overlap", "probability", "evidence", "reason", "detail")
+NOT_FOUND: dict[str, Any] = {"found": False, **dict.fromkeys(PLACE_KEYS)}
 
 
 @dataclass(frozen=True)
@@ -111,12 +113,11 @@ def locate(
             points, classes = _read_one(scan, scans, labels, files, locator)
         except SegslamError as error:
             num_bad += 1
-            found.append(
-                _not_found("unreadable", str(error).partition("; ")[0]) | {"seconds": perf_counter() - started}
-            )
+            one = NOT_FOUND | {"reason": "unreadable", "detail": str(error).partition("; ")[0]}
         else:
             started = perf_counter()
-            found.append(_place(locator.locate(points, classes)) | {"seconds": perf_counter() - started})
+            one = _place(locator.locate(points, classes))
+        found.append(one | {"seconds": perf_counter() - started})
     if terminal.json:
         print_out(dumps(found, allow_nan=False))
     else:
@@ -243,8 +244,9 @@ def _place(found: "Located | Rejected") -> dict[str, Any]:
     from segslam.core.types import Rejected
 
     if isinstance(found, Rejected):
-        return _not_found(found.reason.value, found.detail, found.probability, found.evidence)
-    return {
+        judged = {"probability": found.probability, "evidence": found.evidence or None}
+        return NOT_FOUND | judged | {"reason": found.reason.value, "detail": found.detail}
+    return NOT_FOUND | {
         "found": True,
         "T_world_lidar": found.T_world_lidar.ravel().tolist(),
         "keyframe": found.keyframe_id,
@@ -252,17 +254,7 @@ def _place(found: "Located | Rejected") -> dict[str, Any]:
         "overlap": found.overlap,
         "probability": found.alignment.probability,
         "evidence": found.alignment.evidence,
-        "reason": None,
-        "detail": None,
     }
-
-
-def _not_found(
-    reason: str, detail: str, probability: float | None = None, evidence: dict[str, float] | None = None
-) -> dict[str, Any]:
-    nothing = dict.fromkeys(("T_world_lidar", "keyframe", "inliers", "overlap"))
-    judged = {"probability": probability, "evidence": evidence or None}
-    return {"found": False, **nothing, **judged, "reason": reason, "detail": detail}
 
 
 def _show_places(scans: list[Path], found: list[dict[str, Any]], terminal: Terminal) -> None:

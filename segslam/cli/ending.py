@@ -13,6 +13,18 @@ if TYPE_CHECKING:
     from segslam.run.run import Run
     from segslam.slam.slam_result import SlamResult
 
+TROUBLE = (
+    ("num_scans_skipped", "scan", "{} skipped (unreadable or empty); see the warning above"),
+    ("num_motions_repaired", "motion", "odometry: {} repaired by registration with earlier scans"),
+    ("num_motions_broken", "break", "odometry: {}, i.e. motions not supported by the scans; see the report"),
+    (
+        "num_motions_rejected",
+        "motion",
+        "odometry: {} rejected by the optimiser: loops contradict the odometry there; see the report",
+    ),
+)
+"""Counts that are reported unless they are 0: key, noun, text."""
+
 
 def is_interrupted(items: Iterable[object]) -> bool:
     """Run through the items; True if Ctrl-C ended it before the last one."""
@@ -75,17 +87,7 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         f"{counted(metrics['num_candidates'], 'candidate')}",
         *_length(metrics),
     ]
-    if skipped := metrics["num_scans_skipped"]:
-        lines.append(f"{counted(skipped, 'scan')} skipped (unreadable or empty); see the warning above")
-    if repaired := metrics.get("num_motions_repaired"):
-        lines.append(f"odometry: {counted(repaired, 'motion')} repaired by registration with earlier scans")
-    if broken := metrics.get("num_motions_broken"):
-        lines.append(f"odometry: {counted(broken, 'break')}, i.e. motions not supported by the scans; see the report")
-    if rejected_motions := metrics.get("num_motions_rejected"):
-        lines.append(
-            f"odometry: {counted(rejected_motions, 'motion')} rejected by the optimiser: "
-            "loops contradict the odometry there; see the report"
-        )
+    lines += [text.format(counted(metrics[key], thing)) for key, thing, text in TROUBLE if metrics.get(key)]
     if "adjustment_moved_m" in metrics:
         lines.append(_adjustment(metrics))
     lines += _errors(metrics)
@@ -118,8 +120,8 @@ def _adjustment(metrics: dict[str, Any]) -> str:
         f"{metrics['adjustment_moved_m']:.2f} m (rms)"
     )
     if "map_thickness_m" in metrics and "map_thickness_before_m" in metrics:
-        before, after = (1000 * metrics[key] for key in ("map_thickness_before_m", "map_thickness_m"))
-        line += f"; thickness of surfaces {before:.0f} mm before, {after:.0f} mm after"
+        before, after = metrics["map_thickness_before_m"], metrics["map_thickness_m"]
+        line += f"; thickness of surfaces {1000 * before:.0f} mm before, {1000 * after:.0f} mm after"
     if "vertical_correction_deg" in metrics:
         line += f"; points raised by {metrics['vertical_correction_deg']:.2f} degrees, the measured vertical angle"
     if "sweep_s" in metrics:

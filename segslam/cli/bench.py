@@ -13,6 +13,7 @@ from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.cli.checks import check_free, check_own
 from segslam.cli.completion import methods
 from segslam.cli.console import Terminal
+from segslam.cli.ending import is_interrupted
 from segslam.cli.options import (
     DatasetOption,
     EncodingOption,
@@ -242,15 +243,21 @@ def _read_lists(
     options: Options, reference: "Trajectory | None", *, default: "PairList | None" = None
 ) -> list["PairList"]:
     """The lists from files, or the list selected by distance, or the default; sampled if requested."""
-    from segslam.bench.experiments.pairs import read_pairs, sample_pairs
+    from segslam.bench.experiments.pairs import cut_pairs, read_pairs, sample_pairs
 
-    cuts = options.min_m is not None or options.max_m is not None
+    low_m, high_m = options.min_m, options.max_m
+    cuts = low_m is not None or high_m is not None
     if options.pairs and cuts:
         raise SegslamError("--pairs, --min-m: give lists of pairs, or make one with --min-m and --max-m, not both")
     if options.pairs:
         lists = [read_pairs(file) for file in options.pairs]
     elif cuts:
-        lists = [_cut(options, reference)]
+        if reference is None:
+            raise SegslamError("--min-m: the data has no true poses; give lists with --pairs FILE")
+        if low_m is None or high_m is None or not low_m < high_m:
+            raise SegslamError(f"--min-m {low_m} --max-m {high_m}: give both, the smaller one first")
+        name = f"cut_{low_m:g}to{high_m:g}"
+        lists = [cut_pairs(reference, name=name, min_m=low_m, max_m=high_m, min_gap=options.min_gap)]
     elif default is not None:
         lists = [default]
     else:
@@ -268,29 +275,13 @@ def _run_trials(job: "Job", trials: list["Trial"], options: Options, terminal: T
     kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
     when_stopped(f"the finished registrations {kept}")
     work = run(job, trials, workers=options.workers, scheduler=options.scheduler, folder=options.out)
-    try:
-        for some in terminal.progress(work, len(trials), "bench"):
-            rows += some
-    except KeyboardInterrupt:
+    if is_interrupted(map(rows.extend, terminal.progress(work, len(trials), "bench"))):
         when_stopped(f"{len(rows)} registrations {kept}")
-        raise typer.Exit(EXIT_STATUS) from None
+        raise typer.Exit(EXIT_STATUS)
     rows = in_order(rows, job, trials)
     if options.details is not None:
         write_rows(options.details, rows)
     return rows
-
-
-def _cut(options: Options, reference: "Trajectory | None") -> "PairList":
-    """The list selected by distance from the true poses."""
-    from segslam.bench.experiments.pairs import cut_pairs
-
-    low_m, high_m = options.min_m, options.max_m
-    if reference is None:
-        raise SegslamError("--min-m: the data has no true poses; give lists with --pairs FILE")
-    if low_m is None or high_m is None or not low_m < high_m:
-        raise SegslamError(f"--min-m {low_m} --max-m {high_m}: give both, the smaller one first")
-    name = f"cut_{low_m:g}to{high_m:g}"
-    return cut_pairs(reference, name=name, min_m=low_m, max_m=high_m, min_gap=options.min_gap)
 
 
 def _experiment(
@@ -323,22 +314,14 @@ def _experiment(
     rows = _run_trials(job, trials, options, terminal)
     found = with_paper_values(results(rows, by=by), experiment=name, sequence=options.sequence, lists=lists)
     if options.out is not None:
+        from segslam.bench.experiments.report import write_bench_report
+
         workers = "of a Dask cluster" if options.scheduler else options.workers
         shared = {"sample": options.sample, "seed": options.seed, "workers": workers}
         report = account(name, job, lists, found, options={**shared, **asked})
-        _write_report(options.out, report, _pictures(job, trials, rows, options.draw), terminal)
+        write_bench_report(options.out, report, pictures=_pictures(job, trials, rows, options.draw))
+        terminal.say(f"{options.out / 'report.html'}, report.md, report.json, details.csv")
     terminal.answer(found, plain(overall(found)))
-
-
-def _write_report(out: Path, report: dict[str, Any], pictures: dict[str, bytes], terminal: Terminal) -> None:
-    """Write the report, and the pictures as separate files."""
-    from segslam.bench.experiments.report import write_bench_report
-    from segslam.core.whole_files import write_whole
-
-    write_bench_report(out, report, pictures=pictures)
-    for number, png in enumerate(pictures.values()):
-        write_whole(out / f"failure_{number:02d}.png", png)
-    terminal.say(f"{out / 'report.html'}, report.md, report.json, details.csv")
 
 
 def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) -> dict[str, bytes]:
@@ -352,14 +335,10 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
     for row in worst_failures([row for row in rows if row.reason != BAD_SCAN], count):
         trial = trial_of[row.key[:3]]
         outcome = f"error {row.error_m:.1f} m {row.error_deg:.1f} deg" if row.accepted else row.reason.replace("_", " ")
-        caption = f"{row.method}, {row.pairs}: {row.source} to {row.target}{_changes(row)}, {outcome}"
+        turned = f", rotated by {row.source_yaw_deg:g} deg" if row.source_yaw_deg else ""
+        lost = f", {100 * row.source_lost:g} % of labels lost" if row.source_lost else ""
+        caption = f"{row.method}, {row.pairs}: {row.source} to {row.target}{turned}{lost}, {outcome}"
         poses = {"truth": trial.T_target_source} | ({} if row.estimate is None else {"estimate": row.estimate})
         source, target = points_of(job.source, trial.source), points_of(job.source, trial.target)
         pictures[caption] = draw_pair(source, target, poses=poses, title=caption)
     return pictures
-
-
-def _changes(row: "Row") -> str:
-    """Text with the changes made to the scans."""
-    turned = f", rotated by {row.source_yaw_deg:g} deg" if row.source_yaw_deg else ""
-    return turned + (f", {100 * row.source_lost:g} % of labels lost" if row.source_lost else "")

@@ -98,7 +98,7 @@ def _legend(axes: Axes) -> None:
 
 
 def write_bench_report(folder: Path, report: dict[str, Any], *, pictures: Mapping[str, bytes]) -> None:
-    """Write `report.json`, `report.md` and `report.html` into a folder; `pictures` maps captions to PNGs.
+    """Write `report.json`, `report.md` and `report.html` into a folder, and `pictures`, by caption, as PNG files.
 
     Raises SegslamError if the folder cannot be written.
     """
@@ -116,6 +116,8 @@ def write_bench_report(folder: Path, report: dict[str, Any], *, pictures: Mappin
     }
     for name, text in files.items():
         write_whole(folder / name, text)
+    for number, png in enumerate(pictures.values()):
+        write_whole(folder / f"failure_{number:02d}.png", png)
 
 
 def _title(report: dict[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """`segslam replay`, `edit` and `refine`: a new run from the log of another."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import chain, tee
 from pathlib import Path
@@ -78,8 +78,11 @@ def edit(
     terminal.announce(f"edit: reading {run}")
     _check_keyframes(run, edits, terminal)
 
-    def after(result: "SlamResult") -> Mapping[str, Any]:
-        outcomes = _outcomes(result)
+    from segslam.slam.slam_result import outcome_text
+
+    def after(result: "SlamResult") -> dict[str, Any]:
+        weights = result.estimate.closure_weights
+        outcomes = {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}
         for pair in sorted(edits.added):
             terminal.say(f"added {pair[0]}:{pair[1]}: {outcomes.get(pair, 'not tried, because the run ended before')}")
         return {}
@@ -133,7 +136,7 @@ def _replay_log(
     *,
     foxglove: str | None = None,
     edits: LoopEdits = NO_EDITS,
-    after: "Callable[[SlamResult], Mapping[str, Any]]" = lambda result: {},
+    after: "Callable[[SlamResult], dict[str, Any]]" = lambda result: {},
     overwrite: bool,
 ) -> None:
     """Repeat a run from its log into a new folder; `edits` follow those of the run.
@@ -159,43 +162,37 @@ def _replay_log(
         when_stopped(f"the log in {folder} is kept, without results")
         run = stack.enter_context(replayed.begun(folder, slam, mirror=server.send if server else None))
         copy_alone(recorded.path.parent, folder)
-        compared = _Compared(recorded, run)
-        stopped = is_interrupted(terminal.progress(compared.repeated(), recorded.num_steps(), "replay"))
+        before, now = set[Pair](), set[Pair]()
+        steps = _repeated(recorded, run, before, now)
+        stopped = is_interrupted(terminal.progress(steps, recorded.num_steps(), "replay"))
         if stopped and run.num_steps == 0:
             when_stopped("nothing was written")
             raise typer.Exit(EXIT_STATUS)
-        finish(run, terminal, more=lambda result: {**compared.figures(), **after(result)}, stopped=stopped)
+        finish(run, terminal, more=lambda result: _compared(recorded, before, now) | after(result), stopped=stopped)
     if stopped:
         when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps were replayed; results in {folder}")
         raise typer.Exit(EXIT_STATUS)
 
 
-class _Compared:
-    """Repeats the steps of a log, and compares the loops and the error with those of the logged run."""
+def _repeated(recorded: "RunLog", run: "Run", before: set[Pair], after: set[Pair]) -> "Iterator[Step]":
+    """Repeats the steps of a log; adds the pairs of their loops to `before`, those of the new loops to `after`."""
+    originals, sources = tee(recorded.steps())  # read alternately: only one step is in memory
+    for original, repeated in zip(originals, run.repeat(sources), strict=True):
+        before |= _closures(original)
+        after |= _closures(repeated)
+        yield repeated
 
-    def __init__(self, recorded: "RunLog", run: "Run") -> None:
-        self._recorded, self._run = recorded, run
-        self._before: set[Pair] = set()
-        self._after: set[Pair] = set()
 
-    def repeated(self) -> "Iterator[Step]":
-        originals, sources = tee(self._recorded.steps())  # read alternately: only one step is in memory
-        for original, repeated in zip(originals, self._run.repeat(sources), strict=True):
-            self._before |= _closures(original)
-            self._after |= _closures(repeated)
-            yield repeated
+def _compared(recorded: "RunLog", before: set[Pair], after: set[Pair]) -> dict[str, Any]:
+    """Numbers of new and lost loops; the error of the logged run, if it finished and has ground truth."""
+    from segslam.output.accuracy import trajectory_accuracy
 
-    def figures(self) -> dict[str, Any]:
-        """Numbers of new and lost loops; the error of the logged run, if it finished and has ground truth."""
-        from segslam.output.accuracy import trajectory_accuracy
-
-        before, after = self._before, self._after
-        figures: dict[str, Any] = {"num_loops_won": len(after - before), "num_loops_lost": len(before - after)}
-        reference, result = self._recorded.reference(), self._recorded.result()
-        if reference is not None and result is not None:
-            error = trajectory_accuracy(result[1], reference)
-            figures |= {"recorded_ate_m": error["ate_m"]} if "ate_m" in error else {}
-        return figures
+    figures: dict[str, Any] = {"num_loops_won": len(after - before), "num_loops_lost": len(before - after)}
+    reference, result = recorded.reference(), recorded.result()
+    if reference is not None and result is not None:
+        error = trajectory_accuracy(result[1], reference)
+        figures |= {"recorded_ate_m": error["ate_m"]} if "ate_m" in error else {}
+    return figures
 
 
 def _closures(step: "Step") -> set[Pair]:
@@ -238,11 +235,3 @@ def _check_keyframes(run: Path, edits: LoopEdits, terminal: Terminal) -> None:
     tried = {attempt.candidate.pair for attempt in attempts}
     for newer, older in sorted(edits.forbidden - tried):
         terminal.say(f"{newer}:{older}: {run} has not tried this loop; forbidden all the same (loops.csv has the ids)")
-
-
-def _outcomes(result: "SlamResult") -> dict[Pair, str]:
-    """The outcome of each pair that was tried."""
-    from segslam.slam.slam_result import outcome_text
-
-    weights = result.estimate.closure_weights
-    return {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}

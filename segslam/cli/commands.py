@@ -1,6 +1,7 @@
 """All commands in groups, and their help: aliases, and names of values instead of Python's types."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -102,17 +103,14 @@ class GroupedCommands(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a section for each group."""
         width = max(map(len, self.commands))
-        for title, rows in self._groups(ctx, formatter.width - 6 - width):
-            with formatter.section(title):
-                formatter.write_dl([(f"{name:{width}}", about) for name, about in rows])
-
-    def _groups(self, ctx: Any, limit: int) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-        groups: dict[str, list[tuple[str, str]]] = {}
+        groups: dict[str, list[tuple[str, str]]] = defaultdict(list)
         for name in self.list_commands(ctx):
-            command = self.commands[name]
-            rows = groups.setdefault(getattr(command, "rich_help_panel", None) or "Commands", [])
-            rows.append((name, command.get_short_help_str(limit)))
-        yield from groups.items()
+            command: Any = self.commands[name]
+            about = command.get_short_help_str(formatter.width - 6 - width)
+            groups[command.rich_help_panel].append((f"{name:{width}}", about))
+        for title, rows in groups.items():
+            with formatter.section(title):
+                formatter.write_dl(rows)
 
 
 def _name_values(command: Any) -> None:

@@ -122,11 +122,3 @@ def test_rows_of_a_sweep_belong_together(street):
     assert cars.any()
     assert (one.instances[cars] > 0).all()
     assert (one.instances[np.isin(one.labels, GROUND_LABELS)] == 0).all()
-
-
-def test_a_scan_of_the_sweep_carries_its_points_and_labels(bare_world):
-    one = scan_of(bare_world, SensorConfig())
-    scan = one.scan(index=7, stamp_ns=123)
-    assert (scan.index, scan.stamp_ns) == (7, 123)
-    np.testing.assert_array_equal(scan.points, one.points)
-    assert scan.labels is one.labels

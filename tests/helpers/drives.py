@@ -40,7 +40,7 @@ def simulate_drive(T_world_lidar: Poses, time_s: Vector, *, seed: int, config: S
     """Labelled scans from level poses (n, 4, 4) at the times `time_s` (n,), ascending."""
     world = build_world(T_world_lidar, time_s, config=config.world, seed=seed)
     for index, one in enumerate(drive_sweeps(world, T_world_lidar, time_s, config=config.sensor, seed=seed)):
-        yield one.scan(index=index, stamp_ns=round(time_s[index] * 1e9))
+        yield Scan(one.points, round(time_s[index] * 1e9), index, one.labels)
 
 
 @cache

@@ -182,7 +182,7 @@ def test_a_scan_from_another_town_is_a_break_though_the_odometry_is_steady(inter
     before = _registered(odometry, scans[:20])
     sweeps = round_sweeps(seed=13, only=range(20, 22))
     since_ns = scans[19].stamp_ns + int(interval_s * 1e9)
-    others = [one.scan(index=20 + k, stamp_ns=since_ns + k * 300_000_000) for k, one in enumerate(sweeps)]
+    others = [Scan(one.points, since_ns + k * 300_000_000, 20 + k, one.labels) for k, one in enumerate(sweeps)]
     results = _registered(odometry, others)
     states = [result.motion.state for result in results if result.motion]
     assert states[0] is MotionState.BROKEN

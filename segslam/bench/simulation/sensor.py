@@ -16,7 +16,7 @@ from segslam.bench.simulation.world import Hits, World
 from segslam.bench.simulation.world_settings import SensorConfig, SensorName
 from segslam.core import geometry
 from segslam.core.trajectory import Poses
-from segslam.core.types import Label, Labels, Points, Scan, Tangent, Transform, Vector
+from segslam.core.types import Label, Labels, Points, Tangent, Transform, Vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,10 +122,6 @@ class Sweep:
     intensity: Vector
     labels: Labels
     instances: Instances
-
-    def scan(self, *, index: int, stamp_ns: int) -> Scan:
-        """The sweep as a `Scan`, without intensities and instances."""
-        return Scan(self.points, stamp_ns, index, self.labels)
 
 
 def make_sensor(config: SensorConfig, *, seed: int) -> Sensor:

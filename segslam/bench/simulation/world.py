@@ -1,6 +1,5 @@
 """A labelled street world for ray casting: one static scene, and moving or parked cars."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -31,19 +30,18 @@ class Hits:
     glass: Flags
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class World:
     """Streets along one drive, made by `build_world`. Equal arguments make equal worlds."""
 
-    def __init__(
-        self, ground: Terrain, static: Mesh, route: Route, parked: list[ParkedCar], moving: list[MovingCar], day: int
-    ) -> None:
-        self.day = day
-        self.ground = ground
-        self.static = static
-        self._scene = scene_of(static)
-        self._route = route
-        self._parked = parked
-        self._moving = moving
+    day: int
+    ground: Terrain
+    static: Mesh
+    scene: o3d.t.geometry.RaycastingScene
+    """That of `static`."""
+    route: Route
+    parked: list[ParkedCar]
+    moving: list[MovingCar]
 
     def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
         """The first hits of rays from the sensor's origin; `directions` (n, 3) are unit vectors in the LiDAR frame."""
@@ -51,16 +49,14 @@ class World:
         rays[:, :3] = T_world_lidar[:3, 3]
         R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
         np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # faster than BLAS
-        hits = _relabelled(cast_mesh(self._scene, self.static, rays), self.ground, rays)
-        for thing in self._changing(time_s, T_world_lidar[:2, 3]):
+        hits = _relabelled(cast_mesh(self.scene, self.static, rays), self.ground, rays)
+        at = T_world_lidar[:2, 3]
+        for car in self.parked:
+            if car.start_s <= time_s < car.end_s and np.hypot(*(at - car.at)) < VIEW_M:
+                _put_nearer(hits, car.mesh, rays)
+        for thing in meshes_at(self.moving, self.route, time_s=time_s, near_xy=at, view_m=VIEW_M):
             _put_nearer(hits, thing, rays)
         return hits
-
-    def _changing(self, time_s: float, near_xy: np.ndarray) -> Iterator[Mesh]:
-        for car in self._parked:
-            if car.start_s <= time_s < car.end_s and np.hypot(*(near_xy - car.at)) < VIEW_M:
-                yield car.mesh
-        yield from meshes_at(self._moving, self._route, time_s=time_s, near_xy=near_xy, view_m=VIEW_M)
 
 
 def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> World:
@@ -82,7 +78,8 @@ def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, se
     standing = [car.mesh for car in parked if not car.changes]
     static = join_meshes([ground_mesh(ground), *standing, *_numbered(things)])
     changing = [car for car in parked if car.changes]
-    return World(ground, static, route, changing, moving_cars(route, config, today or rng), config.day)
+    moving = moving_cars(route, config, today or rng)
+    return World(config.day, ground, static, scene_of(static), route, changing, moving)
 
 
 def _numbered(things: list[Mesh]) -> list[Mesh]:

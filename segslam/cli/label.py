@@ -1,17 +1,16 @@
 """`segslam label`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from segslam.cli.checks import check_own
 from segslam.cli.console import Terminal
-from segslam.cli.options import EncodingOption, LabelsOption, OverwriteOption, ScanOptions, Settings
+from segslam.cli.options import EncodingOption, LabelsOption, Numbering, OverwriteOption, ScanOptions, Settings
 from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
-    from segslam.labels.encodings import Encoding
     from segslam.scans import Dataset
 
 
@@ -24,12 +23,9 @@ def label(
     options: ScanOptions,
     encoding: EncodingOption = None,
     truth_encoding: Annotated[
-        Literal["raw", "learning", "learning-0"] | None,
-        typer.Option(help="Numbering of the true labels, if it cannot be detected."),
+        Numbering | None, typer.Option(help="Numbering of the true labels, if it cannot be detected.")
     ] = None,
-    write_as: Annotated[
-        Literal["raw", "learning", "learning-0"], typer.Option(help="Numbering of the written label files.")
-    ] = "raw",
+    write_as: Annotated[Numbering, typer.Option(help="Numbering of the written label files.")] = "raw",
     pictures: Annotated[int, typer.Option(min=0, help="Number of scans to draw, spread evenly over the drive.")] = 1,
     changes: Settings,
     overwrite: OverwriteOption = False,
@@ -46,11 +42,17 @@ def label(
 
     angle_deg = changes.load().sensor.vertical_angle_deg
 
-    def opened(source: str, numbering: "Encoding | None") -> "Dataset":
+    def opened(source: str, numbering: Numbering | None) -> "Dataset":
         return options.source(data, source, numbering, vertical_angle_deg=angle_deg).open()
 
     scans = opened(labels, encoding)
-    true_scans = _open_truth(truth, truth_encoding, opened) if truth else None
+    true_scans = None
+    if truth:  # a relative folder is searched here, then beside the scans
+        try:
+            true_scans = opened(str(truth.expanduser().absolute() if truth.is_dir() else truth), truth_encoding)
+        except SegslamError as error:
+            text = str(error).replace("--labels", "--truth", 1).replace("--encoding", "--truth-encoding")
+            raise SegslamError(text) from error
     folder = out if overwrite and out.is_dir() else new_folder(out)
     tally = Tally(scans, true_scans, folder, write_as=write_as, num_pictures=pictures)
     for row in terminal.progress(range(len(scans)), len(scans), "label"):
@@ -59,17 +61,6 @@ def label(
         raise SegslamError(f"{data}: none of the {len(scans)} scans could be labelled; see the warnings above")
     figures = tally.figures()
     terminal.table(figures, _table(figures, folder))
-
-
-def _open_truth(truth: Path, numbering: "Encoding | None", opened: Any) -> "Dataset":
-    """The same scans with their true labels. A relative folder is searched here, then beside the scans."""
-    try:
-        scans: Dataset = opened(str(truth.expanduser().absolute() if truth.is_dir() else truth), numbering)
-    except SegslamError as error:
-        raise SegslamError(
-            str(error).replace("--labels", "--truth", 1).replace("--encoding", "--truth-encoding")
-        ) from error
-    return scans
 
 
 def _table(figures: dict[str, Any], folder: Path) -> str:

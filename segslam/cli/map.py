@@ -113,25 +113,20 @@ def resume(
         raise SegslamError(
             f"{recorded.path}: made from Python with its own {chosen['python']}; map the data again from there"
         )
-    names = ("dataset", "sequence", "frames", "topic", "labels")
+    from segslam.labels.encodings import ENCODINGS
+
+    if (numbering := chosen.get("encoding", "raw")) not in ENCODINGS:
+        again = "segslam map DATA --out RUN --resume"
+        raise SegslamError(f"{recorded.path}: --encoding {numbering}: unknown; resume with: {again}")
+    names = ("dataset", "sequence", "frames", "topic", "labels", "encoding")
     options = RunOptions(
         **{name: chosen[name] for name in names if name in chosen},
-        encoding=_encoding(chosen.get("encoding"), recorded.path),
         odometry=Path(chosen["odometry"]) if "odometry" in chosen else None,
         resume=True,
     )
     output = RunOutput(map_file=_map_files(chosen.get("map_files", "[]"), run, recorded.path, terminal), view=view)
     in_map = Path(chosen["in_map"]) if "in_map" in chosen else None
     map_data(data, run, options, output, terminal, GnssOptions.of(chosen), in_map=in_map)
-
-
-def _encoding(name: str | None, log: Path) -> Any:
-    """The numbering of the label files that a log names. Raises SegslamError for an unknown one."""
-    from segslam.labels.encodings import ENCODINGS
-
-    if name and name not in ENCODINGS:
-        raise SegslamError(f"{log}: --encoding {name}: unknown; resume with: segslam map DATA --out RUN --resume")
-    return name
 
 
 def _map_files(names: str, run: Path, log: Path, terminal: Terminal) -> list[Path]:

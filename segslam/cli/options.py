@@ -33,8 +33,9 @@ DatasetOption = Annotated[
         help="Kind of data: kitti, or a reader of kiss-icp; detected by default.",
     ),
 ]
+Numbering = Literal["raw", "learning", "learning-0"]
 EncodingOption = Annotated[
-    Literal["raw", "learning", "learning-0"] | None,
+    Numbering | None,
     typer.Option(
         "--encoding",
         help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18).",

@@ -17,7 +17,7 @@ from segslam.cli.checks import check_exists, check_free, live_configs, make_room
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.ending import counted, finish
 from segslam.cli.options import GnssOptions, PresetOption, RunOutput
-from segslam.cli.viewers import check_display, close_scene, open_scene, serve_foxglove
+from segslam.cli.viewers import check_display, scene_in, serve_foxglove
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.extras import how_to_install
 from segslam.core.interrupts import stopped_by_signals, when_stopped
@@ -91,8 +91,8 @@ def live(
     angle_deg = settings.sensor.vertical_angle_deg or 0.0
     source = _source(folder, topic, intensities=settings.map.color == "intensity", vertical_angle_deg=angle_deg)
     recorded = {"labels": labels, "live": source.name, "map_files": json_text.dumps([str(name) for name in map_names])}
-    scene = open_scene(None) if output.view else None
     with ExitStack() as stack:
+        scene = stack.enter_context(scene_in(None)) if output.view else None
         server = serve_foxglove(output.foxglove, stack, terminal)
         make_room(out, overwrite=output.overwrite, inputs=[folder])
         out = new_folder(out)
@@ -137,8 +137,6 @@ def live(
         )
         if advice := too_slow(more, settings.odometry.voxel_size_m):
             terminal.say(advice)
-    if scene:
-        close_scene(scene, None)
     if ended.failed:
         raise WorkFailed(f"{ended.why}; the scans until then are mapped, results in {out}")
 

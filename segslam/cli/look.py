@@ -10,7 +10,7 @@ from segslam.cli.checks import check_free, check_links, check_run
 from segslam.cli.console import Terminal
 from segslam.cli.options import LogArgument, OverwriteOption
 from segslam.cli.tables import figure, with_meaning
-from segslam.cli.viewers import check_display, close_scene, open_scene
+from segslam.cli.viewers import check_display, scene_in
 
 if TYPE_CHECKING:
     from segslam.output.log import RunLog
@@ -56,13 +56,11 @@ def view(
     from segslam.output.log import read_log
 
     log = read_log(run)
-    with nullcontext() if save is None else whole_file(save) as part:
-        scene = open_scene(part, named=save)
+    with nullcontext() if save is None else whole_file(save) as part, scene_in(part, named=save) as scene:
         num_steps = 0
         for step in terminal.progress(log.steps(), log.num_steps(), "view"):
             scene.add(step)
             num_steps += 1
-        close_scene(scene, save)
     figures = {"num_steps": num_steps, "file": str(save) if save else None}
     terminal.answer(figures, f"written to {save}" if save else "all steps are in the viewer")
 

@@ -24,7 +24,7 @@ from segslam.cli.checks import (
 from segslam.cli.console import Terminal, how_to_go_on, print_json, say
 from segslam.cli.ending import finish, is_interrupted, map_summary
 from segslam.cli.options import DataArgument, GnssOptions, RunOptions, RunOutput, ViewOption
-from segslam.cli.viewers import check_display, close_scene, open_scene, serve_foxglove
+from segslam.cli.viewers import check_display, scene_in, serve_foxglove
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
@@ -195,8 +195,8 @@ def map_data(
             raise typer.Exit(0)
     else:
         make_room(folder, overwrite=output.overwrite, inputs=(data, in_map, options.odometry))
-    scene = open_scene(None) if output.view else None
     with ExitStack() as stack:
+        scene = stack.enter_context(scene_in(None)) if output.view else None
         server = serve_foxglove(output.foxglove, stack, terminal)
         map_scans(
             scans,
@@ -213,8 +213,6 @@ def map_data(
             place=place,
             mirror=server.send if server else None,
         )
-    if scene:
-        close_scene(scene, None)
 
 
 def _in_map(in_map: Path | None) -> "tuple[SlamOf | None, Callable[[Path], str] | None]":

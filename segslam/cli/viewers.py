@@ -2,7 +2,8 @@
 
 import os
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,8 +44,12 @@ def check_display() -> None:
         )
 
 
-def open_scene(file: Path | None, *, named: Path | None = None) -> "Scene":
-    """An empty scene in a new viewer, or in a file, called `named` in messages. Raises SegslamError if it fails."""
+@contextmanager
+def scene_in(file: Path | None, *, named: Path | None = None) -> "Iterator[Scene]":
+    """Context manager with an empty scene in a new viewer, or in a file, called `named` in messages.
+
+    It ends when the viewer or the file has received everything. Raises SegslamError if it fails.
+    """
     os.environ.setdefault("RUST_LOG", "off")  # otherwise Rerun prints every action
     try:
         import rerun
@@ -61,17 +66,14 @@ def open_scene(file: Path | None, *, named: Path | None = None) -> "Scene":
             viewer.spawn()
         else:
             viewer.save(file)
-        return Scene(viewer)
+        scene = Scene(viewer)
     except (OSError, RuntimeError) as error:
         raise _no_viewer(named, error) from error
-
-
-def close_scene(scene: "Scene", file: Path | None) -> None:
-    """Wait until the viewer or the file has received everything. Raises SegslamError if it fails."""
+    yield scene
     try:
         scene.end()
     except (OSError, RuntimeError) as error:
-        raise _no_viewer(file, error) from error
+        raise _no_viewer(named, error) from error
 
 
 def _no_viewer(file: Path | None, error: Exception) -> SegslamError:

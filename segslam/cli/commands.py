@@ -26,7 +26,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "locate": ("locate.locate", "Find the poses of single scans in a map."),
         "localise": ("map.localise", "Localise a drive in the map of an earlier run."),
         "merge": ("merge.merge", "Merge runs that share places into one run."),
-        "georeference": ("georeference.georeference", "Place a run on the globe by position fixes."),
+        "georeference": ("export.georeference", "Place a run on the globe by position fixes."),
         "export": ("export.export", "Write the map: cloud, top view, occupancy grid."),
     },
     "Look": {
@@ -43,8 +43,8 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
     "Data and machine": {
         "demo": ("simulate.demo", "Simulate a street drive and map it."),
         "simulate": ("simulate.simulate", "Simulate a labelled drive in KITTI's format."),
-        "label": ("label.label", "Label scans, and measure the labels."),
-        "calibrate": ("calibrate.calibrate", "Measure the error of the sensor's vertical angles."),
+        "label": ("scans.label", "Label scans, and measure the labels."),
+        "calibrate": ("scans.calibrate", "Measure the error of the sensor's vertical angles."),
         "doctor": ("doctor.doctor", "Show versions, libraries and processor."),
         "warm-up": ("doctor.warm_up", "Compile all numba kernels now."),
     },

@@ -1,4 +1,4 @@
-"""`segslam export` and `convert`: maps and trajectories as files for other programs."""
+"""`segslam export`, `convert` and `georeference`: maps and trajectories for other programs; place on the globe."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -6,9 +6,10 @@ from typing import Annotated, Literal
 import typer
 
 from segslam.cli.checks import check_exists, check_free
-from segslam.cli.console import Terminal
+from segslam.cli.console import Terminal, print_out
 from segslam.cli.ending import map_summary
-from segslam.cli.options import OverwriteOption, Settings
+from segslam.cli.options import GnssOptions, OverwriteOption, Settings
+from segslam.core.errors import SegslamError
 
 FormatOf = Literal["kitti", "tum", "csv"] | None
 
@@ -85,3 +86,33 @@ def convert(
         to=to_frame,
     )
     terminal.answer({"num_poses": num_poses, "file": str(target)}, f"{num_poses} poses in {target}")
+
+
+def georeference(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run.")], *, gnss: GnssOptions, terminal: Terminal
+) -> None:
+    """Place a finished run on the globe by its position fixes, right also where the receiver is wrong.
+
+    Writes georeference.json, gnss.csv (each fix: kept, or why not), poses_geodetic.csv and poses_enu_tum.txt into its
+    folder. `segslam export` then writes maps with a coordinate system.
+
+    Example: segslam georeference runs/00 --gnss fixes.csv
+    """
+    check_exists(run, "give the folder of a finished run")
+    terminal.announce(f"georeference: reading {gnss.gnss}")
+    from segslam.output.folder import folder_of
+    from segslam.output.georeferenced import FILE
+    from segslam.output.log import read_log
+    from segslam.output.report import write_report
+
+    folder = folder_of(run)
+    data = read_log(folder).options.get("data")  # may have a topic with fixes
+    place = gnss.placing(Path(data) if data else None)
+    if place is None:
+        raise SegslamError("--gnss: give the position fixes, as in --gnss fixes.csv")
+    placed = place(folder)
+    write_report(folder)
+    if terminal.json:
+        print_out((folder / FILE).read_text(encoding="utf-8").rstrip())
+    else:
+        terminal.say(f"{placed}\nresults in {folder}: georeference.json, gnss.csv, poses_geodetic.csv")

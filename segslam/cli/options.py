@@ -284,15 +284,8 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     parameters = [
         parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
         for name, one in own.parameters.items()
-        for parameter in (_parameters(records[name]) if name in records else [one])
+        for parameter in (inspect.signature(records[name]).parameters.values() if name in records else [one])
     ]
     flat.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {one.name: one.annotation for one in parameters}
     return flat
-
-
-def _parameters(record: type[Any]) -> list[inspect.Parameter]:
-    return [
-        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=field.type, default=field.default)
-        for field in fields(record)
-    ]

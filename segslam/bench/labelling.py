@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from segslam.core import geometry
-from segslam.core.types import GROUND_LABELS, BadScan, Label, Labels, Points, Scan
+from segslam.core.types import GROUND_LABELS, BadScan, Label, Labels, Points
 from segslam.core.whole_files import write_whole
 from segslam.labels import geometric_labels
 from segslam.labels.encodings import Colors, Encoding, of_classes
@@ -85,7 +85,11 @@ class Tally:
         name = self._scans.names[row]
         write_labels(self._folder / f"{name}.label", labels, scan.kept, self._encoding)
         if row in self._drawn:
-            write_whole(self._folder / f"{name}.png", self._picture(name, scan, labels, truth))
+            network = self._scans.labels.network
+            image = network.settings if network else fitting_image(scan.points)
+            title = f"{self._scans.name}, scan {name}, {len(labels)} points"
+            picture = draw_labels(scan.points, labels, truth=truth, image=image, title=title)
+            write_whole(self._folder / f"{name}.png", picture)
 
     def figures(self) -> dict[str, Any]:
         """Shares of the classes and time; with true labels also scores, and `confusion.csv` is written."""
@@ -115,12 +119,6 @@ class Tally:
                 for true, given, share in largest_confusions(counts, 6)
             ],
         }
-
-    def _picture(self, name: str, scan: Scan, labels: Labels, truth: Labels | None) -> bytes:
-        network = self._scans.labels.network
-        image = network.settings if network else fitting_image(scan.points)
-        title = f"{self._scans.name}, scan {name}, {len(labels)} points"
-        return draw_labels(scan.points, labels, truth=truth, image=image, title=title)
 
 
 def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: ImageSettings, title: str) -> bytes:

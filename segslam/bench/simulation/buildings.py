@@ -28,7 +28,8 @@ def wall(rng: np.random.Generator, width_m: float, levels: Vector, *, relief: fl
     `levels` (k,): heights (m) of sills and lintels, alternating, between which the panels lie. `relief`: share of the
     bays, 0 to 1, that differ from a plain window.
     """
-    edges = _bays(rng, width_m)
+    inner = np.cumsum(rng.uniform(0.8, 2.4, size=int(width_m)))
+    edges = np.concatenate([[0.0], inner[inner < width_m - 0.8], [width_m]]) - width_m / 2
     depth = np.zeros((len(levels) - 1, len(edges) - 1))
     kinds = rng.uniform(size=depth.shape[1])
     depth[1::2, kinds > 0.35] = 0.18  # window panes are recessed
@@ -37,12 +38,6 @@ def wall(rng: np.random.Generator, width_m: float, levels: Vector, *, relief: fl
     depth[:2, door] = 0.35
     depth[:2, passage] = rng.uniform(0.8, 2.0)
     return panels(edges, levels, depth)
-
-
-def _bays(rng: np.random.Generator, width_m: float) -> Vector:
-    inner = np.cumsum(rng.uniform(0.8, 2.4, size=int(width_m)))
-    inner = inner[inner < width_m - 0.8]
-    return np.concatenate([[0.0], inner, [width_m]]) - width_m / 2
 
 
 def panels(edges: Vector, levels: Vector, depth: np.ndarray) -> Mesh:

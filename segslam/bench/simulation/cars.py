@@ -141,14 +141,10 @@ def meshes_at(
         travel = car.start_m + car.speed * time_s
         if not 1.0 < travel < route.travel_m[-1] - 1.0:
             continue
-        behind, ahead = (_on_route(route, travel + step) for step in (-0.5, 0.5))
+        near_m = travel - 0.5, travel + 0.5
+        behind, ahead = np.column_stack([np.interp(near_m, route.travel_m, axis) for axis in route.at.T])
         heading = np.arctan2(ahead[1] - behind[1], ahead[0] - behind[0])
         x, y, z = (behind + ahead) / 2 + car.lateral_m * np.array([-np.sin(heading), np.cos(heading), 0.0])
         if SAFE_M < np.hypot(x - near_xy[0], y - near_xy[1]) < view_m:
             turn = heading + (np.pi if car.speed < 0 else 0.0)
             yield as_instance(placed(car.mesh, x, y, z, yaw_rad=turn), number)
-
-
-def _on_route(route: Route, travel_m: float) -> np.ndarray:
-    """(3,) position on the route after a distance of travel."""
-    return np.array([np.interp(travel_m, route.travel_m, route.at[:, axis]) for axis in range(3)])

@@ -40,9 +40,10 @@ def furnish(site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.
             yield from _shrubs(lot, GARDEN_SHRUBS * config.shrubs, GARDEN_M, rng)
         yield from _closure(lot, config, rng)
         yield from _shrubs(lot, BACKDROP_SHRUBS * config.shrubs, BACKDROP_M, rng)
-    make_tree, tree_jitter = (_equal_tree, 0.0) if config.equal_tree_rows else (objects.tree, 0.8)
+    equal = config.equal_tree_rows
+    make_tree: Maker = (lambda _: objects.tree(np.random.default_rng(0), scale=0.5)) if equal else objects.tree
     for per_100m, make, distance_m, jitter in (
-        (config.trees, make_tree, TREE_M, tree_jitter),
+        (config.trees, make_tree, TREE_M, 0.0 if equal else 0.8),
         (config.lamps, buildings.lamp, LAMP_M, 0.3),
         (config.signs, buildings.sign, SIGN_M, 0.9),
         (config.clutter, buildings.clutter, TREE_M, 0.9),
@@ -70,11 +71,6 @@ def _row(
         thing = make(rng)
         if site.claim(spot, 0.5, 0.5, clearance_m=3.0):
             yield site.stand(thing, spot, turn_rad=float(rng.normal(scale=0.05)))
-
-
-def _equal_tree(_: np.random.Generator) -> Mesh:
-    """The same tree each time."""
-    return objects.tree(np.random.default_rng(0), scale=0.5)
 
 
 def _lots(site: Site, frontage: Frontage, rng: np.random.Generator) -> Iterator[Lot]:

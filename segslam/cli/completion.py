@@ -62,7 +62,7 @@ def settings(incomplete: str) -> list[str]:
 
 def simulation_settings(incomplete: str) -> list[str]:
     """As `settings`, of the simulation."""
-    from segslam.bench.simulation import SimulationConfig
+    from segslam.bench.simulation.world_settings import SimulationConfig
 
     return _settings(SimulationConfig, incomplete)
 

@@ -69,19 +69,19 @@ def simulate(
     """
     check_own(out, "sequences", "poses")
     terminal.announce(f"simulate: making a drive in {out}")
-    from segslam.bench import simulation
+    from segslam.bench.simulation.files import prepare_folder, write_drive
+    from segslam.bench.simulation.tracks import example_drive, in_lane, read_drive
+    from segslam.bench.simulation.world_settings import simulation_config
 
-    config = simulation.simulation_config(sensor, settings or ())
-    drive = simulation.example_drive(frames or 0) if poses is None else simulation.read_drive(poses, sequence=sequence)
-    driven = simulation.in_lane(drive, left_m=lane, reverse=reverse)
+    config = simulation_config(sensor, settings or ())
+    drive = example_drive(frames or 0) if poses is None else read_drive(poses, sequence=sequence)
+    driven = in_lane(drive, left_m=lane, reverse=reverse)
     total = min(frames or len(drive.time_s), len(drive.time_s))
     only = _named(pairs, total, sample=sample) if pairs else None
     total = len(only) if only is not None else total
-    simulation.prepare_folder(out, sequence, overwrite=overwrite)
+    prepare_folder(out, sequence, overwrite=overwrite)
     terminal.say(f"building the world for {total} scans")
-    written = simulation.write_drive(
-        out, sequence, drive, config=config, seed=seed, driven=driven, num_frames=frames, only=only
-    )
+    written = write_drive(out, sequence, drive, config=config, seed=seed, driven=driven, num_frames=frames, only=only)
     last = 0
     begin_again = f"to start again: {same_command_with('--overwrite')}"
     try:
@@ -109,8 +109,9 @@ def demo(
     Example: segslam demo --out runs/demo
     """
     terminal.announce(f"demo: simulating a drive in {out}")
-    from segslam.bench import simulation
-    from segslam.bench.simulation.files import SETTINGS_FILE
+    from segslam.bench.simulation.files import SETTINGS_FILE, prepare_folder, write_drive
+    from segslam.bench.simulation.tracks import example_drive
+    from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig
     from segslam.core.config import Config
     from segslam.core.whole_files import write_whole
     from segslam.output.folder import new_folder
@@ -121,11 +122,11 @@ def demo(
     data = new_folder(out) / "data"
     begin_again = f"to start again: {same_command_with('--overwrite')}"
     when_stopped(begin_again)
-    sensor = simulation.SensorConfig(name=SENSOR, axis_wander_sigma_deg=AXIS_WANDER_DEG, axis_wander_s=AXIS_WANDER_S)
-    drive = simulation.example_drive(scale=SCALE)
-    simulation.prepare_folder(data, SEQUENCE, overwrite=False)
-    config = simulation.SimulationConfig(sensor=sensor)
-    written = simulation.write_drive(data, SEQUENCE, drive, config=config, seed=SEED)
+    sensor = SensorConfig(name=SENSOR, axis_wander_sigma_deg=AXIS_WANDER_DEG, axis_wander_s=AXIS_WANDER_S)
+    drive = example_drive(scale=SCALE)
+    prepare_folder(data, SEQUENCE, overwrite=False)
+    config = SimulationConfig(sensor=sensor)
+    written = write_drive(data, SEQUENCE, drive, config=config, seed=SEED)
     with how_to_go_on(begin_again):
         for _ in terminal.progress(written, len(drive.time_s), "simulate"):
             pass

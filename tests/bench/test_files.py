@@ -5,22 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from segslam.bench.simulation import (
-    Drive,
-    SensorConfig,
-    SimulationConfig,
-    WorldConfig,
-    build_world,
-    drive_sweeps,
-    example_drive,
-    in_lane,
-    prepare_folder,
-    read_drive,
-    write_drive,
-    write_sequence,
-)
-from segslam.bench.simulation.files import uncorrected
-from segslam.bench.simulation.tracks import NOMINAL_CALIB
+from segslam.bench.simulation.files import prepare_folder, uncorrected, write_drive, write_sequence
+from segslam.bench.simulation.sensor import drive_sweeps
+from segslam.bench.simulation.tracks import NOMINAL_CALIB, Drive, example_drive, in_lane, read_drive
+from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core.trajectory import read_poses, write_kitti
 from segslam.core.types import Label, SegslamError
 from segslam.labels.encodings import RAW_OF_LABEL

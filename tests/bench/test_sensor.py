@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from segslam.bench.simulation import SensorConfig, WorldConfig, build_world, make_sensor, sweep
-from segslam.bench.simulation.sensor import NO_ERROR, PATTERNS, SweepError
+from segslam.bench.simulation.sensor import NO_ERROR, PATTERNS, SweepError, make_sensor, sweep
+from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world_settings import SensorConfig, WorldConfig
 from segslam.core.types import GROUND_LABELS, Label
 
 PERFECT = {

@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 from helpers.drives import simulate_drive
 
-from segslam.bench.simulation import (
-    WorldConfig,
-    build_world,
-    example_drive,
-    make_sensor,
-    read_drive,
-    sweep,
-)
-from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig
+from segslam.bench.simulation.sensor import make_sensor, sweep
+from segslam.bench.simulation.tracks import example_drive, read_drive
+from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core.types import GROUND_LABELS, Label
 
 STILL = WorldConfig(moving_cars=0)

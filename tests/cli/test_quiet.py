@@ -19,7 +19,7 @@ from helpers.finished_run import make_run
 from typer.main import get_command
 
 from segslam import cli
-from segslam.bench import simulation
+from segslam.bench.simulation import tracks
 from segslam.cli import commands
 from segslam.output import report
 
@@ -108,9 +108,9 @@ OF_MAPPED: dict[str, Callable[[Path, Path, Path], Words]] = {
 
 @pytest.fixture(autouse=True)
 def short_demo(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = simulation.example_drive()
+    drive = tracks.example_drive()
     short = replace(drive, T_world_lidar=drive.T_world_lidar[:2], time_s=drive.time_s[:2])
-    monkeypatch.setattr(simulation, "example_drive", lambda *_, **__: short)
+    monkeypatch.setattr(tracks, "example_drive", lambda *_, **__: short)
 
 
 @pytest.fixture(params=[*COMMANDS, *OF_MAPPED])

@@ -14,16 +14,16 @@ from segslam.core import kernels
 DRIVER = """
 import json, sys
 from dataclasses import replace
-import segslam.bench.simulation
+import segslam.bench.simulation.tracks
 from segslam.cli import main
 
-real = segslam.bench.simulation.example_drive
+real = segslam.bench.simulation.tracks.example_drive
 
 def short_drive(*options, **more):
     drive = real(*options, **more)
     return replace(drive, T_world_lidar=drive.T_world_lidar[:NUM_SCANS], time_s=drive.time_s[:NUM_SCANS])
 
-segslam.bench.simulation.example_drive = short_drive  # the demo's has hundreds of scans
+segslam.bench.simulation.tracks.example_drive = short_drive  # the demo's has hundreds of scans
 if __name__ == "__main__":  # else the process of the odometry runs it too
     for command in json.load(open(sys.argv[1])):
         try:

@@ -7,15 +7,9 @@ import numpy as np
 import pytest
 from helpers.drives import NUM_SCANS, RADIUS_M, STEP_M, simulate_drive
 
-from segslam.bench.simulation import (
-    SensorConfig,
-    SimulationConfig,
-    WorldConfig,
-    build_world,
-    make_sensor,
-    sweep,
-    sweep_errors,
-)
+from segslam.bench.simulation.sensor import make_sensor, sweep, sweep_errors
+from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Alignment, Information, Transform

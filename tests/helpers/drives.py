@@ -7,15 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.bench.simulation import (
-    SensorConfig,
-    SimulationConfig,
-    WorldConfig,
-    example_drive,
-)
 from segslam.bench.simulation.files import uncorrected
 from segslam.bench.simulation.sensor import Sweep, drive_sweeps
+from segslam.bench.simulation.tracks import example_drive
 from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.trajectory import Poses, camera_from_lidar, write_kitti

@@ -6,15 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.bench.simulation import (
-    SensorConfig,
-    SimulationConfig,
-    WorldConfig,
-    example_drive,
-    prepare_folder,
-    write_drive,
-)
-from segslam.bench.simulation.tracks import Drive, in_lane
+from segslam.bench.simulation.files import prepare_folder, write_drive
+from segslam.bench.simulation.tracks import Drive, example_drive, in_lane
+from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core import geometry
 from segslam.core.trajectory import Poses
 

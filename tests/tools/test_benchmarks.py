@@ -16,7 +16,7 @@ from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 
 from segslam.bench.experiments.pairs import PairList
-from segslam.bench.simulation import example_drive
+from segslam.bench.simulation.tracks import example_drive
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.trajectory import camera_from_lidar, write_kitti

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.bench.simulation import level_revisits, level_world
+from segslam.bench.simulation.tracks import level_revisits, level_world
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import trajectory_metrics

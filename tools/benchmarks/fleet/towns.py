@@ -5,15 +5,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from segslam.bench.simulation import (
-    SensorConfig,
-    SimulationConfig,
-    WorldConfig,
-    in_lane,
-    prepare_folder,
-    write_drive,
-)
-from segslam.bench.simulation.tracks import Drive, read_drive
+from segslam.bench.simulation.files import prepare_folder, write_drive
+from segslam.bench.simulation.tracks import Drive, in_lane, read_drive
+from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 
 TOWNS = ("00", "05", "06", "07", "02", "08")
 NUM_FRAMES = 240

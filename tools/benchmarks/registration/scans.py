@@ -9,19 +9,10 @@ import numpy as np
 
 from segslam.bench.experiments.job import open_once
 from segslam.bench.experiments.trials import ScanVariant, Trial
-from segslam.bench.simulation import (
-    Drive,
-    SimulationConfig,
-    SweepError,
-    WorldConfig,
-    build_world,
-    make_sensor,
-    read_drive,
-    sweep,
-    sweep_errors,
-)
-from segslam.bench.simulation.sensor import Sensor
-from segslam.bench.simulation.world import World
+from segslam.bench.simulation.sensor import Sensor, SweepError, make_sensor, sweep, sweep_errors
+from segslam.bench.simulation.tracks import Drive, read_drive
+from segslam.bench.simulation.world import World, build_world
+from segslam.bench.simulation.world_settings import SimulationConfig, WorldConfig
 from segslam.core import geometry
 from segslam.core.types import Labels, Points, Scan, Transform
 from segslam.labels import geometric_labels

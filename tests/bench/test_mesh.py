@@ -4,7 +4,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from segslam.bench.simulation import buildings, objects
+from segslam.bench.simulation import objects
 from segslam.bench.simulation.mesh import Mesh, as_instance, box, extruded, frustum, join_meshes, placed, stem
 from segslam.core.types import Label
 
@@ -103,7 +103,7 @@ def test_lorries_are_longer_and_taller_than_cars():
 
 def test_a_wall_has_no_holes_and_relief_along_the_street():
     """Perpendicular rays all meet it at different ranges: bays make positions along the street distinguishable."""
-    part = buildings.building(np.random.default_rng(1), 20.0, 10.0)
+    part = objects.building(np.random.default_rng(1), 20.0, 10.0)
     x, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-9.7, 9.7, 200), np.linspace(0.1, 3.0, 30)))
     origins = np.column_stack([x, np.full(len(x), -10.0), z])
     ranges, met = cast(part, origins, np.broadcast_to([0.0, 1.0, 0.0], origins.shape))
@@ -115,7 +115,7 @@ def test_a_wall_has_no_holes_and_relief_along_the_street():
 
 
 def test_all_four_sides_of_a_building_face_outward():
-    part = buildings.building(np.random.default_rng(2), 12.0, 9.0)
+    part = objects.building(np.random.default_rng(2), 12.0, 9.0)
     origins = np.array([[0.0, -30.0, 1.5], [0.0, 40.0, 1.5], [-30.0, 4.5, 1.5], [30.0, 4.5, 1.5]])
     ranges, _ = cast(part, origins, np.array([[0, 1.0, 0], [0, -1.0, 0], [1.0, 0, 0], [-1.0, 0, 0]]))
     # reliefs reach 0.9 m out and 2 m in
@@ -144,7 +144,7 @@ def test_a_hedge_stops_most_rays_with_a_rough_face():
 
 
 def test_a_sign_is_a_plate_on_a_post():
-    part = buildings.sign(np.random.default_rng(0))
+    part = objects.sign(np.random.default_rng(0))
     plate = part.vertices[np.unique(part.triangles[part.labels == Label.TRAFFIC_SIGN])]
     post = part.vertices[np.unique(part.triangles[part.labels == Label.POLE])]
     assert plate[:, 2].min() > 1.0

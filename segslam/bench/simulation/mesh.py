@@ -124,8 +124,8 @@ def stem(
     return mesh(np.concatenate(rings), np.concatenate(bands), label)
 
 
-def leaves(centres: np.ndarray, size_m: float, rng: np.random.Generator, label: Label = Label.VEGETATION) -> Mesh:
+def leaves(centres: np.ndarray, size_m: float, rng: np.random.Generator) -> Mesh:
     """A randomly oriented triangle of about `size_m` around each centre; simulates foliage."""
     corners = rng.normal(scale=size_m / 2, size=(len(centres), 3, 3))
     vertices = (centres[:, None] + corners - corners.mean(axis=1, keepdims=True)).reshape(-1, 3)
-    return mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), label)
+    return mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), Label.VEGETATION)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from segslam.bench.simulation import buildings, objects
+from segslam.bench.simulation import objects
 from segslam.bench.simulation.mesh import Mesh
 from segslam.bench.simulation.site import Frontage, Site, displaced
 from segslam.bench.simulation.world_settings import WorldConfig
@@ -44,9 +44,9 @@ def furnish(site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.
     make_tree: Maker = (lambda _: objects.tree(np.random.default_rng(0), scale=0.5)) if equal else objects.tree
     for per_100m, make, distance_m, jitter in (
         (config.trees, make_tree, TREE_M, 0.0 if equal else 0.8),
-        (config.lamps, buildings.lamp, LAMP_M, 0.3),
-        (config.signs, buildings.sign, SIGN_M, 0.9),
-        (config.clutter, buildings.clutter, TREE_M, 0.9),
+        (config.lamps, objects.lamp, LAMP_M, 0.3),
+        (config.signs, objects.sign, SIGN_M, 0.9),
+        (config.clutter, objects.clutter, TREE_M, 0.9),
     ):
         yield from _row(site, frontage, per_100m, make, distance_m, rng, jitter=jitter)
 
@@ -87,7 +87,7 @@ def _house(lot: Lot, rng: np.random.Generator) -> Iterator[Mesh]:
     depth, wide = rng.uniform(8.0, 12.0), lot.width_m - max(0.0, rng.uniform(-1.5, 3.0))
     spot = lot.site.outward(lot.frontage, lot.middle, rng.uniform(*HOUSE_M))
     if lot.site.claim(displaced(spot, out_m=depth / 2 + 0.5), wide, depth, clearance_m=6.5):
-        yield lot.site.stand(buildings.building(rng, wide, depth), spot)
+        yield lot.site.stand(objects.building(rng, wide, depth), spot)
         way = displaced(spot, along_m=rng.uniform(-0.3, 0.3) * wide, out_m=-3.0)
         lot.site.pave(way, 3.0, 6.0, Label.SIDEWALK)
 
@@ -100,7 +100,7 @@ def _closure(lot: Lot, config: WorldConfig, rng: np.random.Generator) -> Iterato
         if kind < config.hedged:
             yield lot.site.stand(objects.hedge(rng, length, rng.uniform(0.7, 1.1), rng.uniform(0.9, 2.2)), spot)
         else:
-            yield lot.site.stand(buildings.fence(rng, length), spot)
+            yield lot.site.stand(objects.fence(rng, length), spot)
 
 
 def _shrubs(lot: Lot, mean: float, distance_m: tuple[float, float], rng: np.random.Generator) -> Iterator[Mesh]:

@@ -29,9 +29,8 @@ from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.bench.experiments.job import Job
-    from segslam.bench.experiments.pairs import PairList
+    from segslam.bench.experiments.pairs import PairList, Trial
     from segslam.bench.experiments.rows import Row
-    from segslam.bench.experiments.trials import Trial
     from segslam.core.types import Trajectory
 
 app = typer.Typer(
@@ -302,11 +301,11 @@ def _experiment(
     """
     job = _make_job(data, options, changes, terminal)
     from segslam.bench.experiments.job import open_once
+    from segslam.bench.experiments.pairs import PAPER_PAIR, pair_trials
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
     from segslam.bench.experiments.report_tables import overall, plain
     from segslam.bench.experiments.rows import results
-    from segslam.bench.experiments.trials import PAPER_PAIR, pair_trials
 
     reference = open_once(job.source)[0].reference
     lists = _read_lists(options, reference, default=PAPER_PAIR if varied else None)

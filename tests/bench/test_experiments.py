@@ -11,9 +11,18 @@ from segslam.bench.experiments import paper, provenance
 from segslam.bench.experiments.benchmark import run
 from segslam.bench.experiments.job import Job
 from segslam.bench.experiments.method_settings import METHOD_NAMES
-from segslam.bench.experiments.pairs import PairList, cut_pairs, read_pairs, sample_pairs, true_poses
+from segslam.bench.experiments.pairs import (
+    PAPER_PAIR,
+    PairList,
+    ScanVariant,
+    cut_pairs,
+    pair_trials,
+    read_pairs,
+    sample_pairs,
+    trial,
+    true_poses,
+)
 from segslam.bench.experiments.rows import Row, figures, read_rows, results, worst_failures, write_rows
-from segslam.bench.experiments.trials import PAPER_PAIR, ScanVariant, pair_trials, trial
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import SegslamError, Trajectory

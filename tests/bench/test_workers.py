@@ -10,9 +10,8 @@ from helpers.drives import round_drive, write_kitti_sequence
 
 from segslam.bench.experiments.benchmark import in_order, run
 from segslam.bench.experiments.job import Job
-from segslam.bench.experiments.pairs import PairList, cut_pairs
+from segslam.bench.experiments.pairs import PairList, Trial, cut_pairs, pair_trials
 from segslam.bench.experiments.rows import Row, read_rows
-from segslam.bench.experiments.trials import Trial, pair_trials
 from segslam.core.config import Config
 from segslam.core.types import SegslamError
 from segslam.scans import DataSource

@@ -8,9 +8,8 @@ import numpy as np
 
 from segslam.bench.experiments import benchmark
 from segslam.bench.experiments.job import Job
-from segslam.bench.experiments.pairs import PairList, read_pairs
+from segslam.bench.experiments.pairs import PairList, Trial, pair_trials, read_pairs
 from segslam.bench.experiments.rows import Row
-from segslam.bench.experiments.trials import Trial, pair_trials
 from segslam.core.config import Config
 from segslam.scans import DataSource
 

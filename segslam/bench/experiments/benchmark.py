@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from segslam.bench.experiments.job import Job, failed_row, register_trial, shared_scan
+from segslam.bench.experiments.pairs import ScanVariant, Trial
 from segslam.bench.experiments.rows import LOST_WORKER, Row, append_rows, grouped, read_rows, write_rows
-from segslam.bench.experiments.trials import ScanVariant, Trial
 from segslam.core.errors import reason
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import write_whole

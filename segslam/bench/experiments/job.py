@@ -8,8 +8,8 @@ from functools import lru_cache
 from segslam.bench.experiments.baselines import Estimate
 from segslam.bench.experiments.meter import Cost, measured
 from segslam.bench.experiments.methods import METHODS, Part, prepare_parts
+from segslam.bench.experiments.pairs import ScanVariant, Trial
 from segslam.bench.experiments.rows import Row
-from segslam.bench.experiments.trials import ScanVariant, Trial
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import PoseError

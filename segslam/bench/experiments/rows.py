@@ -8,7 +8,7 @@ from typing import Annotated, Any, TextIO
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
-from segslam.bench.experiments.trials import ScanVariant
+from segslam.bench.experiments.pairs import ScanVariant
 from segslam.core.evaluation import PoseError
 from segslam.core.types import SegslamError, Transform
 from segslam.core.whole_files import cannot_write, whole_file

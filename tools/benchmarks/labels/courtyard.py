@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from segslam.bench.experiments.job import open_once, points_of
-from segslam.bench.experiments.pairs import PairList, cut_pairs
+from segslam.bench.experiments.pairs import PairList, Trial, cut_pairs, pair_trials
 from segslam.bench.experiments.rows import Row, figures, grouped
-from segslam.bench.experiments.trials import Trial, pair_trials
 from segslam.core.config import Config
 from segslam.core.types import Label, Points, Trajectory
 from segslam.labels import geometric_labels

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam import keep_freed_memory
-from segslam.bench.experiments.trials import pair_trials
+from segslam.bench.experiments.pairs import pair_trials
 from segslam.core.config import Config, load_config
 from segslam.labels.label_files import computed
 from tools.benchmarks import common, real_pairs

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from segslam.bench.experiments.trials import Trial
+from segslam.bench.experiments.pairs import Trial
 from segslam.core.config import Config, load_config
 from segslam.core.types import Description, Label
 from segslam.registration import segregator

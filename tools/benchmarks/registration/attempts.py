@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from segslam.bench.experiments.trials import Trial
+from segslam.bench.experiments.pairs import Trial
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import PoseError

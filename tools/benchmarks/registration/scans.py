@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam.bench.experiments.job import open_once
-from segslam.bench.experiments.trials import ScanVariant, Trial
+from segslam.bench.experiments.pairs import ScanVariant, Trial
 from segslam.bench.simulation.sensor import Sensor, SweepError, make_sensor, sweep, sweep_errors
 from segslam.bench.simulation.tracks import Drive, read_drive
 from segslam.bench.simulation.world import World, build_world

@@ -9,7 +9,7 @@ import numpy as np
 
 from segslam.bench.experiments.baselines import align_gicp, prepare_gicp
 from segslam.bench.experiments.meter import measured
-from segslam.bench.experiments.trials import Trial
+from segslam.bench.experiments.pairs import Trial
 from segslam.core.config import Config
 from segslam.core.types import Description, Label, Points, Registration
 from segslam.registration import refinement, segregator

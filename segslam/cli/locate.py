@@ -170,8 +170,7 @@ def register(
     scans: list[dict[str, Any]] = []
     for name, (points, classes) in zip(("source", "target"), clouds, strict=True):
         with watch(f"describe_{name}"):
-            parts = prepare_parts(points, classes, methods=[method], config=settings)
-        scans.append({part: made.value for part, made in parts.items()})
+            scans.append(prepare_parts(points, classes, methods=[method], config=settings)[0])
     found = chosen.align(scans[0], scans[1], settings, watch)
     figures = _pose(found, watch)
     _show_pose(figures, terminal)

@@ -33,8 +33,8 @@ def parts() -> tuple[dict[str, Any], dict[str, Any]]:
     made = [
         prepare_parts(scans[i].points, scans[i].labels, methods=METHOD_NAMES, config=CONFIG) for i in (SOURCE, TARGET)
     ]
-    assert all(part.cost.seconds > 0 for one in made for part in one.values())
-    source, target = ({name: part.value for name, part in one.items()} for one in made)
+    (source, source_costs), (target, target_costs) = made
+    assert all(cost.seconds > 0 for cost in (*source_costs.values(), *target_costs.values()))
     return source, target
 
 
@@ -70,8 +70,7 @@ def test_a_method_that_finds_nothing_rejects(name: str) -> None:
     both = []
     for seed in range(2):
         points = 30 * np.random.default_rng(seed).normal(size=(12, 3)).astype(np.float32)
-        parts = prepare_parts(points, np.zeros(12, np.uint8), methods=[installed(name)], config=CONFIG)
-        both.append({part: made.value for part, made in parts.items()})
+        both.append(prepare_parts(points, np.zeros(12, np.uint8), methods=[installed(name)], config=CONFIG)[0])
     assert isinstance(METHODS[name].align(*both, CONFIG, Stopwatch()), Rejected)
 
 

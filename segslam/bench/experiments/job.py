@@ -4,10 +4,11 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 from segslam.bench.experiments.baselines import Estimate
 from segslam.bench.experiments.meter import Cost, measured
-from segslam.bench.experiments.methods import METHODS, Part, prepare_parts
+from segslam.bench.experiments.methods import METHODS, prepare_parts
 from segslam.bench.experiments.pairs import ScanVariant, Trial
 from segslam.bench.experiments.rows import Row
 from segslam.core import geometry
@@ -37,7 +38,9 @@ class Job:
 class SharedScan:
     """The data of one scan that the methods share."""
 
-    parts: Mapping[str, Part]
+    values: Mapping[str, Any]
+    """The parts by name."""
+    costs: Mapping[str, Cost]
     labelling: Cost | None = None
     """Cost of labels by geometry or network; None for labels from files."""
 
@@ -60,8 +63,8 @@ def shared_scan(job: Job, variant: ScanVariant) -> SharedScan | None:
     elif dataset.labels.geometric and not labels.any():
         with measured() as labelling:
             labels = geometric_labels(points)
-    parts = prepare_parts(points, variant.remaining(labels), methods=job.methods, config=job.config)
-    return SharedScan(parts, labelling)
+    values, costs = prepare_parts(points, variant.remaining(labels), methods=job.methods, config=job.config)
+    return SharedScan(values, costs, labelling)
 
 
 def points_of(source: DataSource, variant: ScanVariant) -> Points:
@@ -86,12 +89,10 @@ def open_once(source: DataSource) -> tuple[Dataset, dict[int, int]]:
 
 
 def _register(method: str, config: Config, trial: Trial, both: tuple[SharedScan, SharedScan]) -> Row:
-    scans = [{name: shared.parts[name] for name in METHODS[method].parts} for shared in both]
-    values = [{name: part.value for name, part in parts.items()} for parts in scans]
     watch = Stopwatch()
     with measured() as cost:
-        outcome = METHODS[method].align(values[0], values[1], config, watch)
-    costs = [part.cost for parts in scans for part in parts.values()]
+        outcome = METHODS[method].align(both[0].values, both[1].values, config, watch)
+    costs = [shared.costs[name] for shared in both for name in METHODS[method].parts]
     uses_labels = any(part.endswith("description") for part in METHODS[method].parts)
     labelled = [shared.labelling for shared in both if shared.labelling and uses_labels]
     reason = outcome.reason.value if isinstance(outcome, Rejected) else ""

@@ -22,14 +22,6 @@ Values = Mapping[str, Any]
 """The parts of one scan by name."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """Data computed from one scan, and its cost."""
-
-    value: Any
-    cost: Cost
-
-
 @dataclass(frozen=True, slots=True)
 class Method:
     """Aligns two scans, given the parts of each that it names."""
@@ -74,14 +66,15 @@ PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
 """The parts by name, from points, labels and configuration."""
 
 
-def prepare_parts(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> dict[str, Part]:
-    """All parts of a scan that these methods need, each computed once."""
-    parts = {}
+def prepare_parts(
+    points: Points, labels: Labels, *, methods: Iterable[str], config: Config
+) -> tuple[dict[str, Any], dict[str, Cost]]:
+    """All parts of a scan that these methods need, each computed once, and their costs."""
+    values, costs = {}, {}
     for name in dict.fromkeys(part for method in methods for part in METHODS[method].parts):
-        with measured() as cost:
-            value = PARTS[name](points, labels, config)
-        parts[name] = Part(value, cost)
-    return parts
+        with measured() as costs[name]:
+            values[name] = PARTS[name](points, labels, config)
+    return values, costs
 
 
 def find_method(name: str) -> Method:

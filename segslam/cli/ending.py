@@ -80,17 +80,25 @@ def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
 
 def summary(metrics: dict[str, Any], folder: Path) -> str:
     """The summary printed at the end of a run."""
+    length_m, seconds = metrics["length_m"], round(metrics["duration_s"])
+    length = f"{length_m:.0f} m" if length_m < 10_000 else f"{length_m / 1000:.1f} km"
     lines = [
         f"{counted(metrics['num_scans'], 'scan')} in {metrics['seconds_total']:.1f} s "
         f"({metrics['scans_per_second']:.1f}/s), "
         f"{counted(metrics['num_keyframes'], 'keyframe')}, {counted(metrics['num_loops_accepted'], 'loop')} of "
         f"{counted(metrics['num_candidates'], 'candidate')}",
-        *_length(metrics),
+        f"drive: {length} in " + (f"{seconds} s" if seconds < 600 else f"{seconds // 60} min {seconds % 60} s"),
     ]
     lines += [text.format(counted(metrics[key], thing)) for key, thing, text in TROUBLE if metrics.get(key)]
     if "adjustment_moved_m" in metrics:
         lines.append(_adjustment(metrics))
-    lines += _errors(metrics)
+    if "ate_m" in metrics:
+        repaired = "after repairs" if metrics.get("num_motions_repaired") else "only"
+        false = f"; false loops: {metrics['num_loops_false']}" if "num_loops_false" in metrics else ""
+        odometry = f"odometry {repaired}: {metrics['odometry_ate_m']:.3f} m"
+        lines.append(f"error after alignment: {metrics['ate_m']:.3f} m, {odometry}{false}")
+        if (alone_m := metrics.get("kiss_icp_ate_m")) is not None:
+            lines.append(f"the same error of KISS-ICP alone: {alone_m:.3f} m")
     if "localised_percent" in metrics:
         lines.append(f"localised in the old map: {metrics['localised_percent']:.1f} % of the scans; see localised.csv")
     if "num_loops_between" in metrics:
@@ -105,7 +113,18 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         lines.append(
             f"against the logged run: {metrics['num_loops_won']} loops more, {metrics['num_loops_lost']} fewer{before}"
         )
-    return "\n".join([*lines, *_ends(metrics, folder)])
+    where, map_file = shlex.quote(str(folder)), folder / "map.ply"
+    follows = f"segslam locate {where} SCAN"
+    if not map_file.exists():
+        follows = f"segslam export {where} {shlex.quote(str(map_file))}"
+    if "ate_m" not in metrics:
+        follows = f"segslam eval {where} --reference POSES.txt"
+    lines += [
+        f"results in {folder}",
+        f"report: {folder / 'report.html'} (open it in a browser)",
+        f"next: {follows}; all commands: segslam --help",
+    ]
+    return "\n".join(lines)
 
 
 def counted(number: int, thing: str) -> str:
@@ -127,41 +146,3 @@ def _adjustment(metrics: dict[str, Any]) -> str:
     if "sweep_s" in metrics:
         line += f"; points corrected for the motion within sweeps of {abs(metrics['sweep_s']):.2f} s, as measured"
     return line
-
-
-def _errors(metrics: dict[str, Any]) -> list[str]:
-    """Lines about the error by stage: KISS-ICP alone, after repairs of its motions, with loops."""
-    if "ate_m" not in metrics:
-        return []
-    repaired = "after repairs" if metrics.get("num_motions_repaired") else "only"
-    false = f"; false loops: {metrics['num_loops_false']}" if "num_loops_false" in metrics else ""
-    odometry = f"odometry {repaired}: {metrics['odometry_ate_m']:.3f} m"
-    line = f"error after alignment: {metrics['ate_m']:.3f} m, {odometry}{false}"
-    alone = metrics.get("kiss_icp_ate_m")
-    return [line] if alone is None else [line, f"the same error of KISS-ICP alone: {alone:.3f} m"]
-
-
-def _length(metrics: dict[str, Any]) -> list[str]:
-    """A line about the length and duration of the drive."""
-    if "length_m" not in metrics or "duration_s" not in metrics:
-        return []
-    length_m = metrics["length_m"]
-    length = f"{length_m:.0f} m" if length_m < 10_000 else f"{length_m / 1000:.1f} km"
-    seconds = round(metrics["duration_s"])
-    return [f"drive: {length} in " + (f"{seconds} s" if seconds < 600 else f"{seconds // 60} min {seconds % 60} s")]
-
-
-def _ends(metrics: dict[str, Any], folder: Path) -> list[str]:
-    """Lines about the results, and the command that comes next."""
-    where = shlex.quote(str(folder))
-    map_file = folder / "map.ply"
-    follows = f"segslam locate {where} SCAN"
-    if not map_file.exists():
-        follows = f"segslam export {where} {shlex.quote(str(map_file))}"
-    if "ate_m" not in metrics:
-        follows = f"segslam eval {where} --reference POSES.txt"
-    return [
-        f"results in {folder}",
-        f"report: {folder / 'report.html'} (open it in a browser)",
-        f"next: {follows}; all commands: segslam --help",
-    ]

@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from segslam.scans import Dataset
     from segslam.scans.presets import Preset
 
-RUN_LOGS = ("log.mcap", "log.mcap.part")
-"""A folder with one of these is a run."""
-
 
 def check_exists(path: Path, hint: str) -> None:
     """Raises SegslamError with the hint if the path does not exist; called before large libraries are imported."""
@@ -44,7 +41,11 @@ def check_own(folder: Path, *made_by: str) -> None:
 
 
 def make_room(
-    folder: Path, *, overwrite: bool, inputs: Iterable[Path | None] = (), made_by: tuple[str, ...] = RUN_LOGS
+    folder: Path,
+    *,
+    overwrite: bool,
+    inputs: Iterable[Path | None] = (),
+    made_by: tuple[str, ...] = ("log.mcap", "log.mcap.part"),
 ) -> None:
     """Remove an earlier run in the folder of a new one, if `overwrite` is set; otherwise leave all as it is.
 

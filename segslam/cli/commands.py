@@ -89,10 +89,6 @@ def _imported(place: str) -> Any:
 class GroupedCommands(TyperGroup):
     """Commands under the heading `rich_help_panel` in the help, in the order in which they were added."""
 
-    def list_commands(self, ctx: Any) -> list[str]:
-        """Names for help and completion, in order; the bench, which typer adds last, stays last."""
-        return list(self.commands)
-
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of a name or alias."""
         command = super().get_command(ctx, ALIASES.get(cmd_name, cmd_name))

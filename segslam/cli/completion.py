@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-LABELS = ("auto", "none", "geometric", "network:")
 SENSORS = ("hdl64", "os1-64", "vlp16")
 
 
@@ -29,7 +28,7 @@ def labels_or_files(incomplete: str) -> list[str]:
         paths = [f"{path}/" if path.is_dir() else str(path) for path in parent.iterdir()]
     except OSError:
         paths = []
-    return _starting([*LABELS, *sorted(paths)], incomplete)
+    return _starting(["auto", "none", "geometric", "network:", *sorted(paths)], incomplete)
 
 
 def presets(incomplete: str) -> list[str]:
@@ -37,13 +36,6 @@ def presets(incomplete: str) -> list[str]:
     from segslam.scans.presets import SETTINGS
 
     return _starting(["auto", *SETTINGS], incomplete)
-
-
-def methods(incomplete: str) -> list[str]:
-    """Methods of registration."""
-    from segslam.bench.experiments.method_settings import METHOD_NAMES
-
-    return _starting(METHOD_NAMES, incomplete)
 
 
 def datasets(incomplete: str) -> list[str]:

@@ -22,7 +22,6 @@ def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
     seconds = (last.stamp_ns - first.stamp_ns) / 1e9
     ranges_m, elevations, _ = geometry.spherical(first.points)
     elevation_deg = np.degrees(elevations)
-    changed = {key: value for key, _, value in changed_settings(Config(), settings)}
     return {
         "data": scans.name,
         "num_scans": len(scans),
@@ -43,7 +42,7 @@ def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
             "elevation_deg": [float(value) for value in np.percentile(elevation_deg, (1, 99))],
         },
         "odometry": settings.odometry.model_dump(mode="json"),
-        "changed_settings": {key: str(value) for key, value in changed.items()},
+        "changed_settings": {key: str(value) for key, _, value in changed_settings(Config(), settings)},
     }
 
 

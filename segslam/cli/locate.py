@@ -11,7 +11,7 @@ from typer.core import TyperCommand
 
 from segslam.bench.experiments.method_settings import METHOD_NAMES, check_method
 from segslam.cli.checks import check_exists
-from segslam.cli.completion import labels_or_files, methods, one_of
+from segslam.cli.completion import labels_or_files, one_of
 from segslam.cli.console import Terminal, print_json, print_out, say
 from segslam.cli.options import EncodingOption, Settings
 from segslam.core.errors import SegslamError
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from segslam.run.locator import Located, Locator
 
 LABEL_WORDS = ("geometric", "none")
-PLACE_KEYS = ("T_world_lidar", "keyframe", "inliers", "overlap", "probability", "evidence", "reason", "detail")
-NOT_FOUND: dict[str, Any] = {"found": False, **dict.fromkeys(PLACE_KEYS)}
+NOT_FOUND: dict[str, Any] = {"found": False} | dict.fromkeys(
+    ("T_world_lidar", "keyframe", "inliers", "overlap", "probability", "evidence", "reason", "detail")
+)
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ def register(
     ] = None,
     files: ScanFileOptions,
     method: Annotated[
-        str, typer.Option(autocompletion=methods, help=f"Method: {', '.join(METHOD_NAMES)}.")
+        str, typer.Option(autocompletion=one_of(*METHOD_NAMES), help=f"Method: {', '.join(METHOD_NAMES)}.")
     ] = "segregator-c2f",
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="Refine the coarse pose with GICP (method segregator-c2f).")

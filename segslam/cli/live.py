@@ -23,7 +23,6 @@ from segslam.core.extras import how_to_install
 from segslam.core.interrupts import stopped_by_signals, when_stopped
 
 if TYPE_CHECKING:
-    from segslam.core.types import BadScan, Step
     from segslam.output.foxglove_server import FoxgloveServer
     from segslam.output.viewer import Scene
     from segslam.run.live.front import Front
@@ -117,7 +116,7 @@ def live(
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
         publisher = _publisher(source, run, stack)
         with LiveMap(_shows(server, publisher)) as live_map:
-            figures = _follow(front, run, _watch(run, scene, live_map, publisher), terminal)
+            figures = _follow(front, run, terminal, scene=scene, live_map=live_map, publisher=publisher)
         ended = front.ended
         if run.num_steps == 0:
             raise SegslamError(f"{source.name}: no scan was mapped{f' ({ended.why})' if ended.why else ''}")
@@ -147,39 +146,38 @@ def _remove_if_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _follow(front: "Front", run: "Run", watch: "Callable[[Step | BadScan], None]", terminal: Terminal) -> "LiveFigures":
-    """Close the loops of each scan with a pose, log it and show it."""
+def _follow(
+    front: "Front",
+    run: "Run",
+    terminal: Terminal,
+    *,
+    scene: "Scene | None",
+    live_map: "LiveMap",
+    publisher: "MappingPublisher | None",
+) -> "LiveFigures":
+    """Close the loops of each scan with a pose, log it and pass it to all displays."""
+    from segslam.core.types import Step
+
     figures = LiveFigures(front)
     shown = monotonic()
     with _status(terminal) as (show, every_s):
         for placed in front:
             tries_loops = front.num_keyframes_waiting < MOST_BEHIND
-            watch(run.follow(placed.tracked, tries_loops=tries_loops))
+            step = run.follow(placed.tracked, tries_loops=tries_loops)
+            if scene:
+                scene.add(step)
+            if isinstance(step, Step):
+                keyframe = step.keyframe
+                if publisher:
+                    publisher.note_step(step.stamp_ns, keyframe.T_odom_keyframe if keyframe else None, step.estimate)
+                if keyframe:
+                    is_corrected = step.estimate is not None
+                    live_map.note(*run.map_so_far(), stamp_ns=step.stamp_ns, is_corrected=is_corrected)
             figures.note(placed, lag_s=monotonic() - placed.placed_s, tries_loops=tries_loops)
             if monotonic() - shown >= every_s:
                 shown = monotonic()
                 show(figures.line())
     return figures
-
-
-def _watch(
-    run: "Run", scene: "Scene | None", live_map: "LiveMap", publisher: "MappingPublisher | None"
-) -> "Callable[[Step | BadScan], None]":
-    """A function that passes each step to all displays."""
-    from segslam.core.types import Step
-
-    def watch(step: "Step | BadScan") -> None:
-        if scene:
-            scene.add(step)
-        if not isinstance(step, Step):
-            return
-        keyframe = step.keyframe
-        if publisher:
-            publisher.note_step(step.stamp_ns, keyframe.T_odom_keyframe if keyframe else None, step.estimate)
-        if keyframe:
-            live_map.note(*run.map_so_far(), stamp_ns=step.stamp_ns, is_corrected=step.estimate is not None)
-
-    return watch
 
 
 def _shows(server: "FoxgloveServer | None", publisher: "MappingPublisher | None") -> "list[Show]":

@@ -19,10 +19,7 @@ VGICP_VOXEL_M = 1.0
 GICP_NEIGHBOURS = 10
 """small_gicp's defaults (Koide, JOSS 2024), for outdoor LiDAR."""
 GICP_ITERATIONS = 64
-"""Value of the author's fast_gicp, used in the paper.
-
-With small_gicp's 20, two of three pairs 4 m apart do not converge.
-"""
+"""Value of fast_gicp, used in the paper. With small_gicp's 20, two of three pairs 4 m apart do not converge."""
 KISS_MIN_POINTS = 100
 """Chosen: KISS-Matcher 1.0.2 terminates the process with about a dozen points."""
 KISS_VOXEL_M = 0.3

@@ -156,7 +156,11 @@ def level_world(T_world_lidar: Poses) -> Poses:
 
 
 def level_revisits(T_world_lidar: Poses) -> Poses:
-    """The drive with one height for each place; x, y and yaw are unchanged. z must point up."""
+    """The drive with one height for each place; x, y and yaw are unchanged. z must point up.
+
+    The heights of two visits to one place differ in real ground truth, by up to metres. The correction removes the
+    difference with the smallest change of slope; each pose is pitched to its new slope.
+    """
     positions = T_world_lidar[:, :3, 3]
     steps = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1)
     travel = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-6))])  # ascends strictly, also where the car stands

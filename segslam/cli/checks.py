@@ -110,15 +110,13 @@ def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options:
         raise SegslamError(
             f"{key}: {now} now, but {recorded.path} was started with {before}; a resumed run keeps its settings"
         )
-    began = {"data set": recorded.run.get("dataset", "")} | {
-        f"--{name}": value for name, value in recorded.options.items()
-    }
-    given = {"data set": dataset} | {f"--{name}": value for name, value in options.items()}
-    for name in given:
-        if began.get(name, "") != given[name]:
+    compared = [("data set", recorded.run.get("dataset", ""), dataset)]
+    compared += [(f"--{name}", recorded.options.get(name, ""), value) for name, value in options.items()]
+    for name, began, given in compared:
+        if began != given:
             raise SegslamError(
-                f"{name}: {given[name] or 'none'} now, but {recorded.path} was started with {began.get(name) or 'none'}"
-                "; give the same value to resume it"
+                f"{name}: {given or 'none'} now, but {recorded.path} was started with {began or 'none'}; give the same "
+                "value to resume it"
             )
 
 

@@ -10,6 +10,7 @@ from segslam.cli.completion import SENSORS, one_of, simulation_settings
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.map import map_scans
 from segslam.cli.options import OverwriteOption
+from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, interrupts_wait, same_command_with, when_stopped
 
 SEQUENCE = "00"
@@ -140,7 +141,6 @@ def demo(
 def _named(files: list[Path], num_scans: int, *, sample: int | None) -> set[int]:
     """Numbers of the scans in the lists. Raises SegslamError for a scan that the drive does not have."""
     from segslam.bench.experiments.pairs import read_pairs, sample_pairs, scans_named
-    from segslam.core.types import SegslamError
 
     only = scans_named([sample_pairs(read_pairs(file), num_pairs=sample, seed=0) for file in files])
     if max(only) >= num_scans:

@@ -54,10 +54,9 @@ class TableFiles:
 
     def write(self, rows: Rows) -> None:
         """Write the files that are given: CSV has all numbers in full, LaTeX the columns for people."""
-        if self.csv is not None:
-            write_whole(self.csv, as_csv(rows))
-        if self.latex is not None:
-            write_whole(self.latex, as_latex(rows))
+        for file, text_of in ((self.csv, as_csv), (self.latex, as_latex)):
+            if file is not None:
+                write_whole(file, text_of(rows))
 
 
 def as_csv(rows: Rows) -> str:

@@ -134,8 +134,10 @@ def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: 
     ranges.suptitle(title, parse_math=False)  # names of files may contain a dollar sign
     strips = ranges.subplots(len(panels), 1, squeeze=False)[:, 0]
     squares = above.subplots(1, len(panels), squeeze=False)[0]
+    nearest = project(points.astype(np.float64), settings=image).nearest
     for (name, colors), strip, square in zip(panels.items(), strips, squares, strict=True):
-        strip.imshow(_range_image(points, colors, image), aspect="auto", interpolation="nearest")
+        seen = np.where((nearest == EMPTY)[..., None], BACKGROUND, colors[nearest]).astype(np.uint8)
+        strip.imshow(seen, aspect="auto", interpolation="nearest")
         strip.set(title=f"range image, {name}", xticks=[], yticks=[])
         square.imshow(_from_above(points, colors), extent=(REACH_M, -REACH_M, -REACH_M, REACH_M))
         square.set(title=f"top view, {name}", xlabel="y, left (m)", ylabel="x, ahead (m)")
@@ -156,11 +158,6 @@ def _colors(labels: Labels) -> Colors:
     colors = of_classes(STILL[labels])
     colors[labels >= Label.MOVING_CAR] = MOVING
     return colors
-
-
-def _range_image(points: Points, colors: Colors, settings: ImageSettings) -> Image:
-    nearest = project(points.astype(np.float64), settings=settings).nearest
-    return np.where((nearest == EMPTY)[..., None], BACKGROUND, colors[nearest]).astype(np.uint8)
 
 
 def _from_above(points: Points, colors: Colors) -> Image:

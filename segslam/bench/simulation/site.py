@@ -136,15 +136,12 @@ class Site:
 
     def _cells(self, spot: Spot, length_m: float, width_m: float) -> np.ndarray:
         """(2, n) rows and columns of a rectangle centred on a spot, `length_m` along the street."""
-        along, across = (_samples(size) for size in (length_m, width_m))
+        along, across = (  # less than one cell apart
+            np.linspace(-size_m / 2, size_m / 2, int(size_m / CELL_M * 1.3) + 2) for size_m in (length_m, width_m)
+        )
         u, v = (grid.ravel() for grid in np.meshgrid(along, across))
         c, s = np.cos(spot.heading_rad), np.sin(spot.heading_rad)
         return self.ground.cells(spot.x + c * u - s * v, spot.y + s * u + c * v)
-
-
-def _samples(size_m: float) -> Vector:
-    """Positions from one end to the other, less than one cell apart."""
-    return np.linspace(-size_m / 2, size_m / 2, int(size_m / CELL_M * 1.3) + 2)
 
 
 def displaced(spot: Spot, *, along_m: float = 0.0, out_m: float = 0.0) -> Spot:

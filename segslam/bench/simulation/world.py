@@ -49,7 +49,10 @@ class World:
         rays[:, :3] = T_world_lidar[:3, 3]
         R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
         np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # faster than BLAS
-        hits = _relabelled(cast_mesh(self.scene, self.static, rays), self.ground, rays)
+        hits = cast_mesh(self.scene, self.static, rays)
+        rows = np.flatnonzero((hits.labels == Label.TERRAIN) & np.isfinite(hits.range_m))
+        ground_at = rays[rows, :2] + hits.range_m[rows, None] * rays[rows, 3:5]
+        hits.labels[rows] = self.ground.label_at(ground_at[:, 0], ground_at[:, 1])  # road, sidewalk, ...
         at = T_world_lidar[:2, 3]
         for car in self.parked:
             if car.start_s <= time_s < car.end_s and np.hypot(*(at - car.at)) < VIEW_M:
@@ -105,15 +108,6 @@ def cast_mesh(scene: o3d.t.geometry.RaycastingScene, part: Mesh, rays: np.ndarra
     hit = np.where(np.isfinite(range_m), answer["primitive_ids"].numpy(), 0)
     cos = np.abs(np.einsum("ij,ij->i", answer["primitive_normals"].numpy(), rays[:, 3:]))
     return Hits(range_m, part.labels[hit], part.instances[hit], cos, part.glass[hit])
-
-
-def _relabelled(hits: Hits, ground: Terrain, rays: np.ndarray) -> Hits:
-    """Hits of terrain with the class of the ground at each point: road, sidewalk, ..."""
-    rows = np.flatnonzero((hits.labels == Label.TERRAIN) & np.isfinite(hits.range_m))
-    at = rays[rows, :2] + hits.range_m[rows, None] * rays[rows, 3:5]
-    labels = hits.labels.copy()
-    labels[rows] = ground.label_at(at[:, 0], at[:, 1])
-    return replace(hits, labels=labels)
 
 
 def _put_nearer(hits: Hits, thing: Mesh, rays: np.ndarray) -> None:

@@ -15,11 +15,11 @@ from segslam.bench.experiments.pairs import (
     PAPER_PAIR,
     PairList,
     ScanVariant,
+    Trial,
     cut_pairs,
     pair_trials,
     read_pairs,
     sample_pairs,
-    trial,
     true_poses,
 )
 from segslam.bench.experiments.rows import Row, figures, read_rows, results, worst_failures, write_rows
@@ -260,7 +260,7 @@ def test_a_benchmark_continues_where_it_stopped_and_not_in_the_folder_of_another
 
 
 def test_a_finished_benchmark_registers_nothing_again(counted: list[ScanVariant], tmp_path: Path) -> None:
-    trials = [trial("one", ScanVariant(1), ScanVariant(70), np.eye(4))]
+    trials = [Trial("one", ScanVariant(1), ScanVariant(70), np.eye(4))]
     job = Job(DataSource(tmp_path), ("gicp",), Config())
     repeat: Callable[[], list[list[Row]]] = lambda: list(run(job, trials, folder=tmp_path / "bench"))  # noqa: E731
     first = repeat()

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
@@ -174,12 +174,6 @@ class Trial:
         return self.pairs, self.source, self.target
 
 
-def trial(pairs: str, source: ScanVariant, target: ScanVariant, T_target_source: Transform) -> Trial:
-    """The trial of two variants, from the true pose of the unchanged scans."""
-    T_true = target.T_variant_scan @ T_target_source @ geometry.inverse(source.T_variant_scan)
-    return Trial(pairs, source, target, T_true)
-
-
 def pair_trials(
     pairs: PairList,
     reference: Trajectory | None,
@@ -196,15 +190,12 @@ def pair_trials(
     `num_draws` times at random, with `both` also from the target. Raises SegslamError for a pair without known true
     pose.
     """
-    return [
-        trial(
-            pairs.name,
-            ScanVariant(source, float(yaw_deg), percent / 100, draw),
-            ScanVariant(target, lost=percent / 100, draw=draw) if both else ScanVariant(target),
-            T_target_source,
-        )
-        for (source, target), T_target_source in true_poses(pairs, reference).items()
-        for yaw_deg in np.arange(0.0, 360.0, step_deg)
-        for percent in lost_percent
-        for draw in range(seed * num_draws, (seed + 1) * num_draws)
-    ]
+    trials = []
+    draws = range(seed * num_draws, (seed + 1) * num_draws)
+    for (source, target), T_target_source in true_poses(pairs, reference).items():
+        for yaw_deg, percent, draw in product(np.arange(0.0, 360.0, step_deg), lost_percent, draws):
+            moved = ScanVariant(source, float(yaw_deg), percent / 100, draw)
+            fixed = ScanVariant(target, lost=percent / 100, draw=draw) if both else ScanVariant(target)
+            T_true = fixed.T_variant_scan @ T_target_source @ geometry.inverse(moved.T_variant_scan)
+            trials.append(Trial(pairs.name, moved, fixed, T_true))
+    return trials

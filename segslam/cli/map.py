@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 FREE_OPTIONS = ("data", "dataset", "sequence", "map_files", "gnss", "gnss_use", "gnss_offset")
 """Options in the log that may be others when the run is resumed, as long as the data is the same."""
-NO_GNSS = GnssOptions()
 
 
 def map_command(
@@ -81,7 +80,7 @@ def localise(
     friday_scans --out runs/friday
     """
     check_exists(run, "give the folder of a finished run")
-    map_data(data, out, options, output, terminal, in_map=run)
+    map_data(data, out, options, output, terminal, GnssOptions(), in_map=run)
 
 
 def resume(
@@ -150,7 +149,7 @@ def map_data(
     options: RunOptions,
     output: RunOutput,
     terminal: Terminal,
-    gnss: GnssOptions = NO_GNSS,
+    gnss: GnssOptions,
     *,
     dry_run: bool = False,
     in_map: Path | None = None,

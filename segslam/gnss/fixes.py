@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from segslam.core.types import Indices, Mask, Points, SegslamError
-from segslam.gnss.geodesy import Geodetic, Origin
+from segslam.gnss.geodesy import Geodetic
 
-MOST_NS = 2**63
-KEPT = ""
 NO_FIX, NOT_FINITE, DUPLICATE, OUTSIDE = "no_fix", "not_finite", "duplicate", "outside_run"
 """Reasons for which a fix is not used, whatever the trajectory is."""
 
@@ -40,7 +38,7 @@ class Fixes:
     @property
     def usable(self) -> Mask:
         """(n,) True for fixes without a reason against them."""
-        return np.array([reason == KEPT for reason in self.reasons], dtype=bool)
+        return np.array([not reason for reason in self.reasons], dtype=bool)
 
     def shifted(self, seconds: float) -> "Fixes":
         """The fixes with `seconds` added to their times."""
@@ -68,7 +66,7 @@ def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fi
     if not rows:
         raise SegslamError(f"{source}: contains no position fix; give another file or topic")
     ordered = sorted(rows, key=lambda row: row.stamp_ns)
-    if abs(ordered[-1].stamp_ns) >= MOST_NS or abs(ordered[0].stamp_ns) >= MOST_NS:
+    if max(abs(ordered[0].stamp_ns), abs(ordered[-1].stamp_ns)) >= 2**63:
         raise SegslamError(f"{source}: a time is more than 292 years from 1970; correct or remove the line")
     places = np.array([(row.latitude_deg, row.longitude_deg, row.height_m) for row in ordered], dtype=np.float64)
     places[~np.isfinite(places)] = np.nan
@@ -94,16 +92,6 @@ def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fi
     return fixes
 
 
-def origin_of(fixes: Fixes, usable: Mask) -> Origin:
-    """The first usable fix as origin of the local frame; its height is 0 where no height is known."""
-    latitude, longitude, height_m = fixes.places[np.flatnonzero(usable)[0]]
-    known = fixes.places[usable, 2]
-    known = known[np.isfinite(known)]
-    if not np.isfinite(height_m):
-        height_m = known[0] if len(known) else 0.0
-    return Origin(float(latitude), float(longitude), float(height_m))
-
-
 def _reason(row: Row) -> str:
     if not row.has_fix:
         return NO_FIX
@@ -111,4 +99,4 @@ def _reason(row: Row) -> str:
         return NOT_FINITE
     if row.latitude_deg == 0.0 and row.longitude_deg == 0.0:
         return NO_FIX  # off the coast of Africa: the default of many receivers
-    return KEPT
+    return ""

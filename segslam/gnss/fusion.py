@@ -47,13 +47,8 @@ class Constants:
 
     matched: Matched
     placement: Placement
-    offset_s: float
-    """Seconds added to the times of the fixes: those given, and those measured."""
     measured_offset_s: float
-    """The measured part; 0 if it is not significant."""
-    offset_sigma_s: float
-    arm_sigma_m: Vector
-    """(2,)"""
+    """Seconds added to the times of the fixes, beyond those given; 0 if they are not significant."""
     level: Estimate
     covariance: DriveCovariance
 
@@ -98,9 +93,7 @@ def calibrate(
         arm_m = arm_m + np.array([*arm, 0.0]) if free[1] else np.zeros(3)
         matched = prepared.matched(drive, offset_s + measured_s)
         placement = refined(drive, matched, moved(placement.T_enu_map, found.constants[:6]), arm_m)
-    return Constants(
-        matched, placement, offset_s + measured_s, measured_s, float(found.sigma[6]), found.sigma[7:9], found, rotated
-    )
+    return Constants(matched, placement, measured_s, found, rotated)
 
 
 def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> Fused:

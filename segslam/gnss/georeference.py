@@ -9,10 +9,10 @@ import numpy as np
 from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Transform, Vector
 from segslam.gnss.alignment import place
-from segslam.gnss.fixes import Fixes
+from segslam.gnss.fixes import OUTSIDE, Fixes
 from segslam.gnss.fusion import RIGID_M, Constants, calibrate, fuse
 from segslam.gnss.geodesy import Origin
-from segslam.gnss.matching import Drive, outside_reasons, prepare
+from segslam.gnss.matching import Drive, prepare
 from segslam.gnss.statistics import KEPT_WEIGHT, Weights, robust_weights
 from segslam.graph import Edge
 
@@ -94,9 +94,8 @@ def georeference(
     residual[matched.rows] = matched.enu_m - matched.positions(T_enu_keyframe, placement.arm_m)
     all_weights = np.zeros((len(fixes), 2))
     all_weights[matched.rows] = weights
-    reasons = outside_reasons(prepared, drive, constants.offset_s)
-    kept = all_weights[:, 0] >= KEPT_WEIGHT
-    reasons = [reason or ("" if keep else CONTRADICTED) for reason, keep in zip(reasons, kept, strict=True)]
+    against = np.full(len(fixes), OUTSIDE, object)
+    against[matched.rows] = np.where(weights[:, 0] >= KEPT_WEIGHT, "", CONTRADICTED)
     return Georeference(
         fixes=fixes,
         origin=prepared.origin,
@@ -106,11 +105,11 @@ def georeference(
         position_sigma_m=_position_sigma(constants, residual[matched.rows, 2], weights[:, 1]),
         fix_sigma_m=sigma_m,
         arm_m=placement.arm_m,
-        arm_sigma_m=constants.arm_sigma_m,
+        arm_sigma_m=constants.level.sigma[7:9],
         measured_offset_s=constants.measured_offset_s,
-        offset_sigma_s=constants.offset_sigma_s,
+        offset_sigma_s=float(constants.level.sigma[6]),
         is_bent=is_bent,
-        reasons=tuple(reasons),
+        reasons=tuple(reason or other for reason, other in zip(fixes.reasons, against.tolist(), strict=True)),
         measured_enu_m=prepared.enu_m,
         residual_m=residual,
         weights=all_weights,

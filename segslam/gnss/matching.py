@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.trajectory import Poses, nearest_rows, travelled_m
 from segslam.core.types import Indices, Mask, Points, SegslamError, Vector
-from segslam.gnss.fixes import OUTSIDE, Fixes, origin_of
+from segslam.gnss.fixes import Fixes
 from segslam.gnss.geodesy import Geodetic, Origin, enu_from_geodetic
 
 LONGEST_GAP_S = 2.0
@@ -43,8 +43,6 @@ class Matched:
     """(n,) time since the first scan (s), in the clock of the scans."""
     enu_m: Points
     """(n, 3) measured position, east, north, up; NaN for an unknown height."""
-    sigma_m: Points
-    """(n, 3) claimed standard deviations; NaN if unknown."""
     keyframe: Indices
     """(n,) the keyframe nearest in time."""
     T_keyframe_lidar: Poses
@@ -103,7 +101,6 @@ class Prepared:
             rows=rows,
             time_s=time_s,
             enu_m=self.enu_m[rows],
-            sigma_m=self.fixes.sigma_m[rows],
             keyframe=keyframe,
             T_keyframe_lidar=T_keyframe_lidar,
             velocity=_rotated_into(R_map_keyframe, (after - before) / SPEED_OVER_S),
@@ -112,7 +109,7 @@ class Prepared:
 
 
 def prepare(fixes: Fixes, drive: Drive, *, offset_s: float = 0.0) -> Prepared:
-    """The fixes in the local frame at the first one within the drive.
+    """The fixes in the local frame at the first one within the drive; its height is the first that is known, or 0.
 
     Raises SegslamError if no usable fix is within the time of the drive, with both times, and the offset that would
     help if one is obvious.
@@ -120,7 +117,10 @@ def prepare(fixes: Fixes, drive: Drive, *, offset_s: float = 0.0) -> Prepared:
     within = fixes.usable & has_pose(drive, fixes.stamp_ns + round(1e9 * offset_s))
     if not within.any():
         raise SegslamError(_elsewhere(fixes, drive, offset_s))
-    origin = origin_of(fixes, within)
+    latitude, longitude = fixes.places[within][0, :2].tolist()
+    heights = fixes.places[within, 2]
+    known = heights[np.isfinite(heights)].tolist()
+    origin = Origin(latitude, longitude, known[0] if known else 0.0)
     places: Geodetic = fixes.places.copy()
     no_height = ~np.isfinite(places[:, 2])
     places[no_height, 2] = origin.height_m
@@ -136,14 +136,6 @@ def has_pose(drive: Drive, stamp_ns: Indices) -> Mask:
     away = np.abs(stamp_ns - drive.stamp_ns[nearest_rows(drive.stamp_ns, stamp_ns)])
     inside = (stamp_ns >= drive.stamp_ns[0]) & (stamp_ns <= drive.stamp_ns[-1])
     return inside & (away <= 1e9 * LONGEST_GAP_S)
-
-
-def outside_reasons(prepared: Prepared, drive: Drive, offset_s: float) -> list[str]:
-    """The reason of each fix that is not matched; empty for the matched ones."""
-    inside = has_pose(drive, prepared.fixes.stamp_ns + round(1e9 * offset_s))
-    return [
-        reason or ("" if within else OUTSIDE) for reason, within in zip(prepared.fixes.reasons, inside, strict=True)
-    ]
 
 
 def interpolated(drive: Drive, scan_s: Vector, time_s: Vector) -> Poses:

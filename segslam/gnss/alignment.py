@@ -11,7 +11,16 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.types import Mask, Points, SegslamError, Transform, Vector
 from segslam.gnss.matching import Drive, Matched, Prepared
-from segslam.gnss.statistics import axis_sigma, correlated, fix_noise, horizontal_sigma, longest_chain, weight
+from segslam.gnss.statistics import (
+    Weights,
+    axis_sigma,
+    correlated,
+    fix_noise,
+    horizontal_sigma,
+    longest_chain,
+    robust_weights,
+    weight,
+)
 
 NUM_GUESSES = 400
 """Chosen: pairs of fixes that propose a heading; half of the fixes may be wrong, and 100 good pairs are left."""
@@ -37,8 +46,9 @@ class Placement:
     T_enu_map: Transform
     arm_m: Vector
     """(3,) position of the antenna in the LiDAR frame (m); 0 where it is not significant."""
-    chain: Mask
-    """(n,) fixes of the largest chain that is consistent with the drive."""
+    weights: Weights
+    """(n, 2) robust weights, horizontally and in height; 0 outside the largest chain that is consistent with the drive.
+    """
     sigma_m: Vector
     """(3,) standard deviation of single fixes about the placed drive: east, north, up."""
     correlated: float
@@ -52,19 +62,7 @@ def place(prepared: Prepared, drive: Drive, *, offset_s: float = 0.0) -> tuple[M
     Raises SegslamError with the reason if the fixes do not determine a placement.
     """
     matched = prepared.matched(drive, offset_s)
-    _check_span(prepared, matched)
-    placement = refined(drive, matched, _start(prepared, drive, matched), np.zeros(3))
-    if placement.heading_sigma_deg > MOST_HEADING_DEG:
-        raise SegslamError(
-            f"{prepared.fixes.source}: the fixes determine the heading of the map to {placement.heading_sigma_deg:.1f} "
-            f"degrees only ({_span_m(matched.enu_m):.0f} m of drive, errors of {placement.sigma_m[0]:.1f} m): a map is "
-            f"placed if it is known to {MOST_HEADING_DEG:.0f}; use fixes of a longer part of the drive"
-        )
-    return matched, placement
-
-
-def _check_span(prepared: Prepared, matched: Matched) -> None:
-    source, span_m = prepared.fixes.source, _span_m(matched.enu_m)
+    source, span_m = prepared.fixes.source, float(np.hypot(*np.ptp(matched.enu_m[:, :2], axis=0)))
     if len(matched) < LEAST_FIXES:
         raise SegslamError(
             f"{source}: {len(matched)} usable fixes are within the drive; at least {LEAST_FIXES} are needed to place "
@@ -75,11 +73,14 @@ def _check_span(prepared: Prepared, matched: Matched) -> None:
             f"{source}: all fixes are within {span_m:.2f} m, so they show no heading; use fixes of a longer part of "
             "the drive"
         )
-
-
-def _span_m(positions: Points) -> float:
-    """Diagonal of the box around positions, horizontally."""
-    return float(np.hypot(*np.ptp(positions[:, :2], axis=0)))
+    placement = refined(drive, matched, _start(prepared, drive, matched), np.zeros(3))
+    if placement.heading_sigma_deg > MOST_HEADING_DEG:
+        raise SegslamError(
+            f"{source}: the fixes determine the heading of the map to {placement.heading_sigma_deg:.1f} degrees only "
+            f"({span_m:.0f} m of drive, errors of {placement.sigma_m[0]:.1f} m): a map is placed if it is known to "
+            f"{MOST_HEADING_DEG:.0f}; use fixes of a longer part of the drive"
+        )
+    return matched, placement
 
 
 def _start(prepared: Prepared, drive: Drive, matched: Matched) -> Transform:
@@ -131,8 +132,10 @@ def refined(drive: Drive, matched: Matched, start: Transform, arm_m: Vector) -> 
         right = np.einsum("nij,ni,ni->j", six, precision, np.nan_to_num(residual)) - prior * tilt
         covariance = np.linalg.inv(system)
         T_enu_map = moved(T_enu_map, covariance @ right)
+    residual = matched.enu_m - matched.positions(T_enu_map @ drive.T_map_keyframe, arm_m)
+    weights = robust_weights(residual, sigma, matched.time_s) * chain[:, None]
     heading_deg = float(np.degrees(np.sqrt(covariance[2, 2])))
-    return Placement(T_enu_map, arm_m, chain, sigma, many, heading_deg)
+    return Placement(T_enu_map, arm_m, weights, sigma, many, heading_deg)
 
 
 def linearised(drive: Drive, matched: Matched, T_enu_map: Transform, arm_m: Vector) -> tuple[Points, np.ndarray]:

@@ -29,7 +29,7 @@ from scipy.sparse.linalg import splu
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses
-from segslam.core.types import Points, Transform, Vector
+from segslam.core.types import Points, Vector
 from segslam.gnss.matching import Matched
 from segslam.graph import Edge
 from segslam.graph.closure_pairs import adjoints
@@ -85,7 +85,6 @@ class DriveCovariance:
 
     def __init__(self, edges: Sequence[Edge], T: Poses) -> None:
         """`T` (k, 4, 4): the optimum of the edges, in any frame."""
-        self._T = T
         rows, columns, blocks = [0], [0], [np.diag(HELD**-2.0)]
         for edge in edges:
             T_b_a = geometry.inverse(T[edge.b]) @ T[edge.a]
@@ -104,15 +103,12 @@ class DriveCovariance:
         where = [np.broadcast_to(place, values.shape).ravel() for place in (at_row, at_column)]
         self._solver = splu(coo_array((values.ravel(), where), shape=shape).tocsc())
 
-    def placed(self, T_enu_map: Transform) -> "DriveCovariance":
-        """The same drive in the local frame."""
-        made = object.__new__(DriveCovariance)
-        made._solver, made._T = self._solver, T_enu_map @ self._T
-        return made
+    def of(self, T: Poses, keys: np.ndarray, points: Points, axes: Sequence[int]) -> np.ndarray:
+        """(n d, n d) covariance of `points` (n, 3) in the frames of poses `keys`, along d axes, one after the other.
 
-    def of(self, keys: np.ndarray, points: Points, axes: Sequence[int]) -> np.ndarray:
-        """(n d, n d) covariance of `points` (n, 3) in the frames of poses `keys`, along d axes, one after the other."""
-        R = self._T[keys, :3, :3]
+        The axes are those of the frame in which `T` (k, 4, 4) are the poses.
+        """
+        R = T[keys, :3, :3]
         x, y, z = points.T
         zero = np.zeros_like(x)
         cross = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
@@ -128,6 +124,7 @@ class DriveCovariance:
 
 def estimated(
     drive: DriveCovariance,
+    T_enu_keyframe: Poses,
     matched: Matched,
     residual: Points,
     columns: np.ndarray,
@@ -143,32 +140,23 @@ def estimated(
     """
     chosen = np.unique(np.linspace(0, len(matched) - 1, min(MOST_FIXES, len(matched))).round().astype(int))
     some = matched.some(chosen)
-    P = drive.of(some.keyframe, some.points(np.zeros(3)), axes)
+    P = drive.of(T_enu_keyframe, some.keyframe, some.points(np.zeros(3)), axes)
     r = residual[chosen][:, list(axes)].T.ravel()
     A = columns[chosen][:, list(axes)].transpose(1, 0, 2).reshape(len(r), -1)
     fixed = (A * prior**2) @ A.T + white_m**2 * np.eye(len(r))
     scale = max(float(np.sqrt(np.mean(r**2))), white_m)
     apart_s = np.abs(some.time_s[:, None] - some.time_s)
-    best, best_noise = -np.inf, Noise(1.0, scale, 1.0, white_m)
+    best = -np.inf
     for tau in TIME_CONSTANTS_S:
         K = np.kron(np.eye(len(axes)), np.exp(-apart_s / tau))
         for s in DRIFT_FACTORS:
             prior_s = -0.5 * (math.log(s) / math.log(PRIOR_DRIFT_FACTOR)) ** 2
             for q in scale * RECEIVER_FACTORS:
-                likelihood = prior_s + _log_likelihood(s**2 * P + q**2 * K + fixed, r)
-                if likelihood > best:
-                    best, best_noise = likelihood, Noise(float(s), float(q), float(tau), white_m)
-    s, q, tau = best_noise.drift_factor, best_noise.sigma_m, best_noise.time_constant_s
-    factor = cho_factor(s**2 * P + q**2 * np.kron(np.eye(len(axes)), np.exp(-apart_s / tau)) + fixed, lower=True)
+                tried = cho_factor(s**2 * P + q**2 * K + fixed, lower=True, check_finite=False)
+                density = -0.5 * r @ cho_solve(tried, r, check_finite=False) - np.log(np.diag(tried[0])).sum()
+                if prior_s + density > best:
+                    best, factor = prior_s + density, tried
+                    noise = Noise(float(s), float(q), float(tau), white_m)
     gain = (prior**2)[:, None] * A.T
     covariance = np.diag(prior**2) - gain @ cho_solve(factor, gain.T)
-    return Estimate(best_noise, gain @ cho_solve(factor, r), np.sqrt(np.maximum(np.diag(covariance), 0.0)))
-
-
-def _log_likelihood(covariance: np.ndarray, residual: Vector) -> float:
-    """Logarithm of the Gaussian density, without its constant."""
-    try:
-        factor = cho_factor(covariance, lower=True, check_finite=False)
-    except np.linalg.LinAlgError:
-        return -math.inf
-    return float(-0.5 * residual @ cho_solve(factor, residual, check_finite=False) - np.log(np.diag(factor[0])).sum())
+    return Estimate(noise, gain @ cho_solve(factor, r), np.sqrt(np.maximum(np.diag(covariance), 0.0)))

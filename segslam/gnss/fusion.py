@@ -53,19 +53,6 @@ class Constants:
     covariance: DriveCovariance
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Fused:
-    """The drive in the local frame after the joint solution."""
-
-    T_enu_keyframe: Poses
-    weights: Weights
-    """(n, 2) robust weight of each fix, horizontally and vertically; 0 for an unknown height."""
-    sigma_m: Vector
-    """(3,) standard deviation of single fixes about the drive: east, north, up."""
-    acting_sigma_m: Vector
-    """(3,) standard deviations with which fixes of full weight acted: the slow errors are included."""
-
-
 def calibrate(
     edges: Sequence[Edge], drive: Drive, prepared: Prepared, matched: Matched, placement: Placement, *, offset_s: float
 ) -> Constants:
@@ -74,11 +61,11 @@ def calibrate(
     arm_m, measured_s = np.zeros(3), 0.0
     free = np.ones(2, dtype=bool)
     for _ in range(CONSTANT_ROUNDS):
-        rotated = covariance.placed(placement.T_enu_map)
         residual, columns = linearised(drive, matched, placement.T_enu_map, arm_m)
-        kept = placement.chain & (robust_weights(residual, placement.sigma_m, matched.time_s)[:, 0] >= KEPT_WEIGHT)
+        kept = placement.weights[:, 0] >= KEPT_WEIGHT
         found = estimated(
-            rotated,
+            covariance,
+            placement.T_enu_map @ drive.T_map_keyframe,
             matched.some(kept),
             residual[kept],
             columns[kept],
@@ -93,22 +80,26 @@ def calibrate(
         arm_m = arm_m + np.array([*arm, 0.0]) if free[1] else np.zeros(3)
         matched = prepared.matched(drive, offset_s + measured_s)
         placement = refined(drive, matched, moved(placement.T_enu_map, found.constants[:6]), arm_m)
-    return Constants(matched, placement, measured_s, found, rotated)
+    return Constants(matched, placement, measured_s, found, covariance)
 
 
-def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> Fused:
-    """Bend the placed drive by its fixes as far as they are better than it. Raises Unsolvable."""
+def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> tuple[Poses, Weights, Vector, tuple[bool, bool]]:
+    """Bend the placed drive by its fixes as far as they are better than it. Raises Unsolvable.
+
+    Returns the poses (k, 4, 4) of the keyframes in the local frame, the robust weights (n, 2) of the fixes, the
+    standard deviations (3,) of single fixes about the drive, and whether it is bent horizontally and in height.
+    """
     matched, placement = constants.matched, constants.placement
     T_start = placement.T_enu_map @ drive.T_map_keyframe
     problem = _Problem(PositionedGraph(edges, drive.T_map_keyframe), matched, placement, T_start)
     interval_s = float(np.median(np.diff(matched.time_s)))
     residual, columns = linearised(drive, matched, placement.T_enu_map, placement.arm_m)
-    weights = robust_weights(residual, placement.sigma_m, matched.time_s) * placement.chain[:, None]
     up: Noise | None = None
-    used = weights[:, 1] >= KEPT_WEIGHT
+    used = placement.weights[:, 1] >= KEPT_WEIGHT
     if used.sum() >= NUM_WINDOWS:
         up = estimated(
             constants.covariance,
+            T_start,
             matched.some(used),
             residual[used],
             columns[used],
@@ -123,8 +114,7 @@ def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> Fused:
     close = np.array([level.white_m, level.white_m, np.inf if up is None else up.white_m])
     sigma = _chosen(problem, soft, close)
     T, weights, _ = _solved(problem, sigma)
-    scales = _scales(matched.enu_m - problem.positions(T), weights)
-    return Fused(T, weights, scales, sigma)
+    return T, weights, _scales(problem.residual(T), weights), (bool(sigma[0] < RIGID_M), bool(sigma[2] < RIGID_M))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,8 +124,8 @@ class _Problem:
     placement: Placement
     T_start: Poses
 
-    def positions(self, T: Poses) -> Points:
-        return self.matched.positions(T, self.placement.arm_m)
+    def residual(self, T: Poses) -> Points:
+        return self.matched.enu_m - self.matched.positions(T, self.placement.arm_m)
 
     def solve(self, start: Poses, precisions: Points) -> Poses:
         points = self.matched.points(self.placement.arm_m)
@@ -158,10 +148,8 @@ def _best(problem: _Problem, candidates: Sequence[Vector], axis: int) -> Vector:
 
     `axis`: 0 horizontally, 1 vertically.
     """
-    matched = problem.matched
-    reference = matched.enu_m - problem.positions(problem.T_start)
-    weights = robust_weights(reference, problem.placement.sigma_m, matched.time_s)[:, axis]
-    windows = _windows(problem, problem.placement.chain & (weights >= KEPT_WEIGHT))
+    reference = problem.residual(problem.T_start)
+    windows = _windows(problem, problem.placement.weights[:, axis] >= KEPT_WEIGHT)
     known = reference[np.isfinite(_along(reference, axis))]
     scale = axis_sigma(known[:, 2]) if axis else horizontal_sigma(known)
     costs = np.array([_held_out(problem, one, windows, axis, scale) for one in candidates])
@@ -196,7 +184,7 @@ def _held_out(problem: _Problem, sigma: Vector, windows: Sequence[slice], axis: 
         without = precisions.copy()
         without[window] = 0.0
         T_without = problem.solve(T, without) if without.any() else problem.T_start
-        values = _along((problem.matched.enu_m - problem.positions(T_without))[window], axis)
+        values = _along(problem.residual(T_without)[window], axis)
         known = values[np.isfinite(values)]
         costs.append(float(np.mean(np.log1p(known**2 / scale**2))) if len(known) else 0.0)
     return np.array(costs)
@@ -207,15 +195,12 @@ def _solved(problem: _Problem, sigma: Vector) -> tuple[Poses, Weights, Points]:
 
     It starts from the largest chain of consistent fixes; later rounds weight all fixes by their residuals.
     """
-    T, matched = problem.T_start, problem.matched
-    residual = matched.enu_m - problem.positions(T)
-    weights = robust_weights(residual, problem.placement.sigma_m, matched.time_s)
-    weights *= problem.placement.chain[:, None]
+    T, weights = problem.T_start, problem.placement.weights
     for _ in range(ROUNDS):
         precisions = np.column_stack([weights[:, 0], weights[:, 0], weights[:, 1]]) / sigma**2
         T = problem.solve(T, precisions)
-        residual = matched.enu_m - problem.positions(T)
-        weights = robust_weights(residual, _scales(residual, weights), matched.time_s)
+        residual = problem.residual(T)
+        weights = robust_weights(residual, _scales(residual, weights), problem.matched.time_s)
     return T, weights, precisions
 
 

@@ -10,7 +10,7 @@ from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Transform, Vector
 from segslam.gnss.alignment import place
 from segslam.gnss.fixes import OUTSIDE, Fixes
-from segslam.gnss.fusion import RIGID_M, Constants, calibrate, fuse
+from segslam.gnss.fusion import Constants, calibrate, fuse
 from segslam.gnss.geodesy import Origin
 from segslam.gnss.matching import Drive, prepare
 from segslam.gnss.statistics import KEPT_WEIGHT, Weights, robust_weights
@@ -87,9 +87,7 @@ def georeference(
         matched.enu_m - matched.positions(T_enu_keyframe, placement.arm_m), sigma_m, matched.time_s
     )
     if use is Use.FUSE:
-        fused = fuse(edges, drive, constants)
-        T_enu_keyframe, weights, sigma_m = fused.T_enu_keyframe, fused.weights, fused.sigma_m
-        is_bent = (bool(fused.acting_sigma_m[0] < RIGID_M), bool(fused.acting_sigma_m[2] < RIGID_M))
+        T_enu_keyframe, weights, sigma_m, is_bent = fuse(edges, drive, constants)
     residual = np.full((len(fixes), 3), np.nan)
     residual[matched.rows] = matched.enu_m - matched.positions(T_enu_keyframe, placement.arm_m)
     all_weights = np.zeros((len(fixes), 2))

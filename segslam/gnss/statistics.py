@@ -50,9 +50,9 @@ def fix_noise(residual_m: np.ndarray) -> float:
     return max(sigma / np.sqrt(2.0), LEAST_NOISE_M)
 
 
-def weight(squared: Vector, bound: float = 9.0) -> Vector:
-    """Weight of residuals by Geman and McClure's kernel, for squared normalised residuals: 1 at 0, 1/4 at the bound."""
-    return (bound / (bound + squared)) ** 2
+def weight(squared: Vector) -> Vector:
+    """Weight of residuals by Geman and McClure's kernel, for squared normalised residuals: 1 at 0, 1/4 at 9."""
+    return (9.0 / (9.0 + squared)) ** 2
 
 
 def correlated(residuals: np.ndarray) -> float:

@@ -11,16 +11,7 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.types import Mask, Points, SegslamError, Transform, Vector
 from segslam.gnss.matching import Drive, Matched, Prepared
-from segslam.gnss.statistics import (
-    Weights,
-    axis_sigma,
-    correlated,
-    fix_noise,
-    horizontal_sigma,
-    longest_chain,
-    robust_weights,
-    weight,
-)
+from segslam.gnss.statistics import Weights, correlated, fix_noise, longest_chain, robust_weights, sigmas, weight
 
 NUM_GUESSES = 400
 """Chosen: pairs of fixes that propose a heading; half of the fixes may be wrong, and 100 good pairs are left."""
@@ -123,7 +114,7 @@ def refined(drive: Drive, matched: Matched, start: Transform, arm_m: Vector) -> 
     for _ in range(ROUNDS):
         residual, columns = linearised(drive, matched, T_enu_map, arm_m)
         chain = longest_chain(residual, matched.travel_m, sigma_m=fix_noise(residual))
-        sigma = _sigmas(residual, chain)
+        sigma = sigmas(residual, chain, chain & np.isfinite(residual[:, 2]))
         many = correlated(residual[chain][:, :2])
         precision = _precision(residual, sigma, chain) / many
         prior, six = PRIOR[:6] ** -2.0, columns[:, :, :6]
@@ -163,13 +154,6 @@ def moved(T_enu_map: Transform, step: Vector) -> Transform:
     turn = geometry.exp(geometry.tangent(rotation_rad=step[:3], translation_m=0.0))
     rotation = geometry.nearest_rotation(turn[:3, :3] @ T_enu_map[:3, :3])
     return geometry.transform(rotation, T_enu_map[:3, 3] + step[3:6])
-
-
-def _sigmas(residual: Points, chain: Mask) -> Vector:
-    level = horizontal_sigma(residual[chain])
-    up = residual[chain, 2]
-    up = up[np.isfinite(up)]
-    return np.array([level, level, axis_sigma(up) if len(up) else np.inf])
 
 
 def _precision(residual: Points, sigma: Vector, chain: Mask) -> Points:

@@ -21,16 +21,19 @@ A standard deviation claimed by the receiver is not used: it is often wrong by a
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses
-from segslam.core.types import Points, Vector
-from segslam.gnss.matching import Matched
+from segslam.core.types import Vector
+from segslam.gnss.alignment import PRIOR, Placement, linearised
+from segslam.gnss.matching import Drive, Matched
+from segslam.gnss.statistics import KEPT_WEIGHT, fix_noise
 from segslam.graph import Edge
 from segslam.graph.closure_pairs import adjoints
 
@@ -80,69 +83,43 @@ class Estimate:
     """(c,) their standard deviations."""
 
 
-class DriveCovariance:
-    """Covariances of positions of a drive, from the edges of its graph at its optimum."""
-
-    def __init__(self, edges: Sequence[Edge], T: Poses) -> None:
-        """`T` (k, 4, 4): the optimum of the edges, in any frame."""
-        rows, columns, blocks = [0], [0], [np.diag(HELD**-2.0)]
-        for edge in edges:
-            T_b_a = geometry.inverse(T[edge.b]) @ T[edge.a]
-            minus = -adjoints(T_b_a[None])[0]  # derivative by a; that by b is the identity
-            pairs = ((edge.a, edge.a, minus.T @ edge.information @ minus), (edge.b, edge.b, edge.information))
-            cross = minus.T @ edge.information
-            for row, column, block in (*pairs, (edge.a, edge.b, cross), (edge.b, edge.a, cross.T)):
-                rows.append(row)
-                columns.append(column)
-                blocks.append(block)
-        inner = np.arange(6)
-        at_row = 6 * np.array(rows)[:, None, None] + inner[:, None]
-        at_column = 6 * np.array(columns)[:, None, None] + inner
-        values = np.array(blocks)
-        shape = (6 * len(T), 6 * len(T))
-        where = [np.broadcast_to(place, values.shape).ravel() for place in (at_row, at_column)]
-        self._solver = splu(coo_array((values.ravel(), where), shape=shape).tocsc())
-
-    def of(self, T: Poses, keys: np.ndarray, points: Points, axes: Sequence[int]) -> np.ndarray:
-        """(n d, n d) covariance of `points` (n, 3) in the frames of poses `keys`, along d axes, one after the other.
-
-        The axes are those of the frame in which `T` (k, 4, 4) are the poses.
-        """
-        R = T[keys, :3, :3]
-        x, y, z = points.T
-        zero = np.zeros_like(x)
-        cross = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-        jacobian = np.concatenate([-R @ cross, R], axis=2)  # (n, 3, 6)
-        n = len(keys)
-        dense = np.zeros((len(axes) * n, self._solver.shape[0]))
-        for block, axis in enumerate(axes):
-            for row, key in enumerate(keys):
-                dense[block * n + row, 6 * key : 6 * key + 6] = jacobian[row, axis]
-        covariance = dense @ self._solver.solve(np.ascontiguousarray(dense.T))
-        return (covariance + covariance.T) / 2
+def drift_solver(edges: Sequence[Edge], T: Poses) -> SuperLU:
+    """The factorised information of the poses of a drive; `T` (k, 4, 4): the optimum of the edges, in any frame."""
+    rows, columns, blocks = [0], [0], [np.diag(HELD**-2.0)]
+    for edge in edges:
+        T_b_a = geometry.inverse(T[edge.b]) @ T[edge.a]
+        derivatives = (edge.a, -adjoints(T_b_a[None])[0]), (edge.b, np.eye(6))
+        for (row, left), (column, right) in product(derivatives, repeat=2):
+            rows.append(row)
+            columns.append(column)
+            blocks.append(left.T @ edge.information @ right)
+    inner = np.arange(6)
+    at_row = 6 * np.array(rows)[:, None, None] + inner[:, None]
+    at_column = 6 * np.array(columns)[:, None, None] + inner
+    values = np.array(blocks)
+    shape = (6 * len(T), 6 * len(T))
+    where = [np.broadcast_to(place, values.shape).ravel() for place in (at_row, at_column)]
+    return splu(coo_array((values.ravel(), where), shape=shape).tocsc())
 
 
 def estimated(
-    drive: DriveCovariance,
-    T_enu_keyframe: Poses,
-    matched: Matched,
-    residual: Points,
-    columns: np.ndarray,
-    prior: Vector,
-    *,
-    axes: Sequence[int],
-    white_m: float,
+    solver: SuperLU, drive: Drive, matched: Matched, placement: Placement, *, axis: int, free: Sequence[bool]
 ) -> Estimate:
-    """The noise of largest likelihood for residuals (n, 3) without outliers, along some of their axes.
+    """The noise of largest likelihood for the kept fixes, horizontally (`axis` 0) or in height (1).
 
-    `columns` (n, 3, c): derivatives of the positions by the constants, whose standard deviations before the fixes are
-    `prior` (c,). The points on the LiDAR are compared: its distance to the antenna changes nothing here.
+    `solver`: that of the drive's graph. `free`: whether the clock and the lever arm are among the unknowns. The points
+    on the LiDAR are compared: its distance to the antenna changes nothing here.
     """
-    chosen = np.unique(np.linspace(0, len(matched) - 1, min(MOST_FIXES, len(matched))).round().astype(int))
+    axes = [2] if axis else [0, 1]
+    prior = PRIOR * np.repeat([True, *free], [6, 1, 2])
+    residual, columns = linearised(drive, matched, placement.T_enu_map, placement.arm_m)
+    kept = np.flatnonzero(placement.weights[:, axis] >= KEPT_WEIGHT)
+    white_m = fix_noise(residual[kept, 2] if axis else residual[kept])
+    chosen = kept[np.unique(np.linspace(0, len(kept) - 1, min(MOST_FIXES, len(kept))).round().astype(int))]
     some = matched.some(chosen)
-    P = drive.of(T_enu_keyframe, some.keyframe, some.points(np.zeros(3)), axes)
-    r = residual[chosen][:, list(axes)].T.ravel()
-    A = columns[chosen][:, list(axes)].transpose(1, 0, 2).reshape(len(r), -1)
+    P = _covariance(solver, placement.T_enu_map @ drive.T_map_keyframe, some, axes)
+    r = residual[chosen][:, axes].T.ravel()
+    A = columns[chosen][:, axes].transpose(1, 0, 2).reshape(len(r), -1)
     fixed = (A * prior**2) @ A.T + white_m**2 * np.eye(len(r))
     scale = max(float(np.sqrt(np.mean(r**2))), white_m)
     apart_s = np.abs(some.time_s[:, None] - some.time_s)
@@ -160,3 +137,18 @@ def estimated(
     gain = (prior**2)[:, None] * A.T
     covariance = np.diag(prior**2) - gain @ cho_solve(factor, gain.T)
     return Estimate(noise, gain @ cho_solve(factor, r), np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def _covariance(solver: SuperLU, T_enu_keyframe: Poses, matched: Matched, axes: Sequence[int]) -> np.ndarray:
+    """(n d, n d) covariance of the positions of the LiDAR by the drive, along d axes, one after the other."""
+    R = T_enu_keyframe[matched.keyframe, :3, :3]
+    x, y, z = matched.points(np.zeros(3)).T
+    zero = np.zeros_like(x)
+    cross = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    jacobian = np.concatenate([-R @ cross, R], axis=2)  # (n, 3, 6)
+    dense = np.zeros((len(axes), len(matched), solver.shape[0]))
+    for row, key in enumerate(matched.keyframe):
+        dense[:, row, 6 * key : 6 * key + 6] = jacobian[row, axes]
+    dense = dense.reshape(-1, solver.shape[0])
+    covariance = dense @ solver.solve(np.ascontiguousarray(dense.T))
+    return (covariance + covariance.T) / 2

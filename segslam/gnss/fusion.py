@@ -12,13 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse.linalg import SuperLU
 
 from segslam.core.trajectory import Poses, travelled_m
 from segslam.core.types import Mask, Points, Vector
-from segslam.gnss.alignment import PRIOR, Placement, linearised, moved, refined
-from segslam.gnss.evidence import DriveCovariance, Estimate, Noise, estimated
+from segslam.gnss.alignment import Placement, moved, refined
+from segslam.gnss.evidence import Estimate, drift_solver, estimated
 from segslam.gnss.matching import Drive, Matched, Prepared
-from segslam.gnss.statistics import KEPT_WEIGHT, Weights, axis_sigma, fix_noise, horizontal_sigma, robust_weights
+from segslam.gnss.statistics import KEPT_WEIGHT, Weights, axis_sigma, horizontal_sigma, robust_weights, sigmas
 from segslam.graph import Edge
 from segslam.graph.position_fixes import PositionedGraph
 
@@ -50,37 +51,28 @@ class Constants:
     measured_offset_s: float
     """Seconds added to the times of the fixes, beyond those given; 0 if they are not significant."""
     level: Estimate
-    covariance: DriveCovariance
+    solver: SuperLU
+    """That of `evidence`."""
 
 
 def calibrate(
     edges: Sequence[Edge], drive: Drive, prepared: Prepared, matched: Matched, placement: Placement, *, offset_s: float
 ) -> Constants:
     """Clock and lever arm, where they are significant, and the placement with them."""
-    covariance = DriveCovariance(edges, drive.T_map_keyframe)
+    solver = drift_solver(edges, drive.T_map_keyframe)
     arm_m, measured_s = np.zeros(3), 0.0
-    free = np.ones(2, dtype=bool)
+    clock_free = arm_free = True
     for _ in range(CONSTANT_ROUNDS):
-        residual, columns = linearised(drive, matched, placement.T_enu_map, arm_m)
-        kept = placement.weights[:, 0] >= KEPT_WEIGHT
-        found = estimated(
-            covariance,
-            placement.T_enu_map @ drive.T_map_keyframe,
-            matched.some(kept),
-            residual[kept],
-            columns[kept],
-            PRIOR * np.repeat([True, *free], [6, 1, 2]),
-            axes=[0, 1],
-            white_m=fix_noise(residual[kept]),
-        )
+        found = estimated(solver, drive, matched, placement, axis=0, free=(clock_free, arm_free))
         clock, arm = found.constants[6], found.constants[7:9]
-        total = abs(measured_s + clock), np.abs(arm_m[:2] + arm)
-        free &= [total[0] > SIGNIFICANT * found.sigma[6], bool((total[1] > SIGNIFICANT * found.sigma[7:9]).any())]
-        measured_s = measured_s + float(clock) if free[0] else 0.0
-        arm_m = arm_m + np.array([*arm, 0.0]) if free[1] else np.zeros(3)
+        total_s, total_m = abs(measured_s + clock), np.abs(arm_m[:2] + arm)
+        clock_free = clock_free and bool(total_s > SIGNIFICANT * found.sigma[6])
+        arm_free = arm_free and bool((total_m > SIGNIFICANT * found.sigma[7:9]).any())
+        measured_s = measured_s + float(clock) if clock_free else 0.0
+        arm_m = arm_m + np.array([*arm, 0.0]) if arm_free else np.zeros(3)
         matched = prepared.matched(drive, offset_s + measured_s)
         placement = refined(drive, matched, moved(placement.T_enu_map, found.constants[:6]), arm_m)
-    return Constants(matched, placement, measured_s, found, covariance)
+    return Constants(matched, placement, measured_s, found, solver)
 
 
 def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> tuple[Poses, Weights, Vector, tuple[bool, bool]]:
@@ -93,28 +85,21 @@ def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> tuple[Pos
     T_start = placement.T_enu_map @ drive.T_map_keyframe
     problem = _Problem(PositionedGraph(edges, drive.T_map_keyframe), matched, placement, T_start)
     interval_s = float(np.median(np.diff(matched.time_s)))
-    residual, columns = linearised(drive, matched, placement.T_enu_map, placement.arm_m)
-    up: Noise | None = None
-    used = placement.weights[:, 1] >= KEPT_WEIGHT
-    if used.sum() >= NUM_WINDOWS:
-        up = estimated(
-            constants.covariance,
-            T_start,
-            matched.some(used),
-            residual[used],
-            columns[used],
-            PRIOR * np.repeat([True, False], [6, 3]),
-            axes=[2],
-            white_m=fix_noise(residual[used, 2]),
-        ).noise
-    level = constants.level.noise
-    soft = np.array(
-        [*2 * [level.effective_sigma_m(interval_s)], np.inf if up is None else up.effective_sigma_m(interval_s)]
-    )
-    close = np.array([level.white_m, level.white_m, np.inf if up is None else up.white_m])
-    sigma = _chosen(problem, soft, close)
+    noises = [constants.level.noise]
+    if np.sum(placement.weights[:, 1] >= KEPT_WEIGHT) >= NUM_WINDOWS:
+        noises.append(estimated(constants.solver, drive, matched, placement, axis=1, free=(False, False)).noise)
+    sigma = np.full(3, RIGID_M)  # with which the fixes act
+    for axis, noise in enumerate(noises if len(matched) >= LEAST_FUSED else []):
+        is_of_axis = np.array([axis == 0, axis == 0, axis == 1])
+        stiffnesses = (RIGID_M, noise.effective_sigma_m(interval_s), noise.white_m)
+        sigma = _best(problem, [np.where(is_of_axis, one, sigma) for one in stiffnesses], axis)
     T, weights, _ = _solved(problem, sigma)
-    return T, weights, _scales(problem.residual(T), weights), (bool(sigma[0] < RIGID_M), bool(sigma[2] < RIGID_M))
+    return (
+        T,
+        weights,
+        sigmas(problem.residual(T), *(weights >= KEPT_WEIGHT).T),
+        (bool(sigma[0] < RIGID_M), bool(sigma[2] < RIGID_M)),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,17 +115,6 @@ class _Problem:
     def solve(self, start: Poses, precisions: Points) -> Poses:
         points = self.matched.points(self.placement.arm_m)
         return self.graph.solve(start, self.matched.keyframe, points, self.matched.enu_m, precisions)
-
-
-def _chosen(problem: _Problem, soft: Vector, close: Vector) -> Vector:
-    """(3,) standard deviations with which the fixes act."""
-    sigma = np.full(3, RIGID_M)
-    if len(problem.matched) < LEAST_FUSED:
-        return sigma
-    level = _best(problem, [np.array([*one[:2], RIGID_M]) for one in (sigma, soft, close)], 0)
-    if not np.isfinite(close[2]):
-        return level
-    return _best(problem, [np.array([*level[:2], one]) for one in (RIGID_M, soft[2], close[2])], 1)
 
 
 def _best(problem: _Problem, candidates: Sequence[Vector], axis: int) -> Vector:
@@ -200,14 +174,8 @@ def _solved(problem: _Problem, sigma: Vector) -> tuple[Poses, Weights, Points]:
         precisions = np.column_stack([weights[:, 0], weights[:, 0], weights[:, 1]]) / sigma**2
         T = problem.solve(T, precisions)
         residual = problem.residual(T)
-        weights = robust_weights(residual, _scales(residual, weights), problem.matched.time_s)
+        weights = robust_weights(residual, sigmas(residual, *(weights >= KEPT_WEIGHT).T), problem.matched.time_s)
     return T, weights, precisions
-
-
-def _scales(residual: Points, weights: Weights) -> Vector:
-    used, used_up = weights[:, 0] >= KEPT_WEIGHT, weights[:, 1] >= KEPT_WEIGHT
-    level = horizontal_sigma(residual[used] if used.any() else residual)
-    return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
 
 
 def _along(residual: Points, axis: int) -> Vector:

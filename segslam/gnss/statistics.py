@@ -41,6 +41,12 @@ def axis_sigma(residual_m: Vector) -> float:
     return max(float(np.median(np.abs(residual_m))) / MEDIAN_OF_ABS, LEAST_SIGMA_M)
 
 
+def sigmas(residual: Points, used: Mask, used_up: Mask) -> Vector:
+    """(3,) robust standard deviations east, north and up of the used residuals; infinite up if none is used there."""
+    level = horizontal_sigma(residual[used] if used.any() else residual)
+    return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
+
+
 def fix_noise(residual_m: np.ndarray) -> float:
     """Standard deviation of one axis from fix to fix, from changes of residuals: (n,), or (n, 2 or 3) horizontally."""
     changes = np.diff(residual_m, axis=0)

@@ -72,18 +72,12 @@ def _read_messages(recording: Path, topic: str) -> list[Row]:
 def row_of(message: Any) -> Row:
     """The fix of a message. REP 145: the covariance is that of east, north, up; status -1 is no fix."""
     stamp = message.header.stamp
-    nanosec = stamp.nanosec if hasattr(stamp, "nanosec") else stamp.nsec
-    sigma_m = (float("nan"), float("nan"), float("nan"))
-    if message.position_covariance_type != 0:  # 0: not known
-        east, north, up = (float(value) for value in list(message.position_covariance)[::4])
-        sigma_m = _root(east), _root(north), _root(up)
+    is_known = message.position_covariance_type != 0
+    variances = [float(value) if is_known else -1.0 for value in list(message.position_covariance)[::4]]
+    east, north, up = (variance**0.5 if variance > 0.0 else float("nan") for variance in variances)
     has_fix = int(message.status.status) >= 0
     place = float(message.latitude), float(message.longitude), float(message.altitude)
-    return Row(int(stamp.sec) * 10**9 + int(nanosec), *place, sigma_m, has_fix)
-
-
-def _root(variance: float) -> float:
-    return variance**0.5 if variance > 0.0 else float("nan")
+    return Row(int(stamp.sec) * 10**9 + int(stamp.nanosec), *place, (east, north, up), has_fix)
 
 
 def _read_oxts(folder: Path) -> list[Row]:
@@ -94,26 +88,18 @@ def _read_oxts(folder: Path) -> list[Row]:
         raise SegslamError(
             f"{folder}: {len(times)} lines in timestamps.txt, but {len(files)} files in data; copy it again"
         )
-    return [
-        _oxts_row(file, _oxts_stamp(folder, number, text))
-        for number, (file, text) in enumerate(zip(files, times, strict=True), 1)
-    ]
-
-
-def _oxts_row(file: Path, stamp_ns: int) -> Row:
-    words = " ".join(text_lines(file)).split()
-    if len(words) < 3:
-        raise SegslamError(f"{file}: {len(words)} values; latitude, longitude and altitude are needed")
-    latitude, longitude, height_m = (number_in(file, 1, word, "coordinate") for word in words[:3])
-    check_degrees(file, 1, latitude, longitude)
-    sigma_m = number_in(file, 1, words[OXTS_ACCURACY], "accuracy") if len(words) > OXTS_ACCURACY else float("nan")
-    return Row(stamp_ns, latitude, longitude, height_m, (sigma_m, sigma_m, sigma_m))
-
-
-def _oxts_stamp(folder: Path, number: int, text: str) -> int:
-    """Nanoseconds of a date with up to nine decimals."""
-    try:
-        whole, _, fraction = text.partition(".")
-        return stamp_of(datetime.fromisoformat(whole)) + int(fraction.ljust(9, "0")[:9] or 0)
-    except ValueError as error:
-        raise bad_line(folder / "timestamps.txt", number, f"{text[:40]} is no date and time") from error
+    rows = []
+    for number, (file, text) in enumerate(zip(files, times, strict=True), 1):
+        try:
+            whole, _, fraction = text.partition(".")
+            stamp_ns = stamp_of(datetime.fromisoformat(whole)) + int(fraction.ljust(9, "0")[:9] or 0)
+        except ValueError as error:
+            raise bad_line(folder / "timestamps.txt", number, f"{text[:40]} is no date and time") from error
+        words = " ".join(text_lines(file)).split()
+        if len(words) < 3:
+            raise SegslamError(f"{file}: {len(words)} values; latitude, longitude and altitude are needed")
+        latitude, longitude, height_m = (number_in(file, 1, word, "coordinate") for word in words[:3])
+        check_degrees(file, 1, latitude, longitude)
+        sigma_m = number_in(file, 1, words[OXTS_ACCURACY], "accuracy") if len(words) > OXTS_ACCURACY else float("nan")
+        rows.append(Row(stamp_ns, latitude, longitude, height_m, (sigma_m, sigma_m, sigma_m)))
+    return rows

@@ -1,14 +1,16 @@
 """Fixes from RTKLIB's .pos files: geodetic or ECEF, GPS time or UTC, with weeks or dates."""
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 
 from segslam.gnss.fixes import Row
 from segslam.gnss.geodesy import Origin, geodetic_from_ecef, rotation_ecef_enu
-from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, stamp_of_week, utc_of_gps
+from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, utc_of_gps
+
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 
 
 def is_rtklib(lines: Sequence[str]) -> bool:
@@ -38,32 +40,28 @@ def _row(file: Path, number: int, words: Sequence[str], *, is_ecef: bool, is_gps
     errors = np.full(3, np.nan)
     if len(words) >= 10:
         errors = np.array([number_in(file, number, word, "standard deviation") for word in words[7:10]])
+    sigma_m = errors[[1, 0, 2]]  # north comes before east
     if is_ecef:
-        latitude, longitude, height_m = (
-            geodetic_from_ecef(position[None])[0] if np.isfinite(position).all() else position
-        )
-        rotation = rotation_ecef_enu(Origin(float(latitude), float(longitude), float(height_m)))
+        if np.isfinite(position).all():
+            position = geodetic_from_ecef(position[None])[0]
+        rotation = rotation_ecef_enu(Origin(*position.tolist()))
         sigma_m = np.sqrt((rotation.T**2) @ errors**2)  # without the correlations of the axes of ECEF
-    else:
-        latitude, longitude, height_m = position
-        sigma_m = errors[[1, 0, 2]]  # north comes before east
-    check_degrees(file, number, float(latitude), float(longitude))
-    east, north, up = (float(value) for value in sigma_m)
+    latitude, longitude, height_m = position.tolist()
+    check_degrees(file, number, latitude, longitude)
     stamp_ns = _stamp(file, number, words[0], words[1], is_gpst=is_gpst)
-    return Row(stamp_ns, float(latitude), float(longitude), float(height_m), (east, north, up), words[5] != "0")
+    return Row(stamp_ns, latitude, longitude, height_m, tuple(sigma_m.tolist()), words[5] != "0")
 
 
 def _stamp(file: Path, number: int, first: str, second: str, *, is_gpst: bool) -> int:
-    """Time (ns) of a week and second, or of a date and time."""
+    """Time (ns) of a GPS week and second of the week, or of a date and time."""
     try:
         if "/" not in first:
-            return stamp_of_week(int(first), float(second))
-        moment = datetime.strptime(
-            f"{first} {second}", "%Y/%m/%d %H:%M:%S.%f" if "." in second else "%Y/%m/%d %H:%M:%S"
-        )
-        moment = moment.replace(tzinfo=UTC)
+            week, seconds = int(first), float(second)
+            moment = GPS_EPOCH + timedelta(weeks=week, seconds=int(seconds))
+            return stamp_of(utc_of_gps(moment)) + round((seconds - int(seconds)) * 1e9)
+        form = "%Y/%m/%d %H:%M:%S.%f" if "." in second else "%Y/%m/%d %H:%M:%S"
+        moment = datetime.strptime(f"{first} {second}", form).replace(tzinfo=UTC)
         return stamp_of(utc_of_gps(moment) if is_gpst else moment)
     except (ValueError, OverflowError) as error:
-        raise bad_line(
-            file, number, f"time {first[:20]} {second[:20]} is neither week and seconds nor a date"
-        ) from error
+        what = f"time {first[:20]} {second[:20]} is neither week and seconds nor a date"
+        raise bad_line(file, number, what) from error

@@ -10,14 +10,14 @@ from segslam.core.types import SegslamError
 
 MOST_BYTES = 2**30
 """Chosen: no log of fixes is larger than a gigabyte."""
-GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 LEAPS = [
-    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01"),
-    *("1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01"),
-    *("2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
+    datetime(year, month, 1, tzinfo=UTC)
+    for year, month in (
+        *((1981, 7), (1982, 7), (1983, 7), (1985, 7), (1988, 1), (1990, 1), (1991, 1), (1992, 7), (1993, 7)),
+        *((1994, 7), (1996, 1), (1997, 7), (1999, 1), (2006, 1), (2009, 1), (2012, 7), (2015, 7), (2017, 1)),
+    )
 ]
 """Days (UTC) that begin after a leap second since GPS began (IERS Bulletin C)."""
-_LEAP_TIMES = [datetime.fromisoformat(day).replace(tzinfo=UTC) for day in LEAPS]
 
 
 def text_lines(file: Path) -> list[str]:
@@ -68,13 +68,6 @@ def stamp_of(moment: datetime) -> int:
 
 def utc_of_gps(moment: datetime) -> datetime:
     """The moment in UTC of one in GPS time, which has no leap seconds: 18 s earlier since 2017."""
-    leaps = bisect_right(_LEAP_TIMES, moment)
+    leaps = bisect_right(LEAPS, moment)
     utc = moment - timedelta(seconds=leaps)
-    return utc if bisect_right(_LEAP_TIMES, utc) == leaps else utc + timedelta(seconds=1)
-
-
-def stamp_of_week(week: int, seconds: float) -> int:
-    """Nanoseconds since 1970, UTC, of a GPS week and second of the week."""
-    whole = int(seconds)
-    moment = GPS_EPOCH + timedelta(weeks=week, seconds=whole)
-    return stamp_of(utc_of_gps(moment)) + round((seconds - whole) * 1e9)
+    return utc if bisect_right(LEAPS, utc) == leaps else utc + timedelta(seconds=1)

@@ -17,8 +17,8 @@ from scipy.ndimage import map_coordinates
 
 from segslam.core.points import hash_keys, voxel_first
 from segslam.core.types import Label, Labels, Points, Record, SegslamError
-from segslam.labels.geometric import GROUND_CELL_M, MAX_RANGE_M, MAX_SLOPE
-from segslam.labels.ground_surface import heights_above_ground, rotated, upright
+from segslam.labels.geometric import MAX_RANGE_M
+from segslam.labels.ground_surface import GROUND_CELL_M, heights_above_ground, rotated, upright
 
 CELL_M = 0.4
 HALF = 75
@@ -92,12 +92,7 @@ def _standing(points: Points, labels: Labels, *, reach_m: float) -> Points:
     level = rotated(thinned, upright(thinned))
     edge_m = reach_m + 2 * GROUND_CELL_M
     near = level.compress((np.abs(level[:, 0]) <= edge_m) & (np.abs(level[:, 1]) <= edge_m), axis=0)
-    heights = heights_above_ground(
-        near,
-        cell_m=GROUND_CELL_M,
-        max_range_m=min(MAX_RANGE_M, edge_m + GROUND_CELL_M),
-        max_slope=MAX_SLOPE,
-    )
+    heights = heights_above_ground(near, max_range_m=min(MAX_RANGE_M, edge_m + GROUND_CELL_M))
     return near[heights > GROUND_M]
 
 

@@ -12,10 +12,6 @@ from segslam.labels.shapes import NUM_SLICES, Pieces, grid_cells, on_thin_uprigh
 
 MAX_RANGE_M = 70.0
 """Chosen: points farther away remain unlabelled (m)."""
-GROUND_CELL_M = 1.0
-"""Chosen: cell size of the ground surface (m)."""
-MAX_SLOPE = 0.2
-"""Chosen: largest slope of the ground between cells."""
 GROUND_HEIGHT_M = 0.15
 """Chosen: points lower than this are ground (m)."""
 BAND_M = (0.4, 2.6)
@@ -68,7 +64,7 @@ def geometric_labels(points: Points) -> Labels:
 
 
 def _labels_of_level(level: Points) -> Labels:
-    heights = heights_above_ground(level, cell_m=GROUND_CELL_M, max_range_m=MAX_RANGE_M, max_slope=MAX_SLOPE)
+    heights = heights_above_ground(level, max_range_m=MAX_RANGE_M)
     labels = np.where(heights < GROUND_HEIGHT_M, np.uint8(Label.ROAD), np.uint8(Label.VEGETATION))
     for rule in (_poles, _solids, _walls):
         rest = np.flatnonzero(labels == Label.VEGETATION)

@@ -20,6 +20,10 @@ LEVEL_RADIUS_M = 15.0
 LEVEL_BIN_M = 0.2
 """Chosen: thickness of a layer whose points count for the same plane."""
 MIN_LEVEL_CELLS = 10
+GROUND_CELL_M = 1.0
+"""Chosen: cell size of the ground surface (m)."""
+MAX_SLOPE = 0.2
+"""Chosen: largest slope of the ground between cells."""
 SURFACE_M = 0.15
 """Chosen: the height of a cell is the mean of its lowest points within this height."""
 
@@ -47,19 +51,19 @@ def rotated(points: Points, R_a_b: Rotation) -> Points:
     return np.column_stack([_along(points, row) for row in R_a_b])
 
 
-def heights_above_ground(points: Points, *, cell_m: float, max_range_m: float, max_slope: float) -> Vector:
+def heights_above_ground(points: Points, *, max_range_m: float) -> Vector:
     """Height (n,) of each point above the ground (m), for points in a level frame with the sensor at the origin.
 
     Points farther than `max_range_m` in x or y use the nearest cell of the border. Cells without visible ground
     take the height of their neighbours nearer to the sensor.
     """
-    half = int(np.ceil(max_range_m / cell_m))
-    cells = np.clip(np.floor(points[:, :2] / cell_m).astype(np.int64) + half, 0, 2 * half - 1)
-    order, starts = _grouped(cells[:, 0] * 2 * half + cells[:, 1], 4 * half * half)
-    z = points[order, 2]
-    start_height = _start_height(z, starts, half, cell_m)
-    surface = _follow(z, starts, _outward(half), start_height, half, cell_m, max_slope)
-    return points[:, 2] - _interpolate(points, surface, half, cell_m)
+    half = int(np.ceil(max_range_m / GROUND_CELL_M))
+    cells = np.clip(np.floor(points[:, :2] / GROUND_CELL_M).astype(np.int64) + half, 0, 2 * half - 1)
+    cell = cells[:, 0] * 2 * half + cells[:, 1]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=4 * half * half))])
+    z = points[np.argsort(cell, kind="stable"), 2]
+    surface = _follow(z, starts, _outward(half), _start_height(points), half)
+    return points[:, 2] - _interpolate(points, surface, half)
 
 
 def _along(points: Points, direction: np.ndarray) -> Vector:
@@ -86,19 +90,19 @@ def _lowest_of_cells(points, radius_m):
 def _most_voted_plane(points: Points) -> tuple[np.ndarray, float]:
     """Unit normal of the plane below the sensor with the most points, and its height along the normal."""
     normals = _upward_normals()
-    votes = _votes(points, normals, LEVEL_BIN_M, int(LEVEL_RADIUS_M / LEVEL_BIN_M))
+    votes = _votes(points, normals, int(LEVEL_RADIUS_M / LEVEL_BIN_M))
     best, depth = np.unravel_index(int(np.argmax(votes)), votes.shape)
     return normals[best], -(depth + 0.5) * LEVEL_BIN_M
 
 
-@kernel("int64[:, ::1](float64[:, :], float64[:, ::1], float64, int64)")
-def _votes(points, normals, bin_m, num_bins):
+@kernel("int64[:, ::1](float64[:, :], float64[:, ::1], int64)")
+def _votes(points, normals, num_bins):
     """Number of points in each bin of depth below the sensor, for each normal. Bins above the sensor stay empty."""
     votes = np.zeros((len(normals), num_bins), np.int64)
     for n in range(len(normals)):
         x, y, z = normals[n]
         for k in range(len(points)):
-            depth = -(points[k, 0] * x + points[k, 1] * y + points[k, 2] * z) / bin_m
+            depth = -(points[k, 0] * x + points[k, 1] * y + points[k, 2] * z) / LEVEL_BIN_M
             if 1.0 <= depth < num_bins:
                 votes[n, int(depth)] += 1
     return votes
@@ -123,21 +127,6 @@ def _plane(points: Points) -> tuple[np.ndarray, float]:
     return normal, float(mean @ normal)
 
 
-@kernel("UniTuple(int64[::1], 2)(int64[::1], int64)")
-def _grouped(group, num_groups):
-    """Rows sorted by group (counting sort), and the start of each group (num_groups + 1 values)."""
-    starts = np.zeros(num_groups + 1, np.int64)
-    for k in range(len(group)):
-        starts[group[k] + 1] += 1
-    starts = np.cumsum(starts)
-    free = starts.copy()
-    order = np.empty(len(group), np.int64)
-    for k in range(len(group)):
-        order[free[group[k]]] = k
-        free[group[k]] += 1
-    return order, starts
-
-
 @cache
 def _outward(half: int) -> Indices:
     """Cells of the grid by distance from the sensor, nearest first."""
@@ -145,18 +134,15 @@ def _outward(half: int) -> Indices:
     return np.argsort((squared[:, None] + squared).ravel(), kind="stable")
 
 
-def _start_height(z: Vector, starts: Indices, half: int, cell_m: float) -> float:
+def _start_height(points: Points) -> float:
     """Height of the ground at the sensor: 10th percentile of the points below it within 8 m; -1.7 m without points."""
-    reach = min(int(8.0 / cell_m), half)
-    rows = 2 * half * np.arange(half - reach, half + reach) + half
-    near = [z[first:last] for first, last in zip(starts[rows - reach], starts[rows + reach], strict=True)]
-    below = np.concatenate(near)
-    below = below[below < -0.3]
+    x, y, z = points.T
+    below = z[(x >= -8.0) & (x < 8.0) & (y >= -8.0) & (y < 8.0) & (z < -0.3)]
     return float(np.percentile(below, 10)) if len(below) else -1.7
 
 
-@kernel("float64[:, ::1](float64[::1], int64[::1], int64[::1], float64, int64, float64, float64)")
-def _follow(z, starts, outward, height_below_sensor, half, cell_m, max_slope):
+@kernel("float64[:, ::1](float64[::1], int64[::1], int64[::1], float64, int64)")
+def _follow(z, starts, outward, height_below_sensor, half):
     """Ground height of each cell, (2 half, 2 half)."""
     side = 2 * half
     height = np.full((side, side), np.nan)
@@ -166,7 +152,7 @@ def _follow(z, starts, outward, height_below_sensor, half, cell_m, max_slope):
         expected, reach = _expected(height, gap, i, j, half)
         if np.isnan(expected):
             expected = height_below_sensor
-        tolerance = min(0.1 + max_slope * cell_m * (1.0 + reach), 1.0)
+        tolerance = min(0.1 + MAX_SLOPE * GROUND_CELL_M * (1.0 + reach), 1.0)
         found = _lowest_surface(z[starts[flat] : starts[flat + 1]], expected - tolerance - 0.1, expected + tolerance)
         if np.isnan(found):
             height[i, j] = expected
@@ -209,14 +195,14 @@ def _lowest_surface(z, low, high):
     return total_um / count / 1e6 if count > 0 else np.nan
 
 
-@kernel("float64[::1](float64[:, ::1], float64[:, ::1], int64, float64)")
-def _interpolate(points, surface, half, cell_m):
+@kernel("float64[::1](float64[:, ::1], float64[:, ::1], int64)")
+def _interpolate(points, surface, half):
     """Height of the surface below each point, bilinear."""
     heights = np.empty(len(points))
     last = 2 * half - 1
     for k in range(len(points)):
-        x = min(max(points[k, 0] / cell_m + half - 0.5, 0.0), float(last))
-        y = min(max(points[k, 1] / cell_m + half - 0.5, 0.0), float(last))
+        x = min(max(points[k, 0] / GROUND_CELL_M + half - 0.5, 0.0), float(last))
+        y = min(max(points[k, 1] / GROUND_CELL_M + half - 0.5, 0.0), float(last))
         i, j = min(int(x), last - 1), min(int(y), last - 1)
         u, v = x - i, y - j
         below = surface[i, j] * (1 - v) + surface[i, j + 1] * v

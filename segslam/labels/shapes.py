@@ -130,72 +130,24 @@ def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: 
     """
     cells, corner, shape = grid_cells(points, WALL_CELL_M, border=1)
     layers = np.clip(heights / LAYER_M, 0, NUM_LAYERS - 1).astype(np.int64)
-    voxel, moments = _moments(points, layers, cells, corner, (NUM_LAYERS, *shape))
-    top = np.full(shape, -np.inf)
-    np.maximum.at(top.ravel(), cells[:, 0] * shape[1] + cells[:, 1], heights)
-    tall = maximum_filter(top, 3) >= min_top_m
-    walls = _walls(voxel, moments, tall, thickness_m * 1000, MIN_LENGTH_M * 1000)
-    return walls[voxel[layers, cells[:, 0], cells[:, 1]]]
-
-
-@kernel(
-    "Tuple((int32[:, :, ::1], int64[:, ::1]))(float64[:, ::1], int64[::1], int64[:, ::1], float64[::1],"
-    "UniTuple(int64, 3))"
-)
-def _moments(points, layers, cells, corner, shape):
-    """Index of each occupied voxel (-1 elsewhere), and the sums of 1, x, y, xx, xy, yy over the points of each voxel.
-
-    The sums are in integer millimetres and do not depend on the order of the points.
-    """
-    voxel = np.full(shape, -1, np.int32)
-    moments = np.zeros((len(layers), 6), np.int64)
-    num_voxels = 0
-    for k in range(len(layers)):
-        layer, i, j = layers[k], cells[k, 0], cells[k, 1]
-        if voxel[layer, i, j] < 0:
-            voxel[layer, i, j] = num_voxels
-            num_voxels += 1
-        x = int(np.round((points[k, 0] - corner[0]) * 1000))
-        y = int(np.round((points[k, 1] - corner[1]) * 1000))
-        m = moments[voxel[layer, i, j]]
-        m[0] += 1
-        m[1] += x
-        m[2] += y
-        m[3] += x * x
-        m[4] += x * y
-        m[5] += y * y
-    return voxel, moments[:num_voxels]
-
-
-@kernel("boolean[::1](int32[:, :, ::1], int64[:, ::1], boolean[:, ::1], float64, float64)")
-def _walls(voxel, moments, tall, thickness_mm, min_length_mm):
-    """True for each voxel that is part of a vertical surface. Neighbours are within the grid, whose border is empty."""
-    walls = np.zeros(len(moments), np.bool_)
-    total = np.zeros(6, np.int64)
-    for layer in range(voxel.shape[0]):
-        for i in range(1, voxel.shape[1] - 1):
-            for j in range(1, voxel.shape[2] - 1):
-                if voxel[layer, i, j] < 0 or not tall[i, j]:
-                    continue
-                total[:] = 0
-                for a in range(i - 1, i + 2):
-                    for b in range(j - 1, j + 2):
-                        if voxel[layer, a, b] >= 0:
-                            for m in range(6):
-                                total[m] += moments[voxel[layer, a, b], m]
-                walls[voxel[layer, i, j]] = _is_line(total, thickness_mm, min_length_mm)
-    return walls
-
-
-@kernel("boolean(int64[::1], float64, float64)")
-def _is_line(moments, thickness_mm, min_length_mm):
-    n, x, y = moments[0], moments[1], moments[2]
-    xx, xy, yy = moments[3], moments[4], moments[5]
-    if n < MIN_POINTS:
-        return False
-    a, b, c = xx / n - (x / n) ** 2, xy / n - (x / n) * (y / n), yy / n - (y / n) ** 2
+    column = cells[:, 0] * shape[1] + cells[:, 1]
+    voxel = layers * (shape[0] * shape[1]) + column
+    occupied = np.zeros(NUM_LAYERS * shape[0] * shape[1], bool)
+    occupied[voxel] = True
+    rows, places = np.cumsum(occupied) - 1, np.flatnonzero(occupied)  # row of each occupied voxel, and the reverse
+    x, y = np.round((points[:, :2] - corner) * 1000).T  # whole mm: the sums do not depend on the order of the points
+    values = np.ones(len(points)), x, y, x * x, x * y, y * y
+    own = np.array([np.bincount(rows[voxel], value, len(places)) for value in values])
+    near = [places + i * shape[1] + j for i in (-1, 0, 1) for j in (-1, 0, 1)]  # the border of the grid is empty
+    n, *sums = sum(own[:, rows[voxels]] * occupied[voxels] for voxels in near)
+    x, y, xx, xy, yy = (one / n for one in sums)
+    a, b, c = xx - x**2, xy - x * y, yy - y**2
     middle, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
-    return middle - spread < thickness_mm**2 and middle + spread > min_length_mm**2
+    top = np.full(shape, -np.inf)
+    np.maximum.at(top.ravel(), column, heights)
+    walls = (n >= MIN_POINTS) & (maximum_filter(top, 3).ravel()[places % top.size] >= min_top_m)
+    walls &= (middle - spread < (thickness_m * 1000) ** 2) & (middle + spread > (MIN_LENGTH_M * 1000) ** 2)
+    return walls[rows[voxel]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -85,7 +85,7 @@ def _labels(scans: "Dataset") -> str:
     source = scans.labels
     if source.network is not None:
         return "by network, for keyframes"
-    if source.files is not None:
+    if source.folder is not None:
         others = "geometric for the others" if source.geometric else "none for the others"
-        return f"{source.files.folder} ({source.files.encoding} ids), {others}"
+        return f"{source.folder} ({source.encoding} ids), {others}"
     return "geometric" if source.geometric else "none"

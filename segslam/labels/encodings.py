@@ -52,9 +52,8 @@ RAW_OF_LABEL = np.array([RAW[label][0] for label in Label], dtype=np.uint32)
 """The raw id that is written for each label; merged classes such as buses are written as the class they merge into."""
 
 RARE = (Label.BICYCLE, Label.MOTORCYCLE, Label.BICYCLIST, Label.MOTORCYCLIST)
-RARE_MAX_SHARE = (
-    0.02  # chosen: together they have 0.1 % of the data set's points, and under 0.1 % of each real scan tried
-)
+RARE_MAX_SHARE = 0.02
+"""Chosen: together they have 0.1 % of the data set's points, and under 0.1 % of each real scan tried."""
 ROAD_MIN_SHARE = 0.02  # chosen: the real scans of KITTI 00 contain 20 to 28 %
 COLORS = {
     Label.UNLABELLED: "#9a9a9a",

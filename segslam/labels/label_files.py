@@ -5,6 +5,7 @@ A network's labels are computed on first use: it is slow, and only keyframes nee
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from segslam.core.errors import unreadable
 from segslam.core.types import BadScan, Label, Labels, Mask, Points, ScanLabels, SegslamError, Vector
 from segslam.core.whole_files import expanded, whole_file
-from segslam.labels.encodings import Encoding, Histogram, Ids, detect_encoding, to_ids, to_labels
+from segslam.labels.encodings import Encoding, Ids, detect_encoding, to_ids, to_labels
 
 if TYPE_CHECKING:
     from segslam.labels.network import Network
@@ -26,36 +27,22 @@ NETWORK = "network:"
 
 
 @dataclass(frozen=True, slots=True)
-class LabelFiles:
-    """A folder of `.label` files, named like the scans."""
-
-    folder: Path
-    encoding: Encoding
-
-    def read(self, name: str, num_points: int) -> Labels:
-        """The labels of the scan `name`; all UNLABELLED if it has no file.
-
-        Raises BadScan if the file is invalid, does not have `num_points` labels, or has ids outside its encoding.
-        """
-        file = self.folder / f"{name}.label"
-        return read_labels(file, num_points, self.encoding) if file.exists() else unlabelled(num_points)
-
-
-@dataclass(frozen=True, slots=True)
 class LabelSource:
-    """The source of the labels of a drive: files, a network, or none."""
+    """The source of the labels of a drive: a folder of `.label` files, named like the scans; a network; or none."""
 
-    files: LabelFiles | None
     geometric: bool
     """True if scans without a label file are labelled by geometry when they become keyframes."""
+    folder: Path | None = None
+    encoding: Encoding | None = None
+    """That of the files; known if there is a folder."""
     network: "Network | None" = None
 
     def read(self, name: str, points: Points, intensities: Vector | None = None) -> ScanLabels:
-        """The labels of the scan `name`; all UNLABELLED if there is no source for it.
+        """The labels of the scan `name`; all UNLABELLED if there is no source for it, or no file.
 
         `points` and `intensities` are in the order of the scan file. The labels of a network are computed when they are
         first used; that call raises SegslamError like `Network.labels`, and zeros replace unknown intensities. Raises
-        BadScan like `LabelFiles.read`.
+        BadScan as `read_labels`.
         """
         if self.network:
             if intensities is None:
@@ -63,7 +50,10 @@ class LabelSource:
                 intensities = np.zeros(len(points))
             network, known = self.network, intensities
             return lambda: network.labels(points, known)
-        return self.files.read(name, len(points)) if self.files else unlabelled(len(points))
+        file = self.folder / f"{name}.label" if self.folder else None
+        if file is None or self.encoding is None or not file.exists():
+            return unlabelled(len(points))
+        return read_labels(file, len(points), self.encoding)
 
 
 def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelSource:
@@ -74,23 +64,25 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
     given nor detectable, and for a network that `open_network` rejects.
     """
     if source in ("none", "geometric"):
-        return LabelSource(None, geometric=source == "geometric")
+        return LabelSource(source == "geometric")
     if source.startswith(NETWORK):
         from segslam.labels.network import open_network
 
-        return LabelSource(None, geometric=False, network=open_network(expanded(source.removeprefix(NETWORK))))
-    if source == "auto":
-        if not _labelled(beside / "labels", scan_names):
-            return LabelSource(None, geometric=True)
-        return LabelSource(_open_folder(beside / "labels", scan_names, encoding), geometric=True)
-    folder = beside / expanded(source)
-    if not folder.is_dir():
+        return LabelSource(False, network=open_network(expanded(source.removeprefix(NETWORK))))
+    folder = beside / ("labels" if source == "auto" else expanded(source))
+    if source != "auto" and not folder.is_dir():
         raise SegslamError(f"--labels {source}: no folder {folder}; give one, auto, none, geometric or network:MODEL")
-    if not _labelled(folder, scan_names):
+    files = [file for name in scan_names if (file := folder / f"{name}.label").is_file()]
+    if not files and source == "auto":
+        return LabelSource(True)
+    if not files:
         raise SegslamError(
             f"{folder}: no .label file for any of the {len(scan_names)} scans; label files are named like the scans"
         )
-    return LabelSource(_open_folder(folder, scan_names, encoding), geometric=False)
+    if len(files) < len(scan_names):
+        logger.warning("%s: %d of %d scans have no label file", folder, len(scan_names) - len(files), len(scan_names))
+    spread = np.unique(np.linspace(0, len(files) - 1, 8).astype(int))  # chosen: so many files show it
+    return LabelSource(source == "auto", folder, encoding or encoding_of([files[row] for row in spread]))
 
 
 def read_ids(file: Path) -> Ids:
@@ -137,8 +129,12 @@ def write_labels(file: Path, labels: Labels, kept: Mask | None, encoding: Encodi
 
 def encoding_of(files: Sequence[Path]) -> Encoding:
     """The encoding of label files, detected from all of them. Raises SegslamError if it is ambiguous."""
+    num_points_of_id = np.zeros(2**16, np.int64)
+    for file in files:
+        with suppress(BadScan):  # of an invalid file, which is reported when its scan is read
+            num_points_of_id += np.bincount(read_ids(file), minlength=2**16)
     try:
-        return detect_encoding(sum((_histogram(file) for file in files), np.zeros(2**16, dtype=np.int64)))
+        return detect_encoding(num_points_of_id)
     except SegslamError as error:
         where = files[0].parent if len(files) > 2 else " and ".join(str(file) for file in files)
         raise SegslamError(f"{where}: {error}") from error
@@ -153,27 +149,6 @@ def unlabelled(num_points: int) -> Labels:
 def _warn_of_zeros() -> None:
     """Warn once, not for every scan."""
     logger.warning("the data contain no readable intensities; the network receives zeros instead")
-
-
-def _labelled(folder: Path, scan_names: Sequence[str]) -> list[str]:
-    return [name for name in scan_names if (folder / f"{name}.label").is_file()]
-
-
-def _open_folder(folder: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelFiles:
-    named = _labelled(folder, scan_names)
-    if len(named) < len(scan_names):
-        logger.warning("%s: %d of %d scans have no label file", folder, len(scan_names) - len(named), len(scan_names))
-    spread = np.unique(np.linspace(0, len(named) - 1, 8).astype(int))  # chosen: so many files show it
-    return LabelFiles(folder, encoding or encoding_of([folder / f"{named[row]}.label" for row in spread]))
-
-
-def _histogram(file: Path) -> Histogram:
-    """Number of points of each id; empty for an invalid file, which is reported when its scan is read."""
-    try:
-        ids = read_ids(file)
-    except BadScan:
-        ids = np.empty(0, dtype=np.uint32)
-    return np.bincount(ids, minlength=2**16)
 
 
 def computed(labels: ScanLabels) -> Labels:

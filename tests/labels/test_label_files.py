@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from segslam.core.types import BadScan, Label, SegslamError
-from segslam.labels.label_files import LabelFiles, encoding_of, open_labels, read_ids
+from segslam.labels.label_files import encoding_of, open_labels, read_ids, read_labels
 
 NAMES = ["000000", "000001"]
 
@@ -28,13 +28,13 @@ def test_labels_beside_the_scans_are_found_by_themselves(tmp_path: Path) -> None
     for name in NAMES:
         _write(tmp_path / "labels", name, [10, 40, 50])
     source = open_labels("auto", beside=tmp_path, scan_names=NAMES, encoding=None)
-    assert source.files == LabelFiles(tmp_path / "labels", "raw")
+    assert (source.folder, source.encoding) == (tmp_path / "labels", "raw")
     np.testing.assert_array_equal(source.read("000001", np.ones((3, 3))), [Label.CAR, Label.ROAD, Label.BUILDING])
 
 
 def test_without_label_files_labels_are_geometric(tmp_path: Path) -> None:
     source = open_labels("auto", beside=tmp_path, scan_names=NAMES, encoding=None)
-    assert source.files is None
+    assert source.folder is None
     assert source.geometric
     np.testing.assert_array_equal(source.read("000000", np.ones((2, 3))), [Label.UNLABELLED] * 2)
 
@@ -43,7 +43,7 @@ def test_without_label_files_labels_are_geometric(tmp_path: Path) -> None:
 def test_files_are_not_read_unless_requested(tmp_path: Path, name: str, geometric: bool) -> None:
     _write(tmp_path / "labels", "000000", [10, 40])
     source = open_labels(name, beside=tmp_path, scan_names=NAMES, encoding=None)
-    assert source.files is None
+    assert source.folder is None
     assert source.geometric == geometric
 
 
@@ -70,26 +70,26 @@ def test_scans_without_a_file_stay_unlabelled_and_are_counted_once(
 def test_labels_of_another_length_are_refused_with_both_numbers(tmp_path: Path) -> None:
     _write(tmp_path, "000000", [10, 40])
     with pytest.raises(BadScan, match=r"000000\.label: 2 labels for 3 points"):
-        LabelFiles(tmp_path, "raw").read("000000", 3)
+        read_labels(tmp_path / "000000.label", 3, "raw")
 
 
 def test_truncated_labels_are_refused(tmp_path: Path) -> None:
     (tmp_path / "000000.label").write_bytes(b"12345")
     with pytest.raises(BadScan, match=r"000000\.label: 5 bytes"):
-        LabelFiles(tmp_path, "raw").read("000000", 1)
+        read_labels(tmp_path / "000000.label", 1, "raw")
 
 
 def test_id_of_another_encoding_is_the_scans_failure(tmp_path: Path) -> None:
     _write(tmp_path, "000000", [10, 40])
     with pytest.raises(BadScan, match=r"000000\.label: id 40 is not in the encoding learning"):
-        LabelFiles(tmp_path, "learning").read("000000", 2)
+        read_labels(tmp_path / "000000.label", 2, "learning")
 
 
 def test_an_invalid_file_does_not_prevent_detection_of_the_encoding(tmp_path: Path) -> None:
     _write(tmp_path / "labels", "000000", [10, 40])
     (tmp_path / "labels" / "000001.label").write_bytes(b"123")
     source = open_labels("auto", beside=tmp_path, scan_names=NAMES, encoding=None)
-    assert source.files == LabelFiles(tmp_path / "labels", "raw")
+    assert (source.folder, source.encoding) == (tmp_path / "labels", "raw")
 
 
 def test_missing_folder_and_unknown_source_are_named(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_missing_network_is_named(tmp_path: Path) -> None:
 def test_the_encoding_of_each_real_prediction_is_detected_from_one_file(data_dir: Path, name: str) -> None:
     sequence = data_dir / "kitti" / "sequences" / "00"
     source = open_labels("predicted_labels", beside=sequence, scan_names=[name], encoding=None)
-    assert source.files == LabelFiles(sequence / "predicted_labels", "learning-0")
+    assert (source.folder, source.encoding) == (sequence / "predicted_labels", "learning-0")
 
 
 @pytest.mark.data

@@ -11,7 +11,7 @@ import numpy as np
 from segslam.core.types import BadScan, SegslamError
 from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
-from segslam.scans.scan_files import INTENSITY_FIELDS, TIME_FIELDS, Columns, read_bytes
+from segslam.scans.scan_files import INTENSITY_FIELDS, NO_POINTS, TIME_FIELDS, Columns, read_bytes
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 TIMES = (*TIME_FIELDS, "timestamps", "stamps")
@@ -75,7 +75,7 @@ def _parse_npy(content: bytes) -> np.ndarray:
     if num_bytes != math.prod((rows, columns, np.dtype(kind).itemsize)):
         raise ValueError(f"its header claims {rows} x {columns} {kind}, but {num_bytes} bytes follow: truncated")
     if rows == 0:
-        raise ValueError("it has no points")
+        raise ValueError(NO_POINTS)
     return np.frombuffer(content, kind, offset=start).reshape((rows, columns), order="F" if by_columns else "C")
 
 
@@ -86,11 +86,9 @@ def _from_rows(rows: np.ndarray) -> Cloud:
 
 
 def _from_columns(columns: Columns) -> Cloud:
-    """Raises ValueError without x, y and z, and without any point."""
+    """Raises ValueError without x, y and z."""
     if not {"x", "y", "z"} <= set(columns):
         raise ValueError(f"it has no fields x y z, only {' '.join(columns)[:80] or 'none'}")
-    if len(columns["x"]) == 0:
-        raise ValueError("it has no points")
     axes = [columns[axis] for axis in "xyz"]
     points = np.empty((len(axes[0]), 3), np.result_type(*map(_kind, axes)))
     for k, axis in enumerate(axes):

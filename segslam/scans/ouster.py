@@ -49,8 +49,8 @@ CHANNELS = {
     "FUSA_RNG15_RFL8_NIR8_DUAL": _Channel(8, "<u2", 15, 8, "u1", 2),
 }
 """By profile name."""
-HEADER_BYTES = FOOTER_BYTES = 32
-"""Bytes around the columns of a packet, except in the legacy profile."""
+HEADER_BYTES = 32
+"""Bytes before and after the columns of a packet, except in the legacy profile."""
 MAX_COLUMNS, MAX_BEAMS = 4096, 256
 """Largest numbers in metadata. Chosen: the largest sensors have 4096 columns and 128 beams."""
 
@@ -81,21 +81,19 @@ class _Sensor:
     def header_bytes(self) -> int:
         return 0 if self.profile == "LEGACY" else HEADER_BYTES
 
-    def contradiction(self) -> str:
-        """What no sensor has; empty if there is nothing of the kind."""
-        numbers = (self.altitude_rad, self.azimuth_rad, self.T_sensor_lidar_mm, np.array(self.beam_origin_mm))
-        if not 1 <= self.columns_per_packet <= self.columns_per_frame <= MAX_COLUMNS:
-            return f"{self.columns_per_frame} columns per frame, {self.columns_per_packet} per packet"
-        if self.altitude_rad.shape != self.azimuth_rad.shape or not 1 <= self.altitude_rad.size <= MAX_BEAMS:
-            return f"{self.altitude_rad.size} elevations and {self.azimuth_rad.size} azimuths of beams"
-        if self.altitude_rad.ndim != 1 or not all(np.isfinite(each).all() for each in numbers):
-            return "angles or distances that are not numbers"
-        return ""
-
     @property
     def packet_bytes(self) -> int:
-        around = 0 if self.profile == "LEGACY" else HEADER_BYTES + FOOTER_BYTES
-        return around + self.columns_per_packet * self.column_dtype.itemsize
+        return 2 * self.header_bytes + self.columns_per_packet * self.column_dtype.itemsize
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for values that no sensor has."""
+        numbers = (self.altitude_rad, self.azimuth_rad, self.T_sensor_lidar_mm, np.array(self.beam_origin_mm))
+        if not 1 <= self.columns_per_packet <= self.columns_per_frame <= MAX_COLUMNS:
+            raise ValueError(f"{self.columns_per_frame} columns per frame, {self.columns_per_packet} per packet")
+        if self.altitude_rad.shape != self.azimuth_rad.shape or not 1 <= self.altitude_rad.size <= MAX_BEAMS:
+            raise ValueError(f"{self.altitude_rad.size} elevations and {self.azimuth_rad.size} azimuths of beams")
+        if self.altitude_rad.ndim != 1 or not all(np.isfinite(each).all() for each in numbers):
+            raise ValueError("angles or distances that are not numbers")
 
 
 class OusterFrames:
@@ -161,14 +159,9 @@ class OusterFrames:
         encoder = 2 * np.pi * (1 - np.arange(sensor.columns_per_frame) / sensor.columns_per_frame)[:, None]
         heading = encoder - sensor.azimuth_rad
         level = np.cos(sensor.altitude_rad)
-        ray = [
-            np.cos(heading) * level,
-            np.sin(heading) * level,
-            np.broadcast_to(np.sin(sensor.altitude_rad), heading.shape),
-        ]
-        rays = np.stack(ray, axis=-1)
-        turned = np.broadcast_to(encoder, heading.shape)
-        axis = np.stack([np.cos(turned), np.sin(turned), np.zeros_like(turned)], axis=-1)
+        ray = np.cos(heading) * level, np.sin(heading) * level, np.sin(sensor.altitude_rad)
+        rays = np.stack(np.broadcast_arrays(*ray), axis=-1)
+        axis = np.stack([np.cos(encoder), np.sin(encoder), np.zeros_like(encoder)], axis=-1)
         rotation, shift = sensor.T_sensor_lidar_mm[:3, :3], sensor.T_sensor_lidar_mm[:3, 3]
         return rays @ rotation.T, (axis - rays) * sensor.beam_origin_mm @ rotation.T + shift
 
@@ -190,7 +183,7 @@ def _read_sensor(file: Path) -> _Sensor:
         profile = str(values.get("udp_profile_lidar", "LEGACY"))
         if profile not in CHANNELS:
             raise ValueError(f"packets of profile {profile}; known: {', '.join(CHANNELS)}")
-        sensor = _Sensor(
+        return _Sensor(
             profile=profile,
             port=int(values.get("udp_port_lidar") or 0) or None,
             columns_per_frame=int(values["columns_per_frame"]),
@@ -204,16 +197,11 @@ def _read_sensor(file: Path) -> _Sensor:
         raise ValueError(f"{file.name} has no key {error}; it must be the metadata of an Ouster sensor") from error
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"{file.name} is not the metadata of an Ouster sensor ({error})") from error
-    wrong = sensor.contradiction()
-    if wrong:
-        raise ValueError(f"{file.name} is not the metadata of an Ouster sensor ({wrong})")
-    return sensor
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:
     """The keys of all sections in one mapping; older metadata have no sections."""
-    inner = [_flat(value) for value in values.values() if isinstance(value, dict)]
     flat = {key: value for key, value in values.items() if not isinstance(value, dict)}
-    for section in inner:
-        flat.update(section)
+    for section in values.values():
+        flat |= _flat(section) if isinstance(section, dict) else {}
     return flat

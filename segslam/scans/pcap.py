@@ -4,7 +4,6 @@ import logging
 import mmap
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 logger = logging.getLogger(__name__)
 
@@ -26,22 +25,13 @@ UDP_HEADER_BYTES = 8
 Content = bytes | mmap.mmap
 
 
-@dataclass(slots=True)
-class _Fragments:
-    """A datagram that was split into IP fragments, as positions in the file."""
-
-    missing_bytes: int = 0
-    """Remaining bytes: negative until the first fragment, which contains the length, is found."""
-    pieces: dict[int, slice] = field(default_factory=dict)
-
-
 def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Iterator[list[slice]]:
     """Positions of the payloads of this length, sent to this port (None: any), in order of arrival.
 
     A payload is one slice, or several if the datagram was fragmented. Incomplete datagrams are skipped.
     Raises ValueError if the file is not a pcap, or has an unknown link type.
     """
-    waiting: dict[bytes, _Fragments] = {}
+    waiting: dict[bytes, dict[int, slice]] = {}  # the fragments of a datagram by their offsets
     wanted_bytes = num_bytes + UDP_HEADER_BYTES
     for start, end in _ip_packets(content):
         header_end = start + 4 * (content[start] & 0xF)
@@ -59,13 +49,10 @@ def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Itera
                     yield [slice(header_end, end)]
                 continue
         key = content[start + 12 : start + 20] + content[start + 4 : start + 6]  # source, destination, datagram number
-        fragments = waiting.setdefault(key, _Fragments())
-        fragments.pieces[offset] = slice(header_end, end)
-        fragments.missing_bytes += (num_bytes if offset == 0 else 0) - (end - header_end)
-        if fragments.missing_bytes == 0:
-            pieces = [fragments.pieces[place] for place in sorted(fragments.pieces)]
-            if sum(piece.stop - piece.start for piece in pieces) == num_bytes:
-                yield pieces
+        pieces = waiting.setdefault(key, {})
+        pieces[offset] = slice(header_end, end)
+        if 0 in pieces and sum(piece.stop - piece.start for piece in pieces.values()) == num_bytes:
+            yield [pieces[place] for place in sorted(pieces)]
             del waiting[key]
 
 

@@ -16,14 +16,8 @@ from segslam.scans.scan_files import (
     text_columns,
 )
 
-TYPES = {
-    **{("F", "4"): "<f4", ("F", "8"): "<f8"},
-    **{("I", str(size)): f"<i{size}" for size in (1, 2, 4, 8)},
-    **{("U", str(size)): f"<u{size}" for size in (1, 2, 4, 8)},
-}
+TYPES = [(kind, size) for kind, sizes in {"F": "48", "I": "1248", "U": "1248"}.items() for size in sizes]
 KEYS = ("VERSION", "FIELDS", "COLUMNS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
-SIZES = struct.Struct("<II")
-"""Compressed data begin with their size and the size after decompression (bytes)."""
 MAX_RATIO = 88
 """Three bytes of LZF stand for at most 264."""
 
@@ -60,7 +54,7 @@ def _fields(header: dict[str, list[str]]) -> list[Field]:
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         if (kind, size) not in TYPES:
             raise ValueError(f"its field {name[:40]} has the unknown type {kind[:10]} of {size[:10]} bytes")
-        fields.append(Field(name, np.dtype(TYPES[kind, size]), number(count)))
+        fields.append(Field(name, np.dtype(f"<{kind.lower()}{size}"), number(count)))
     return fields
 
 
@@ -81,12 +75,12 @@ def _count(header: dict[str, list[str]], key: str) -> int:
 
 
 def _compressed_columns(content: bytes, start: int, num_points: int, fields: list[Field]) -> Columns:
-    """The fields of data that are compressed field by field."""
+    """The fields of data that are compressed field by field, after their size and that after decompression (bytes)."""
     expected = num_points * sum(field.dtype.itemsize * field.num_values for field in fields)
-    if len(content) - start < SIZES.size:
+    if len(content) - start < 8:
         raise ValueError("it is truncated: nothing follows its header")
-    num_compressed, num_bytes = SIZES.unpack_from(content, start)
-    start += SIZES.size
+    num_compressed, num_bytes = struct.unpack_from("<II", content, start)
+    start += 8
     if num_bytes != expected or num_bytes > MAX_SCAN_BYTES:
         raise ValueError(f"its header claims {expected} bytes, at most {MAX_SCAN_BYTES}, but its data {num_bytes}")
     check_size(len(content) - start, num_compressed, num_points, tolerated=num_compressed)

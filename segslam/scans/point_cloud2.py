@@ -63,27 +63,13 @@ def stamp_ns_of(message: Any) -> int:
 
 
 def _rows(message: Any) -> np.ndarray:
-    """(height, width) structured array with the fields of the message."""
+    """(height, width) structured array with the fields of the message.
+
+    Raises ValueError unless all fields lie in a point, and all points in the data, one after the other: NumPy checks
+    neither the bounds of empty data nor those of large offsets, and lets points overlap.
+    """
     order = ">" if message.is_bigendian else "<"
     formats = [np.dtype(order + KINDS[field.datatype]) for field in message.fields]
-    _check_size(message, formats)
-    dtype = np.dtype(
-        {
-            "names": [field.name for field in message.fields],
-            "formats": formats,
-            "offsets": [field.offset for field in message.fields],
-            "itemsize": message.point_step,
-        }
-    )
-    shape, strides = (message.height, message.width), (message.row_step, message.point_step)
-    return np.ndarray(shape, dtype, buffer=message.data, strides=strides)
-
-
-def _check_size(message: Any, formats: list[np.dtype]) -> None:
-    """Raises ValueError unless all fields lie in a point, and all points in the data, one after the other.
-
-    NumPy checks neither the bounds of empty data nor those of large offsets, and lets points overlap.
-    """
     height, width, step = message.height, message.width, message.point_step
     num_bytes = (height - 1) * message.row_step + width * step if height * width else 0
     overlap = not 0 < step < 2**31 or (height > 1 and message.row_step < width * step)
@@ -92,3 +78,12 @@ def _check_size(message: Any, formats: list[np.dtype]) -> None:
     for field, kind in zip(message.fields, formats, strict=True):
         if not 0 <= field.offset <= step - kind.itemsize:
             raise ValueError(f"the field {field.name[:40]} at {field.offset} is not in a point of {step} bytes")
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in message.fields],
+            "formats": formats,
+            "offsets": [field.offset for field in message.fields],
+            "itemsize": step,
+        }
+    )
+    return np.ndarray((height, width), dtype, buffer=message.data, strides=(message.row_step, step))

@@ -3,6 +3,7 @@
 import os
 import stat
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time")
 """Names that drivers (Ouster, Velodyne, Hesai, Robosense, Livox) use for the time of a point, in any unit."""
 INTENSITY_FIELDS = ("intensity", "reflectivity", "signal")
 """Names that drivers and programs use for the intensity; the first that exists is used."""
+NO_POINTS = "it has no points"
 Columns = dict[str, np.ndarray]
 """One array (n,) per field, by its name in the file."""
 
@@ -71,24 +73,23 @@ def binary_columns(
     content: bytes | memoryview, start: int, num_rows: int, fields: Sequence[Field], *, is_last: bool
 ) -> Columns:
     """The fields of rows that follow one another, as views; `is_last`: nothing follows the rows."""
-    row_bytes = sum(field.dtype.itemsize * field.num_values for field in fields)
+    ends = np.cumsum([0, *(field.dtype.itemsize * field.num_values for field in fields)]).tolist()
+    row_bytes = ends[-1]
     check_size(len(content) - start, num_rows * row_bytes, num_rows, tolerated=row_bytes - 1 if is_last else None)
     if num_rows == 0:
-        return _empty(fields)
-    ends = np.cumsum([field.dtype.itemsize * field.num_values for field in fields])
-    columns = []
-    for field, end in zip(fields, ends, strict=True):
-        begin = int(end) - field.dtype.itemsize * field.num_values
-        one = np.dtype({"names": ["value"], "formats": [field.dtype], "offsets": [begin], "itemsize": row_bytes})
-        if field.num_values == 1:
-            columns.append((field.name, np.frombuffer(content, one, num_rows, start)["value"]))
-    return _by_name(columns)
+        raise ValueError(NO_POINTS)
+    rows = np.frombuffer(content, np.uint8, num_rows * row_bytes, start).reshape(num_rows, row_bytes)
+    return _by_name(
+        (field.name, rows[:, begin:end].view(field.dtype)[:, 0])
+        for field, (begin, end) in zip(fields, pairwise(ends), strict=True)
+        if field.num_values == 1
+    )
 
 
 def text_columns(content: bytes, start: int, num_rows: int, fields: Sequence[Field], *, is_last: bool) -> Columns:
     """The fields of rows in text, as float32 or float64; `is_last`: nothing follows the rows."""
     if num_rows == 0:
-        return _empty(fields)
+        raise ValueError(NO_POINTS)
     num_columns = sum(field.num_values for field in fields)
     wanted = num_rows * num_columns
     if 2 * wanted > len(content) - start:
@@ -135,7 +136,3 @@ def _by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
             raise ValueError(f"its header has the field {name} twice")
         named.setdefault(name, values)
     return named
-
-
-def _empty(fields: Sequence[Field]) -> Columns:
-    return {field.name: np.empty(0, field.dtype) for field in fields}

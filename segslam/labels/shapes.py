@@ -139,7 +139,7 @@ def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: 
     values = np.ones(len(points)), x, y, x * x, x * y, y * y
     own = np.array([np.bincount(rows[voxel], value, len(places)) for value in values])
     near = [places + i * shape[1] + j for i in (-1, 0, 1) for j in (-1, 0, 1)]  # the border of the grid is empty
-    n, *sums = sum(own[:, rows[voxels]] * occupied[voxels] for voxels in near)
+    n, *sums = np.sum([own[:, rows[voxels]] * occupied[voxels] for voxels in near], axis=0)
     x, y, xx, xy, yy = (one / n for one in sums)
     a, b, c = xx - x**2, xy - x * y, yy - y**2
     middle, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)

@@ -38,7 +38,12 @@ class KittiSequence(Dataset):
         folder, poses_file = _find_sequence(source.data, source.sequence)
         velodyne = folder / "velodyne"
         files, numbers = _numbered_scans(velodyne)
-        stamps = _stamps_of(folder / "times.txt", numbers)
+        stamps = read_stamps(folder / "times.txt")
+        if numbers[-1] >= len(stamps):
+            raise SegslamError(
+                f"{folder / 'times.txt'}: {len(stamps)} lines, but there is a scan {numbers[-1]}; line n + 1 is the "
+                "time of scan n"
+            )
         self.T_camera_lidar = read_calibration(folder / "calib.txt")
         rows = selected_rows(numbers, source.frames, velodyne)
         self.name = f"kitti/{folder.name}"
@@ -48,7 +53,11 @@ class KittiSequence(Dataset):
         self.stamp_ns = stamps[self.scan_index]
         self.num_recorded = len(stamps)
         self.labels = open_labels(source.labels, beside=folder, scan_names=self.names, encoding=source.encoding)
-        self.reference = _reference(poses_file, self.scan_index, stamps, self.T_camera_lidar)
+        self.reference = None
+        if poses_file.exists():
+            poses = lidar_from_camera(read_poses(poses_file, format="kitti").T_a_b, self.T_camera_lidar)
+            check_num_poses(poses_file, len(poses), len(stamps))
+            self.reference = Trajectory(self.scan_index, self.stamp_ns, poses[self.scan_index])
         self.vertical_angle_deg = VERTICAL_ANGLE_DEG if source.vertical_angle_deg is None else source.vertical_angle_deg
         self._has_intensities = source.intensities
 
@@ -168,20 +177,3 @@ def _numbered_scans(velodyne: Path) -> tuple[list[Path], Indices]:
         raise SegslamError(f"{misnamed[0]}: the name is not a scan number; rename the file, for example 000000.bin")
     files.sort(key=lambda file: int(file.stem))
     return files, np.array([int(file.stem) for file in files])
-
-
-def _stamps_of(times_file: Path, numbers: Indices) -> Indices:
-    stamps = read_stamps(times_file)
-    if numbers[-1] >= len(stamps):
-        raise SegslamError(
-            f"{times_file}: {len(stamps)} lines, but there is a scan {numbers[-1]}; line n + 1 is the time of scan n"
-        )
-    return stamps
-
-
-def _reference(poses_file: Path, numbers: Indices, stamps: Indices, T_camera_lidar: Transform) -> Trajectory | None:
-    if not poses_file.exists():
-        return None
-    poses = lidar_from_camera(read_poses(poses_file, format="kitti").T_a_b, T_camera_lidar)
-    check_num_poses(poses_file, len(poses), len(stamps))
-    return Trajectory(numbers, stamps[numbers], poses[numbers])

@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, NamedTuple, cast
+from typing import IO, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Message, MessageIndex, Schema
+from mcap.records import Channel, Chunk, Message, MessageIndex
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
@@ -21,6 +21,7 @@ from segslam.scans.scan_files import MAX_SCAN_BYTES
 
 DAMAGE = (McapError, ValueError, OverflowError, struct.error)
 """Exceptions of the library for damaged records."""
+DAMAGED_INDEX = "the index of the file is damaged"
 
 
 class _Place(NamedTuple):
@@ -50,13 +51,21 @@ class McapMessages:
         with file.open("rb") as stream:
             summary = _summary(stream)
             assert summary.statistics is not None
-            alike = [one for one in summary.channels.values() if one.schema_id and _schema(summary, one).name == kind]
+            known = [one for one in summary.channels.values() if one.schema_id]
+            if any(one.schema_id not in summary.schemas for one in known):
+                raise ValueError(DAMAGED_INDEX)
+            alike = [one for one in known if summary.schemas[one.schema_id].name == kind]
             self._topic = one_topic({one.topic for one in alike}, topic, kind=kind, option=option)
             channels = {one.id: one for one in alike if one.topic == self._topic}
             counts = summary.statistics.channel_message_counts
             self._num_messages = sum(counts.get(id, 0) for id in channels)
             self._places = _places(stream, summary, channels)
-        self._decode = {id: _decoder(DecoderFactory(), one, _schema(summary, one)) for id, one in channels.items()}
+        self._decode: dict[int, Callable[[bytes], Any]] = {}
+        for id, one in channels.items():
+            decode = DecoderFactory().decoder_for(one.message_encoding, summary.schemas[one.schema_id])
+            if decode is None:
+                raise ValueError(f"messages on {one.topic} are encoded as {one.message_encoding}, not as ROS 2's cdr")
+            self._decode[id] = decode
         self._in_order = None
         if len(self._places) != self._num_messages:
             num_bytes = file.stat().st_size if kind == CLOUD else None
@@ -78,25 +87,17 @@ class McapMessages:
         data = BytesIO(self._chunk[1])
         data.seek(place.offset)
         record = ReadDataStream(data)
-        if record.read1() != Opcode.MESSAGE:
-            raise ValueError("the index of the file is damaged")
-        message = Message.read(record, record.read8())
-        if message.channel_id not in self._decode or message.log_time != place.log_ns:
-            raise ValueError("the index of the file is damaged")
-        return message
+        if record.read1() == Opcode.MESSAGE:
+            message = Message.read(record, record.read8())
+            if message.channel_id in self._decode and message.log_time == place.log_ns:
+                return message
+        raise ValueError(DAMAGED_INDEX)
 
     def _messages(self) -> Iterator[Message]:
         with self._file.open("rb") as stream:
             for _, _, message in make_reader(stream, validate_crcs=True).iter_messages(topics=[self._topic]):
                 if message.channel_id in self._decode:
                     yield message
-
-
-def _decoder(factory: Any, channel: Channel, schema: Schema) -> Callable[[bytes], Any]:
-    decode = factory.decoder_for(channel.message_encoding, schema)
-    if decode is None:
-        raise ValueError(f"messages on {channel.topic} are encoded as {channel.message_encoding}, not as ROS 2's cdr")
-    return cast(Callable[[bytes], Any], decode)
 
 
 def _summary(stream: IO[bytes]) -> Summary:
@@ -106,13 +107,6 @@ def _summary(stream: IO[bytes]) -> Summary:
     if summary is None or summary.statistics is None:
         raise ValueError("the file has no index, for example after a crash; `mcap recover` adds one")
     return summary
-
-
-def _schema(summary: Summary, channel: Channel) -> Schema:
-    try:
-        return summary.schemas[channel.schema_id]
-    except KeyError as error:
-        raise ValueError("the index of the file is damaged") from error
 
 
 def _places(stream: IO[bytes], summary: Summary, channels: dict[int, Channel]) -> list[_Place]:
@@ -132,10 +126,9 @@ def _chunk_data(stream: IO[bytes], start: int) -> bytes:
     """The decompressed messages of a chunk. Raises ValueError if their checksum is wrong or there are too many."""
     stream.seek(start)
     record = ReadDataStream(stream)
-    if record.read1() != Opcode.CHUNK or record.read8() > MAX_SCAN_BYTES:
-        raise ValueError("the chunk of this message is damaged")
-    chunk = Chunk.read(record)
-    if chunk.uncompressed_size > MAX_SCAN_BYTES:
-        raise ValueError("the chunk of this message is damaged")
-    data, num_bytes = get_chunk_data_stream(chunk, validate_crc=True)
-    return data.read(num_bytes)
+    if record.read1() == Opcode.CHUNK and record.read8() <= MAX_SCAN_BYTES:
+        chunk = Chunk.read(record)
+        if chunk.uncompressed_size <= MAX_SCAN_BYTES:
+            data, num_bytes = get_chunk_data_stream(chunk, validate_crc=True)
+            return data.read(num_bytes)
+    raise ValueError("the chunk of this message is damaged")

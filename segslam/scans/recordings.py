@@ -15,7 +15,7 @@ import numpy as np
 
 from segslam.core.errors import brief
 from segslam.core.trajectory import read_poses
-from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory
+from segslam.core.types import BadScan, Scan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.scans.clouds import SUFFIXES, read_file
 from segslam.scans.dataset import (
@@ -49,17 +49,34 @@ class Recording(Dataset):
         Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan.
         """
         kind, self._source, self._loader = _opened(source)
-        beside = _beside(self._source)
+        place = self._source.resolve()
+        beside = place.parent if place.name == "velodyne" else self._source  # here are times, poses and labels
         self.name = f"{kind}/{beside.resolve().name}"
         self._has_intensities = source.intensities
         self.vertical_angle_deg = source.vertical_angle_deg or 0.0
         self.is_sequential = bool(getattr(self._loader, "is_sequential", False))
         self.num_recorded = len(self._loader)
-        self._stamps = _whole_stamps(beside / "times.txt", self.num_recorded) if kind == "generic" else None
+        self._stamps = None
+        times_file = beside / "times.txt"
+        if kind == "generic" and times_file.exists():
+            self._stamps = read_stamps(times_file)
+            if len(self._stamps) != self.num_recorded:
+                what = f"{len(self._stamps)} lines for {self.num_recorded} scans"
+                raise SegslamError(f"{times_file}: {what}; correct or remove the file")
         self.scan_index = selected_rows(np.arange(self.num_recorded), source.frames, self._source)
         self.names = [self._file(int(index)).stem for index in self.scan_index]
         self.labels = open_labels(source.labels, beside=beside, scan_names=self.names, encoding=source.encoding)
-        self.reference = self._reference(beside / "poses.txt" if kind == "generic" else None)
+        poses_file = beside / "poses.txt"
+        if kind == "generic" and poses_file.exists():
+            poses = read_poses(poses_file, format="kitti").T_a_b
+            check_num_poses(poses_file, len(poses), self.num_recorded)
+        else:
+            poses = np.asarray(getattr(self._loader, "gt_poses", np.empty((0, 4, 4))), dtype=float)
+        self.reference = None
+        posed = self.scan_index[self.scan_index < len(poses)]
+        if len(posed):
+            stamp_ns = np.array([self._stamp_ns(index) for index in posed.tolist()])
+            self.reference = Trajectory(posed, stamp_ns, poses[posed])
 
     def __getitem__(self, row: int) -> Scan:
         """The scan. Raises BadScan if its reader fails on it or its labels cannot be used."""
@@ -114,22 +131,9 @@ class Recording(Dataset):
         files = getattr(self._loader, "scan_files", None)
         return Path(str(files[index])) if files is not None else self._source / f"{index:06d}"
 
-    def _reference(self, poses_file: Path | None) -> Trajectory | None:
-        if poses_file is not None and poses_file.exists():
-            poses = read_poses(poses_file, format="kitti").T_a_b
-            check_num_poses(poses_file, len(poses), self.num_recorded)
-        else:
-            poses = np.asarray(getattr(self._loader, "gt_poses", np.empty((0, 4, 4))), dtype=float)
-        posed = self.scan_index[self.scan_index < len(poses)]
-        if len(posed) == 0:
-            return None
-        return Trajectory(posed, np.array([self._stamp_ns(int(index)) for index in posed]), poses[posed])
-
 
 class ScanFolder:
     """The scans of a folder: all files of one format, without hidden ones. Numbers in names are sorted by value."""
-
-    is_sequential = False
 
     def __init__(self, folder: Path) -> None:
         self.scan_files = scan_files(folder)
@@ -233,20 +237,6 @@ def _kind_of(data: Path) -> str:
 
 def _scans_folder(data: Path) -> Path:
     return data / "velodyne" if not scan_files(data) and (data / "velodyne").is_dir() else data
-
-
-def _beside(source: Path) -> Path:
-    """Folder in which the times, poses and labels of a folder of scans are searched."""
-    return source.resolve().parent if source.resolve().name == "velodyne" else source
-
-
-def _whole_stamps(times_file: Path, num_scans: int) -> Indices | None:
-    if not times_file.exists():
-        return None
-    stamps = read_stamps(times_file)
-    if len(stamps) != num_scans:
-        raise SegslamError(f"{times_file}: {len(stamps)} lines for {num_scans} scans; correct or remove the file")
-    return stamps
 
 
 def _reason(error: BaseException) -> str:

@@ -83,6 +83,7 @@ class Dataset:
     """Number of lines in a pose file of the whole data; line n + 1 belongs to scan n, selected or not."""
     T_camera_lidar: Transform | None = None
     """Transform if ground-truth files contain camera poses (KITTI); None if they contain LiDAR poses."""
+    _has_intensities: bool
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
@@ -91,6 +92,21 @@ class Dataset:
         return len(self.scan_index)
 
     def __getitem__(self, row: int) -> Scan:
+        """The scan. Raises BadScan if it cannot be read or its labels cannot be used."""
+        file, stamp_ns, cloud = self._read(row)
+        return make_scan(
+            file,
+            int(self.scan_index[row]),
+            stamp_ns,
+            cloud.points,
+            self.labels.read(file.stem, cloud.points, cloud.intensities),
+            sweep_times(cloud.times, len(cloud.points), stamp_ns * 1e-9),
+            intensities=cloud.intensities if self._has_intensities else None,
+            vertical_angle_deg=self.vertical_angle_deg,
+        )
+
+    def _read(self, row: int) -> tuple[Path, int, Cloud]:
+        """The file of a scan, or a path with its name; its stamp (ns); and its cloud. Raises BadScan."""
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[Scan]:

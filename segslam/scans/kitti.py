@@ -12,9 +12,9 @@ from jaxtyping import Float32
 from segslam.core import geometry
 from segslam.core.errors import brief, unreadable
 from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera, read_poses
-from segslam.core.types import BadScan, Indices, Scan, SegslamError, Trajectory, Transform
+from segslam.core.types import BadScan, Indices, SegslamError, Trajectory, Transform
 from segslam.labels.label_files import open_labels
-from segslam.scans.dataset import Dataset, DataSource, check_num_poses, make_scan, read_stamps, selected_rows
+from segslam.scans.dataset import Cloud, Dataset, DataSource, check_num_poses, read_stamps, selected_rows
 from segslam.scans.scan_files import read_bytes
 
 VERTICAL_ANGLE_DEG = 0.205
@@ -61,20 +61,9 @@ class KittiSequence(Dataset):
         self.vertical_angle_deg = VERTICAL_ANGLE_DEG if source.vertical_angle_deg is None else source.vertical_angle_deg
         self._has_intensities = source.intensities
 
-    def __getitem__(self, row: int) -> Scan:
-        """The scan, with corrected vertical angles. Raises BadScan if the file or its labels cannot be used."""
-        file = self.scan_files[row]
-        returns = read_returns(file)
-        points, intensities = returns[:, :3], returns[:, 3]
-        return make_scan(
-            file,
-            int(self.scan_index[row]),
-            int(self.stamp_ns[row]),
-            points,
-            self.labels.read(file.stem, points, intensities),
-            intensities=intensities if self._has_intensities else None,
-            vertical_angle_deg=self.vertical_angle_deg,
-        )
+    def _read(self, row: int) -> tuple[Path, int, Cloud]:
+        returns = read_returns(self.scan_files[row])
+        return self.scan_files[row], int(self.stamp_ns[row]), Cloud(returns[:, :3], intensities=returns[:, 3])
 
 
 def is_kitti(data: Path) -> bool:

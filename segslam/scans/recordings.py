@@ -15,7 +15,7 @@ import numpy as np
 
 from segslam.core.errors import brief
 from segslam.core.trajectory import read_poses
-from segslam.core.types import BadScan, Scan, SegslamError, Trajectory
+from segslam.core.types import BadScan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.scans.clouds import SUFFIXES, read_file
 from segslam.scans.dataset import (
@@ -24,11 +24,9 @@ from segslam.scans.dataset import (
     Dataset,
     DataSource,
     check_num_poses,
-    make_scan,
     no_topics,
     read_stamps,
     selected_rows,
-    sweep_times,
 )
 
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
@@ -78,27 +76,10 @@ class Recording(Dataset):
             stamp_ns = np.array([self._stamp_ns(index) for index in posed.tolist()])
             self.reference = Trajectory(posed, stamp_ns, poses[posed])
 
-    def __getitem__(self, row: int) -> Scan:
-        """The scan. Raises BadScan if its reader fails on it or its labels cannot be used."""
+    def _read(self, row: int) -> tuple[Path, int, Cloud]:
+        """As in the base class; readers of kiss_icp give points, or points and times."""
         index = int(self.scan_index[row])
         file = self._file(index)
-        cloud = self._read(index, file)
-        stamp_ns = self._stamp_ns(index, cloud)
-        if abs(stamp_ns) >= 2**63:
-            raise BadScan(f"{file}: its stamp {stamp_ns} ns is more than 292 years; correct the sensor's clock")
-        return make_scan(
-            file,
-            index,
-            stamp_ns,
-            cloud.points,
-            self.labels.read(file.stem, cloud.points, cloud.intensities),
-            sweep_times(cloud.times, len(cloud.points), stamp_ns * 1e-9),
-            intensities=cloud.intensities if self._has_intensities else None,
-            vertical_angle_deg=self.vertical_angle_deg,
-        )
-
-    def _read(self, index: int, file: Path) -> Cloud:
-        """The cloud of a scan; readers of kiss_icp give points, or points and times."""
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 item = self._loader[index]
@@ -111,11 +92,15 @@ class Recording(Dataset):
             points = points if points.dtype == np.float32 else points.astype(np.float64)
             fits = item.intensities is not None and len(item.intensities) == len(points)
             times = np.asarray(item.times, dtype=np.float64).ravel()
-            return Cloud(points, times, item.intensities if fits else None, item.stamp_ns)
+            cloud = Cloud(points, times, item.intensities if fits else None, item.stamp_ns)
         except BadScan:
             raise
         except FOREIGN_ERRORS as error:
             raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
+        stamp_ns = self._stamp_ns(index, cloud)
+        if abs(stamp_ns) >= 2**63:
+            raise BadScan(f"{file}: its stamp {stamp_ns} ns is more than 292 years; correct the sensor's clock")
+        return file, stamp_ns, cloud
 
     def _stamp_ns(self, index: int, cloud: Cloud | None = None) -> int:
         if self._stamps is not None:

@@ -50,33 +50,32 @@ class Network:
         try:
             output = self._session.run(None, {self._input: image})[0]
         except _runtime_errors() as error:
-            raise SegslamError(f"{self._model}: fails on an input {_shape(image.shape)} ({_brief(error)})") from error
+            raise SegslamError(
+                f"{self._model}: fails on an input {_shape(image.shape)} ({brief(str(error), 300)})"
+            ) from error
         if not isinstance(output, np.ndarray):
             raise SegslamError(f"{self._model}: gives a {type(output).__name__}; export it with one array as output")
         return self._label_of_class[self._class_image(output)]
 
     def _class_image(self, output: np.ndarray) -> np.ndarray:
         """(height, width) class ids of the first output: ids as given, or the class with the largest logit."""
-        size = (self.settings.height, self.settings.width)
+        size, num = (self.settings.height, self.settings.width), len(self._label_of_class)
         if output.dtype.kind in "iu":
-            self._check_output(output, "class ids", [(1, *size), (1, 1, *size), size])
-            ids = output.reshape(size)
-            if ids.min() < 0 or ids.max() >= len(self._label_of_class):
-                raise _misfit(
-                    self._model,
-                    f"gave class id {ids.min() if ids.min() < 0 else ids.max()}",
-                    f"names {len(self._label_of_class)} classes, ids 0 to {len(self._label_of_class) - 1}",
-                )
-            return ids
-        self._check_output(output, "logits", [(1, len(self._label_of_class), *size)])
-        if not np.isfinite(output).all():
-            raise SegslamError(f"{self._model}: returned logits that are not finite; export it again in float32")
-        return output[0].argmax(axis=0)
-
-    def _check_output(self, output: np.ndarray, what: str, allowed: list[tuple[int, ...]]) -> None:
+            what, allowed = "class ids", [(1, *size), (1, 1, *size), size]
+        else:
+            what, allowed = "logits", [(1, num, *size)]
         if output.shape not in allowed:
             expected = " or ".join(_shape(shape) for shape in allowed)
             raise _misfit(self._model, f"gives {what} of {_shape(output.shape)}", f"requires {expected}")
+        if what == "logits":
+            if not np.isfinite(output).all():
+                raise SegslamError(f"{self._model}: returned logits that are not finite; export it again in float32")
+            return output[0].argmax(axis=0)
+        ids = output.reshape(size)
+        if ids.min() < 0 or ids.max() >= num:
+            wrong = ids.min() if ids.min() < 0 else ids.max()
+            raise _misfit(self._model, f"gave class id {wrong}", f"names {num} classes, ids 0 to {num - 1}")
+        return ids
 
 
 def open_network(model: Path) -> Network:
@@ -109,7 +108,9 @@ def _session(model: Path) -> Any:
         [(each.name, each.type, each.shape) for each in session.get_inputs()]  # fails for names that are not UTF-8
         return session
     except _runtime_errors() as error:
-        raise SegslamError(f"{model}: onnxruntime cannot load it ({_brief(error)}); {_remedy(error)}") from error
+        raise SegslamError(
+            f"{model}: onnxruntime cannot load it ({brief(str(error), 300)}); {_remedy(error)}"
+        ) from error
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:
@@ -152,7 +153,3 @@ def _misfit(model: Path, found: str, expected: str) -> SegslamError:
 
 def _shape(sizes: Any) -> str:
     return " x ".join(str(size) for size in sizes)
-
-
-def _brief(error: Exception) -> str:
-    return brief(str(error), 300)

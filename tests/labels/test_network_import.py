@@ -12,8 +12,7 @@ from helpers.made_networks import made_network
 from segslam.core.types import Label, SegslamError
 from segslam.labels.encodings import RAW_OF_LABEL
 from segslam.labels.network import open_network
-from segslam.labels.network_import import DATA
-from segslam.labels.network_settings import read_settings, settings_file
+from segslam.labels.network_settings import DATA, read_settings, settings_file
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "network_labels.md"
 SENSOR: dict[str, Any] = {

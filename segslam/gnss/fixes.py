@@ -74,15 +74,18 @@ def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fi
     sigma_m = np.where(np.isfinite(sigma_m) & (sigma_m > 0.0), sigma_m, np.nan)
     stamp_ns = np.array([row.stamp_ns for row in ordered], dtype=np.int64)
     reasons: list[str] = []
-    last: tuple[int, tuple[float, ...]] | None = None
-    for number, row in enumerate(ordered):
-        reason = _reason(row)
-        place = tuple(places[number].tolist())
-        if not reason and last is not None and (row.stamp_ns == last[0] or place == last[1]):
-            reason = DUPLICATE
-        if not reason:
+    last: tuple[int, list[float]] | None = None
+    for row, place in zip(ordered, places.tolist(), strict=True):
+        is_default = row.latitude_deg == row.longitude_deg == 0.0  # off the coast of Africa: that of many receivers
+        if not row.has_fix or is_default:
+            reasons.append(NO_FIX)
+        elif not (np.isfinite(row.latitude_deg) and np.isfinite(row.longitude_deg)):
+            reasons.append(NOT_FINITE)
+        elif last is not None and (row.stamp_ns == last[0] or place == last[1]):
+            reasons.append(DUPLICATE)
+        else:
+            reasons.append("")
             last = row.stamp_ns, place
-        reasons.append(reason)
     fixes = Fixes(str(source), stamp_ns, places, sigma_m, tuple(reasons), note)
     if not fixes.usable.any():
         counts = ", ".join(f"{reasons.count(one)} {one}" for one in sorted(set(reasons)))
@@ -90,13 +93,3 @@ def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fi
             f"{source}: none of its {len(rows)} fixes can be used ({counts}); give another file or topic"
         )
     return fixes
-
-
-def _reason(row: Row) -> str:
-    if not row.has_fix:
-        return NO_FIX
-    if not (np.isfinite(row.latitude_deg) and np.isfinite(row.longitude_deg)):
-        return NOT_FINITE
-    if row.latitude_deg == 0.0 and row.longitude_deg == 0.0:
-        return NO_FIX  # off the coast of Africa: the default of many receivers
-    return ""

@@ -26,7 +26,6 @@ MODULES = (
     "registration.segregator.fpfh",
     "registration.segregator.consistency_graph",
     "labels.ground_surface",
-    "labels.shapes",
     "labels.range_image",
     "registration.segregator.clusters",
     "registration.segregator.plan",

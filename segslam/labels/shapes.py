@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import label, maximum_filter
 
-from segslam.core.kernels import kernel
 from segslam.core.types import IndexPairs, Indices, Mask, Points, Vector
 
 NUM_SLICES = 16
@@ -28,7 +27,7 @@ NO_PIECE = -1
 RECTANGLE_STEP_DEG = 5.0
 """Chosen: angle steps for which the short side of a car is overestimated by at most 20 cm."""
 _ANGLES = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
-DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 
 
 def on_thin_uprights(
@@ -124,11 +123,18 @@ def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
     occupied[cells[chosen, 0], cells[chosen, 1]] = True
     grid, num_pieces = label(occupied, structure=np.ones((3, 3), bool))
     of_point = grid[cells[:, 0], cells[:, 1]].astype(np.int64) + NO_PIECE  # labels start at 1; 0 is the background
-    num_points = np.bincount(of_point[chosen], minlength=num_pieces)
-    top_m = np.full(num_pieces, -np.inf)
-    np.maximum.at(top_m, of_point[chosen], heights[chosen])
-    sides_m = _tightest_rectangles(points, of_point, chosen, num_pieces, DIRECTIONS)
-    return Pieces(of_point, num_points, top_m, sides_m[:, 0], sides_m[:, 1])
+    rows = np.flatnonzero(chosen)
+    rows = rows[np.argsort(of_point[rows], kind="stable")]
+    starts = np.searchsorted(of_point[rows], np.arange(num_pieces))
+    num_points = np.diff(starts, append=len(rows))
+    x, y = points[rows, 0], points[rows, 1]
+    turned = [np.outer(COSINES, x) + np.outer(SINES, y), np.outer(COSINES, y) - np.outer(SINES, x)]
+    sides_m = np.array(
+        [np.maximum.reduceat(u, starts, axis=1) - np.minimum.reduceat(u, starts, axis=1) for u in turned]
+    )
+    tightest = sides_m.prod(axis=0).argmin(axis=0)
+    width_m, length_m = np.sort(sides_m[:, tightest, np.arange(num_pieces)], axis=0)
+    return Pieces(of_point, num_points, np.maximum.reduceat(heights[rows], starts), length_m, width_m)
 
 
 def grid_cells(points: Points, cell_m: float, *, border: int) -> tuple[IndexPairs, Vector, tuple[int, int]]:
@@ -141,27 +147,3 @@ def grid_cells(points: Points, cell_m: float, *, border: int) -> tuple[IndexPair
     cells = np.column_stack([column - start for column, start in zip(whole, first, strict=True)]).astype(np.int64)
     rows, columns = (int(cells[:, axis].max(initial=0)) + border + 1 for axis in (0, 1))
     return cells, first * cell_m, (rows, columns)
-
-
-@kernel("float64[:, ::1](float64[:, ::1], int64[::1], boolean[::1], int64, float64[:, ::1])")
-def _tightest_rectangles(points, piece, chosen, num_pieces, directions):
-    """(num_pieces, 2) longer and shorter side (m) of the smallest-area bounding rectangle of each segment."""
-    low = np.full((num_pieces, len(directions), 2), np.inf)
-    high = np.full((num_pieces, len(directions), 2), -np.inf)
-    for k in range(len(points)):
-        if chosen[k]:
-            lows, highs = low[piece[k]], high[piece[k]]
-            for n in range(len(directions)):
-                u = directions[n, 0] * points[k, 0] + directions[n, 1] * points[k, 1]
-                v = directions[n, 0] * points[k, 1] - directions[n, 1] * points[k, 0]
-                lows[n, 0], highs[n, 0] = min(lows[n, 0], u), max(highs[n, 0], u)
-                lows[n, 1], highs[n, 1] = min(lows[n, 1], v), max(highs[n, 1], v)
-    sides = np.empty((num_pieces, 2))
-    for k in range(num_pieces):
-        least = np.inf
-        for n in range(len(directions)):
-            first, second = high[k, n, 0] - low[k, n, 0], high[k, n, 1] - low[k, n, 1]
-            if first * second < least:
-                least = first * second
-                sides[k, 0], sides[k, 1] = max(first, second), min(first, second)
-    return sides

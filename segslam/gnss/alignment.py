@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.types import Mask, Points, SegslamError, Transform, Vector
+from segslam.core.types import Points, SegslamError, Transform, Vector
 from segslam.gnss.matching import Drive, Matched, Prepared
 from segslam.gnss.statistics import Weights, correlated, fix_noise, longest_chain, robust_weights, sigmas, weight
 
@@ -116,7 +116,11 @@ def refined(drive: Drive, matched: Matched, start: Transform, arm_m: Vector) -> 
         chain = longest_chain(residual, matched.travel_m, sigma_m=fix_noise(residual))
         sigma = sigmas(residual, chain, chain & np.isfinite(residual[:, 2]))
         many = correlated(residual[chain][:, :2])
-        precision = _precision(residual, sigma, chain) / many
+        weights = np.column_stack(  # horizontally and vertically apart
+            [weight(np.sum(residual[:, :2] ** 2, axis=1) / sigma[0] ** 2), weight(residual[:, 2] ** 2 / sigma[2] ** 2)]
+        )
+        weights = np.where(np.isfinite(residual[:, 1:]), weights, 0.0) * chain[:, None]
+        precision = weights.take([0, 0, 1], axis=1) / sigma**2 / many
         prior, six = PRIOR[:6] ** -2.0, columns[:, :, :6]
         tilt = np.array([-T_enu_map[1, 2], T_enu_map[0, 2], 0.0, 0.0, 0.0, 0.0])  # heading, position: no prior value
         system = np.einsum("nij,ni,nik->jk", six, precision, six) + np.diag(prior)
@@ -154,10 +158,3 @@ def moved(T_enu_map: Transform, step: Vector) -> Transform:
     turn = geometry.exp(geometry.tangent(rotation_rad=step[:3], translation_m=0.0))
     rotation = geometry.nearest_rotation(turn[:3, :3] @ T_enu_map[:3, :3])
     return geometry.transform(rotation, T_enu_map[:3, 3] + step[3:6])
-
-
-def _precision(residual: Points, sigma: Vector, chain: Mask) -> Points:
-    """(n, 3) inverse variances with robust weights, horizontally and vertically apart."""
-    level = weight(np.sum(residual[:, :2] ** 2, axis=1) / sigma[0] ** 2) * chain
-    up = np.where(np.isfinite(residual[:, 2]), weight(np.nan_to_num(residual[:, 2]) ** 2 / sigma[2] ** 2), 0.0) * chain
-    return np.column_stack([level, level, up]) / sigma**2

@@ -11,12 +11,12 @@ from ECEF to geodetic coordinates: Bowring, "The accuracy of geodetic latitude a
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from segslam.core.types import Points, Rotation, Vector
+from segslam.core.types import Points, Rotation
 
 SEMI_MAJOR_M = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
@@ -31,8 +31,7 @@ Geodetic = Float[np.ndarray, "_ 3"]
 """Latitude and longitude (degrees), height above the ellipsoid (m), a row for each place."""
 
 
-@dataclass(frozen=True, slots=True)
-class Origin:
+class Origin(NamedTuple):
     """Origin of a local frame: latitude and longitude (degrees), height above the ellipsoid (m)."""
 
     latitude_deg: float
@@ -77,12 +76,12 @@ def enu_from_geodetic(places: Geodetic, origin: Origin) -> Points:
 
     Exact at any distance, also across the date line and the edges of UTM zones.
     """
-    return (ecef_from_geodetic(places) - _ecef_of(origin)) @ rotation_ecef_enu(origin)
+    return (ecef_from_geodetic(places) - ecef_from_geodetic(np.array([origin]))) @ rotation_ecef_enu(origin)
 
 
 def geodetic_from_enu(enu_m: Points, origin: Origin) -> Geodetic:
     """(n, 3) geodetic places of positions (n, 3) east, north, up (m) in the local frame of `origin`."""
-    return geodetic_from_ecef(enu_m @ rotation_ecef_enu(origin).T + _ecef_of(origin))
+    return geodetic_from_ecef(enu_m @ rotation_ecef_enu(origin).T + ecef_from_geodetic(np.array([origin])))
 
 
 def rotation_ecef_enu(origin: Origin) -> Rotation:
@@ -112,7 +111,3 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
     elif latitude_deg >= 72.0 and 0.0 <= longitude < 42.0:
         zone = 31 + 2 * int((longitude + 3.0) // 12.0)
     return (32600 if latitude_deg >= 0.0 else 32700) + zone
-
-
-def _ecef_of(origin: Origin) -> Vector:
-    return ecef_from_geodetic(np.array([[origin.latitude_deg, origin.longitude_deg, origin.height_m]]))[0]

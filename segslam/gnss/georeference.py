@@ -10,7 +10,7 @@ from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Transform, Vector
 from segslam.gnss.alignment import place
 from segslam.gnss.fixes import OUTSIDE, Fixes
-from segslam.gnss.fusion import Constants, calibrate, fuse
+from segslam.gnss.fusion import calibrate, fuse
 from segslam.gnss.geodesy import Origin
 from segslam.gnss.matching import Drive, prepare
 from segslam.gnss.statistics import KEPT_WEIGHT, Weights, robust_weights
@@ -41,7 +41,7 @@ class Georeference:
     """(k, 4, 4) poses of the keyframes; with bent axes not `T_enu_map` times those of the map."""
     heading_sigma_deg: float
     position_sigma_m: Vector
-    """(3,) standard deviations of the placement: east, north, up."""
+    """(3,) standard deviations of the placement: east, north, up (that of the mean of correlated heights)."""
     fix_sigma_m: Vector
     """(3,) standard deviations of single fixes about the drive; infinite for heights that are unknown."""
     arm_m: Vector
@@ -94,13 +94,15 @@ def georeference(
     all_weights[matched.rows] = weights
     against = np.full(len(fixes), OUTSIDE, object)
     against[matched.rows] = np.where(weights[:, 0] >= KEPT_WEIGHT, "", CONTRADICTED)
+    num_up = np.sum(np.isfinite(residual[matched.rows, 2]) & (weights[:, 1] >= KEPT_WEIGHT))
+    up_sigma_m = placement.sigma_m[2] / np.sqrt(max(num_up / placement.correlated, 1.0)) if num_up else np.inf
     return Georeference(
         fixes=fixes,
         origin=prepared.origin,
         T_enu_map=placement.T_enu_map,
         T_enu_keyframe=T_enu_keyframe,
         heading_sigma_deg=float(np.degrees(constants.level.sigma[2])),
-        position_sigma_m=_position_sigma(constants, residual[matched.rows, 2], weights[:, 1]),
+        position_sigma_m=np.array([*constants.level.sigma[3:5], up_sigma_m]),
         fix_sigma_m=sigma_m,
         arm_m=placement.arm_m,
         arm_sigma_m=constants.level.sigma[7:9],
@@ -112,11 +114,3 @@ def georeference(
         residual_m=residual,
         weights=all_weights,
     )
-
-
-def _position_sigma(constants: Constants, up_m: Vector, weights: Vector) -> Vector:
-    """(3,) standard deviations of the placement; that of the height is the one of the mean of correlated fixes."""
-    used = np.isfinite(up_m) & (weights >= KEPT_WEIGHT)
-    many = max(used.sum() / constants.placement.correlated, 1.0)
-    up = constants.placement.sigma_m[2] / np.sqrt(many) if used.any() else np.inf
-    return np.array([*constants.level.sigma[3:5], up])

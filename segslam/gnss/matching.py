@@ -116,7 +116,13 @@ def prepare(fixes: Fixes, drive: Drive, *, offset_s: float = 0.0) -> Prepared:
     """
     within = fixes.usable & has_pose(drive, fixes.stamp_ns + round(1e9 * offset_s))
     if not within.any():
-        raise SegslamError(_elsewhere(fixes, drive, offset_s))
+        first, last = (1e-9 * (fixes.stamp_ns[fixes.usable][row]) + offset_s for row in (0, -1))
+        begin, end = 1e-9 * drive.stamp_ns[0], 1e-9 * drive.stamp_ns[-1]
+        raise SegslamError(
+            f"{fixes.source}: its fixes are from {first:.1f} to {last:.1f} s, the scans from {begin:.1f} to {end:.1f} "
+            "s: no fix is within the drive. If both are of one drive, give the difference of the clocks: --gnss-offset "
+            f"{begin - first + offset_s:.1f} lets them begin together"
+        )
     latitude, longitude = fixes.places[within][0, :2].tolist()
     heights = fixes.places[within, 2]
     known = heights[np.isfinite(heights)].tolist()
@@ -153,14 +159,3 @@ def interpolated(drive: Drive, scan_s: Vector, time_s: Vector) -> Poses:
 
 def _rotated_into(rotations: np.ndarray, vectors: Points) -> Points:
     return np.einsum("nji,nj->ni", rotations, vectors)
-
-
-def _elsewhere(fixes: Fixes, drive: Drive, offset_s: float) -> str:
-    """A message for fixes of another time than the drive."""
-    first, last = (1e-9 * (fixes.stamp_ns[fixes.usable][row]) + offset_s for row in (0, -1))
-    begin, end = 1e-9 * drive.stamp_ns[0], 1e-9 * drive.stamp_ns[-1]
-    return (
-        f"{fixes.source}: its fixes are from {first:.1f} to {last:.1f} s, the scans from {begin:.1f} to {end:.1f} s: "
-        f"no fix is within the drive. If both are of one drive, give the difference of the clocks: --gnss-offset "
-        f"{begin - first + offset_s:.1f} lets them begin together"
-    )

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from datetime import UTC, date, datetime, time, timedelta
+from functools import reduce
+from operator import xor
 from pathlib import Path
 
 from segslam.core.types import SegslamError
@@ -23,16 +25,15 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     position with a right checksum that is none.
     """
     found: dict[str, list[Row]] = {"GGA": [], "RMC": []}
-    dates = (_date(words) for words in map(_words, lines) if words)
+    all_words = {number: _words(line) for number, line in enumerate(lines, 1) if line.lstrip().startswith("$")}
+    sentences = {number: words for number, words in all_words.items() if words}
+    num_wrong = len(all_words) - len(sentences)
+    if not sentences:
+        raise SegslamError(f"{file}: all {num_wrong} NMEA sentences have wrong checksums; log them again")
     # Fixes before the first date are of the same day. Without RMC or ZDA the times are those of a day.
-    day = next((one for one in dates if one), date(1970, 1, 1))
-    last, num_wrong, num_right = None, 0, 0
-    for number, line in enumerate(lines, 1):
-        words = _words(line)
-        if words is None:
-            num_wrong += line.lstrip().startswith("$")
-            continue
-        num_right += 1
+    day = next(filter(None, map(_date, sentences.values())), date(1970, 1, 1))
+    last = None
+    for number, words in sentences.items():
         kind = words[0][-3:]
         day = _date(words) or day
         if kind not in found or len(words) < 10 or not words[1]:
@@ -42,8 +43,6 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
             day += timedelta(days=kind == "GGA")  # midnight, before the next RMC
         last = at
         found[kind].append(_row(file, number, kind, words, datetime.combine(day, at, tzinfo=UTC)))
-    if not num_right:
-        raise SegslamError(f"{file}: all {num_wrong} NMEA sentences have wrong checksums; log them again")
     left_out = f"; {num_wrong} lines with wrong checksums left out" if num_wrong else ""
     if not found["GGA"]:
         return found["RMC"], f"no heights{left_out}"
@@ -52,14 +51,10 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
 
 
 def _words(line: str) -> list[str] | None:
-    """The fields of a sentence; None for a line that is none, or has a wrong checksum."""
+    """The fields of a sentence; None if its checksum is wrong or missing."""
     content, star, checksum = line.strip().removeprefix("$").rpartition("*")
-    if not star or not line.lstrip().startswith("$"):
-        return None
-    total = 0
-    for letter in content.encode(errors="replace"):
-        total ^= letter
-    return content.split(",") if checksum.upper() == f"{total:02X}" else None
+    total = reduce(xor, content.encode(errors="replace"), 0)
+    return content.split(",") if star and checksum.upper() == f"{total:02X}" else None
 
 
 def _row(file: Path, number: int, kind: str, words: Sequence[str], moment: datetime) -> Row:
@@ -68,15 +63,12 @@ def _row(file: Path, number: int, kind: str, words: Sequence[str], moment: datet
         _degrees(file, number, words[place], words[place + 1], digits) for place, digits in ((first, 2), (first + 2, 3))
     )
     check_degrees(file, number, latitude, longitude)
-    height_m = float("nan")
-    if kind == "GGA":
-        has_fix = words[6] not in ("", "0")
-        height_m = number_in(file, number, words[9], "altitude")
-        if len(words) > 11 and words[11]:
-            height_m += number_in(file, number, words[11], "geoid separation")
-    else:
-        has_fix = words[2] == "A"
-    return Row(stamp_of(moment), latitude, longitude, height_m, has_fix=has_fix)
+    if kind == "RMC":
+        return Row(stamp_of(moment), latitude, longitude, has_fix=words[2] == "A")
+    height_m = number_in(file, number, words[9], "altitude")
+    if len(words) > 11 and words[11]:
+        height_m += number_in(file, number, words[11], "geoid separation")
+    return Row(stamp_of(moment), latitude, longitude, height_m, has_fix=words[6] not in ("", "0"))
 
 
 def _degrees(file: Path, number: int, text: str, hemisphere: str, digits: int) -> float:

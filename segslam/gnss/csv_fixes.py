@@ -89,39 +89,35 @@ def _row(file: Path, number: int, cells: Sequence[str], places: dict[str, int]) 
     if len(cells) <= needed:
         raise bad_line(file, number, f"{len(cells)} columns; at least {needed + 1} are needed")
 
+    def cell(name: str) -> str:
+        place = places.get(name, len(cells))
+        return cells[place] if place < len(cells) else ""
+
     def value(name: str) -> float:
-        place = places.get(name)
-        return np.nan if place is None or place >= len(cells) else number_in(file, number, cells[place], name)
+        return number_in(file, number, cell(name), name)
 
     latitude, longitude = value("latitude"), value("longitude")
     check_degrees(file, number, latitude, longitude)
     both = value("sigma")
     east, north, up = (value(f"sigma_{axis}") for axis in ("east", "north", "up"))
-    if "time_ns" in places:
-        stamp_ns = _stamp(file, number, cells[places["time_ns"]], 1)
-    else:
-        stamp_ns = _stamp(file, number, cells[places["time"]], None)
+    is_ns = "time_ns" in places
     return Row(
-        stamp_ns,
+        _stamp(file, number, cell("time_ns" if is_ns else "time"), is_ns=is_ns),
         latitude,
         longitude,
         value("height"),
         (both if np.isnan(east) else east, both if np.isnan(north) else north, up),
-        has_fix=all(
-            _has_fix(cells[places[name]], least)
-            for name, least in LEAST_STATUS.items()
-            if places.get(name, len(cells)) < len(cells)
-        ),
+        has_fix=all(_has_fix(cell(name), least) for name, least in LEAST_STATUS.items()),
     )
 
 
-def _stamp(file: Path, number: int, text: str, unit_ns: int | None) -> int:
-    """Time in ns of a number, in the unit that its size shows, or of a date in ISO 8601."""
+def _stamp(file: Path, number: int, text: str, *, is_ns: bool) -> int:
+    """Time in ns of a number, in ns or the unit that its size shows, or of a date in ISO 8601."""
     text = text.strip()
     try:
         if re.match(r"\d{4}-\d\d-\d\d", text):
             return stamp_of(datetime.fromisoformat(text.replace("Z", "+00:00")))
-        if unit_ns is not None:
+        if is_ns:
             return int(text)
         value = Decimal(text)
         steps = next(steps for steps in range(4) if abs(value) < LATEST_S * 1000**steps)  # s, ms, us, ns

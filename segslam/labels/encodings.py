@@ -119,9 +119,7 @@ def detect_encoding(num_points_of_id: Histogram) -> Encoding:
     fitting = [
         encoding for encoding, table in _TABLES.items() if (table[np.minimum(ids, len(table) - 1)] != UNKNOWN).all()
     ]
-    possible = fitting
-    if len(fitting) > 1:
-        possible = [encoding for encoding in fitting if _looks_like_a_street(num_points_of_id, encoding)]
+    possible = [one for one in fitting if len(fitting) == 1 or _looks_like_a_street(num_points_of_id, one)]
     if len(possible) != 1:
         shown = ", ".join(str(value) for value in ids[:30]) or "none"
         why = "no encoding contains all of them"

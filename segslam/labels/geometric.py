@@ -102,9 +102,11 @@ def _solids(points: Points, heights: Vector) -> Labels:
     is_trunk = (found.top_m >= TRUNK_MIN_M) & (found.length_m <= TRUNK_MAX_M)
     is_car = _within(found.top_m, CAR_TOP_M) & _within(found.length_m, CAR_LENGTH_M)
     is_car &= (found.width_m <= CAR_MAX_WIDTH_M) & ~is_trunk
-    trunks = _labelled(found, _most_seen(found, is_trunk), in_band, Label.TRUNK)
-    cars = _labelled(found, _most_seen(found, is_car), heights < BAND_M[1], Label.CAR)
-    return np.where(trunks == Label.TRUNK, trunks, cars)
+    labels = np.full(len(points), Label.VEGETATION, np.uint8)
+    for label, suitable, eligible in ((Label.TRUNK, is_trunk, in_band), (Label.CAR, is_car, heights < BAND_M[1])):
+        in_chosen = np.append(_most_seen(found, suitable), False)[found.of_point]  # NO_PIECE is the last one
+        labels[in_chosen & eligible] = label
+    return labels
 
 
 def _walls(points: Points, heights: Vector) -> Labels:
@@ -118,12 +120,6 @@ def _most_seen(found: Pieces, suitable: Mask) -> Mask:
     counts = np.sort(found.num_points[suitable])
     least = max(MIN_POINTS, counts[-MAX_THINGS]) if len(counts) > MAX_THINGS else MIN_POINTS
     return suitable & (found.num_points >= least)
-
-
-def _labelled(found: Pieces, chosen: Mask, eligible: Mask, label: Label) -> Labels:
-    """`label` for the eligible points of the chosen segments, VEGETATION for the others."""
-    in_chosen = np.append(chosen, False)[found.of_point]  # points without a segment have the number -1
-    return np.where(in_chosen & eligible, np.uint8(label), np.uint8(Label.VEGETATION))
 
 
 def _within(values: Vector, bounds: tuple[float, float]) -> Mask:

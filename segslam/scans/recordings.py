@@ -188,16 +188,12 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
     match kind:
         case "generic":
             return ScanFolder(source)
-        case "mcap":
+        case "mcap" | "rosbag":
+            from segslam.scans.bag_messages import BagMessages
             from segslam.scans.mcap_messages import McapMessages
             from segslam.scans.point_cloud2 import MessageClouds
 
-            return MessageClouds(McapMessages(source, topic))
-        case "rosbag":
-            from segslam.scans.bag_messages import BagMessages
-            from segslam.scans.point_cloud2 import MessageClouds
-
-            return MessageClouds(BagMessages(source, topic))
+            return MessageClouds((McapMessages if kind == "mcap" else BagMessages)(source, topic))
         case "ouster":
             from segslam.scans.ouster import OusterFrames
 

@@ -57,18 +57,16 @@ def geometric_labels(points: Points) -> Labels:
     """
     labels = np.full(len(points), Label.UNLABELLED, np.uint8)
     usable = within_range(points, 0.0, MAX_RANGE_M)
-    if usable.any():
-        near = points[usable].astype(np.float64)
-        labels[usable] = _labels_of_level(rotated(near, upright(near)))
-    return labels
-
-
-def _labels_of_level(level: Points) -> Labels:
+    if not usable.any():
+        return labels
+    near = points[usable].astype(np.float64)
+    level = rotated(near, upright(near))
     heights = heights_above_ground(level, max_range_m=MAX_RANGE_M)
-    labels = np.where(heights < GROUND_HEIGHT_M, np.uint8(Label.ROAD), np.uint8(Label.VEGETATION))
+    of_level = np.where(heights < GROUND_HEIGHT_M, np.uint8(Label.ROAD), np.uint8(Label.VEGETATION))
     for rule in (_poles, _solids, _walls):
-        rest = np.flatnonzero(labels == Label.VEGETATION)
-        labels[rest] = rule(level[rest], heights[rest])
+        rest = np.flatnonzero(of_level == Label.VEGETATION)
+        of_level[rest] = rule(level[rest], heights[rest])
+    labels[usable] = of_level
     return labels
 
 

@@ -42,7 +42,10 @@ def upright(points: Points) -> Rotation:
         near = lowest[np.abs(_along(lowest, normal) - height) < bound_m]
         if len(near) < MIN_LEVEL_CELLS:
             return np.eye(3)
-        normal, height = _plane(near)
+        mean = near.mean(axis=0)
+        normal = np.linalg.eigh(np.cov(near.T))[1][:, 0]  # of the least-squares plane
+        normal = normal if normal[2] > 0 else -normal
+        height = float(mean @ normal)
     return geometry.level(normal) if normal[2] > np.cos(np.radians(MAX_TILT_DEG)) else np.eye(3)
 
 
@@ -117,14 +120,6 @@ def _upward_normals() -> Points:
         around = np.arange(0.0, 2 * np.pi, step / np.sin(tilt))
         normals += [(np.sin(tilt) * np.cos(a), np.sin(tilt) * np.sin(a), np.cos(tilt)) for a in around]
     return np.array(normals)
-
-
-def _plane(points: Points) -> tuple[np.ndarray, float]:
-    """Upward unit normal of the least-squares plane through points, and its height along the normal."""
-    mean = points.mean(axis=0)
-    normal = np.linalg.eigh(np.cov(points.T))[1][:, 0]
-    normal = normal if normal[2] > 0 else -normal
-    return normal, float(mean @ normal)
 
 
 @cache

@@ -11,6 +11,8 @@ import numpy as np
 from segslam.core.types import BadScan, SegslamError
 from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
+from segslam.scans.pcd import parse_pcd
+from segslam.scans.ply import parse_ply
 from segslam.scans.scan_files import INTENSITY_FIELDS, NO_POINTS, TIME_FIELDS, Columns, read_bytes
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
@@ -33,12 +35,8 @@ def read_file(file: Path) -> Cloud:
             case ".npy":
                 return _from_rows(_parse_npy(read_bytes(file)))
             case ".ply":
-                from segslam.scans.ply import parse_ply
-
                 return _from_columns(parse_ply(read_bytes(file)))
             case ".pcd":
-                from segslam.scans.pcd import parse_pcd
-
                 return _from_columns(parse_pcd(read_bytes(file)))
             case other:
                 raise SegslamError(f"{file}: unknown format {other or '(no extension)'}; give .bin, .npy, .ply or .pcd")

@@ -55,8 +55,7 @@ def _read_messages(recording: Path, topic: str) -> list[Row]:
     Raises SegslamError, naming the recording and its topics, if there is no such topic, if the recording cannot be
     read, or if a package is missing.
     """
-    from segslam.scans.bag_messages import BagMessages
-    from segslam.scans.mcap_messages import McapMessages
+    from segslam.scans.messages import BagMessages, McapMessages
 
     read = McapMessages if recording.suffix == ".mcap" else BagMessages
     try:

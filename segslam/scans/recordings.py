@@ -189,8 +189,7 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
         case "generic":
             return ScanFolder(source)
         case "mcap" | "rosbag":
-            from segslam.scans.bag_messages import BagMessages
-            from segslam.scans.mcap_messages import McapMessages
+            from segslam.scans.messages import BagMessages, McapMessages
             from segslam.scans.point_cloud2 import MessageClouds
 
             return MessageClouds((McapMessages if kind == "mcap" else BagMessages)(source, topic))

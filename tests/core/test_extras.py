@@ -11,7 +11,7 @@ from segslam.core.extras import how_to_install, requirements
 from segslam.core.types import SegslamError
 from segslam.gnss import Origin
 from segslam.output.map import write
-from segslam.scans.mcap_messages import McapMessages
+from segslam.scans.messages import McapMessages
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 

@@ -11,7 +11,7 @@ from helpers.recorded_drive import CLOUD, TOPIC, write_bag1, write_bag2, write_m
 
 from segslam.core.types import BadScan, SegslamError
 from segslam.scans import open_dataset
-from segslam.scans.bag_messages import InOrder
+from segslam.scans.messages import InOrder
 
 SECOND = 10**9
 

@@ -10,8 +10,8 @@ from segslam.core import geometry
 from segslam.core.trajectory import write_kitti
 from segslam.core.types import BadScan, Label, SegslamError
 from segslam.scans import open_dataset
-from segslam.scans.bag_messages import InOrder
 from segslam.scans.dataset import Cloud
+from segslam.scans.messages import InOrder
 
 
 def _write_clouds(folder: Path, num_clouds: int) -> Path:

@@ -31,8 +31,8 @@ from segslam.gnss.fixes import Row
 from segslam.gnss.reading import row_of
 from segslam.run.live.live_map import DrawnMap
 from segslam.run.live.waiting import Arrival, Waiting
-from segslam.scans.bag_messages import CLOUD
 from segslam.scans.dataset import make_scan, sweep_times
+from segslam.scans.messages import CLOUD
 from segslam.scans.point_cloud2 import read_message, stamp_ns_of
 
 try:

@@ -14,8 +14,7 @@ import numpy as np
 
 from segslam.core.errors import brief
 from segslam.core.types import SegslamError
-from segslam.gnss.fixes import Row
-from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of
+from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
 COLUMNS: dict[str, tuple[str, ...]] = {
     "time": ("time", "t", "seconds", "timestamp", "stamp", "stamp_s", "time_s", "sec", "utc", "unix_time"),

@@ -1,16 +1,21 @@
-"""Position fixes of a receiver, as all readers return them, and the checks that do not need a trajectory."""
+"""Position fixes of a receiver: what their readers return and share, and the checks that need no trajectory."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
+from segslam.core.errors import brief, unreadable
 from segslam.core.types import Indices, Mask, Points, SegslamError
 from segslam.gnss.geodesy import Geodetic
 
 NO_FIX, NOT_FINITE, DUPLICATE, OUTSIDE = "no_fix", "not_finite", "duplicate", "outside_run"
 """Reasons for which a fix is not used, whatever the trajectory is."""
+MOST_BYTES = 2**30
+"""Chosen: no log of fixes is larger than a gigabyte."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,3 +98,49 @@ def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fi
             f"{source}: none of its {len(rows)} fixes can be used ({counts}); give another file or topic"
         )
     return fixes
+
+
+def text_lines(file: Path) -> list[str]:
+    """The lines of a file. Raises SegslamError if it cannot be read as text."""
+    try:
+        if file.stat().st_size > MOST_BYTES:
+            raise SegslamError(f"{file}: larger than 1 GB; is it a file of position fixes?")
+        content = file.read_bytes()
+    except OSError as error:
+        raise SegslamError(f"{unreadable(file, 'fixes', error)}; give another file with --gnss") from error
+    if b"\0" in content[:4096]:
+        raise SegslamError(f"{file}: a binary file; give CSV, NMEA or RTKLIB .pos, a KITTI oxts folder, or a recording")
+    return content.decode("utf-8", errors="replace").lstrip("\ufeff").splitlines()
+
+
+def bad_line(file: Path, number: int, what: str, remedy: str = "correct or remove the line") -> SegslamError:
+    """An error for a line, counted from 1."""
+    return SegslamError(f"{file}:{number}: {what}; {remedy}")
+
+
+def number_in(file: Path, line: int, text: str, name: str) -> float:
+    """The number in a cell. Raises SegslamError if it is none; an empty cell, `nan`, `null` and infinity are NaN."""
+    text = text.strip()
+    if text.lower() in ("", "nan", "null", "none", "na"):
+        return float("nan")
+    try:
+        value = float(text)
+        return value if math.isfinite(value) else float("nan")
+    except ValueError as error:
+        raise bad_line(file, line, f"{name} {brief(text, 30)} is not a number") from error
+
+
+def check_degrees(file: Path, line: int, latitude_deg: float, longitude_deg: float) -> None:
+    """Raises SegslamError for a latitude beyond 90 or a longitude beyond 360 degrees; NaN is allowed."""
+    if abs(latitude_deg) > 90.0:
+        hint = "is it a longitude, or metres?" if abs(latitude_deg) <= 360.0 else "degrees are needed, not metres"
+        raise bad_line(file, line, f"latitude {latitude_deg:g} is not within -90 and 90 degrees", hint)
+    if abs(longitude_deg) > 360.0:
+        raise bad_line(file, line, f"longitude {longitude_deg:g} is not within -180 and 180 degrees")
+
+
+def stamp_of(moment: datetime) -> int:
+    """Nanoseconds since 1970 of a moment; one without a time zone is in UTC."""
+    aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    since = aware - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000

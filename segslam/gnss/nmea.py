@@ -7,8 +7,7 @@ from operator import xor
 from pathlib import Path
 
 from segslam.core.types import SegslamError
-from segslam.gnss.fixes import Row
-from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of
+from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
 
 def is_nmea(lines: Sequence[str]) -> bool:

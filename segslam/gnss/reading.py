@@ -7,10 +7,9 @@ from typing import Any
 from segslam.core.errors import brief
 from segslam.core.types import SegslamError
 from segslam.gnss.csv_fixes import read_csv
-from segslam.gnss.fixes import Fixes, Row, make_fixes
+from segslam.gnss.fixes import Fixes, Row, make_fixes, bad_line, check_degrees, number_in, stamp_of, text_lines
 from segslam.gnss.nmea import is_nmea, read_nmea
 from segslam.gnss.rtklib import is_rtklib, read_rtklib
-from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, text_lines
 
 OXTS_ACCURACY = 23
 """Column of the accuracy of the position (m), counted from 0, as the devkit's dataformat.txt lists them."""

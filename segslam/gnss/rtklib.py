@@ -1,16 +1,24 @@
 """Fixes from RTKLIB's .pos files: geodetic or ECEF, GPS time or UTC, with weeks or dates."""
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 
-from segslam.gnss.fixes import Row
+from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 from segslam.gnss.geodesy import Origin, geodetic_from_ecef, rotation_ecef_enu
-from segslam.gnss.text import bad_line, check_degrees, number_in, stamp_of, utc_of_gps
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+LEAPS = [
+    datetime(year, month, 1, tzinfo=UTC)
+    for year, month in (
+        *((1981, 7), (1982, 7), (1983, 7), (1985, 7), (1988, 1), (1990, 1), (1991, 1), (1992, 7), (1993, 7)),
+        *((1994, 7), (1996, 1), (1997, 7), (1999, 1), (2006, 1), (2009, 1), (2012, 7), (2015, 7), (2017, 1)),
+    )
+]
+"""Days (UTC) that begin after a leap second since GPS began (IERS Bulletin C)."""
 
 
 def is_rtklib(lines: Sequence[str]) -> bool:
@@ -58,10 +66,17 @@ def _stamp(file: Path, number: int, first: str, second: str, *, is_gpst: bool) -
         if "/" not in first:
             week, seconds = int(first), float(second)
             moment = GPS_EPOCH + timedelta(weeks=week, seconds=int(seconds))
-            return stamp_of(utc_of_gps(moment)) + round((seconds - int(seconds)) * 1e9)
+            return stamp_of(_utc_of_gps(moment)) + round((seconds - int(seconds)) * 1e9)
         form = "%Y/%m/%d %H:%M:%S.%f" if "." in second else "%Y/%m/%d %H:%M:%S"
         moment = datetime.strptime(f"{first} {second}", form).replace(tzinfo=UTC)
-        return stamp_of(utc_of_gps(moment) if is_gpst else moment)
+        return stamp_of(_utc_of_gps(moment) if is_gpst else moment)
     except (ValueError, OverflowError) as error:
         what = f"time {first[:20]} {second[:20]} is neither week and seconds nor a date"
         raise bad_line(file, number, what) from error
+
+
+def _utc_of_gps(moment: datetime) -> datetime:
+    """The moment in UTC of one in GPS time, which has no leap seconds: 18 s earlier since 2017."""
+    leaps = bisect_right(LEAPS, moment)
+    utc = moment - timedelta(seconds=leaps)
+    return utc if bisect_right(LEAPS, utc) == leaps else utc + timedelta(seconds=1)

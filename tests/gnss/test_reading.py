@@ -14,10 +14,9 @@ from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from segslam.core.types import SegslamError
-from segslam.gnss.fixes import make_fixes
+from segslam.gnss.fixes import make_fixes, stamp_of
 from segslam.gnss.geodesy import Origin, ecef_from_geodetic, enu_from_geodetic
 from segslam.gnss.reading import read_fixes, row_of
-from segslam.gnss.text import stamp_of
 
 MOMENT = datetime(2021, 5, 17, 2, 33, 17, 500000, tzinfo=UTC)
 STAMP_NS = stamp_of(MOMENT)

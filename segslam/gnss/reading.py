@@ -7,7 +7,7 @@ from typing import Any
 from segslam.core.errors import brief
 from segslam.core.types import SegslamError
 from segslam.gnss.csv_fixes import read_csv
-from segslam.gnss.fixes import Fixes, Row, make_fixes, bad_line, check_degrees, number_in, stamp_of, text_lines
+from segslam.gnss.fixes import Fixes, Row, bad_line, check_degrees, make_fixes, number_in, stamp_of, text_lines
 from segslam.gnss.nmea import is_nmea, read_nmea
 from segslam.gnss.rtklib import is_rtklib, read_rtklib
 

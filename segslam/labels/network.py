@@ -87,15 +87,6 @@ def open_network(model: Path) -> Network:
     if not model.is_file():
         raise SegslamError(f"{model}: no such file; give the model as network:MODEL.onnx")
     settings = read_settings(settings_file(model))
-    session = _session(model)
-    wanted = (1, len(settings.channels), settings.height, settings.width)
-    _check_input(session, model, wanted)
-    network = Network(model, settings, session)
-    network.label_image(np.zeros(wanted, np.float32))
-    return network
-
-
-def _session(model: Path) -> Any:
     try:
         import onnxruntime
     except ImportError as error:
@@ -106,11 +97,15 @@ def _session(model: Path) -> Any:
     try:
         session = onnxruntime.InferenceSession(model, options, providers=onnxruntime.get_available_providers())
         [(each.name, each.type, each.shape) for each in session.get_inputs()]  # fails for names that are not UTF-8
-        return session
     except _runtime_errors() as error:
         raise SegslamError(
             f"{model}: onnxruntime cannot load it ({brief(str(error), 300)}); {_remedy(error)}"
         ) from error
+    wanted = (1, len(settings.channels), settings.height, settings.width)
+    _check_input(session, model, wanted)
+    network = Network(model, settings, session)
+    network.label_image(np.zeros(wanted, np.float32))
+    return network
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from segslam.scans.dataset import sweep_times
+from segslam.scans.scan_files import sweep_times
 
 SHARES = np.linspace(0.125, 0.875, 7)  # nothing is seen in the first and the last eighth of the turn
 

@@ -31,9 +31,10 @@ from segslam.gnss.fixes import Row
 from segslam.gnss.reading import row_of
 from segslam.run.live.live_map import DrawnMap
 from segslam.run.live.waiting import Arrival, Waiting
-from segslam.scans.dataset import make_scan, sweep_times
+from segslam.scans.dataset import make_scan
 from segslam.scans.messages import CLOUD
 from segslam.scans.point_cloud2 import read_message, stamp_ns_of
+from segslam.scans.scan_files import sweep_times
 
 try:
     from tf2_msgs.msg import TFMessage

@@ -5,7 +5,7 @@ import json
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -193,7 +193,7 @@ def figures(placed: Georeference) -> dict[str, Any]:
     origin = placed.origin
     return {
         "datum": "WGS84 (EPSG:4979)",
-        **asdict(origin),
+        **origin._asdict(),
         "epsg": utm_epsg(origin.latitude_deg, origin.longitude_deg),
         "T_enu_map": placed.T_enu_map.ravel().tolist(),
         "sigma": dict(zip(SIGMAS, _known(placed.position_sigma_m), strict=True))

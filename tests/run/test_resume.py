@@ -82,7 +82,7 @@ def _assert_as_whole(whole: Path, resumed: Path) -> None:
     np.testing.assert_array_equal(poses_again.scan_index, poses.scan_index)
     np.testing.assert_array_equal(poses_again.stamp_ns, poses.stamp_ns)
     apart_m = np.linalg.norm((poses_again.T_world_lidar - poses.T_world_lidar)[:, :3, 3], axis=1)
-    assert apart_m.max() < 0.05, "the odometry of so short a drive starts again from its first scan"
+    assert apart_m.max() < 0.1, "odometry and motion model start again from the first scan of so short a drive"
     metrics, metrics_again = (json.loads((folder / "metrics.json").read_text()) for folder in (whole, resumed))
     assert metrics_again["num_scans"] == metrics["num_scans"]
     assert metrics_again["num_scans_skipped"] == metrics["num_scans_skipped"] == 1

@@ -15,13 +15,11 @@ from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import corrected_poses
 from segslam.core.types import (
     GraphEstimate,
-    Indices,
     Keyframe,
     LoopAttempt,
     LoopClosure,
     Motion,
     MotionState,
-    Points,
     Scan,
     SegslamError,
     Step,
@@ -35,7 +33,7 @@ from segslam.labels.label_files import computed
 from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
 from segslam.odometry import Tracked as Tracked
 from segslam.registration.prepared import Labeller
-from segslam.slam.adjustment import Adjusted, Known, Progress, Velocities, adjust, no_progress, velocities_of
+from segslam.slam.adjustment import Known, Progress, adjust, no_progress, velocities_of
 from segslam.slam.loop_edits import NO_EDITS, LoopEdits
 from segslam.slam.loops import ROUNDS, LoopCloser
 from segslam.slam.slam_result import SlamResult as SlamResult
@@ -108,27 +106,15 @@ class Slam:
 
     def close_loops(self, tracked: Tracked, *, tries_loops: bool = True) -> Step:
         """Close the loops of a tracked scan. Loops that are not tried now may be tried in the search of `finish`."""
-        keyframe = None
-        if tracked.registered is not None:
-            keyframe = self._cut(tracked, tracked.registered)
-        return self._advance(
-            tracked.scan_index,
-            tracked.stamp_ns,
-            tracked.T_odom_lidar,
-            tracked.motion,
-            keyframe,
-            tracked.watch,
-            tries_loops=tries_loops,
-        )
+        keyframe = None if tracked.registered is None else self._cut(tracked, tracked.registered)
+        step = Step(tracked.scan_index, tracked.stamp_ns, tracked.T_odom_lidar, keyframe, (), None, {}, tracked.motion)
+        return self._advance(step, tracked.watch, self._loops.attempt if tries_loops else lambda *_: ())
 
     def repeat(self, recorded: Step) -> Step:
         """As `process`, but from a recorded Step: repeat everything after the selection of the keyframe."""
-        motion = recorded.motion or Motion(MotionState.UNCHECKED)
-        keyframe = None if recorded.keyframe is None else replace(recorded.keyframe, place=None)
         self._tracker.note(recorded)
-        return self._advance(
-            recorded.scan_index, recorded.stamp_ns, recorded.T_odom_lidar, motion, keyframe, Stopwatch()
-        )
+        keyframe = None if recorded.keyframe is None else replace(recorded.keyframe, place=None)
+        return self._advance(replace(recorded, keyframe=keyframe), Stopwatch(), self._loops.attempt)
 
     def take(self, recorded: Step, *, below: int = 0, optimize: bool = False) -> Step:
         """As `repeat`, but with the recorded loops and places.
@@ -140,16 +126,7 @@ class Slam:
             self._loops.take(recorded.attempts)
             return (*recorded.attempts, *(self._loops.attempt(keyframe_id, watch, below=below) if below else ()))
 
-        return self._advance(
-            recorded.scan_index,
-            recorded.stamp_ns,
-            recorded.T_odom_lidar,
-            recorded.motion or Motion(MotionState.UNCHECKED),
-            recorded.keyframe,
-            Stopwatch(),
-            attempts_of=attempts,
-            is_due=lambda: optimize,
-        )
+        return self._advance(recorded, Stopwatch(), attempts, optimize=optimize)
 
     def resume(self, scan_of: Callable[[int], Scan]) -> None:
         """Prepare `process` to continue after `repeat`.
@@ -157,8 +134,8 @@ class Slam:
         `scan_of` reads the scan of a step, counted from 0, if needed.
         """
         if self._steps:
-            T_odom_lidar = np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps])
-            self._tracker.resume(T_odom_lidar, self._stamps(), scan_of)
+            odometry = self._odometry()
+            self._tracker.resume(odometry.T_world_lidar, odometry.stamp_ns, scan_of)
 
     def finish(self, *, search_s: float = math.inf, progress: Progress = no_progress) -> SlamResult:
         """Final optimisation; returns the pose of every scan. Raises ValueError before the first scan.
@@ -170,54 +147,36 @@ class Slam:
             raise ValueError("no scan was processed")
         self._is_finished = True
         estimate, late = self._settle(monotonic() + search_s)
-        odometry = Trajectory(
-            scan_index=np.array([index for index, _, _ in self._steps]),
-            stamp_ns=self._stamps(),
-            T_world_lidar=np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]),
-        )
+        odometry = self._odometry()
         rows = np.array(self._keyframe_rows)
-        adjusted = self._adjust(estimate, velocities_of(odometry, rows, self._motions), progress)
+        adjusted = None
+        if isinstance(self.graph, PoseGraph):  # an existing map stays as it is
+            adjusted = adjust(
+                self.graph,
+                estimate,
+                lambda keyframe_id: self._clouds.cloud(keyframe_id)[0],
+                velocities_of(odometry, rows, self._motions),
+                config=self.config,
+                known=self._known,
+                progress=progress,
+            )
         T_world_lidar = corrected_poses(
             odometry.T_world_lidar,
             rows,
             self.graph.T_world_keyframes,
             after_break=np.array([self._motions[row].is_break for row in self._keyframe_rows]),
         )
-        trajectory = replace(odometry, T_world_lidar=T_world_lidar)
-        attempts = (*self._attempts, *late)
+        alone = self._tracker.alone()[: len(odometry)]  # tracking may be ahead when a run is stopped
         return SlamResult(
-            trajectory,
+            replace(odometry, T_world_lidar=T_world_lidar),
             odometry,
             estimate if adjusted is None else adjusted.after,
             rows,
-            attempts,
+            (*self._attempts, *late),
             tuple(self._motions),
             len(late),
             adjusted=adjusted,
-            alone=self._alone(odometry),
-        )
-
-    def _alone(self, odometry: Trajectory) -> Trajectory | None:
-        """The poses by KISS-ICP alone; None if they were not all kept, as after `resume`."""
-        poses = self._tracker.alone()[: len(odometry)]  # tracking may be ahead when a run is stopped
-        return replace(odometry, T_world_lidar=np.stack(poses)) if len(poses) == len(odometry) else None
-
-    def _adjust(self, estimate: GraphEstimate, velocities: Velocities, progress: Progress) -> Adjusted | None:
-        """The adjustment of the whole map; None if it is off, or for a graph in the frame of an existing map."""
-        if not isinstance(self.graph, PoseGraph):
-            return None
-
-        def points_of(keyframe_id: int) -> Points:
-            return self._clouds.cloud(keyframe_id)[0]
-
-        return adjust(
-            self.graph,
-            estimate,
-            points_of,
-            velocities,
-            config=self.config,
-            known=self._known,
-            progress=progress,
+            alone=replace(odometry, T_world_lidar=np.stack(alone)) if len(alone) == len(odometry) else None,
         )
 
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
@@ -238,23 +197,22 @@ class Slam:
             estimate = self.graph.finish()
         return estimate, late
 
-    def _stamps(self) -> Indices:
-        return np.array([stamp_ns for _, stamp_ns, _ in self._steps])
+    def _odometry(self) -> Trajectory:
+        scan_index, stamp_ns, T_odom_lidar = zip(*self._steps, strict=True)
+        return Trajectory(np.array(scan_index), np.array(stamp_ns), np.stack(T_odom_lidar))
 
     def _advance(
         self,
-        scan_index: int,
-        stamp_ns: int,
-        T_odom_lidar: Transform,
-        motion: Motion,
-        keyframe: Keyframe | None,
+        step: Step,
         watch: Stopwatch,
+        attempts_of: Callable[[int, Stopwatch], tuple[LoopAttempt, ...]],
         *,
-        tries_loops: bool = True,
-        attempts_of: Callable[[int, Stopwatch], tuple[LoopAttempt, ...]] | None = None,
-        is_due: Callable[[], bool] | None = None,
+        optimize: bool | None = None,
     ) -> Step:
-        self._steps.append((scan_index, stamp_ns, T_odom_lidar))
+        """Everything after the selection of the keyframe. The graph is optimised if `optimize`; None: if it is due."""
+        motion, keyframe = step.motion or Motion(MotionState.UNCHECKED), step.keyframe
+        about = step.scan_index, step.stamp_ns, step.T_odom_lidar
+        self._steps.append(about)
         self._motions.append(motion)
         self._since_keyframe.append(motion)
         attempts: tuple[LoopAttempt, ...] = ()
@@ -277,14 +235,13 @@ class Slam:
                     recorded=keyframe.place,
                 )
             keyframe = replace(keyframe, place=None if place is None else place.to_bytes())
-            if tries_loops:
-                attempts = (attempts_of or self._loops.attempt)(keyframe.id, watch)
-                self._attempts += attempts
-            if is_due() if is_due else self.graph.is_due:
+            attempts = attempts_of(keyframe.id, watch)
+            self._attempts += attempts
+            if self.graph.is_due if optimize is None else optimize:
                 with watch("optimize"):
                     estimate = self.graph.optimize()
                 self._loops.note_estimate(estimate.closure_weights)
-        return Step(scan_index, stamp_ns, T_odom_lidar, keyframe, attempts, estimate, watch.seconds, motion)
+        return Step(*about, keyframe, attempts, estimate, watch.seconds, motion)
 
     def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:
         """A keyframe of this scan, downsampled; geometric labels are computed if it has none."""

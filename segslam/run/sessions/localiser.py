@@ -53,9 +53,9 @@ class Localiser(Slam):
         self._anchored = AnchoredGraph(self.config.graph)
         return self._anchored
 
-    def _advance(self, *about_scan: Any, **_: Any) -> Step:
+    def _advance(self, step: Step, watch: Stopwatch, *_: Any, **__: Any) -> Step:
         self._placed = (), None
-        step = super()._advance(*about_scan, attempts_of=self._place)
+        step = super()._advance(step, watch, self._place)
         placements, why = self._placed
         return replace(step, placements=placements, not_placed=why)
 
@@ -72,7 +72,7 @@ class Localiser(Slam):
 
     def _from_map_m(self) -> Vector:
         """(n,) travel from each scan to the nearest keyframe whose placement was kept; infinite across a break."""
-        travel_m = travelled_m(np.stack([T_odom_lidar for _, _, T_odom_lidar in self._steps]))
+        travel_m = travelled_m(self._odometry().T_world_lidar)
         segment = np.cumsum([motion.is_break for motion in self._motions])
         distance_m = np.full(len(travel_m), np.inf)
         kept = [number for number, weight in self._anchored.weights.items() if weight >= REJECTED_WEIGHT]

@@ -6,7 +6,7 @@ A place is accepted only if no other place fits almost as well, because streets 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from itertools import islice
 
 import numpy as np
 
@@ -61,94 +61,59 @@ def recognise(
     """
     watch = watch or Stopwatch()
 
-    def tried(place_id: int, also: Gate) -> tuple[Trial, list[Found] | Rejected]:
+    def tried(place_id: int, T_world_found: Transform | None = None) -> tuple[Trial, list[Found] | Rejected]:
+        """The poses at a place; after one was found, those that are elsewhere."""
         with watch("prepare"):
             place = places(place_id)
-        trial = Trial(scan, place, config, _Both(gate(place_id), also), watch, score.shipped())
+        gate_here, T_world_here = gate(place_id), T_world_place(place_id)
+
+        def allowed(T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+            rejected = gate_here(T_target_source, slack_m=slack_m)
+            if rejected is not None or T_world_found is None:
+                return rejected
+            is_same = _apart_m(T_world_here @ T_target_source, T_world_found) < ELSEWHERE_M
+            return Rejected(RejectReason.FAR_FROM_PRIOR, "the same place") if is_same else None
+
+        trial = Trial(scan, place, config, allowed, watch, score.shipped())
         return trial, tried_poses(trial)
 
-    rejection: Rejected | None = None
-    for place_id in _spread(candidates, T_world_place, max_places):
-        trial, found = tried(place_id, anywhere)
+    def found_elsewhere(T_world_found: Transform, place_ids: Sequence[int]) -> list[Found]:
+        """The best poses at other places, by what the patches of the scan show there."""
+        outcomes = [tried(place_id, T_world_found)[1] for place_id in place_ids]
+        best = [found[0] for found in outcomes if not isinstance(found, Rejected)]
+        return [one._replace(agreement=one.agreement._replace(of_target=NO_PATCHES)) for one in best]
+
+    rejections = []
+    for place_id in islice(_spread(candidates, T_world_place, SPREAD_M), max_places):
+        trial, found = tried(place_id)
         if isinstance(found, Rejected):
-            outcome: Alignment | Rejected = found
-        else:
-            outcome = trial.judge(found[0], found[1:])
-        if isinstance(outcome, Alignment):
-            assert not isinstance(found, Rejected)
-            T_world_lidar = T_world_place(place_id) @ found[0].T_target_source
-            others = _others(T_world_lidar, candidates, T_world_place)
-            elsewhere = [(other, _Elsewhere(T_world_lidar, T_world_place(other))) for other in others]
-            halves = at_once(partial(_found, tried, elsewhere[0::2]), partial(_found, tried, elsewhere[1::2]))
-            outcome = trial.judge(found[0], [*found[1:], *halves[0], *halves[1]])
-            return outcome if isinstance(outcome, Rejected) else Recognised(place_id, T_world_lidar, outcome)
-        if rejection is None:
-            rejection = outcome
-    if rejection is None:
-        return Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, "no place to compare with")
-    return rejection
-
-
-def _found(
-    tried: Callable[[int, Gate], tuple[Trial, list[Found] | Rejected]], places: Sequence[tuple[int, Gate]]
-) -> list[Found]:
-    """The best poses at other places, by what the patches of the scan show there."""
-    outcomes = [tried(*place)[1] for place in places]
-    best = [found[0] for found in outcomes if not isinstance(found, Rejected)]
-    return [one._replace(agreement=one.agreement._replace(of_target=NO_PATCHES)) for one in best]
-
-
-class _Both(NamedTuple):
-    """Combination of two gates."""
-
-    first: Gate
-    second: Gate
-
-    def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
-        rejected = self.first(T_target_source, slack_m=slack_m)
-        return rejected if rejected is not None else self.second(T_target_source, slack_m=slack_m)
-
-
-class _Elsewhere(NamedTuple):
-    """Rejects poses near a place that was found already."""
-
-    T_world_found: Transform
-    T_world_target: Transform
-
-    def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
-        if _apart_m(self.T_world_target @ T_target_source, self.T_world_found) < ELSEWHERE_M:
-            return Rejected(RejectReason.FAR_FROM_PRIOR, "the same place")
-        return None
+            rejections.append(found)
+            continue
+        outcome = trial.judge(found[0], found[1:])
+        if isinstance(outcome, Rejected):
+            rejections.append(outcome)
+            continue
+        T_world_lidar = T_world_place(place_id) @ found[0].T_target_source
+        others = list(islice(_spread(candidates, T_world_place, ELSEWHERE_M, [T_world_lidar]), MAX_RIVALS))
+        halves = at_once(*(partial(found_elsewhere, T_world_lidar, half) for half in (others[0::2], others[1::2])))
+        outcome = trial.judge(found[0], [*found[1:], *halves[0], *halves[1]])
+        return outcome if isinstance(outcome, Rejected) else Recognised(place_id, T_world_lidar, outcome)
+    return rejections[0] if rejections else Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, "no place to compare with")
 
 
 def _spread(
-    candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform], most: int
+    candidates: Sequence[PlaceCandidate],
+    T_world_place: Callable[[int], Transform],
+    apart_m: float,
+    taken: Sequence[Transform] = (),
 ) -> Iterator[int]:
-    """At most `most` candidates, each `SPREAD_M` from all previous ones."""
-    taken: list[Transform] = []
+    """The candidates that are at least so far from all before, and from places that are taken already."""
+    taken = list(taken)
     for candidate in candidates:
         T_world = T_world_place(candidate.place_id)
-        if all(_apart_m(T_world, other) >= SPREAD_M for other in taken):
+        if all(_apart_m(T_world, other) >= apart_m for other in taken):
             taken.append(T_world)
             yield candidate.place_id
-        if len(taken) == most:
-            return
-
-
-def _others(
-    T_world_found: Transform, candidates: Sequence[PlaceCandidate], T_world_place: Callable[[int], Transform]
-) -> list[int]:
-    """At most `MAX_RIVALS` most similar places, `ELSEWHERE_M` from the found one and from each other."""
-    taken: list[int] = []
-    for candidate in candidates:
-        T_world = T_world_place(candidate.place_id)
-        if _apart_m(T_world, T_world_found) < ELSEWHERE_M:
-            continue
-        if all(_apart_m(T_world, T_world_place(other)) >= ELSEWHERE_M for other in taken):
-            taken.append(candidate.place_id)
-        if len(taken) == MAX_RIVALS:
-            break
-    return taken
 
 
 def _apart_m(T_world_a: Transform, T_world_b: Transform) -> float:

@@ -45,19 +45,35 @@ def align(source: LightSurface, target: LightSurface, T_target_source: Transform
     """The pose that aligns source and target near an initial guess; None if it does not converge."""
     if min(len(source), len(target)) < MIN_PAIRED:
         return None
-    fit = _Fit(source, target)
-    length = np.inf
+    points, normals = _sample(source)
     for iteration in range(20):
-        step = fit.step(T_target_source, iteration)
-        if step is None:
+        nearest, distance_m = target.nearest(geometry.apply(T_target_source, points))
+        paired = distance_m < SEARCH_M[min(iteration, len(SEARCH_M) - 1)]
+        rows = nearest[paired]
+        hessian, gradient, squares, weights, num = _normal_equations(
+            points[paired],
+            normals[paired],
+            target.points[rows],
+            target.normals_at(rows),
+            np.ascontiguousarray(T_target_source),
+            KERNEL_M[min(iteration, len(KERNEL_M) - 1)],
+        )
+        if num < MIN_PAIRED or weights == 0.0:
             return None
+        step = -np.linalg.lstsq(hessian, gradient)[0]
         length = float(np.linalg.norm(step))
         T_target_source = T_target_source @ geometry.exp(step)
         if length < CONVERGED and iteration >= len(KERNEL_M) - 1:
             break
     if length > SETTLED:
         return None
-    return Alignment(T_target_source, fit.hessian / fit.variance, fit.num / len(fit.points))
+    return Alignment(T_target_source, hessian / (squares / weights), num / len(points))
+
+
+def _sample(source: LightSurface) -> tuple[Points, Points]:
+    """At most `MOST_POINTS` points of a surface, and their normals."""
+    rows = np.arange(0, len(source), max(1, -(-len(source) // MOST_POINTS)))
+    return source.points[rows], source.normals_at(rows)
 
 
 class Pairs(NamedTuple):
@@ -75,45 +91,17 @@ class Pairs(NamedTuple):
 
 def pairs_of(source: LightSurface, target: LightSurface, T_target_source: Transform) -> Pairs:
     """The pairs of points at the pose of an alignment, as its last steps choose and weigh them."""
-    fit = _Fit(source, target)
-    moved = geometry.apply(T_target_source, fit.points)
+    points_source, own_normals = _sample(source)
+    moved = geometry.apply(T_target_source, points_source)
     nearest, distance_m = target.nearest(moved)
     normals = target.normals_at(nearest)
     normals_source = normals @ T_target_source[:3, :3]
-    same = np.abs(np.einsum("ij,ij->i", normals_source, fit.normals)) >= SAME_NORMAL
+    same = np.abs(np.einsum("ij,ij->i", normals_source, own_normals)) >= SAME_NORMAL
     rows = np.flatnonzero(same & (distance_m < SEARCH_M[-1]))
     points = target.points[nearest[rows]]
     residual_m = np.einsum("ij,ij->i", moved[rows] - points, normals[rows])
     weights = (1.0 + (residual_m / KERNEL_M[-1]) ** 2) ** -2
-    return Pairs(fit.points[rows], points, normals[rows], normals_source[rows], residual_m, weights)
-
-
-class _Fit:
-    """Steps of Gauss and Newton for one pair, and the system of the last of them."""
-
-    def __init__(self, source: LightSurface, target: LightSurface) -> None:
-        rows = np.arange(0, len(source), max(1, -(-len(source) // MOST_POINTS)))
-        self.points, self.normals = source.points[rows], source.normals_at(rows)
-        self._target = target
-
-    def step(self, T_target_source: Transform, iteration: int) -> Vector | None:
-        """The next step of the pose (right perturbation); None with few pairs."""
-        target = self._target
-        nearest, distance_m = target.nearest(geometry.apply(T_target_source, self.points))
-        paired = distance_m < SEARCH_M[min(iteration, len(SEARCH_M) - 1)]
-        rows = nearest[paired]
-        self.hessian, gradient, squares, weights, self.num = _normal_equations(
-            self.points[paired],
-            self.normals[paired],
-            target.points[rows],
-            target.normals_at(rows),
-            np.ascontiguousarray(T_target_source),
-            KERNEL_M[min(iteration, len(KERNEL_M) - 1)],
-        )
-        if self.num < MIN_PAIRED or weights == 0.0:
-            return None
-        self.variance = squares / weights
-        return -np.linalg.lstsq(self.hessian, gradient)[0]
+    return Pairs(points_source[rows], points, normals[rows], normals_source[rows], residual_m, weights)
 
 
 @kernel(

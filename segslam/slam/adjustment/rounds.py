@@ -6,7 +6,7 @@ result shows the angle better, and another round corrects the scans by it.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import takewhile
 from time import monotonic
@@ -17,7 +17,7 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import GraphEstimate, IndexPairs, Mask, Record, Vector
+from segslam.core.types import GraphEstimate, IndexPairs, Record
 from segslam.graph import Edge, PoseGraph
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
 from segslam.slam.adjustment.correction import Sweep, Velocities, corrected_by, corrections_of
@@ -142,13 +142,16 @@ def adjust(
     end_s = started + 60.0 * config.adjustment.max_minutes
     if started >= end_s:
         return None
-    T_before, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
+    T_before, travel_m = graph.T_world_keyframes, graph.travel_m
     sweep = known.sweep if known else measure_sweep(points_of, T_before, travel_m, velocities, config=config.refine)
     last = _rounds(graph, points_of, velocities, sweep, known, config, end_s, progress)
     if last is None:
         return None
     of_map = corrected_by(corrections_of(_correction_deg(last.angle), sweep, velocities), points_of)
-    seen_twice = _seen_twice(last.registered, travel_m, config.proximity.min_travel_m)
+    ends = np.array([(edge.a, edge.b) for edge in last.registered])
+    is_between = np.abs(np.diff(travel_m[ends], axis=1)[:, 0]) >= config.proximity.min_travel_m
+    apart = np.diff(ends, axis=1)[:, 0]
+    seen_twice = ends[is_between if is_between.any() else apart == apart.max()]  # else seen from farthest apart
     before_m, after_m = (map_thickness_m(of_map, T, seen_twice) for T in (T_before, graph.T_world_keyframes))
     is_corrected = sweep is not None or _correction_deg(last.angle) != 0.0
     raw_before_m = map_thickness_m(points_of, T_before, seen_twice) if is_corrected else before_m
@@ -160,7 +163,7 @@ def adjust(
     record = Adjustment(
         num_pairs=last.num_pairs,
         num_registered=len(last.registered),
-        num_between_passes=int(_is_between(last.registered, travel_m, config.proximity.min_travel_m).sum()),
+        num_between_passes=int(is_between.sum()),
         odometry_noise_factor=last.noise_factors[0],
         noise_factor=last.noise_factors[1],
         moved_m=float(np.sqrt(np.mean(np.sum(moved_m**2, axis=1)))),
@@ -192,78 +195,37 @@ def _rounds(
     refine, travel_m = config.refine, graph.travel_m
     of_drives = known.aligned(points_of, travel_m, config=refine) if known else None
     straight_of = corrected_by(corrections_of(0.0, sweep, velocities), points_of)
-    T_world = graph.T_world_keyframes.copy()
+    T_world = graph.T_world_keyframes
     angle = known.angle if known else measure_vertical_angle(straight_of, T_world, travel_m, config=refine)
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
-        if number > 1:
-            again = _measured_again(angle, straight_of, graph, config)
-            if again is angle:
+        T_world = graph.T_world_keyframes
+        if number > 1:  # the motions of the odometry turn with the angle: submaps built by them show too much of it
+            again = None
+            if angle is not None and angle.is_significant:
+                near_deg = angle.angle_deg
+                again = measure_vertical_angle(straight_of, T_world, travel_m, config=refine, near_deg=near_deg)
+            if again is None or not again.is_significant:
                 break
             angle = again
         corrections = known.corrections if known else corrections_of(_correction_deg(angle), sweep, velocities)
         shared_within = STEPS[-1] if any(one.raised_deg for one in corrections) else 0
-        title = f"refine {number}/{config.adjustment.rounds}"
-        corrected_of = corrected_by(corrections, points_of)
-        aligned = of_drives or Submaps(corrected_of, graph.T_world_keyframes.copy(), travel_m, config=refine).aligned
-        made = _round(graph, aligned, angle, config, end_s, shared_within, progress, title)
-        last = made or last
-        if made is None or not made.is_complete:
+        aligned = of_drives or Submaps(corrected_by(corrections, points_of), T_world, travel_m, config=refine).aligned
+        pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
+        in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, aligned, T_world, config=refine))
+        tried = list(progress(in_time, len(pairs), f"refine {number}/{config.adjustment.rounds}"))
+        registered = [one for one in tried if one is not None]
+        if not registered:
+            break
+        estimate, noise_factors = graph.adjust(registered, shared_within=shared_within)
+        last = _Round(angle, len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
+        if not last.is_complete:
             break
     return last
 
 
-def _is_between(registered: Sequence[Edge], travel_m: Vector, min_travel_m: float) -> Mask:
-    """(k,) True for edges between different passes of a place."""
-    return np.array([abs(travel_m[edge.b] - travel_m[edge.a]) >= min_travel_m for edge in registered])
-
-
-def _seen_twice(registered: Sequence[Edge], travel_m: Vector, min_travel_m: float) -> IndexPairs:
-    """(k, 2) keyframes that see the same surfaces from different passes, or else from farthest apart."""
-    ends = np.array([(edge.a, edge.b) for edge in registered])
-    is_between = _is_between(registered, travel_m, min_travel_m)
-    apart = np.diff(ends, axis=1)[:, 0]
-    return ends[is_between if is_between.any() else apart == apart.max()]
-
-
-def _measured_again(
-    angle: VerticalAngle | None, points_of: PointsOf, graph: PoseGraph, config: Config
-) -> VerticalAngle | None:
-    """The angle by the poses of an adjustment with it, if that is significant, too.
-
-    The motions of the odometry turn with the angle, so submaps built by them show too much of it.
-    """
-    if angle is None or not angle.is_significant:
-        return angle
-    T_world, near_deg = graph.T_world_keyframes, angle.angle_deg
-    again = measure_vertical_angle(points_of, T_world, graph.travel_m, config=config.refine, near_deg=near_deg)
-    return again if again is not None and again.is_significant else angle
-
-
 def _correction_deg(angle: VerticalAngle | None) -> float:
     return 0.0 if angle is None else angle.correction_deg
-
-
-def _round(
-    graph: PoseGraph,
-    aligned: Aligned,
-    angle: VerticalAngle | None,
-    config: Config,
-    end_s: float,
-    shared_within: int,
-    progress: Progress,
-    title: str,
-) -> _Round | None:
-    """Register submaps by the current poses, and solve the graph; None if no pair could be registered."""
-    T_world, travel_m = graph.T_world_keyframes.copy(), graph.travel_m
-    pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
-    in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, aligned, T_world, config=config.refine))
-    tried = list(progress(in_time, len(pairs), title))
-    registered = [one for one in tried if one is not None]
-    if not registered:
-        return None
-    estimate, noise_factors = graph.adjust(registered, shared_within=shared_within)
-    return _Round(angle, len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
 
 
 def register_pairs(

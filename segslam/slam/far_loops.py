@@ -38,7 +38,7 @@ class FarLoops:
         graph: Graph,
         prepared: Callable[[int], PreparedScan],
         confirmation: Confirmation,
-        forbidden: frozenset[tuple[int, int]] = frozenset(),
+        forbidden: frozenset[tuple[int, int]],
     ) -> None:
         """`forbidden`: pairs (newer, older) of keyframes that are never tried."""
         self._config, self._graph = config, graph

@@ -17,7 +17,7 @@ from segslam.keyframes import Clouds, Submaps
 from segslam.registration.hypotheses import anywhere
 from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops
-from segslam.slam.loop_edits import NO_EDITS, LoopEdits
+from segslam.slam.loop_edits import LoopEdits
 from segslam.verification import register_near, register_prepared
 from segslam.verification.score import MISLED
 
@@ -39,9 +39,9 @@ class LoopCloser:
         graph: Graph,
         clouds: Callable[[], Clouds],
         labeller: Labeller,
-        edits: LoopEdits = NO_EDITS,
+        edits: LoopEdits,
         *,
-        is_known: bool = False,
+        is_known: bool,
     ) -> None:
         """`clouds` provides the points of keyframes; `labeller` computes geometric labels of gathered clouds.
 
@@ -52,7 +52,7 @@ class LoopCloser:
         self._is_known = is_known
         self._config = config
         self._graph = graph
-        self._detector = ProximityDetector(config.proximity)
+        self.detector = ProximityDetector(config.proximity)
         self.submaps = Submaps(config, clouds, labeller, lambda: graph.motion_variance)
         self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         self._confirmation = Confirmation(graph)
@@ -84,7 +84,7 @@ class LoopCloser:
     def attempt(self, keyframe_id: int, watch: Stopwatch, *, below: int | None = None) -> tuple[LoopAttempt, ...]:
         """Propose and try loops for a keyframe; with `below`, only with smaller ids, those of earlier sessions."""
         with watch("propose"):
-            candidates = self._detector.candidates(
+            candidates = self.detector.candidates(
                 keyframe_id,
                 self._graph.T_world_keyframes,
                 self._graph.travel_m,
@@ -92,15 +92,17 @@ class LoopCloser:
                 below=below,
             )
         by_hand = [self._far.candidate(keyframe_id, target_id) for target_id in self._edits.targets(keyframe_id)]
-        new = [c for c in (*by_hand, *candidates) if (c.source_id, c.target_id) not in self._tried]
-        near = self._tried_in_turn(_once_each(new), watch)
+        new = {one.pair: one for one in reversed((*by_hand, *candidates)) if one.pair not in self._tried}
+        near = tuple(attempt for candidate in reversed(new.values()) for attempt in self._attempts(candidate, watch))
+        self._take(near)
         is_first_time = below is None and keyframe_id in self._unsearched
         self._unsearched.discard(keyframe_id)
-        return (*near, *self._far_loops(keyframe_id, watch)) if is_first_time and not _has_closure(near) else near
-
-    def note_estimate(self, weights: dict[tuple[int, int], float]) -> None:
-        """Note the result of an optimisation: closures with weight shorten the chains between keyframes."""
-        self._detector.note_estimate(weights)
+        has_closure = any(isinstance(attempt.outcome, LoopClosure) for attempt in near)
+        if has_closure or not is_first_time or not self._config.retrieval.enabled:
+            return near
+        far = self._far.attempt(keyframe_id, watch)
+        self._take(far)
+        return (*near, *far)
 
     def search_again(self, watch: Stopwatch, *, end_s: float = math.inf) -> Iterator[LoopAttempt]:
         """Try the pairs proposed from the final poses that were not tried before, up to a limit of their number.
@@ -115,19 +117,6 @@ class LoopCloser:
             if most <= 0 or monotonic() > end_s:
                 return
 
-    def _far_loops(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        """Loops found by place recognition."""
-        if not self._config.retrieval.enabled:
-            return ()
-        attempts = self._far.attempt(keyframe_id, watch)
-        self._take(attempts)
-        return attempts
-
-    def _tried_in_turn(self, candidates: list[LoopCandidate], watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        attempts = tuple(attempt for candidate in candidates for attempt in self._attempts(candidate, watch))
-        self._take(attempts)
-        return attempts
-
     def take(self, attempts: tuple[LoopAttempt, ...]) -> None:
         """Add the loops of the newest keyframe that were tried in an earlier run; they are not tried again."""
         self._unsearched.discard(len(self.submaps.T_odom) - 1)
@@ -135,10 +124,10 @@ class LoopCloser:
 
     def _take(self, attempts: tuple[LoopAttempt, ...]) -> None:
         for attempt in attempts:
-            self._tried.add((attempt.candidate.source_id, attempt.candidate.target_id))
+            self._tried.add(attempt.candidate.pair)
             if isinstance(attempt.outcome, LoopClosure):
                 self._graph.add_closure(attempt.outcome)
-                self._detector.note_closure(attempt.outcome)
+                self.detector.note_closure(attempt.outcome)
 
     def _attempts(self, candidate: LoopCandidate, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
         own = Stopwatch()
@@ -147,7 +136,7 @@ class LoopCloser:
                 lambda: self._prepared(candidate.source_id), lambda: self._prepared(candidate.target_id)
             )
         outcome: Alignment | Rejected | None = None
-        is_by_hand = (candidate.source_id, candidate.target_id) in self._edits.added
+        is_by_hand = candidate.pair in self._edits.added
         if self._is_known:
             prior = candidate.T_target_source_prior
             outcome = register_near(source, target, prior, config=self._config, watch=own)
@@ -181,12 +170,3 @@ class LoopCloser:
             return False
         near = candidate.near_probability
         return MISLED * (1.0 - near) <= LEAST_PROBABILITY * near
-
-
-def _once_each(candidates: list[LoopCandidate]) -> list[LoopCandidate]:
-    """The first candidate of each pair."""
-    return list({(one.source_id, one.target_id): one for one in reversed(candidates)}.values())[::-1]
-
-
-def _has_closure(attempts: tuple[LoopAttempt, ...]) -> bool:
-    return any(isinstance(attempt.outcome, LoopClosure) for attempt in attempts)

@@ -62,14 +62,13 @@ class Slam:
         """
         self.config = config or Config()
         self._known = known
-        by_shape = geometric_labels
         self._tracker = Tracker(self.config, odometry=odometry)
-        self._labeller = labeller or by_shape
+        self._labeller = labeller or geometric_labels
         self._labels_by_shape = labeller is None
         self.graph = self._new_graph()
         self._clouds: Clouds = CloudStore(self.config.keyframes.resolution_m)
         self._loops = LoopCloser(
-            self.config, self.graph, lambda: self._clouds, by_shape, edits, is_known=known is not None
+            self.config, self.graph, lambda: self._clouds, geometric_labels, edits, is_known=known is not None
         )
         self._steps: list[tuple[int, int, Transform]] = []
         self._motions: list[Motion] = []
@@ -189,7 +188,7 @@ class Slam:
         for _ in range(ROUNDS):
             if monotonic() >= end_s:
                 break
-            self._loops.note_estimate(estimate.closure_weights)
+            self._loops.detector.note_estimate(estimate.closure_weights)
             found = list(self._loops.search_again(Stopwatch(), end_s=end_s))
             late += found
             if not any(isinstance(attempt.outcome, LoopClosure) for attempt in found):
@@ -240,7 +239,7 @@ class Slam:
             if self.graph.is_due if optimize is None else optimize:
                 with watch("optimize"):
                     estimate = self.graph.optimize()
-                self._loops.note_estimate(estimate.closure_weights)
+                self._loops.detector.note_estimate(estimate.closure_weights)
         return Step(*about, keyframe, attempts, estimate, watch.seconds, motion)
 
     def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:

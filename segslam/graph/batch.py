@@ -1,7 +1,7 @@
 """Optimisation of a whole pose graph from a file."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import compress
 from time import perf_counter
@@ -11,10 +11,10 @@ import gtsam
 import numpy as np
 from scipy.special import chdtrc
 
-from segslam.core.types import SegslamError, Vector
+from segslam.core.types import Mask, SegslamError, Vector
 from segslam.graph import gnc, noise
 from segslam.graph.batch_search import IMPLAUSIBLE, FileProblem, least_squares, plausible, select
-from segslam.graph.edges import Edge, factor_graph, joined, poses_by_id, squared_errors
+from segslam.graph.edges import factor_graph, joined, poses_by_id, squared_errors, values_of
 from segslam.graph.g2o import G2oGraph, parts
 from segslam.graph.levenberg_marquardt import Search, search
 
@@ -71,12 +71,15 @@ def optimize_graph(graph: G2oGraph, *, robust: Robust = "consistent", inlier_pro
     If odometry alone does not connect the graph, `gnc` raises SegslamError, and `consistent` falls back to `cauchy`.
     """
     problem = FileProblem.of(graph, inlier_probability)
-    start = _values(graph)
     robust = _possible(robust, graph, problem)
+    start = values_of(graph.T_world_vertex.values(), graph.T_world_vertex)
+    backbone = gtsam.NonlinearFactorGraph()
+    for vertex in graph.fixed or (next(iter(graph.T_world_vertex)),):  # these fix the world frame
+        backbone.add(gtsam.PriorFactorPose3(vertex, start.atPose3(vertex), noise.first_pose()))
+    backbone.push_back(factor_graph(problem.odometry))
     started = perf_counter()
-    solution = _solve(problem, _anchors(graph, start), start, robust, inlier_probability)
-    seconds = perf_counter() - started
-    return _described(graph, problem, start, solution, robust, seconds)
+    found, weights = _solve(problem, backbone, start, robust, inlier_probability)
+    return _described(graph, problem, start, found, weights > 0.0, robust, perf_counter() - started)
 
 
 def _possible(robust: Robust, graph: G2oGraph, problem: FileProblem) -> Robust:
@@ -98,13 +101,12 @@ def _possible(robust: Robust, graph: G2oGraph, problem: FileProblem) -> Robust:
 
 def _solve(
     problem: FileProblem,
-    anchors: gtsam.NonlinearFactorGraph,
+    backbone: gtsam.NonlinearFactorGraph,
     start: gtsam.Values,
     robust: Robust,
     inlier_probability: float,
 ) -> tuple[Search, Vector]:
     """The poses, and the weight of each closure: 0 if it was rejected."""
-    backbone = joined(anchors, factor_graph(problem.odometry))
     weights = np.ones(len(problem.closures))
     if robust in ("gnc", "consistent"):
         truncated = gnc.TruncatedProblem(backbone, problem.closures, problem.inlier_bound)
@@ -112,7 +114,7 @@ def _solve(
         return solution.search, solution.weights
     if robust == "none":
         factors = joined(backbone, factor_graph(problem.closures))
-        return least_squares(factors, start, redundancy=problem.redundancy(weights)), weights
+        return least_squares(factors, start, redundancy=problem.redundancy(len(weights))), weights
     kernel = noise.robust_kernel(robust, noise.inlier_bound(inlier_probability))
     return search(joined(backbone, factor_graph(problem.closures, kernel=kernel)), start), weights
 
@@ -121,21 +123,19 @@ def _described(
     graph: G2oGraph,
     problem: FileProblem,
     start: gtsam.Values,
-    solution: tuple[Search, Vector],
+    found: Search,
+    kept: Mask,
     robust: Robust,
     seconds: float,
 ) -> Optimized:
-    found, weights = solution
     odometry, closures = factor_graph(problem.odometry), factor_graph(problem.closures)
     before, after = squared_errors(closures, start), squared_errors(closures, found.values)
     is_outlier = after > problem.inlier_bound
-    kept = weights > 0.0
     fitted = kept if robust == "none" else kept & ~is_outlier
-    spread = np.concatenate([squared_errors(odometry, found.values), after[fitted]])
-    redundancy = problem.redundancy(fitted.astype(float))
-    chi2 = float(spread.sum())
+    chi2 = np.concatenate([squared_errors(odometry, found.values), after[fitted]])
+    redundancy = problem.redundancy(int(fitted.sum()))
     poses = dict(zip(sorted(graph.T_world_vertex), poses_by_id(found.values), strict=True))
-    median, p95, most = np.quantile(spread, [0.5, 0.95, 1.0]).tolist() if len(spread) else (0.0, 0.0, 0.0)
+    median, p95, most = np.quantile(chi2, [0.5, 0.95, 1.0]).tolist() if len(chi2) else (0.0, 0.0, 0.0)
     return Optimized(
         graph=replace(graph, T_world_vertex={vertex: poses[vertex] for vertex in graph.T_world_vertex}),
         robust=robust,
@@ -145,57 +145,32 @@ def _described(
         iterations=found.iterations,
         seconds=seconds,
         num_outliers=int(is_outlier.sum()),
-        outliers=tuple((edge.a, edge.b) for edge, out in zip(problem.closures, is_outlier, strict=True) if out),
-        chi2_per_dof=chi2 / redundancy if redundancy > 0 else None,
+        outliers=tuple((edge.a, edge.b) for edge in compress(problem.closures, is_outlier)),
+        chi2_per_dof=float(chi2.sum()) / redundancy if redundancy > 0 else None,
         chi2_quantiles=(median, p95, most),
-        doubts=(
-            *_warnings(found, chi2, redundancy, float(fitted.mean()) if len(fitted) else 1.0),
-            *_poor_edges([*problem.odometry, *compress(problem.closures, fitted)], spread),
-            *(
-                f"the edges between {a} and {b} contradict each other, and no closure shows which is correct"
-                for a, b in problem.undecided(fitted.astype(float))
-            ),
-        ),
+        doubts=tuple(_warnings(problem, found, fitted, chi2)),
     )
 
 
-def _poor_edges(edges: Sequence[Edge], chi2: Vector) -> Iterator[str]:
-    """The kept edge that fits worst, if its chi-square is improbable for the largest of so many."""
-    if len(chi2) == 0:
-        return
-    worst = int(np.argmax(chi2))
-    if len(chi2) * chdtrc(noise.DEGREES_OF_FREEDOM, chi2[worst]) < IMPLAUSIBLE:
-        edge = edges[worst]
+def _warnings(problem: FileProblem, found: Search, fitted: Mask, chi2: Vector) -> Iterator[str]:
+    """Why a solution may be wrong, by the closures that are `fitted`, and the chi-squares of odometry and of these."""
+    total, redundancy = float(chi2.sum()), problem.redundancy(int(fitted.sum()))
+    if not found.converged:
+        yield "the search stopped before it converged"
+    if not plausible(total, redundancy):
         yield (
-            f"the edge from {edge.a} to {edge.b} is kept with a chi-square of {chi2[worst]:.6g}, far above the "
+            f"the edges fit worse than their information claims: chi-square {total:.6g} with {redundancy} degrees of "
+            f"freedom, probability {chdtrc(redundancy, total):.1g}"
+        )
+    share = float(fitted.mean()) if len(fitted) else 1.0
+    if share < MIN_KEPT:
+        yield f"only {share:.0%} of the closures are inliers"
+    worst = chi2.max(initial=0.0)
+    if len(chi2) and len(chi2) * chdtrc(noise.DEGREES_OF_FREEDOM, worst) < IMPLAUSIBLE:  # the largest of so many
+        edge = [*problem.odometry, *compress(problem.closures, fitted)][int(np.argmax(chi2))]
+        yield (
+            f"the edge from {edge.a} to {edge.b} is kept with a chi-square of {worst:.6g}, far above the "
             f"{noise.DEGREES_OF_FREEDOM} that its information claims"
         )
-
-
-def _warnings(found: Search, chi2: float, redundancy: int, share: float) -> list[str]:
-    doubts = []
-    if not found.converged:
-        doubts.append("the search stopped before it converged")
-    if not plausible(chi2, redundancy):
-        doubts.append(
-            f"the edges fit worse than their information claims: chi-square {chi2:.6g} with {redundancy} degrees of "
-            f"freedom, probability {chdtrc(redundancy, chi2):.1g}"
-        )
-    if share < MIN_KEPT:
-        doubts.append(f"only {share:.0%} of the closures are inliers")
-    return doubts
-
-
-def _values(graph: G2oGraph) -> gtsam.Values:
-    values = gtsam.Values()
-    for vertex, T_world_vertex in graph.T_world_vertex.items():
-        values.insert(vertex, gtsam.Pose3(T_world_vertex))
-    return values
-
-
-def _anchors(graph: G2oGraph, start: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-    """Priors that fix the world frame: on the fixed vertices, or on the first one in the file."""
-    anchors = gtsam.NonlinearFactorGraph()
-    for vertex in graph.fixed or (next(iter(graph.T_world_vertex)),):
-        anchors.add(gtsam.PriorFactorPose3(vertex, start.atPose3(vertex), noise.first_pose()))
-    return anchors
+    for a, b in problem.undecided(fitted):
+        yield f"the edges between {a} and {b} contradict each other, and no closure shows which is correct"

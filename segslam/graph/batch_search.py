@@ -4,14 +4,14 @@ import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, compress
 
 import gtsam
 import numpy as np
 from scipy.special import chdtrc
 
 from segslam.core import geometry
-from segslam.core.types import Mask, Vector
+from segslam.core.types import Mask
 from segslam.graph import noise
 from segslam.graph.closure_pairs import MAX_PAIRED, adjoints, consistent_pairs, ends_m, largest_consistent, neighbours
 from segslam.graph.edges import Edge
@@ -63,19 +63,15 @@ class FileProblem:
         first_id = min(graph.T_world_vertex)
         return cls(len(graph.T_world_vertex), first_id, odometry, closures, groups, noise.inlier_bound(each))
 
-    def redundancy(self, weights: Vector) -> int:
-        """Degrees of freedom of the edges beyond those of the poses, without the closures of weight 0."""
-        num_edges = len(self.odometry) - len(self.contradicting) + int((weights > 0.0).sum())
+    def redundancy(self, num_closures: int) -> int:
+        """Degrees of freedom of odometry and so many closures beyond those of the poses."""
+        num_edges = len(self.odometry) - len(self.contradicting) + num_closures
         return noise.DEGREES_OF_FREEDOM * (num_edges - self.num_vertices + 1)
 
-    def undecided(self, weights: Vector) -> list[tuple[int, int]]:
-        """The neighbours whose contradicting edges no kept closure (of weight above 0) across them decides."""
+    def undecided(self, kept: Mask) -> list[tuple[int, int]]:
+        """The neighbours whose contradicting edges no kept closure across them decides."""
         moved = {id(edge) for edges in self.contradicting for edge in edges}
-        across = [
-            (min(edge.a, edge.b), max(edge.a, edge.b))
-            for edge, weight in zip(self.closures, weights, strict=True)
-            if weight > 0.0 and id(edge) not in moved
-        ]
+        across = [sorted((edge.a, edge.b)) for edge in compress(self.closures, kept) if id(edge) not in moved]
         pairs = [sorted((edges[0].a, edges[0].b)) for edges in self.contradicting]
         return [(a, b) for a, b in pairs if not any(first <= a and b <= last for first, last in across)]
 
@@ -127,8 +123,8 @@ def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Value
     largest = largest_consistent(consistent, np.ones(len(closures), dtype=bool))
 
     def settled(likely: Mask) -> Solution:
-        weights = likely.astype(float)
-        found = least_squares(truncated.weighted(weights), start, redundancy=problem.redundancy(weights))
+        factors = truncated.weighted(likely.astype(float))
+        found = least_squares(factors, start, redundancy=problem.redundancy(int(likely.sum())))
         return _generous(truncated, settle(truncated, found.values, found.iterations))
 
     candidates.append(settled(large_groups(consistent, near, largest)))
@@ -144,7 +140,7 @@ def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Value
 def _is_certain(problem: FileProblem, solution: Solution) -> bool:
     """Whether a solution is plausible and keeps most closures."""
     enough = bool(solution.weights.mean() >= MIN_KEPT)
-    return enough and plausible(2.0 * solution.search.error, problem.redundancy(solution.weights))
+    return enough and plausible(2.0 * solution.search.error, problem.redundancy(int(solution.weights.sum())))
 
 
 def _generous(truncated: TruncatedProblem, solution: Solution) -> Solution:

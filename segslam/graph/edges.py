@@ -62,10 +62,10 @@ def squared_errors(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> V
     return np.array([2.0 * graph.at(i).error(values) for i in range(graph.size())])
 
 
-def values_of(T_world: Transforms) -> gtsam.Values:
-    """Poses under the keys 0, 1, 2, ..."""
+def values_of(T_world: Iterable[Transform], keys: Iterable[int] | None = None) -> gtsam.Values:
+    """Poses under their keys, by default 0, 1, 2, ..."""
     values = gtsam.Values()
-    for key, T_world_key in enumerate(T_world):
+    for key, T_world_key in enumerate(T_world) if keys is None else zip(keys, T_world, strict=True):
         values.insert(key, gtsam.Pose3(T_world_key))
     return values
 

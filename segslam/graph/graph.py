@@ -45,7 +45,7 @@ from segslam.graph.edges import (
 )
 from segslam.graph.g2o import G2oGraph, write_g2o
 from segslam.graph.levenberg_marquardt import Search, Unsolvable, search
-from segslam.graph.motions import Drive, MotionSolution, solve_consistent, solve_gnc, without
+from segslam.graph.motions import Drive, solve_consistent, solve_gnc, without
 from segslam.graph.noise import INLIER_PROBABILITY
 from segslam.graph.steady_drift import noise_factor, steady_drift, turned
 
@@ -77,26 +77,21 @@ class PoseGraph:
         self._has_own_information: list[bool] = []
         """For each motion: whether it was added with its own information."""
         self._closures: list[Edge] = []
+        self._prior = gtsam.NonlinearFactorGraph()
+        """The factor of the first pose."""
         self._backbone = gtsam.NonlinearFactorGraph()
-        """The prior of the first pose and the factors of odometry."""
-        self._closure_factors = gtsam.NonlinearFactorGraph()
-        """The factors of the closures, without robust kernel."""
-        self._robust = gtsam.NonlinearFactorGraph()
-        """The same factors with the robust kernel."""
+        """The same and the factors of odometry."""
         self._inlier_bound = noise.inlier_bound(INLIER_PROBABILITY, error_allowance=config.error_allowance)
         self._kernel = noise.robust_kernel(config.robust, self._inlier_bound)
         self._values = gtsam.Values()
         self._T_world = Rows(np.empty((0, 4, 4)))
         """The poses in `_values`, as an array."""
-        self._num_closures_in_estimate = 0
         self._weights: list[float] = []
         """Weights of the closures in the last estimate."""
         self._chains: Chains | None = None
         """Chains of the last estimate, continued by odometry; None before the first use."""
-        self._adjusted_odometry: list[Edge] = []
-        self._measured: list[Edge] = []
-        """The motions and the relative poses of the last adjustment."""
-        self._noise_factors = (1.0, 1.0)
+        self._adjustment: tuple[list[Edge], list[Edge], tuple[float, float]] | None = None
+        """The motions, the relative poses and the factors of noise of the last adjustment."""
         self._finished = gtsam.Values()
         """Poses before the first adjustment."""
         self._T_odom_last = np.eye(4)
@@ -127,8 +122,7 @@ class PoseGraph:
     @property
     def is_due(self) -> bool:
         """True if enough closures wait for an optimisation: one, or more if the estimate has hundreds already."""
-        waiting = len(self._closures) - self._num_closures_in_estimate
-        return waiting > self._num_closures_in_estimate // CLOSURES_PER_WAITING
+        return len(self._closures) - len(self._weights) > len(self._weights) // CLOSURES_PER_WAITING
 
     def T_world_keyframe(self, keyframe_id: int) -> Transform:  # noqa: N802
         """The current estimate of one pose. Raises SegslamError for an unknown id."""
@@ -157,9 +151,9 @@ class PoseGraph:
                 f"keyframe ids count from 0 without gaps: expected {self.num_keyframes}, got {keyframe_id}"
             )
         if keyframe_id == 0:
-            first = gtsam.Pose3(geometry.nearest_transform(T_odom_keyframe))
-            self._backbone.add(gtsam.PriorFactorPose3(0, first, noise.first_pose()))
-            pose = first
+            pose = gtsam.Pose3(geometry.nearest_transform(T_odom_keyframe))
+            self._prior.add(gtsam.PriorFactorPose3(0, pose, noise.first_pose()))
+            self._backbone.push_back(self._prior)
         else:
             # Rounding in a long chain would stop the solver far from the optimum.
             T_last_new = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
@@ -191,10 +185,7 @@ class PoseGraph:
 
         Raises SegslamError for an unknown keyframe, ValueError for an invalid information matrix.
         """
-        edge = self._edge(closure)
-        self._closures.append(edge)
-        self._closure_factors.add(edge.factor())
-        self._robust.add(edge.factor(kernel=self._kernel))
+        self._closures.append(self._edge(closure))
 
     def covariances(self, keyframe_id: int, others: Indices) -> Matrices:
         """(k, 6, 6) covariance of the pose of a keyframe in each of others, as a tangent of the keyframe.
@@ -269,13 +260,13 @@ class PoseGraph:
         if self._config.final == "none":
             return robust
         try:
-            final = self._solve_final()
-        except Unsolvable as error:
-            logger.warning("no final optimisation, the estimate under the robust kernel remains: %s", error)
+            error = self._solve_final()
+        except Unsolvable as why:
+            logger.warning("no final optimisation, the estimate under the robust kernel remains: %s", why)
             return robust
-        if self._corrects_steady_drift(final.solution.weights):
-            final = self._solve_final()
-        return self._estimate(final.solution.search.error, final.solution.weights)
+        if self._corrects_steady_drift():
+            error = self._solve_final()
+        return self._estimate(error)
 
     def adjust(self, measured: Sequence[Edge], *, shared_within: int = 0) -> tuple[GraphEstimate, tuple[float, float]]:
         """The estimate with further relative poses, after `finish`, and factors of noise (`solve_adjusted`).
@@ -283,68 +274,60 @@ class PoseGraph:
         Rejected closures and motions stay rejected. `measured` replaces that of an earlier call. Measurements of at
         most `shared_within` keyframes' distance show the rotation that all motions share, which is removed for it.
         """
-        kept = [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
-        odometry = without_shared_rotation(self._kept_odometry(), measured, shared_within)
-        found, factors = solve_adjusted(self._prior(), odometry, kept, measured, self._values, self._kernel)
-        if not self._measured:
+        odometry, closures = without_shared_rotation(self._kept_odometry(), measured, shared_within), self._kept()
+        found, factors = solve_adjusted(self._prior, odometry, closures, measured, self._values, self._kernel)
+        if self._adjustment is None:
             self._finished = self._values
-        self._take(found.values)
-        self._adjusted_odometry, self._measured, self._noise_factors = odometry, list(measured), factors
-        return self._estimate(found.error, self._weights), factors
+        self._take(found.values, self._weights)
+        self._adjustment = odometry, list(measured), factors
+        return self._estimate(found.error), factors
 
     def drop_adjustment(self) -> None:
         """Return to the result of `finish`."""
-        self._take(self._finished)
-        self._adjusted_odometry, self._measured, self._noise_factors = [], [], (1.0, 1.0)
+        self._take(self._finished, self._weights)
+        self._adjustment = None
 
-    def _solve_final(self) -> MotionSolution:
+    def _solve_final(self) -> float:
+        """Take the final solution; returns its error."""
         claimed_bound = noise.inlier_bound(INLIER_PROBABILITY)
-        drive = Drive(self._prior(), self._closures, self.travel_m, self._inlier_bound, claimed_bound)
+        drive = Drive(self._prior, self._closures, self.travel_m, self._inlier_bound, claimed_bound)
         if self._config.final == "gnc":
             final = solve_gnc(drive, self._odometry, self._values)
         else:
             final = solve_consistent(drive, self._odometry, self._values, self._rejected_motions())
         self._rejected = final.rejected
         self._rebuild_backbone()
-        self._take(final.solution.search.values)
-        return final
+        self._take(final.solution.search.values, final.solution.weights)
+        return final.solution.search.error
 
-    def _corrects_steady_drift(self, weights: Vector) -> bool:
+    def _corrects_steady_drift(self) -> bool:
         """Correct a steady drift of the heading, if that explains a drift beyond the tolerated errors."""
-        kept = [edge for edge, weight in zip(self._closures, weights, strict=True) if weight > 0.0]
         growth = np.column_stack([np.diff(self.travel_m), np.nan_to_num(np.diff(self._time_s.all()))])
         growth[np.array(self._has_own_information, dtype=bool) | self._rejected_motions()] = 0.0
         raised = self._config
         self.use_odometry_noise(0.0, 0.0)
-        tolerated = self._config.error_allowance
-        found = steady_drift(self._prior(), self._kept_odometry(), kept, growth, self._values, tolerated=tolerated)
+        found = steady_drift(
+            self._prior, self._kept_odometry(), self._kept(), growth, self._values, tolerated=raised.error_allowance
+        )
         if found is None:
             self.use_odometry_noise(raised.odometry_sigma_m, raised.odometry_sigma_deg)
             return False
         self._odometry = turned(self._odometry, growth, found.rates)
         self._multiply_noise(found.noise_factor)
-        self._take(found.values)
+        self._take(found.values, self._weights)
         return True
 
     def write_g2o(self, path: Path) -> None:
         """Poses, odometry and closures (without robust kernel) as g2o text."""
-        poses = dict(enumerate(self.T_world_keyframes))
-        write_g2o(path, G2oGraph(poses, self._kept_odometry() + self._closures))
+        write_g2o(path, G2oGraph(dict(enumerate(self.T_world_keyframes)), self._kept_odometry() + self._closures))
 
     def write_adjusted_g2o(self, path: Path) -> None:
         """Poses and all edges of the last estimate, those of the adjustment included, as g2o text.
 
         The information is that with which an edge acts: rejected closures are omitted, robust weights are applied.
         """
-        kept = [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
-        edges = weighted_edges(
-            self._adjusted_odometry or self._kept_odometry(),
-            kept,
-            self._measured,
-            self._noise_factors,
-            self._values,
-            self._kernel,
-        )
+        odometry, measured, factors = self._adjustment or (self._kept_odometry(), [], (1.0, 1.0))
+        edges = weighted_edges(odometry, self._kept(), measured, factors, self._values, self._kernel)
         write_g2o(path, G2oGraph(dict(enumerate(self.T_world_keyframes)), edges))
 
     def _edge(self, closure: LoopClosure) -> Edge:
@@ -359,33 +342,31 @@ class PoseGraph:
         """(n - 1,) True for motions that the last final optimisation rejected."""
         return np.concatenate([self._rejected, np.zeros(len(self._odometry) - len(self._rejected), dtype=bool)])
 
+    def _kept(self) -> list[Edge]:
+        """The closures that the last estimate kept."""
+        return [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
+
     def _kept_odometry(self) -> list[Edge]:
         return without(self._odometry, self._rejected_motions())
 
     def _multiply_noise(self, factor: float) -> None:
         self.use_odometry_noise(factor * self._config.odometry_sigma_m, factor * self._config.odometry_sigma_deg)
 
-    def _prior(self) -> gtsam.NonlinearFactorGraph:
-        """The factor of the first pose."""
-        prior = gtsam.NonlinearFactorGraph()
-        prior.add(self._backbone.at(0))
-        return prior
-
     def _rebuild_backbone(self) -> None:
-        self._backbone = joined(self._prior(), factor_graph(self._kept_odometry()))
+        self._backbone = joined(self._prior, factor_graph(self._kept_odometry()))
         self._chains = None
 
     def _optimize(self, tolerance: float) -> GraphEstimate:
-        factors, start = joined(self._backbone, self._robust), self._linked()
+        factors = joined(self._backbone, factor_graph(self._closures, kernel=self._kernel))
+        start = self._linked()
         try:
             found = search(factors, start, tolerance=tolerance)
         except Unsolvable as error:
             logger.warning("the poses remain as they were before the last loops: %s", error)
             found = Search(start, factors.error(start), 0, converged=False)
-        self._take(found.values)
-        errors = np.sqrt(squared_errors(self._closure_factors, self._values))
-        weights = [1.0 if self._kernel is None else self._kernel.weight(float(error)) for error in errors]
-        return self._estimate(found.error, weights)
+        errors = np.sqrt(squared_errors(factor_graph(self._closures), found.values))
+        self._take(found.values, [1.0 if self._kernel is None else self._kernel.weight(float(one)) for one in errors])
+        return self._estimate(found.error)
 
     def _linked(self) -> gtsam.Values:
         """The last estimate, with segments between breaks moved to satisfy consistent closures."""
@@ -396,16 +377,14 @@ class PoseGraph:
         likely = largest_consistent(consistent, np.ones(len(consistent), dtype=bool))
         return values_of(relinked(odometry, self._closures, self.T_world_keyframes, likely))
 
-    def _take(self, values: gtsam.Values) -> None:
-        """Store values that include all closures so far."""
-        self._values = values
+    def _take(self, values: gtsam.Values, weights: Iterable[float]) -> None:
+        """Store poses, and the weights of all closures so far."""
+        self._values, self._weights = values, list(map(float, weights))
         self._T_world = Rows(poses_by_id(values))
         self._chains = None
-        self._num_closures_in_estimate = len(self._closures)
 
-    def _estimate(self, error: float, weights: Iterable[float]) -> GraphEstimate:
+    def _estimate(self, error: float) -> GraphEstimate:
         pairs = [(closure.b, closure.a) for closure in self._closures]
-        self._weights = list(map(float, weights))
         return GraphEstimate(
             dict(enumerate(self.T_world_keyframes)),
             float(error),

@@ -7,8 +7,8 @@ import gtsam
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.types import Indices, Points, Transform
-from segslam.graph.edges import Edge, Transforms, factor_graph, joined, poses_by_id, values_of
+from segslam.core.types import Indices, Points
+from segslam.graph.edges import Edge, Transforms, factor_graph, poses_by_id, values_of
 from segslam.graph.levenberg_marquardt import search
 
 GAUGE = geometry.tangent(rotation_rad=[0.1, 0.1, 10.0], translation_m=1e4)
@@ -38,25 +38,11 @@ class PositionedGraph:
 
         `precisions` (n, 3): inverse variance of each axis (1 / m^2); 0 for an unknown one. Raises Unsolvable.
         """
-        values = search(self._with_fixes(start, keys, points, positions, precisions), values_of(start)).values
-        return poses_by_id(values)
-
-    def covariance(
-        self, T: Transforms, keys: Indices, points: Points, positions: Points, precisions: Points, *, key: int
-    ) -> np.ndarray:
-        """(6, 6) covariance of the pose `key` at the solution `T`, tangent in its own frame."""
-        graph = self._with_fixes(T, keys, points, positions, precisions)
-        return gtsam.Marginals(graph, values_of(T)).marginalCovariance(key)
-
-    def _with_fixes(
-        self, start: Transforms, keys: Indices, points: Points, positions: Points, precisions: Points
-    ) -> gtsam.NonlinearFactorGraph:
-        fixes = gtsam.NonlinearFactorGraph()
-        first: Transform = geometry.nearest_transform(start[0])
-        fixes.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(first), gtsam.noiseModel.Diagonal.Sigmas(GAUGE)))
+        graph = gtsam.NonlinearFactorGraph(self._factors)
+        first = gtsam.Pose3(geometry.nearest_transform(start[0]))
+        graph.add(gtsam.PriorFactorPose3(0, first, gtsam.noiseModel.Diagonal.Sigmas(GAUGE)))
         for key, point, position, precision in zip(keys, points, positions, precisions, strict=True):
-            if precision.max() <= LEAST_PRECISION:
-                continue
-            model = gtsam.noiseModel.Diagonal.Precisions(np.maximum(precision, LEAST_PRECISION))
-            fixes.add(gtsam.GPSFactorArm(int(key), np.nan_to_num(position), point, model))
-        return joined(self._factors, fixes)
+            if precision.max() > LEAST_PRECISION:
+                model = gtsam.noiseModel.Diagonal.Precisions(np.maximum(precision, LEAST_PRECISION))
+                graph.add(gtsam.GPSFactorArm(int(key), np.nan_to_num(position), point, model))
+        return poses_by_id(search(graph, values_of(start)).values)

@@ -8,6 +8,7 @@ optimisation of loops and breaks therefore applies to placements without change.
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from segslam.core.types import (
     Indices,
     Information,
     LoopClosure,
-    Mask,
     Placement,
     SegslamError,
     Transform,
@@ -82,19 +82,15 @@ class AnchoredGraph:
         at_m = travel_m + BREAK_TRAVEL_M
         self._graph.add_keyframe(keyframe_id + 1, T_odom_keyframe, at_m, information=information, stamp_ns=stamp_ns)
 
-    def add_closure(self, closure: LoopClosure) -> None:
+    def add_closure(self, closure: LoopClosure, others: Sequence[LoopClosure] = ()) -> Any:
         """Raises SegslamError: a localised drive has no loops of its own."""
         raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 
-    weigh_odometry_by = add_closure
+    weigh_odometry_by = consistent_with = add_closure
 
     def covariances(self, keyframe_id: int, others: Indices) -> Matrices:
         """As `PoseGraph.covariances`."""
         return self._graph.covariances(keyframe_id + 1, others + 1)
-
-    def consistent_with(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
-        """As `add_closure`."""
-        raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 
     def place(self, placement: Placement) -> None:
         """Place a keyframe in the map; takes effect in the next optimisation."""

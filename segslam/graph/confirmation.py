@@ -6,7 +6,7 @@ loop, one that contradicts its prior, and one that is less probable than the use
 keyframes, along some metres of travel, are registered, and their poses are consistent with the odometry between them.
 """
 
-from dataclasses import dataclass
+from itertools import compress
 
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason
 from segslam.graph import Graph
@@ -17,25 +17,19 @@ WAITING_M = 40.0
 """Chosen: travel after which an unconfirmed registration is dropped."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Unconfirmed:
-    """A registration that is not yet confirmed by others."""
-
-    closure: LoopClosure
-    candidate: LoopCandidate
-
-
 class Confirmation:
     """The registrations that are not yet confirmed, and their confirmation by later ones."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
-        self._waiting: list[Unconfirmed] = []
+        self._waiting: list[tuple[LoopCandidate, LoopClosure]] = []
 
     def is_waiting(self, keyframe_id: int) -> bool:
         """True if this keyframe may confirm an earlier registration."""
-        at_m = self._graph.travel_m[keyframe_id]
-        self._waiting = [one for one in self._waiting if abs(at_m - self._travel_m(one)) <= WAITING_M]
+        travel_m = self._graph.travel_m
+        self._waiting = [
+            one for one in self._waiting if abs(travel_m[keyframe_id] - travel_m[one[1].source_id]) <= WAITING_M
+        ]
         return bool(self._waiting)
 
     def attempts(
@@ -45,24 +39,18 @@ class Confirmation:
 
         If they confirm each other, the noise of an odometry that contradicts them is increased.
         """
-        newest = Unconfirmed(closure, candidate)
         waiting = self._waiting if self.is_waiting(closure.source_id) else []
-        is_consistent = self._graph.consistent_with(closure, [one.closure for one in waiting]) if waiting else ()
-        consistent = [one for one, keep in zip(waiting, is_consistent, strict=True) if keep]
-        sources = {one.closure.source_id for one in consistent} - {closure.source_id}
+        is_consistent = self._graph.consistent_with(closure, [other for _, other in waiting]) if waiting else ()
+        consistent = list(compress(waiting, is_consistent))
+        sources = {other.source_id for _, other in consistent} - {closure.source_id}
+        travel_m = self._graph.travel_m
         if (
             len(sources) + 1 < MIN_CONSISTENT
-            or max(abs(self._travel_m(newest) - self._travel_m(one)) for one in consistent) < MIN_SPREAD_M
+            or max(abs(travel_m[closure.source_id] - travel_m[source_id]) for source_id in sources) < MIN_SPREAD_M
         ):
-            self._waiting.append(newest)
+            self._waiting.append((candidate, closure))
             shown = f"{len(sources)} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
             return (LoopAttempt(candidate, Rejected(RejectReason.UNCONFIRMED, shown), seconds),)
         self._waiting = []
         self._graph.weigh_odometry_by(closure)
-        return (
-            *(LoopAttempt(one.candidate, one.closure, {}) for one in consistent),
-            LoopAttempt(candidate, closure, seconds),
-        )
-
-    def _travel_m(self, one: Unconfirmed) -> float:
-        return float(self._graph.travel_m[one.closure.source_id])
+        return *(LoopAttempt(*one, {}) for one in consistent), LoopAttempt(candidate, closure, seconds)

@@ -120,7 +120,7 @@ def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Value
     odometry, closures = problem.chain()
     consistent = consistent_pairs(odometry, closures, problem.inlier_bound)
     near = neighbours(ends_m(closures, np.arange(problem.num_vertices, dtype=float)), NEAR_IDS)
-    largest = largest_consistent(consistent, np.ones(len(closures), dtype=bool))
+    largest = largest_consistent(consistent)
 
     def settled(likely: Mask) -> Solution:
         factors = truncated.weighted(likely.astype(float))

@@ -18,7 +18,6 @@ the paper: odometry shared by both stretches cancels if both are driven the same
 
 import math
 from collections.abc import Sequence
-from itertools import accumulate
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,7 +25,7 @@ from scipy.spatial import KDTree
 
 from segslam.core.kernels import kernel
 from segslam.core.types import Indices, Mask, Vector
-from segslam.graph.edges import Edge, Transforms
+from segslam.graph.edges import Edge, Transforms, chained
 from segslam.registration.cliques import maximum_cliques, pack_rows
 
 MAX_PAIRED = 5_000
@@ -48,10 +47,10 @@ def consistent_pairs(odometry: Sequence[Edge], closures: Sequence[Edge], bound: 
     return pairwise_chi2(odometry, closures, enough=bound) <= bound
 
 
-def largest_consistent(consistent: Pairs, among: Mask) -> Mask:
-    """(k,) the largest pairwise-consistent set among some closures."""
-    chosen = np.zeros(len(among), dtype=bool)
-    rows = np.flatnonzero(among)
+def largest_consistent(consistent: Pairs, among: Mask | None = None) -> Mask:
+    """(k,) the largest pairwise-consistent set among some closures, by default all."""
+    rows = np.arange(len(consistent)) if among is None else np.flatnonzero(among)
+    chosen = np.zeros(len(consistent), dtype=bool)
     if len(rows):
         found = maximum_cliques(pack_rows(consistent[np.ix_(rows, rows)]), max_cliques=1, max_nodes=MOST_NODES)
         chosen[rows[found.cliques[0]]] = True
@@ -62,7 +61,7 @@ def pairwise_chi2(
     odometry: Sequence[Edge], closures: Sequence[Edge], *, enough: float = math.inf
 ) -> Float[np.ndarray, "_ _"]:
     """(k, k) chi-square of the loop that two closures make; above `enough`, a lower bound of it, which is faster."""
-    T_world = np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
+    T_world = chained(odometry)
     T_world[:, :3, 3] -= T_world[:, :3, 3].mean(axis=0)  # an origin amid the poses limits rounding errors
     targets, sources = np.array([(edge.a, edge.b) for edge in closures]).T.copy()
     T_world_moved = T_world[targets] @ np.array([edge.T_a_b for edge in closures])

@@ -8,6 +8,7 @@ body to satisfy one closure.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, compress
 from typing import Any
 
 import gtsam
@@ -79,6 +80,11 @@ def poses_by_id(values: gtsam.Values) -> Transforms:
     return poses
 
 
+def chained(odometry: Sequence[Edge]) -> Transforms:
+    """(n, 4, 4) poses by the motions alone, from each vertex 0, 1, 2, ... to the next, in the frame of the first."""
+    return np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
+
+
 def segments(odometry: Sequence[Edge]) -> Indices:
     """(n,) the segment of each keyframe, counted from 0; a break separates two segments."""
     return np.cumsum([False, *(is_break(edge) for edge in odometry)])
@@ -104,11 +110,7 @@ def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Transf
     Segments that already fit the closure that joins them are not moved; segments without one follow the segment before.
     """
     segment = segments(odometry)
-    joining = [
-        closure
-        for closure, use in zip(closures, likely, strict=True)
-        if use and segment[closure.a] != segment[closure.b]
-    ]
+    joining = [edge for edge in compress(closures, likely) if segment[edge.a] != segment[edge.b]]
     if not joining:
         return T_world
     moved = T_world.copy()
@@ -119,21 +121,14 @@ def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Transf
             first = next(number for number in range(1, segment[-1] + 1) if number not in placed)
             row = int(np.argmax(segment == first))
             step = Edge(row - 1, row, geometry.inverse(T_world[row - 1]) @ T_world[row], odometry[row - 1].information)
-        _join(moved, segment, step, placed)
+        if segment[step.a] in placed:
+            end, T_world_end = step.b, moved[step.a] @ step.T_a_b
+        else:
+            end, T_world_end = step.a, moved[step.b] @ geometry.inverse(step.T_a_b)
+        T_new_old = T_world_end @ geometry.inverse(moved[end])
+        off_m = geometry.distance(geometry.inverse(moved[end]) @ T_world_end)
+        if geometry.angle(T_new_old) > np.radians(BREAK_DEG) or off_m > BREAK_M:
+            rows = segment == segment[end]
+            moved[rows] = T_new_old @ moved[rows]
+        placed.add(int(segment[end]))
     return moved
-
-
-def _join(T_world: Transforms, segment: Indices, edge: Edge, placed: set[int]) -> None:
-    """Move the segment at one end of an edge to fit the edge, if it does not yet, and mark it as placed."""
-    if segment[edge.a] in placed:
-        end, T_world_end = edge.b, T_world[edge.a] @ edge.T_a_b
-    else:
-        end, T_world_end = edge.a, T_world[edge.b] @ geometry.inverse(edge.T_a_b)
-    T_new_old = T_world_end @ geometry.inverse(T_world[end])
-    if (
-        geometry.angle(T_new_old) > np.radians(BREAK_DEG)
-        or geometry.distance(geometry.inverse(T_world[end]) @ T_world_end) > BREAK_M
-    ):
-        rows = segment == segment[end]
-        T_world[rows] = T_new_old @ T_world[rows]
-    placed.add(int(segment[end]))

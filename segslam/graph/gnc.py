@@ -163,7 +163,7 @@ def select_consistent(problem: TruncatedProblem, start: gtsam.Values, consistent
 
     `consistent` and `near` (k, k): which pairs of closures are consistent, and which join the same places.
     """
-    best = settle_from(problem, start, largest_consistent(consistent, np.ones(len(consistent), dtype=bool)))
+    best = settle_from(problem, start, largest_consistent(consistent))
     return exchange_groups(problem, better(best, settle(problem, start)), consistent, near)
 
 

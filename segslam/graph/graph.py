@@ -215,8 +215,7 @@ class PoseGraph:
         The closures need not be in the graph, but their keyframes must be.
         """
         edges = [self._edge(closure) for closure in closures]
-        pairs = consistent_pairs(self._kept_odometry(), edges, self._inlier_bound)
-        return largest_consistent(pairs, np.ones(len(edges), dtype=bool))
+        return largest_consistent(consistent_pairs(self._kept_odometry(), edges, self._inlier_bound))
 
     def use_odometry_noise(self, sigma_m: float, sigma_deg: float) -> None:
         """Use the odometry noise measured on this drive (per root metre), if it is above the configured noise.
@@ -373,8 +372,7 @@ class PoseGraph:
         if not self._has_breaks or not self._closures:
             return self._values
         odometry = self._kept_odometry()
-        consistent = consistent_pairs(odometry, self._closures, self._inlier_bound)
-        likely = largest_consistent(consistent, np.ones(len(consistent), dtype=bool))
+        likely = largest_consistent(consistent_pairs(odometry, self._closures, self._inlier_bound))
         return values_of(relinked(odometry, self._closures, self.T_world_keyframes, likely))
 
     def _take(self, values: gtsam.Values, weights: Iterable[float]) -> None:

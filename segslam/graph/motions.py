@@ -12,7 +12,6 @@ to less than that of a motion.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate
 from typing import NamedTuple
 
 import gtsam
@@ -30,7 +29,7 @@ from segslam.graph.closure_pairs import (
     neighbours,
     num_near,
 )
-from segslam.graph.edges import Edge, factor_graph, joined, poses_by_id, values_of
+from segslam.graph.edges import Edge, chained, factor_graph, joined, poses_by_id, values_of
 from segslam.graph.gnc import MIN_GROUP, select_consistent
 
 PLACE_M = 30.0
@@ -171,7 +170,7 @@ def _jump(drive: Drive, odometry: Sequence[Edge], group: Mask, weights: Vector) 
     if against.min() + MOTION_PENALTY >= drive.penalties[group].sum():
         return None
     rows = first + np.flatnonzero(against <= against.min() + 1e-9)
-    T_world = np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
+    T_world = chained(odometry)
     closure = drive.closures[np.flatnonzero(group)[group.sum() // 2]]
     T_drift = T_world[closure.a] @ closure.T_a_b @ geometry.inverse(T_world[closure.b])  # of later poses, by the jump
     T_drift = T_drift if closure.a < closure.b else geometry.inverse(T_drift)

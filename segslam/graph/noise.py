@@ -1,7 +1,6 @@
 """Noise models of the edges: odometry, closures, first pose."""
 
 import math
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -61,8 +60,7 @@ def motion_information(information: Information) -> Information:
     The information of `UNKNOWN_MOTION` is added: it keeps every sum of covariances finite, and changes no other motion.
     Raises ValueError if `information` is not symmetric positive semidefinite.
     """
-    if not is_positive_semidefinite(information):
-        raise ValueError("the information of a motion must be finite, symmetric and positive semidefinite")
+    _check(information, "motion")
     return (information + information.T) / 2 + UNKNOWN_MOTION
 
 
@@ -75,8 +73,7 @@ def closure_information(information: Information) -> Information:
     In directions without information, 1e-10 of the smallest noise's information keeps the sum positive definite.
     Raises ValueError if `information` is not symmetric positive semidefinite.
     """
-    if not is_positive_semidefinite(information):
-        raise ValueError("the information of a closure must be finite, symmetric and positive semidefinite")
+    _check(information, "closure")
     least = np.diag(closure_sigmas() ** -2.0)
     total = information @ np.linalg.solve(information + least, least)  # inverse(inverse(I) + inverse(L)), I may be flat
     return (total + total.T) / 2 + 1e-10 * least
@@ -87,12 +84,14 @@ def closure_sigmas() -> Tangent:
     return geometry.tangent(rotation_rad=math.radians(CLOSURE_SIGMA_DEG), translation_m=CLOSURE_SIGMA_M)
 
 
-def is_positive_semidefinite(matrix: Information) -> bool:
-    """Whether a matrix is finite, symmetric and without a negative eigenvalue, up to rounding."""
-    if not np.isfinite(matrix).all():
-        return False
-    tolerance = 1e-9 * max(float(np.abs(matrix).max()), np.finfo(float).tiny)
-    return bool(np.abs(matrix - matrix.T).max() <= tolerance and np.linalg.eigvalsh(matrix).min() >= -tolerance)
+def _check(information: Information, what: str) -> None:
+    """Raises ValueError unless it is finite, symmetric and without a negative eigenvalue, up to rounding."""
+    if np.isfinite(information).all():
+        tolerance = 1e-9 * max(float(np.abs(information).max()), np.finfo(float).tiny)
+        is_symmetric = np.abs(information - information.T).max() <= tolerance
+        if is_symmetric and np.linalg.eigvalsh(information).min() >= -tolerance:
+            return
+    raise ValueError(f"the information of a {what} must be finite, symmetric and positive semidefinite")
 
 
 def inlier_bound(probability: float, *, error_allowance: float = 1.0) -> float:
@@ -105,10 +104,5 @@ def inlier_bound(probability: float, *, error_allowance: float = 1.0) -> float:
 
 def robust_kernel(name: str, inlier_bound: float) -> Kernel | None:
     """A robust kernel as wide as the bound of inliers; None for least squares (`none`)."""
-    estimators = gtsam.noiseModel.mEstimator
-    kinds: dict[str, Any] = {
-        "huber": estimators.Huber,
-        "cauchy": estimators.Cauchy,
-        "geman-mcclure": estimators.GemanMcClure,
-    }
-    return None if name == "none" else kinds[name].Create(math.sqrt(inlier_bound))
+    kinds = {"huber": "Huber", "cauchy": "Cauchy", "geman-mcclure": "GemanMcClure"}
+    return None if name == "none" else getattr(gtsam.noiseModel.mEstimator, kinds[name]).Create(math.sqrt(inlier_bound))

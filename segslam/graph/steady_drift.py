@@ -85,9 +85,8 @@ def steady_drift(
     for model in ([0], [1], [0, 1]):  # rates by travel, by time, by both
         if not growth[:, model].any(axis=0).all():
             continue
-        rates, at = np.zeros(growth.shape[1]), values
+        rates, corrected, at = np.zeros(growth.shape[1]), list(odometry), values
         for _ in range(3):  # linear estimates, each from the one before
-            corrected = turned(odometry, growth, rates)
             rates[model] += _rates(prior, corrected, closures, growth[:, model], at)
             corrected = turned(odometry, growth, rates)
             found = search(joined(prior, factor_graph(corrected), factor_graph(closures)), at)

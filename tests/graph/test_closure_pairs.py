@@ -71,7 +71,7 @@ def plain_chi2(edges: list[Edge], p: Edge, q: Edge) -> float:
 
 
 def largest(edges: list[Edge], closures: list[Edge]) -> np.ndarray:
-    return largest_consistent(consistent_pairs(edges, closures, BOUND), np.ones(len(closures), dtype=bool))
+    return largest_consistent(consistent_pairs(edges, closures, BOUND))
 
 
 def test_the_chi_square_of_two_closures_is_that_of_plain_sums() -> None:
@@ -189,7 +189,7 @@ def test_one_closure_is_consistent_with_itself() -> None:
 def test_the_largest_set_is_searched_among_the_given_closures() -> None:
     agree = np.eye(6, dtype=bool)
     agree[:3, :3] = agree[3:5, 3:5] = True
-    assert largest_consistent(agree, np.ones(6, dtype=bool)).tolist() == [True] * 3 + [False] * 3
+    assert largest_consistent(agree).tolist() == [True] * 3 + [False] * 3
     assert largest_consistent(agree, np.arange(6) > 1).tolist() == [False] * 3 + [True, True, False]
     assert not largest_consistent(agree, np.zeros(6, dtype=bool)).any()
 

@@ -54,7 +54,7 @@ def test_false_closures_that_outnumber_the_true_ones_of_their_place_are_rejected
     closures = TRUE + FALSE
     problem, truth, agree, near = problem_of(closures)
     is_false = np.arange(len(closures)) >= len(TRUE)
-    most = largest_consistent(agree, np.ones(len(closures), dtype=bool))
+    most = largest_consistent(agree)
     assert most[is_false].all(), "else the false ones are not the majority"
     misled = settle_from(problem, truth, most)
     assert misled.weights[is_false].all(), "else they would be rejected without a trial"

@@ -3,7 +3,7 @@
 Pairs lie along the drive at several distances, and between passes of one place.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -93,17 +93,12 @@ def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: floa
         older = np.array(sorted(rows))
         older = older[travel_m[nodes[row]] - travel_m[nodes[older]] >= min_travel_m]
         older = older[np.abs(places[older, 2] - places[row, 2]) < STOREY_M]
-        for one in _passes(older, travel_m[nodes], min_travel_m):
-            nearest = one[np.argmin(np.linalg.norm(places[one] - places[row], axis=1))]
-            pairs.append((nodes[nearest], nodes[row]))
+        for one in np.split(older, 1 + np.flatnonzero(np.diff(travel_m[nodes[older]]) >= min_travel_m)):
+            if len(one):
+                nearest = one[np.argmin(np.linalg.norm(places[one] - places[row], axis=1))]
+                pairs.append((nodes[nearest], nodes[row]))
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
 def _nodes(travel_m: Vector) -> Indices:
     return np.arange(0, len(travel_m), EVERY)
-
-
-def _passes(rows: Indices, travel_m: Vector, min_travel_m: float) -> Iterator[Indices]:
-    """Rows, ascending, divided where the travel between two of them is at least `min_travel_m`."""
-    if len(rows):
-        yield from np.split(rows, 1 + np.flatnonzero(np.diff(travel_m[rows]) >= min_travel_m))

@@ -13,7 +13,7 @@ from scipy.stats import wilcoxon
 from segslam.core import geometry
 from segslam.core.points import cell_keys, within_range
 from segslam.core.trajectory import Poses
-from segslam.core.types import IndexPairs, Indices, Points, Vector
+from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
 from segslam.odometry.checked import SIGNIFICANT
 
 CELL_M = 1.0
@@ -30,16 +30,14 @@ MIN_PATCHES = 20
 """Chosen: the median of fewer is too uncertain."""
 
 
-def map_thickness_m(
-    points_of: Callable[[int], Points], T_world: Poses, pairs: IndexPairs, *, within_m: float = WITHIN_M
-) -> list[Vector]:
+def map_thickness_m(points_of: Callable[[int], Points], T_world: Poses, pairs: IndexPairs) -> list[Vector]:
     """Standard deviation of points about the plane of each patch that both scans of a pair observe, by pair (m).
 
     `pairs` (k, 2): keyframes that see the same surfaces, of which at most `MOST_PAIRS` are used.
     """
     chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS)).astype(int))]
     return [
-        patch_thickness_m(points_of(int(a)), points_of(int(b)), geometry.inverse(T_world[a]) @ T_world[b], within_m)
+        patch_thickness_m(points_of(int(a)), points_of(int(b)), geometry.inverse(T_world[a]) @ T_world[b])
         for a, b in chosen
     ]
 
@@ -63,13 +61,13 @@ def is_thicker(before_m: Sequence[Vector], after_m: Sequence[Vector]) -> bool:
     return bool(change.any() and wilcoxon(change, alternative="greater").pvalue < SIGNIFICANT)
 
 
-def patch_thickness_m(points_a: Points, points_b: Points, T_a_b: np.ndarray, within_m: float = WITHIN_M) -> Vector:
+def patch_thickness_m(points_a: Points, points_b: Points, T_a_b: Transform) -> Vector:
     """(k,) root mean square distance of the points of two scans to the plane of each flat patch that both observe (m).
 
     The normal of the plane is that of the points of scan a, its position the mean of all points.
     """
-    a = points_a[within_range(points_a, 0.0, within_m)].astype(np.float64)
-    b = geometry.apply(T_a_b, points_b[within_range(points_b, 0.0, within_m)].astype(np.float64))
+    a = points_a[within_range(points_a, 0.0, WITHIN_M)].astype(np.float64)
+    b = geometry.apply(T_a_b, points_b[within_range(points_b, 0.0, WITHIN_M)].astype(np.float64))
     keys, _ = cell_keys(np.vstack([a, b]), CELL_M)
     _, cell = np.unique(keys, return_inverse=True)
     in_a, in_b = cell[: len(a)], cell[len(a) :]

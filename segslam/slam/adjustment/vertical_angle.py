@@ -8,7 +8,7 @@ Positive angles: the points of a scan are too low and have to be raised by the a
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -17,11 +17,9 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig, SensorCalibrationConfig
-from segslam.core.geometry import raising
 from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Scan, Transform, Vector
-from segslam.keyframes import KeyframeSelector
-from segslam.keyframes import downsample_keyframe as thin_keyframe
+from segslam.keyframes import KeyframeSelector, downsample_keyframe
 from segslam.labels.label_files import unlabelled
 from segslam.odometry import KissOdometry, Odometry
 from segslam.registration.refinement import downsample
@@ -41,9 +39,6 @@ BIAS_DEG = 0.05
 Chosen: KITTI 00 shows 0.18 of 0.205 degrees, a campus (NCLT) -0.04 of 0, simulated streets 0.09 of 0.03."""
 SIGNIFICANT_SIGMAS = 2.5
 """Chosen: an angle is significant above so many standard deviations, 0.125 degrees or more."""
-
-LeftOf = Callable[[float], Shown | None]
-"""Returns what pairs show beyond a correction (degrees)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +87,18 @@ def measure_vertical_angle(
     An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
     none, by the method of secants, from no correction and `near_deg`, by default twice the angle that they show.
     """
-    left_of = _left_of(points_of, T_world, travel_m, config)
+    thinned = cache(lambda keyframe_id: downsample(points_of(keyframe_id), config=config))
+    pairs = _pairs(T_world, travel_m)
+
+    def left_of(correction_deg: float) -> Shown | None:
+        """What pairs show beyond a correction."""
+
+        def raised(keyframe_id: int) -> Points:
+            return geometry.raise_beams(thinned(keyframe_id), correction_deg)
+
+        submap_of = Submaps(raised, T_world, travel_m, config=config).submap
+        return shown(pairs, submap_of, T_world, lambda _, points: np.radians(geometry.raising(points))[None])
+
     found = left_of(0.0)
     if found is None:
         return None
@@ -112,21 +118,6 @@ def measure_vertical_angle(
     return VerticalAngle(correction_deg, math.hypot(float(found.sigma[0]) / share, BIAS_DEG), found.num_pairs)
 
 
-def _left_of(points_of: PointsOf, T_world: Poses, travel_m: Vector, config: RefineConfig) -> LeftOf:
-    """What pairs show beyond a correction, for several corrections of the same scans."""
-    thinned = cache(lambda keyframe_id: downsample(points_of(keyframe_id), config=config))
-    pairs = _pairs(T_world, travel_m)
-
-    def left(correction_deg: float) -> Shown | None:
-        def raised(keyframe_id: int) -> Points:
-            return geometry.raise_beams(thinned(keyframe_id), correction_deg)
-
-        submap_of = Submaps(raised, T_world, travel_m, config=config).submap
-        return shown(pairs, submap_of, T_world, lambda _, points: np.radians(raising(points))[None])
-
-    return left
-
-
 class Calibrator:
     """Measures the vertical angle of the scans of one drive, without labels and map. It stores keyframes only."""
 
@@ -134,9 +125,8 @@ class Calibrator:
         self._config = config
         self._odometry = odometry or KissOdometry(config.odometry)
         self._selector = KeyframeSelector(config.keyframes)
-        self._points: list[Points] = []
-        self._T_odom_keyframes: list[Transform] = []
-        self._travel_m: list[float] = []
+        self._kept: list[tuple[Points, Transform, float]] = []
+        """Points, pose and travel of each keyframe."""
 
     @property
     def travel_m(self) -> float:
@@ -147,24 +137,19 @@ class Calibrator:
         """Add the next scan in order of time. Raises BadScan, and ignores the scan, if it cannot be used."""
         registered = self._odometry.register(scan)
         if self._selector.update(registered.T_odom_lidar):
-            kept = thin_keyframe(
+            kept = downsample_keyframe(
                 registered.points, unlabelled(len(registered.points)), config=self._config.keyframes, whole_classes=()
             )[0]
-            self._points.append(downsample(kept, config=self._config.refine))
-            self._T_odom_keyframes.append(registered.T_odom_lidar)
-            self._travel_m.append(self._selector.travel_m)
+            thinned = downsample(kept, config=self._config.refine)
+            self._kept.append((thinned, registered.T_odom_lidar, self.travel_m))
 
     def vertical_angle(self) -> VerticalAngle | None:
         """The remaining vertical angle of the scans so far; None if too few of them determine it."""
-        if not self._points:
+        if not self._kept:
             return None
-        poses, travel_m = np.stack(self._T_odom_keyframes), np.array(self._travel_m)
-        return measure_vertical_angle(
-            self._points.__getitem__,
-            poses,
-            travel_m,
-            config=self._config.refine,
-        )
+        points, T_odom, travel_m = zip(*self._kept, strict=True)
+        refine = self._config.refine
+        return measure_vertical_angle(points.__getitem__, np.stack(T_odom), np.array(travel_m), config=refine)
 
 
 def _pairs(T_world: Poses, travel_m: Vector) -> list[tuple[int, int]]:

@@ -11,7 +11,7 @@ from segslam.output.folder import ADJUSTED_GRAPH
 from segslam.output.log import read_log
 from segslam.run.sessions.recorded import known_of, read_session
 from segslam.slam.adjustment import Sweep, rounds
-from segslam.slam.adjustment.correction import swept
+from segslam.slam.adjustment.sweeps import swept
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

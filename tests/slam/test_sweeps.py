@@ -13,8 +13,7 @@ from segslam.core.config import Config
 from segslam.core.points import voxel_first
 from segslam.core.types import Motion, MotionState, Trajectory
 from segslam.slam.adjustment import Correction, Sweep, Velocities, corrections_of, velocities_of
-from segslam.slam.adjustment.correction import common_sweep, swept
-from segslam.slam.adjustment.sweeps import measure_sweep
+from segslam.slam.adjustment.sweeps import common_sweep, measure_sweep, swept
 
 CONFIG = Config().refine
 NUM, STEP_M, INTERVAL_S = 36, 2.0, 0.2

@@ -20,11 +20,10 @@ from segslam.core.trajectory import Poses
 from segslam.core.types import GraphEstimate, IndexPairs, Record
 from segslam.graph import Edge, PoseGraph
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
-from segslam.slam.adjustment.correction import Sweep, Velocities, corrected_by, corrections_of
 from segslam.slam.adjustment.distortion import PointsOf
 from segslam.slam.adjustment.known import Known
 from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, Submaps, all_pairs
-from segslam.slam.adjustment.sweeps import measure_sweep
+from segslam.slam.adjustment.sweeps import Sweep, Velocities, corrected_by, corrections_of, measure_sweep
 from segslam.slam.adjustment.thickness import is_thicker, map_thickness_m, median_m
 from segslam.slam.adjustment.vertical_angle import VerticalAngle, measure_vertical_angle
 

@@ -52,21 +52,21 @@ def solve_adjusted(
     """
     fixed = [edge for edge in odometry if is_break(edge)]
     groups = [edge for edge in odometry if not is_break(edge)], list(measured)
-    kernels = None, kernel
     factors = np.ones(2)
     rng = np.random.default_rng(0)
 
-    def solved(groups: Sequence[Sequence[Edge]], closures: Sequence[Edge], start: gtsam.Values) -> Search:
-        parts = [factor_graph(group, kernel=one) for group, one in zip(groups, kernels, strict=True)]
-        return search(joined(prior, factor_graph(fixed), factor_graph(closures, kernel=kernel), *parts), start)
+    def solved(edges: Sequence[Sequence[Edge]], at: gtsam.Values) -> Search:
+        moving, relative, loops = edges
+        robust = factor_graph(loops, kernel=kernel), factor_graph(moving), factor_graph(relative, kernel=kernel)
+        return search(joined(prior, factor_graph(fixed), *robust), at)
 
     for _ in range(ROUNDS):
         scaled = [_scaled(group, float(factor)) for group, factor in zip(groups, factors, strict=True)]
-        found = solved(scaled, closures, start)
+        found = solved([*scaled, closures], start)
         start = found.values
         T_world = poses_by_id(start)
         exact = [_simulated(group, T_world, rng) for group in (*scaled, closures)]
-        simulated = solved(exact[:2], exact[2], values_of(T_world))
+        simulated = solved(exact, values_of(T_world))
         change = np.array(
             [
                 np.sqrt(_median_chi2(real, start) / _median_chi2(made, simulated.values))

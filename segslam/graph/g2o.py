@@ -58,11 +58,14 @@ def read_g2o(path: Path) -> G2oGraph:
     Raises SegslamError that names file and line: an unknown tag, a broken line, a vertex missing or twice there,
     an information that is not positive definite, a vertex without a chain of edges to the first, no vertex at all.
     """
-    fields, line_numbers = _read_fields(path)
-    vertices, edges, fixes = (_table(path, tag, line_numbers[tag], fields[tag]) for tag in (VERTEX, EDGE, FIX))
+    lines = _read_lines(path)
+    vertices, edges, fixes = (_table(path, tag, lines[tag]) for tag in (VERTEX, EDGE, FIX))
     if not vertices.ids:
         raise SegslamError(f"{path}: holds no vertex; a graph needs lines of {VERTEX}")
-    row_of = _row_of_vertex(vertices)
+    row_of: dict[int, int] = {}
+    for row, (vertex,) in enumerate(vertices.ids):
+        if row_of.setdefault(vertex, row) != row:
+            raise vertices.refusal(row, f"vertex {vertex} is in line {vertices.line_numbers[row_of[vertex]]} already")
     for table in (edges, fixes):
         for row, vertex in ((row, vertex) for row, ids in enumerate(table.ids) for vertex in ids):
             if vertex not in row_of:
@@ -98,22 +101,20 @@ def parts(vertices: Iterable[int], edges: Iterable[Edge]) -> Indices:
     return connected_components(adjacency, directed=False)[1]
 
 
-def _read_fields(path: Path) -> tuple[dict[str, list[list[str]]], dict[str, list[int]]]:
-    """The fields after each tag, a list a line, and the numbers of those lines."""
+def _read_lines(path: Path) -> dict[str, list[tuple[int, list[str]]]]:
+    """The lines of each tag: their numbers, and the fields after the tag."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(f"{unreadable(path, 'pose graph', error)}; give a g2o file") from error
-    fields: dict[str, list[list[str]]] = {tag: [] for tag in NUM_FIELDS}
-    line_numbers: dict[str, list[int]] = {tag: [] for tag in NUM_FIELDS}
+    lines: dict[str, list[tuple[int, list[str]]]] = {tag: [] for tag in NUM_FIELDS}
     for number, line in enumerate(text.split("\n"), start=1):
         tag, *rest = line.partition("#")[0].split() or [""]
         if len(rest) == NUM_FIELDS.get(tag):
-            fields[tag].append(rest)
-            line_numbers[tag].append(number)
+            lines[tag].append((number, rest))
         elif tag:
             raise SegslamError(f"{path}:{number}: {_complaint(tag, len(rest))}")
-    return fields, line_numbers
+    return lines
 
 
 def _complaint(tag: str, num_fields: int) -> str:
@@ -124,10 +125,11 @@ def _complaint(tag: str, num_fields: int) -> str:
     return f"{tag} takes {NUM_FIELDS[tag]} numbers, found {num_fields}; correct or remove the line"
 
 
-def _table(path: Path, tag: str, line_numbers: list[int], fields: list[list[str]]) -> _Table:
+def _table(path: Path, tag: str, lines: list[tuple[int, list[str]]]) -> _Table:
     num_ids = 2 if tag == EDGE else 1
-    table = _Table(path, line_numbers, [], np.empty((len(fields), NUM_FIELDS[tag] - num_ids)))
-    for row, texts in enumerate(fields):
+    numbers = np.empty((len(lines), NUM_FIELDS[tag] - num_ids))
+    table = _Table(path, [number for number, _ in lines], [], numbers)
+    for row, (_, texts) in enumerate(lines):
         try:
             table.ids.append([int(text) for text in texts[:num_ids]])
             table.numbers[row] = texts[num_ids:]
@@ -138,14 +140,6 @@ def _table(path: Path, tag: str, line_numbers: list[int], fields: list[list[str]
     for broken in np.flatnonzero(~np.isfinite(table.numbers).all(axis=1)):
         raise table.refusal(broken, "every number must be finite")
     return table
-
-
-def _row_of_vertex(vertices: _Table) -> dict[int, int]:
-    row_of: dict[int, int] = {}
-    for row, (vertex,) in enumerate(vertices.ids):
-        if row_of.setdefault(vertex, row) != row:
-            raise vertices.refusal(row, f"vertex {vertex} is in line {vertices.line_numbers[row_of[vertex]]} already")
-    return row_of
 
 
 def _poses(table: _Table) -> Transforms:

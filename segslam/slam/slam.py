@@ -63,8 +63,7 @@ class Slam:
         self.config = config or Config()
         self._known = known
         self._tracker = Tracker(self.config, odometry=odometry)
-        self._labeller = labeller or geometric_labels
-        self._labels_by_shape = labeller is None
+        self._labeller = labeller
         self.graph = self._new_graph()
         self._clouds: Clouds = CloudStore(self.config.keyframes.resolution_m)
         self._loops = LoopCloser(
@@ -72,7 +71,6 @@ class Slam:
         )
         self._steps: list[tuple[int, int, Transform]] = []
         self._motions: list[Motion] = []
-        self._since_keyframe: list[Motion] = []
         self._keyframe_rows: list[int] = []
         self._attempts: list[LoopAttempt] = []
         self._is_finished = False
@@ -213,20 +211,19 @@ class Slam:
         about = step.scan_index, step.stamp_ns, step.T_odom_lidar
         self._steps.append(about)
         self._motions.append(motion)
-        self._since_keyframe.append(motion)
         attempts: tuple[LoopAttempt, ...] = ()
         estimate = None
         if keyframe is not None:
             self._clouds.keep(keyframe)
+            since_last = self._motions[self._keyframe_rows[-1] + 1 :] if self._keyframe_rows else self._motions
             self._keyframe_rows.append(len(self._steps) - 1)
             self.graph.add_keyframe(
                 keyframe.id,
                 keyframe.T_odom_keyframe,
                 keyframe.travel_m,
-                information=information_of(self._since_keyframe),
+                information=information_of(since_last),
                 stamp_ns=keyframe.stamp_ns,
             )
-            self._since_keyframe = []
             with watch("recognise"):
                 place = self._loops.add(
                     keyframe.T_odom_keyframe,
@@ -248,7 +245,7 @@ class Slam:
             labels = computed(registered.labels)
             is_unlabelled = not labels.any()
             if is_unlabelled:
-                labels = self._labeller(registered.points)
+                labels = (self._labeller or geometric_labels)(registered.points)
         with tracked.watch("keyframe"):
             points, labels, rows = downsample_keyframe(
                 registered.points,
@@ -265,5 +262,5 @@ class Slam:
             points=points,
             labels=labels,
             intensities=None if registered.intensities is None else registered.intensities[rows],
-            labelled_by_shape=True if is_unlabelled and self._labels_by_shape else None,
+            labelled_by_shape=True if is_unlabelled and self._labeller is None else None,
         )

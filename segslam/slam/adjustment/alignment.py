@@ -5,13 +5,12 @@ under the Geman-McClure kernel, which is wide at first and then as wide as surfa
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from segslam.core import geometry
 from segslam.core.kernels import kernel
-from segslam.core.types import Information, Points, Transform, Vector
+from segslam.core.types import Information, Points, Transform
 from segslam.registration.refinement import LightSurface
 
 SEARCH_M = (1.0, 0.8, 0.7)
@@ -45,7 +44,7 @@ def align(source: LightSurface, target: LightSurface, T_target_source: Transform
     """The pose that aligns source and target near an initial guess; None if it does not converge."""
     if min(len(source), len(target)) < MIN_PAIRED:
         return None
-    points, normals = _sample(source)
+    points, normals = sample(source)
     for iteration in range(20):
         nearest, distance_m = target.nearest(geometry.apply(T_target_source, points))
         paired = distance_m < SEARCH_M[min(iteration, len(SEARCH_M) - 1)]
@@ -70,38 +69,10 @@ def align(source: LightSurface, target: LightSurface, T_target_source: Transform
     return Alignment(T_target_source, hessian / (squares / weights), num / len(points))
 
 
-def _sample(source: LightSurface) -> tuple[Points, Points]:
+def sample(source: LightSurface) -> tuple[Points, Points]:
     """At most `MOST_POINTS` points of a surface, and their normals."""
     rows = np.arange(0, len(source), max(1, -(-len(source) // MOST_POINTS)))
     return source.points[rows], source.normals_at(rows)
-
-
-class Pairs(NamedTuple):
-    """The pairs of points of an alignment: of source and target, each in its own frame."""
-
-    source: Points
-    target: Points
-    normals: Points
-    """Normals of the target."""
-    normals_source: Points
-    """The same normals in the frame of the source."""
-    residual_m: Vector
-    weights: Vector
-
-
-def pairs_of(source: LightSurface, target: LightSurface, T_target_source: Transform) -> Pairs:
-    """The pairs of points at the pose of an alignment, as its last steps choose and weigh them."""
-    points_source, own_normals = _sample(source)
-    moved = geometry.apply(T_target_source, points_source)
-    nearest, distance_m = target.nearest(moved)
-    normals = target.normals_at(nearest)
-    normals_source = normals @ T_target_source[:3, :3]
-    same = np.abs(np.einsum("ij,ij->i", normals_source, own_normals)) >= SAME_NORMAL
-    rows = np.flatnonzero(same & (distance_m < SEARCH_M[-1]))
-    points = target.points[nearest[rows]]
-    residual_m = np.einsum("ij,ij->i", moved[rows] - points, normals[rows])
-    weights = (1.0 + (residual_m / KERNEL_M[-1]) ** 2) ** -2
-    return Pairs(points_source[rows], points, normals[rows], normals_source[rows], residual_m, weights)
 
 
 @kernel(

@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses
-from segslam.core.types import Points, Vector
+from segslam.core.types import Points, Transform, Vector
 from segslam.registration.refinement import LightSurface
-from segslam.slam.adjustment.alignment import align, pairs_of
+from segslam.slam.adjustment.alignment import KERNEL_M, SAME_NORMAL, SEARCH_M, align, sample
 
 PointsOf = Callable[[int], Points]
 """Returns the points of a keyframe, by id, in its own frame."""
@@ -46,22 +46,11 @@ def shown(
     `T_world` (n, 4, 4): poses of the keyframes.
     """
     found = []
-    for target, source in pairs:
-        clouds = surface_of(source), surface_of(target)
-        aligned = align(*clouds, geometry.inverse(T_world[target]) @ T_world[source])
-        if aligned is None:
-            continue
-        matched = pairs_of(*clouds, aligned.T_target_source)
-        pose = np.column_stack([np.cross(matched.source, matched.normals_source), matched.normals_source])
-        columns = np.einsum("mij,ij->im", corrects(source, matched.source), matched.normals_source)
-        columns -= np.einsum("mij,ij->im", corrects(target, matched.target), matched.normals)
-        weighted = pose.T * matched.weights
-        coupling = weighted @ columns
-        poses = np.linalg.lstsq(weighted @ pose, np.column_stack([weighted @ matched.residual_m, coupling]))[0]
-        gradient = coupling.T @ poses[:, 0] - columns.T @ (matched.weights * matched.residual_m)
-        curvature = matched.weights @ columns**2 - np.einsum("ij,ij->j", coupling, poses[:, 1:])
-        variance = float(matched.weights @ matched.residual_m**2 / matched.weights.sum())
-        found.append(np.array([gradient, curvature]) / variance)
+    for ids in pairs:
+        target, source = map(surface_of, ids)
+        aligned = align(source, target, geometry.inverse(T_world[ids[0]]) @ T_world[ids[1]])
+        if aligned is not None:
+            found.append(_of_pair(ids, source, target, aligned.T_target_source, corrects))
     if len(found) < MIN_PAIRS:
         return None
     gradients, curvatures = np.array(found).transpose(1, 0, 2)
@@ -71,3 +60,28 @@ def shown(
     value = gradients.sum(axis=0) / total
     sigma = np.sqrt(np.sum((gradients - value * curvatures) ** 2, axis=0)) / total
     return Shown(value, sigma, value**2 * total / 2.0, len(found))
+
+
+def _of_pair(
+    ids: tuple[int, int], source: LightSurface, target: LightSurface, T_target_source: Transform, corrects: Corrects
+) -> Float[np.ndarray, "2 m"]:
+    """Gradient and curvature of a pair's likelihood by each correction; points are paired as in the last alignment."""
+    p, own_normals = sample(source)
+    moved = geometry.apply(T_target_source, p)
+    nearest, distance_m = target.nearest(moved)
+    normals = target.normals_at(nearest)
+    normals_source = normals @ T_target_source[:3, :3]
+    same = np.abs(np.einsum("ij,ij->i", normals_source, own_normals)) >= SAME_NORMAL
+    rows = np.flatnonzero(same & (distance_m < SEARCH_M[-1]))
+    p, q, normals, normals_source = p[rows], target.points[nearest[rows]], normals[rows], normals_source[rows]
+    residual_m = np.einsum("ij,ij->i", moved[rows] - q, normals)
+    weights = (1.0 + (residual_m / KERNEL_M[-1]) ** 2) ** -2
+    pose = np.column_stack([np.cross(p, normals_source), normals_source])
+    columns = np.einsum("mij,ij->im", corrects(ids[1], p), normals_source)
+    columns -= np.einsum("mij,ij->im", corrects(ids[0], q), normals)
+    weighted = pose.T * weights
+    coupling = weighted @ columns
+    poses = np.linalg.lstsq(weighted @ pose, np.column_stack([weighted @ residual_m, coupling]))[0]
+    gradient = coupling.T @ poses[:, 0] - columns.T @ (weights * residual_m)
+    curvature = weights @ columns**2 - np.einsum("ij,ij->j", coupling, poses[:, 1:])
+    return np.array([gradient, curvature]) / float(weights @ residual_m**2 / weights.sum())

@@ -146,13 +146,14 @@ def adjust(
     last = _rounds(graph, points_of, velocities, sweep, known, config, end_s, progress)
     if last is None:
         return None
-    of_map = corrected_by(corrections_of(_correction_deg(last.angle), sweep, velocities), points_of)
+    correction_deg = 0.0 if last.angle is None else last.angle.correction_deg
+    of_map = corrected_by(corrections_of(correction_deg, sweep, velocities), points_of)
     ends = np.array([(edge.a, edge.b) for edge in last.registered])
     is_between = np.abs(np.diff(travel_m[ends], axis=1)[:, 0]) >= config.proximity.min_travel_m
     apart = np.diff(ends, axis=1)[:, 0]
     seen_twice = ends[is_between if is_between.any() else apart == apart.max()]  # else seen from farthest apart
     before_m, after_m = (map_thickness_m(of_map, T, seen_twice) for T in (T_before, graph.T_world_keyframes))
-    is_corrected = sweep is not None or _correction_deg(last.angle) != 0.0
+    is_corrected = sweep is not None or correction_deg != 0.0
     raw_before_m = map_thickness_m(points_of, T_before, seen_twice) if is_corrected else before_m
     if is_thicker(before_m, after_m):
         graph.drop_adjustment()
@@ -170,7 +171,7 @@ def adjust(
         seconds=monotonic() - started,
         vertical_deg=None if last.angle is None else last.angle.angle_deg,
         vertical_sigma_deg=None if last.angle is None else last.angle.sigma_deg,
-        correction_deg=_correction_deg(last.angle),
+        correction_deg=correction_deg,
         sweep_s=None if sweep is None else sweep.seconds,
         sweep_sigma_s=None if sweep is None else sweep.sigma_s,
         sweep_from_deg=None if sweep is None else sweep.from_deg,
@@ -207,7 +208,8 @@ def _rounds(
             if again is None or not again.is_significant:
                 break
             angle = again
-        corrections = known.corrections if known else corrections_of(_correction_deg(angle), sweep, velocities)
+        raised_deg = 0.0 if angle is None else angle.correction_deg
+        corrections = known.corrections if known else corrections_of(raised_deg, sweep, velocities)
         shared_within = STEPS[-1] if any(one.raised_deg for one in corrections) else 0
         aligned = of_drives or Submaps(corrected_by(corrections, points_of), T_world, travel_m, config=refine).aligned
         pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
@@ -221,10 +223,6 @@ def _rounds(
         if not last.is_complete:
             break
     return last
-
-
-def _correction_deg(angle: VerticalAngle | None) -> float:
-    return 0.0 if angle is None else angle.correction_deg
 
 
 def register_pairs(

@@ -12,11 +12,11 @@ from scipy.special import chdtrc
 
 from segslam.core import geometry
 from segslam.core.types import Mask
-from segslam.graph import noise
+from segslam.graph import gnc, noise
 from segslam.graph.closure_pairs import MAX_PAIRED, adjoints, consistent_pairs, ends_m, largest_consistent, neighbours
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph
-from segslam.graph.gnc import Solution, TruncatedProblem, better, exchange_groups, large_groups, settle, solve
+from segslam.graph.gnc import Solution, TruncatedProblem
 from segslam.graph.levenberg_marquardt import Search, deeply, search
 
 logger = logging.getLogger(__name__)
@@ -41,7 +41,6 @@ class FileProblem:
     """The edges of a file by their role."""
 
     num_vertices: int
-    first_id: int
     odometry: list[Edge]
     """Edges between consecutive ids; where several contradict each other, one without information."""
     closures: list[Edge]
@@ -60,8 +59,7 @@ class FileProblem:
         odometry += [replace(edges[0], information=noise.UNKNOWN_MOTION) for edges in groups]
         closures = [edge for edge in graph.edges if abs(edge.a - edge.b) != 1 or id(edge) in moved]
         each = 1.0 - (1.0 - inlier_probability) / max(1, len(closures))
-        first_id = min(graph.T_world_vertex)
-        return cls(len(graph.T_world_vertex), first_id, odometry, closures, groups, noise.inlier_bound(each))
+        return cls(len(graph.T_world_vertex), odometry, closures, groups, noise.inlier_bound(each))
 
     def redundancy(self, num_closures: int) -> int:
         """Degrees of freedom of odometry and so many closures beyond those of the poses."""
@@ -77,9 +75,11 @@ class FileProblem:
 
     def chain(self) -> tuple[list[Edge], list[Edge]]:
         """One motion from each vertex to the next, and the closures, with vertices numbered from 0."""
-        motions = {min(edge.a, edge.b): edge for edge in reversed(self.odometry)}  # the first of several stays
-        forwards = [edge if edge.a < edge.b else turned(edge) for _, edge in sorted(motions.items())]
-        return _renumbered(forwards, self.first_id), _renumbered(self.closures, self.first_id)
+        first_of = {min(edge.a, edge.b): edge for edge in reversed(self.odometry)}
+        forwards = [edge if edge.a < edge.b else turned(edge) for _, edge in sorted(first_of.items())]
+        first, groups = forwards[0].a, (forwards, self.closures)
+        motions, closures = ([replace(edge, a=edge.a - first, b=edge.b - first) for edge in each] for each in groups)
+        return motions, closures
 
 
 def plausible(chi2: float, redundancy: int) -> bool:
@@ -108,15 +108,15 @@ def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Value
     groups of rejected closures follow only if the solution is implausible or rejects many closures.
     """
     if not problem.closures:
-        return settle(truncated, least_squares(truncated.weighted(np.ones(0)), start, redundancy=0).values)
+        return gnc.settle(truncated, least_squares(truncated.weighted(np.ones(0)), start, redundancy=0).values)
     candidates = []
     if truncated.inliers(start).mean() >= GOOD_START:
-        candidates.append(_generous(truncated, settle(truncated, start)))
+        candidates.append(_generous(truncated, gnc.settle(truncated, start)))
         if _is_certain(problem, candidates[0]):
             return candidates[0]
     if len(problem.closures) > MAX_PAIRED:
         logger.info("more than %d closures: graduated non-convexity instead of pairwise consistency", MAX_PAIRED)
-        return solve(truncated, start)
+        return gnc.solve(truncated, start)
     odometry, closures = problem.chain()
     consistent = consistent_pairs(odometry, closures, problem.inlier_bound)
     near = neighbours(ends_m(closures, np.arange(problem.num_vertices, dtype=float)), NEAR_IDS)
@@ -125,15 +125,15 @@ def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Value
     def settled(likely: Mask) -> Solution:
         factors = truncated.weighted(likely.astype(float))
         found = least_squares(factors, start, redundancy=problem.redundancy(int(likely.sum())))
-        return _generous(truncated, settle(truncated, found.values, found.iterations))
+        return _generous(truncated, gnc.settle(truncated, found.values, found.iterations))
 
-    candidates.append(settled(large_groups(consistent, near, largest)))
+    candidates.append(settled(gnc.large_groups(consistent, near, largest)))
     best = min(candidates, key=lambda solution: solution.truncated_cost)
     if _is_certain(problem, best):
         return best
     logger.info("the solution is uncertain: searching from other starts")
-    candidates += [settled(largest), solve(truncated, start)]
-    exchanged = [exchange_groups(truncated, solution, consistent, near) for solution in candidates]
+    candidates += [settled(largest), gnc.solve(truncated, start)]
+    exchanged = [gnc.exchange_groups(truncated, solution, consistent, near) for solution in candidates]
     return _generous(truncated, min(exchanged, key=lambda solution: solution.truncated_cost))
 
 
@@ -149,12 +149,7 @@ def _generous(truncated: TruncatedProblem, solution: Solution) -> Solution:
     wider = squared <= GENEROUS * truncated.inlier_bound
     if (wider == (solution.weights > 0.0)).all():
         return solution
-    found = search(truncated.weighted(wider.astype(float)), solution.search.values)
-    return better(solution, settle(truncated, found.values, solution.search.iterations + found.iterations))
-
-
-def _renumbered(edges: list[Edge], first: int) -> list[Edge]:
-    return [Edge(edge.a - first, edge.b - first, edge.T_a_b, edge.information) for edge in edges]
+    return gnc.better(solution, gnc.settle_from(truncated, solution.search.values, wider, solution.search.iterations))
 
 
 def contradicting(odometry: Sequence[Edge]) -> list[list[Edge]]:

@@ -118,10 +118,10 @@ def better(first: Solution, second: Solution) -> Solution:
     return second if second.truncated_cost < first.truncated_cost else first
 
 
-def settle_from(problem: TruncatedProblem, start: gtsam.Values, likely: Mask) -> Solution:
+def settle_from(problem: TruncatedProblem, start: gtsam.Values, likely: Mask, iterations: int = 0) -> Solution:
     """The solution near the optimum, searched from `start`, of some `likely` closures (k,)."""
     found = search(problem.weighted(likely.astype(float)), start)
-    return settle(problem, found.values, found.iterations)
+    return settle(problem, found.values, iterations + found.iterations)
 
 
 def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Values, int]:

@@ -159,10 +159,6 @@ class Submaps:
         made = self.submap(keyframe_id)
         return prepare_scan(made.points, made.labels, config=self._config, seen_from_here=made.seen_from_here)
 
-    def lag(self, keyframe_id: int) -> int:
-        """Number of keyframes back to the nearest one whose submap shares no scan with this one's."""
-        return 1 if self._is_dense([self._clouds().cloud(keyframe_id)[0]]) else MAX_GATHERED + 1
-
     def _is_dense(self, clouds: list[Points]) -> bool:
         downsampled = refinement.downsample(np.vstack(clouds), config=self._config.refine)
         return len(downsampled) >= DENSE_VOXELS

@@ -29,10 +29,6 @@ class LoopEdits:
         """These edits followed by others, which win where the two contradict."""
         return LoopEdits((self.forbidden - later.added) | later.forbidden, (self.added - later.forbidden) | later.added)
 
-    def targets(self, keyframe_id: int) -> list[int]:
-        """The older keyframes with which a loop of this one is to be tried."""
-        return sorted(older for newer, older in self.added if newer == keyframe_id)
-
     def to_json(self) -> str:
         """Text for the options of a log."""
         return json.dumps({"forbidden": sorted(self.forbidden), "added": sorted(self.added)})

@@ -91,7 +91,8 @@ class LoopCloser:
                 self._graph.covariances,
                 below=below,
             )
-        by_hand = [self._far.candidate(keyframe_id, target_id) for target_id in self._edits.targets(keyframe_id)]
+        added = sorted(older_id for newer_id, older_id in self._edits.added if newer_id == keyframe_id)
+        by_hand = [self._far.candidate(keyframe_id, older_id) for older_id in added]
         new = {one.pair: one for one in reversed((*by_hand, *candidates)) if one.pair not in self._tried}
         near = tuple(attempt for candidate in reversed(new.values()) for attempt in self._attempts(candidate, watch))
         self._take(near)

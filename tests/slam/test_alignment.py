@@ -70,5 +70,5 @@ def test_the_gradient_is_the_derivative_of_the_cost() -> None:
 
 def test_a_submap_does_not_reach_across_a_break() -> None:
     travel_m = np.array([0.0, 2.0, 4.0, BREAK_TRAVEL_M + 6.0, BREAK_TRAVEL_M + 8.0])
-    assert members(2, travel_m, reach=2) == [0, 1, 2]
-    assert members(3, travel_m, reach=2) == [3, 4]
+    assert members(2, travel_m) == [0, 1, 2]
+    assert members(3, travel_m) == [3, 4]

@@ -16,7 +16,6 @@ def test_the_later_edit_wins() -> None:
     later = LoopEdits(frozenset({(9, 3)}), frozenset({(5, 1)}))
     assert first.and_then(later) == LoopEdits(frozenset({(6, 2), (9, 3)}), frozenset({(5, 1)}))
     assert first.and_then(LoopEdits()) == first
-    assert first.targets(9) == [3]
 
 
 def test_contradicting_and_impossible_pairs_are_refused() -> None:

@@ -54,14 +54,14 @@ class Submaps:
 
     def _submap(self, keyframe_id: int) -> LightSurface:
         T_keyframe_world = geometry.inverse(self._T_world[keyframe_id])
-        near = members(keyframe_id, self._travel_m, reach=REACH)
+        near = members(keyframe_id, self._travel_m)
         points = np.vstack([geometry.apply(T_keyframe_world @ self._T_world[one], self._scan(one)) for one in near])
         return LightSurface(voxel_means(points, self._refine.voxel_m))
 
 
-def members(keyframe_id: int, travel_m: Vector, *, reach: int) -> list[int]:
-    """The keyframes of a submap: up to `reach` before and after one, without those beyond a break."""
-    near = range(max(0, keyframe_id - reach), min(len(travel_m), keyframe_id + reach + 1))
+def members(keyframe_id: int, travel_m: Vector) -> list[int]:
+    """The keyframes of a submap: up to `REACH` before and after one, without those beyond a break."""
+    near = range(max(0, keyframe_id - REACH), min(len(travel_m), keyframe_id + REACH + 1))
     return [other for other in near if abs(travel_m[other] - travel_m[keyframe_id]) < BREAK_TRAVEL_M]
 
 

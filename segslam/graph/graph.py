@@ -54,7 +54,6 @@ logger = logging.getLogger(__name__)
 RUNNING_TOLERANCE = 1e-3
 """Relative tolerance of the optimisations while running. Chosen: the same trajectories to a centimetre, with a third
 fewer iterations."""
-FINAL_TOLERANCE = 1e-5
 CLOSURES_PER_WAITING = 200
 """Chosen: the graph is optimised after 1 + n / 200 new closures, with n closures in the estimate, so that the time of
 all optimisations grows linearly with the drive. The KITTI drives tried have 86 closures at most."""
@@ -255,7 +254,7 @@ class PoseGraph:
 
         `consistent` also rejects motions of the odometry that closures of more than one place contradict.
         """
-        robust = self._optimize(FINAL_TOLERANCE)
+        robust = self._optimize()
         if self._config.final == "none":
             return robust
         try:
@@ -355,7 +354,7 @@ class PoseGraph:
         self._backbone = joined(self._prior, factor_graph(self._kept_odometry()))
         self._chains = None
 
-    def _optimize(self, tolerance: float) -> GraphEstimate:
+    def _optimize(self, tolerance: float = 1e-5) -> GraphEstimate:
         factors = joined(self._backbone, factor_graph(self._closures, kernel=self._kernel))
         start = self._linked()
         try:

@@ -43,14 +43,12 @@ class KeyframeSelector:
         elif self._T_odom_last is not None:
             self.travel_m += geometry.distance(geometry.inverse(self._T_odom_last) @ T_odom_lidar)
         self._T_odom_last = T_odom_lidar
-        is_keyframe = break_m > 0 or self._T_odom_keyframe is None
-        if self._T_odom_keyframe is not None:
+        if self._T_odom_keyframe is not None and not break_m:
             moved = geometry.inverse(self._T_odom_keyframe) @ T_odom_lidar
-            is_keyframe |= geometry.distance(moved) >= self._config.distance_m
-            is_keyframe |= geometry.angle(moved) >= math.radians(ANGLE_DEG)
-        if is_keyframe:
-            self._T_odom_keyframe = T_odom_lidar
-        return is_keyframe
+            if geometry.distance(moved) < self._config.distance_m and geometry.angle(moved) < math.radians(ANGLE_DEG):
+                return False
+        self._T_odom_keyframe = T_odom_lidar
+        return True
 
 
 def downsample_keyframe(
@@ -144,7 +142,7 @@ class Submaps:
         points, labels = self._clouds().cloud(keyframe_id)
         clouds, all_labels = [points], [labels]
         for neighbour in self._neighbours(keyframe_id, len(self.T_odom) - 1 if newest_id is None else newest_id):
-            if self._is_dense(clouds):
+            if len(refinement.downsample(np.vstack(clouds), config=self._config.refine)) >= DENSE_VOXELS:
                 break
             T_keyframe_neighbour = geometry.inverse(self.T_odom[keyframe_id]) @ self.T_odom[neighbour]
             more, more_labels = self._clouds().cloud(neighbour)
@@ -158,10 +156,6 @@ class Submaps:
         """The submap of a keyframe, prepared for alignment."""
         made = self.submap(keyframe_id)
         return prepare_scan(made.points, made.labels, config=self._config, seen_from_here=made.seen_from_here)
-
-    def _is_dense(self, clouds: list[Points]) -> bool:
-        downsampled = refinement.downsample(np.vstack(clouds), config=self._config.refine)
-        return len(downsampled) >= DENSE_VOXELS
 
     def _neighbours(self, keyframe_id: int, newest_id: int) -> Iterator[int]:
         """Keyframes around one, nearest first, whose relative pose odometry knows better than the size of a voxel."""

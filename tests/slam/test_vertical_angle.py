@@ -13,7 +13,7 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig, SensorCalibrationConfig
 from segslam.core.geometry import raise_beams
 from segslam.registration import refinement
-from segslam.slam.adjustment.distortion import MIN_PAIRS
+from segslam.slam.adjustment.alignment import MIN_PAIRS
 from segslam.slam.adjustment.vertical_angle import (
     BIAS_DEG,
     VerticalAngle,

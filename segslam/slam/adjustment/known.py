@@ -15,8 +15,7 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import Transform, Vector
-from segslam.slam.adjustment.alignment import Alignment
-from segslam.slam.adjustment.distortion import PointsOf
+from segslam.slam.adjustment.alignment import Alignment, PointsOf
 from segslam.slam.adjustment.submaps import Aligned, Submaps
 from segslam.slam.adjustment.sweeps import Correction, Sweep, corrected_by
 from segslam.slam.adjustment.vertical_angle import VerticalAngle

@@ -20,7 +20,7 @@ from segslam.core.trajectory import Poses
 from segslam.core.types import GraphEstimate, IndexPairs, Record
 from segslam.graph import Edge, PoseGraph
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
-from segslam.slam.adjustment.distortion import PointsOf
+from segslam.slam.adjustment.alignment import PointsOf
 from segslam.slam.adjustment.known import Known
 from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, Submaps, all_pairs
 from segslam.slam.adjustment.sweeps import Sweep, Velocities, corrected_by, corrections_of, measure_sweep

@@ -16,8 +16,7 @@ from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
 from segslam.registration.refinement import LightSurface, downsample
-from segslam.slam.adjustment.alignment import Alignment, align
-from segslam.slam.adjustment.distortion import PointsOf
+from segslam.slam.adjustment.alignment import Alignment, PointsOf, align
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""

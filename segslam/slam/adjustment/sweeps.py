@@ -2,7 +2,7 @@
 
 A spinning LiDAR measures the points of a sweep one after the other while it moves. Without times they are not moved to
 one time, and the scan stays distorted: in a bend by metres at large distances. The duration of the sweep is measured
-(`distortion`) for each azimuth at which a sweep may begin; the azimuth that explains most is kept, and the duration is
+(`shown`) for each azimuth at which a sweep may begin; the azimuth that explains most is kept, and the duration is
 the one that leaves none.
 """
 
@@ -23,7 +23,7 @@ from segslam.core.trajectory import Poses
 from segslam.core.types import Indices, Motion, Points, Tangent, Trajectory, Vector
 from segslam.odometry.checked import SIGNIFICANT
 from segslam.registration.refinement import LightSurface, downsample
-from segslam.slam.adjustment.distortion import MOST_PAIRS, PointsOf, Shown, shown
+from segslam.slam.adjustment.alignment import MOST_PAIRS, PointsOf, Shown, shown
 from segslam.slam.adjustment.submaps import STEPS
 
 FROM_DEG = np.arange(0.0, 360.0, 45.0)

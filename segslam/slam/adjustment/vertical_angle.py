@@ -1,6 +1,6 @@
 """Vertical angle of a LiDAR, measured on submaps of one drive that are some metres apart.
 
-If all beams point lower than assumed, every plane is measured as a cone around the sensor (`distortion`). An odometry
+If all beams point lower than assumed, every plane is measured as a cone around the sensor (`shown`). An odometry
 that registers such scans explains part of the angle by a pitch in every motion. The angle is therefore corrected in the
 scans, before the odometry (`sensor.vertical_angle_deg`).
 
@@ -23,7 +23,7 @@ from segslam.keyframes import KeyframeSelector, downsample_keyframe
 from segslam.labels.label_files import unlabelled
 from segslam.odometry import KissOdometry, Odometry
 from segslam.registration.refinement import downsample
-from segslam.slam.adjustment.distortion import MIN_PAIRS, MOST_PAIRS, PointsOf, Shown, shown
+from segslam.slam.adjustment.alignment import MIN_PAIRS, MOST_PAIRS, PointsOf, Shown, shown
 from segslam.slam.adjustment.submaps import Submaps
 
 APART_M = (20.0, 30.0)

@@ -8,6 +8,7 @@ several closures are collected before an optimisation.
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 
 import gtsam
@@ -192,12 +193,8 @@ class PoseGraph:
         By the shortest chain of odometry and of the loops that the last estimate kept (`Chains`).
         """
         if self._chains is None:
-            kept = [
-                closure
-                for closure, weight in zip(self._closures, self._weights, strict=False)  # newer ones have no weight yet
-                if weight >= REJECTED_WEIGHT
-            ]
-            self._chains = Chains(self.T_world_keyframes, self._kept_odometry(), kept)
+            kept = compress(self._closures, [weight >= REJECTED_WEIGHT for weight in self._weights])
+            self._chains = Chains(self.T_world_keyframes, self._kept_odometry(), list(kept))
         return self._chains.covariances(keyframe_id, others)
 
     def consistent_with(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:

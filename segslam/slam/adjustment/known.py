@@ -20,7 +20,7 @@ from segslam.slam.adjustment.submaps import Aligned, Submaps
 from segslam.slam.adjustment.sweeps import Correction, Sweep, corrected_by
 from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
-Guess = tuple[int, int, int, int, int, int]
+Guess = tuple[int, ...]
 """A rounded initial guess: rotation vector and translation, in whole steps."""
 STEP_RAD, STEP_M = 0.01, 0.25
 """Chosen: steps of the initial guess. In a simulated town, alignments from rounded guesses differ by 3 mm at most from
@@ -65,8 +65,7 @@ class Known:
 def rounded(T: Transform) -> Guess:
     """The initial guess in whole steps."""
     values = np.concatenate([geometry.log(T)[:3] / STEP_RAD, T[:3, 3] / STEP_M])
-    a, b, c, x, y, z = np.round(values).astype(int).tolist()
-    return a, b, c, x, y, z
+    return tuple(np.round(values).astype(int).tolist())
 
 
 def transform_of(guess: Guess) -> Transform:

@@ -147,9 +147,8 @@ class PoseGraph:
         Raises ValueError unless ids count from 0, and for an information that is not positive semidefinite.
         """
         if keyframe_id != self.num_keyframes:
-            raise ValueError(
-                f"keyframe ids count from 0 without gaps: expected {self.num_keyframes}, got {keyframe_id}"
-            )
+            expected = f"expected {self.num_keyframes}, got {keyframe_id}"
+            raise ValueError(f"keyframe ids count from 0 without gaps: {expected}")
         if keyframe_id == 0:
             pose = gtsam.Pose3(geometry.nearest_transform(T_odom_keyframe))
             self._prior.add(gtsam.PriorFactorPose3(0, pose, noise.first_pose()))
@@ -157,15 +156,11 @@ class PoseGraph:
         else:
             # Rounding in a long chain would stop the solver far from the optimum.
             T_last_new = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
-            way_m = travel_m - self.travel_m[-1]
-            edge = Edge(
-                keyframe_id - 1,
-                keyframe_id,
-                T_last_new,
-                noise.odometry_information(way_m, T_last_new, self._config)
-                if information is None
-                else noise.motion_information(information),
-            )
+            if information is None:
+                known = noise.odometry_information(travel_m - self.travel_m[-1], T_last_new, self._config)
+            else:
+                known = noise.motion_information(information)
+            edge = Edge(keyframe_id - 1, keyframe_id, T_last_new, known)
             self._has_own_information.append(information is not None)
             self._has_breaks |= is_break(edge)
             self._odometry.append(edge)
@@ -326,12 +321,11 @@ class PoseGraph:
         write_g2o(path, G2oGraph(dict(enumerate(self.T_world_keyframes)), edges))
 
     def _edge(self, closure: LoopClosure) -> Edge:
-        for keyframe_id in (closure.target_id, closure.source_id):
+        ids = closure.target_id, closure.source_id
+        for keyframe_id in ids:
             self.T_world_keyframe(keyframe_id)
-        information = noise.closure_information(closure.information)
-        return Edge(
-            closure.target_id, closure.source_id, geometry.nearest_transform(closure.T_target_source), information
-        )
+        T_target_source = geometry.nearest_transform(closure.T_target_source)
+        return Edge(*ids, T_target_source, noise.closure_information(closure.information))
 
     def _rejected_motions(self) -> Mask:
         """(n - 1,) True for motions that the last final optimisation rejected."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int8
+from scipy.ndimage import minimum_filter
 
 from segslam.core import geometry
 from segslam.core.kernels import kernel
@@ -58,10 +59,9 @@ class FreeSpace:
     """Median range over the directions with a return: the scale of the place (m); 0 without returns."""
 
     @property
-    def margins(self) -> Vector:
-        """(2,) distance (m) before a return at which a point violates free space, and its growth per metre of range."""
-        margin_m = min(max(SHARE_OF_PATH * self.free_path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
-        return np.array([margin_m, FREE_SPACE_MARGIN_RATIO])
+    def margin_m(self) -> float:
+        """Distance before a return at which a point violates free space, besides the growth with its range."""
+        return min(max(SHARE_OF_PATH * self.free_path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
 
 
 def observe_free_space(points: Points) -> FreeSpace:
@@ -75,10 +75,7 @@ def observe_free_space(points: Points) -> FreeSpace:
     num_rows = 1 + int((float(elevation.max(initial=lowest_rad)) - lowest_rad) / row_rad)
     nearest = _nearest_returns(rays, lowest_rad, row_rad, num_rows)
     seen = np.isfinite(nearest)
-    padded = np.pad(nearest, ((1, 1), (0, 0)), constant_values=np.inf)
-    padded = np.pad(padded, ((0, 0), (1, 1)), mode="wrap")
-    across = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
-    around = np.minimum(np.minimum(across[:-2], across[1:-1]), across[2:])
+    around = minimum_filter(nearest, 3, mode=("nearest", "wrap"))
     path_m = float(np.median(nearest[seen])) if seen.any() else 0.0
     return FreeSpace(np.where(seen, around, np.float32(np.inf)), lowest_rad, row_rad, path_m)
 
@@ -100,15 +97,14 @@ def violation(points: Points, seen: FreeSpace, T_view_points: Transform) -> floa
 
     Only directions with a return count; 0 where there is none.
     """
-    moved = geometry.apply(T_view_points, points).astype(np.float32)
-    num_violations, num_seen = _count_violations(moved, seen.nearest_m, seen.lowest_rad, seen.row_rad, seen.margins)
-    return num_violations / num_seen if num_seen else 0.0
+    found = fates(geometry.apply(T_view_points, points), seen)
+    known = found[found != NO_RETURN]
+    return float(np.mean(known == IN_FRONT)) if len(known) else 0.0
 
 
 def fates(points: Points, seen: FreeSpace) -> Fates:
     """Where points (n, 3) in the frame of the scan that sees are, compared with the returns in their direction."""
-    found: Fates = _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, seen.margins)
-    return found
+    return _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, seen.margin_m)
 
 
 @kernel("UniTuple(int64, 2)(float32, float32, float32, float64, float64)")
@@ -132,36 +128,19 @@ def _nearest_returns(points, lowest_rad, row_rad, num_rows):
     return nearest
 
 
-@kernel("UniTuple(int64, 2)(float32[:, :], float32[:, :], float64, float64, float64[:])")
-def _count_violations(points, nearest, lowest_rad, row_rad, margins):
-    """Number of points in front of the returns in their direction by `margins` (m, and per metre), and number of points
-    in directions with a return."""
-    num_violations = num_seen = 0
-    for x, y, z in points:
-        row, column = _cell(x, y, z, lowest_rad, row_rad)
-        if 0 <= row < len(nearest) and nearest[row, column] < np.inf:
-            num_seen += 1
-            distance = math.sqrt(x * x + y * y + z * z)
-            if distance + margins[0] + margins[1] * distance < nearest[row, column]:
-                num_violations += 1
-    return num_violations, num_seen
-
-
-@kernel("int8[:](float32[:, :], float32[:, :], float64, float64, float64[:])")
-def _fates(points, nearest, lowest_rad, row_rad, margins):
-    """For each point whether it is in front of the returns in its direction, or behind them, by `margins` (m, and per
-    metre)."""
+@kernel("int8[:](float32[:, :], float32[:, :], float64, float64, float64)")
+def _fates(points, nearest, lowest_rad, row_rad, margin_m):
     found = np.full(len(points), AT_RETURN, np.int8)
     for at in range(len(points)):
         x, y, z = points[at]
         row, column = _cell(x, y, z, lowest_rad, row_rad)
         return_m = nearest[row, column] if 0 <= row < len(nearest) else np.inf
         distance = math.sqrt(x * x + y * y + z * z)
-        margin_m = margins[0] + margins[1] * distance
+        room_m = margin_m + FREE_SPACE_MARGIN_RATIO * distance
         if return_m == np.inf:
             found[at] = NO_RETURN
-        elif distance > return_m + margin_m:
+        elif distance > return_m + room_m:
             found[at] = BEHIND
-        elif distance + margin_m < return_m:
+        elif distance + room_m < return_m:
             found[at] = IN_FRONT
     return found

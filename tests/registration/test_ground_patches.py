@@ -22,21 +22,21 @@ def road(count: int) -> np.ndarray:
 
 def test_patches_of_a_plane_lie_on_it_and_share_its_normal() -> None:
     points = sloping_road()
-    patches = ground_patches(points, road(len(points)))
-    assert len(patches.points) == pytest.approx((2 * REACH_M / CELL_M) ** 2, abs=1)
-    assert np.allclose(patches.normals, SLOPE[:3, 2], atol=1e-3)  # the resolution is 0.1 mm over 4 m
-    assert np.abs(geometry.apply(geometry.inverse(SLOPE), patches.points)[:, 2]).max() < 1e-3
+    centres, normals = ground_patches(points, road(len(points)))
+    assert len(centres) == pytest.approx((2 * REACH_M / CELL_M) ** 2, abs=1)
+    assert np.allclose(normals, SLOPE[:3, 2], atol=1e-3)  # the resolution is 0.1 mm over 4 m
+    assert np.abs(geometry.apply(geometry.inverse(SLOPE), centres)[:, 2]).max() < 1e-3
 
 
 def test_normals_point_to_the_sensor_even_from_a_ceiling() -> None:
     points = sloping_road() * [1, 1, -1]
-    patches = ground_patches(points, road(len(points)))
-    assert np.all(np.sum(patches.points * patches.normals, axis=1) < 0)
+    centres, normals = ground_patches(points, road(len(points)))
+    assert np.all(np.sum(centres * normals, axis=1) < 0)
 
 
 def test_only_ground_makes_patches() -> None:
     points = sloping_road()
-    assert len(ground_patches(points, np.full(len(points), Label.BUILDING, np.uint8)).points) == 0
+    assert len(ground_patches(points, np.full(len(points), Label.BUILDING, np.uint8))[0]) == 0
 
 
 def test_rough_cells_and_thin_rings_make_none() -> None:
@@ -44,7 +44,7 @@ def test_rough_cells_and_thin_rings_make_none() -> None:
     bushes = rng.uniform([4, 4, -1], [8, 8, 1], size=(500, 3))
     ring = np.column_stack([rng.uniform(4, 8, 500), np.full((500, 2), -1.0)])
     for points in (bushes, ring):
-        assert len(ground_patches(points, road(500)).points) == 0
+        assert len(ground_patches(points, road(500))[0]) == 0
 
 
 def test_order_of_points_does_not_matter_to_the_last_bit() -> None:
@@ -67,14 +67,14 @@ def test_far_points_and_no_numbers_change_nothing() -> None:
 
 
 def test_no_points_make_no_patches() -> None:
-    patches = ground_patches(np.empty((0, 3)), np.empty(0, np.uint8))
-    assert patches.points.shape == patches.normals.shape == (0, 3)
+    centres, normals = ground_patches(np.empty((0, 3)), np.empty(0, np.uint8))
+    assert centres.shape == normals.shape == (0, 3)
 
 
 @pytest.mark.data
 def test_the_real_road_is_below_the_sensor_and_nearly_level(data_dir) -> None:
-    patches = ground_patches(*raw_scan(data_dir, 0))
-    near = np.linalg.norm(patches.points, axis=1) < 15
+    centres, normals = ground_patches(*raw_scan(data_dir, 0))
+    near = np.linalg.norm(centres, axis=1) < 15
     assert near.sum() > 10
-    assert np.median(patches.points[near, 2]) == pytest.approx(-1.73, abs=0.15)  # KITTI's sensor height
-    assert np.median(patches.normals[near, 2]) > 0.99
+    assert np.median(centres[near, 2]) == pytest.approx(-1.73, abs=0.15)  # KITTI's sensor height
+    assert np.median(normals[near, 2]) > 0.99

@@ -62,32 +62,16 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
         raise ValueError(f"points of shape {points.shape}; give a row x, y, z for each")
     if len(points) != len(labels):
         raise ValueError(f"{len(points)} points but {len(labels)} labels; give one label for each point")
-    clusters = _grounded(semantic_clusters(points, labels, config=config), points, labels, config)
+    clusters = semantic_clusters(points, labels, config=config)
+    upright = np.isin(clusters.classes, [int(label) for label in config.foot_classes])
+    if upright.any():
+        ground = ground_cells(points, labels, reach_m=MAX_RANGE_M)
+        clusters = stand_on_ground(clusters, upright, ground, max_distance_m=FOOT_MAX_DISTANCE_M)
     wanted = config.features == "always" or (
         config.features == "when_few_clusters" and len(clusters.sizes) < FEW_CLUSTERS
     )
     features = point_features(points, labels, config=config) if wanted else NO_FEATURES
-    ground = ground_patches(points, labels)
-    return Description(
-        means=clusters.means,
-        covariances=clusters.covariances,
-        classes=clusters.classes,
-        sizes=clusters.sizes,
-        feature_points=features.points,
-        feature_covariances=features.covariances,
-        feature_classes=features.classes,
-        feature_descriptors=features.descriptors,
-        ground_points=ground.points,
-        ground_normals=ground.normals,
-    )
-
-
-def _grounded(clusters: Clusters, points: Points, labels: Labels, config: SegregatorConfig) -> Clusters:
-    upright = np.isin(clusters.classes, [int(label) for label in config.foot_classes])
-    if not upright.any():
-        return clusters
-    ground = ground_cells(points, labels, reach_m=MAX_RANGE_M)
-    return stand_on_ground(clusters, upright, ground, max_distance_m=FOOT_MAX_DISTANCE_M)
+    return Description(*clusters, *features, *ground_patches(points, labels))
 
 
 def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) -> Features:

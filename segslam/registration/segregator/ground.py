@@ -9,13 +9,11 @@ error of real pairs 9 to 35 m apart is 0.1 instead of 0.2 degrees.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from segslam.core.kernels import kernel
-from segslam.core.types import GROUND_LABELS, Labels, Points, Vector
+from segslam.core.types import GROUND_LABELS, Indices, Labels, Points, Vector
 from segslam.registration.segregator.clusters import Clusters
 
 FOOT_CELL_M = 1.0
@@ -32,7 +30,7 @@ MAX_THICKNESS_M = 0.15
 MIN_BREADTH_M = 0.3
 """Chosen: smallest root mean square extent along the shorter side; a single ring has no defined tilt (m)."""
 RESOLUTION_M = 1e-4
-"""Unit of the integer sums of coordinates (m), which do not depend on the order of points."""
+"""Unit of the integer sums of coordinates (m)."""
 
 
 def stand_on_ground(clusters: Clusters, upright: np.ndarray, ground: Points, *, max_distance_m: float) -> Clusters:
@@ -63,68 +61,39 @@ def ground_cells(points: Points, labels: Labels, *, reach_m: float) -> Points:
 
     Sums in float64 of float32 values above 1e-5 m are exact, so they do not depend on the order of points.
     """
-    sums = _cell_sums(points[np.isin(labels, GROUND_LABELS)].astype(np.float64), reach_m, FOOT_CELL_M)
-    sums = sums[sums[:, 3] > 0]
-    return sums[:, :3] / sums[:, 3:]
+    with np.errstate(over="ignore"):  # what float32 cannot hold is out of reach
+        ground = _ground(points.astype(np.float32), labels, reach_m)
+    return _cell_means(ground, ground, reach_m, FOOT_CELL_M)[0]
 
 
-@kernel("float64[:, ::1](float64[:, ::1], float64, float64)")
-def _cell_sums(points, reach, cell):
-    """Sums of x, y, z, each rounded to float32, and the number of points in each cell of a square grid."""
-    side = math.ceil(2.0 * reach / cell)
-    sums = np.zeros((side * side, 4))
-    for row in range(len(points)):
-        x, y, z = np.float32(points[row, 0]), np.float32(points[row, 1]), np.float32(points[row, 2])
-        if abs(x) < reach and abs(y) < reach and abs(z) < reach:  # false for NaN
-            at = int((x + reach) / cell) * side + int((y + reach) / cell)
-            sums[at, 0] += x
-            sums[at, 1] += y
-            sums[at, 2] += z
-            sums[at, 3] += 1.0
-    return sums
+def ground_patches(points: Points, labels: Labels) -> tuple[Points, Points]:
+    """Centres (m) and unit normals of the ground patches of a scan, a row each, float32, in the frame of `points`.
 
-
-class GroundPatches(NamedTuple):
-    """Patches, a row each: centre (m) and unit normal. float32."""
-
-    points: Points
-    normals: Points
-
-
-def ground_patches(points: Points, labels: Labels) -> GroundPatches:
-    """The ground patches of a scan, in the frame of `points`, whose origin is the sensor. NaN points are ignored.
-
-    Normals point towards the sensor.
+    Its origin is the sensor, towards which the normals point. NaN points are ignored.
     """
-    sums = _moments(points[np.isin(labels, GROUND_LABELS)].astype(np.float64), REACH_M, CELL_M, RESOLUTION_M)
-    sums = sums[sums[:, 0] >= MIN_POINTS]
-    means = sums[:, 1:] / sums[:, :1]
+    ground = _ground(points, labels, REACH_M)
+    x, y, z = np.rint(ground / RESOLUTION_M).T  # sums of integers do not depend on the order of points
+    moments = np.column_stack([x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])
+    means, counts = _cell_means(ground, moments, REACH_M, CELL_M)
+    means = means[counts >= MIN_POINTS]
     centres = means[:, :3] * RESOLUTION_M
     squares = means[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3) * RESOLUTION_M**2
     variances, axes = np.linalg.eigh(squares - centres[:, :, None] * centres[:, None, :])
     flat = (variances[:, 0] <= MAX_THICKNESS_M**2) & (variances[:, 1] >= MIN_BREADTH_M**2)
     centres, normals = centres[flat], axes[flat, :, 0]
     away = np.sum(normals * centres, axis=1, keepdims=True) > 0.0
-    return GroundPatches(centres.astype(np.float32), np.where(away, -normals, normals).astype(np.float32))
+    return centres.astype(np.float32), np.where(away, -normals, normals).astype(np.float32)
 
 
-@kernel("int64[:, ::1](float64[:, ::1], float64, float64, float64)")
-def _moments(points, reach, cell, resolution):
-    """Number of points and sums of x, y, z, xx, xy, xz, yy, yz, zz for each cell of a square grid."""
-    side = int(np.ceil(2.0 * reach / cell))
-    sums = np.zeros((side * side, 10), np.int64)
-    for i in range(len(points)):
-        if abs(points[i, 0]) < reach and abs(points[i, 1]) < reach and abs(points[i, 2]) < reach:  # false for NaN
-            k = int((points[i, 0] + reach) / cell) * side + int((points[i, 1] + reach) / cell)
-            x, y, z = np.rint(points[i] / resolution).astype(np.int64)
-            sums[k, 0] += 1
-            sums[k, 1] += x
-            sums[k, 2] += y
-            sums[k, 3] += z
-            sums[k, 4] += x * x
-            sums[k, 5] += x * y
-            sums[k, 6] += x * z
-            sums[k, 7] += y * y
-            sums[k, 8] += y * z
-            sums[k, 9] += z * z
-    return sums
+def _ground(points: Points, labels: Labels, reach_m: float) -> Points:
+    ground = points.compress(np.isin(labels, GROUND_LABELS), axis=0).astype(np.float64)
+    return ground.compress((np.abs(ground) < reach_m).all(axis=1), axis=0)  # false for NaN
+
+
+def _cell_means(ground: Points, rows: np.ndarray, reach_m: float, cell_m: float) -> tuple[np.ndarray, Indices]:
+    """Mean of the rows, one for each point, in each occupied cell of a square grid, and the number of its points."""
+    i, j = ((ground[:, :2] + reach_m) / cell_m).astype(np.int64).T
+    cell = i * math.ceil(2.0 * reach_m / cell_m) + j
+    counts = np.bincount(cell)
+    sums = np.column_stack([np.bincount(cell, column) for column in rows.T])
+    return sums[counts > 0] / counts[counts > 0, None], counts[counts > 0]

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from segslam.core.config import SegregatorConfig
 from segslam.core.points import normals, patch_covariances, radius_neighbours, voxel_means, within_range
 from segslam.core.types import Covariances, Description, Label, Labels, Points
-from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, Clusters, semantic_clusters
+from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, semantic_clusters
 from segslam.registration.segregator.fpfh import fpfh
 from segslam.registration.segregator.ground import ground_cells, ground_patches, stand_on_ground
 

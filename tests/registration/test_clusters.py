@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.dcvc_twins import START_M, STEP_M, authors_dcvc, plain_dcvc
+from helpers.dcvc_twins import authors_dcvc, plain_dcvc
 from helpers.real_scans import raw_scan
 
 from segslam.core import geometry
@@ -19,7 +19,7 @@ from segslam.registration.segregator.clusters import (
 )
 
 CONFIG = SegregatorConfig()
-DCVC = {"start_m": START_M, "step_m": STEP_M, "pitch_deg": 1.2, "azimuth_deg": 1.2}
+PITCH_DEG = 1.2
 AUTHORS = load_config(Path(__file__).resolve().parents[2] / "configs" / "authors.yaml").segregator
 GOLDEN = {  # scan -> where its clusters are kept
     0: ("000000_004413_fixed_trunkDCVC.npz", "src"),
@@ -88,7 +88,7 @@ def test_what_the_authors_program_splits_depends_on_the_order_of_its_points(data
     points, labels = raw_scan(data_dir, scan)
     points = points[labels == CLASSES[name]]
     theirs = authors_dcvc(points)
-    ours = curved_voxel_clusters(points.astype(float), **DCVC)
+    ours = curved_voxel_clusters(points.astype(float), pitch_deg=PITCH_DEG)
     counts = np.bincount(theirs)
     large = np.flatnonzero(counts >= AUTHORS.cluster_min_points[CLASSES[name]])
     kept = np.isin(theirs, large)
@@ -102,7 +102,7 @@ def test_what_the_authors_program_splits_depends_on_the_order_of_its_points(data
 @pytest.mark.parametrize("seed", range(10))
 def test_clusters_are_the_connected_components_of_touching_voxels(seed: int) -> None:
     points = scattered(np.random.default_rng(seed), num_points=120, num_clumps=30)
-    assert sets_of(curved_voxel_clusters(points.astype(float), **DCVC)) == plain_dcvc(points)
+    assert sets_of(curved_voxel_clusters(points.astype(float), pitch_deg=PITCH_DEG)) == plain_dcvc(points)
 
 
 def test_a_car_behind_the_sensor_is_one_cluster() -> None:

@@ -22,9 +22,9 @@ from segslam.core.points import EMPTY, canonical_order, find_key, group_means, h
 from segslam.core.types import Covariances, Indices, Label, Labels, Points, Vector
 
 DCVC_START_RADIUS_M = 0.35
-"""Authors: first radial bin of DCVC (m)."""
+"""Authors: depth of the first radial bin of DCVC before it shrinks (m)."""
 DCVC_RADIUS_STEP_M = 0.0004
-"""Authors: shrinking of each further radial bin (m)."""
+"""Authors: shrinking of each radial bin, the first included (m)."""
 DCVC_AZIMUTH_DEG = 1.2
 """Authors: azimuth bin of DCVC (degrees)."""
 MIN_RANGE_M = 0.5
@@ -67,24 +67,26 @@ def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfi
     return Clusters(*(np.concatenate(columns) for columns in zip(NO_CLUSTERS, *parts, strict=True)))
 
 
-def curved_voxel_clusters(
-    points: Points, *, start_m: float, step_m: float, pitch_deg: float, azimuth_deg: float
-) -> Indices:
+def curved_voxel_clusters(points: Points, *, pitch_deg: float) -> Indices:
     """(n,) the cluster of each point by DCVC, numbered from 0. The points are finite and none is at the origin.
 
-    Radial bin k, from 1, is `start_m - k * step_m` deep; the first starts at the nearest point, 5 m away at most. The
-    width of azimuth bins is the one nearest to `azimuth_deg` that divides the circle.
+    The first radial bin starts at the nearest point, `FIRST_RADIUS_M` away at most. The width of azimuth bins is the
+    one nearest to `DCVC_AZIMUTH_DEG` that divides the circle.
     """
     if not len(points):
         return np.empty(0, np.int64)
     range_m, elevation, turn = geometry.spherical(points)
-    num_azimuth = max(1, round(360.0 / azimuth_deg))
-    radial = _radial_bins(range_m, start_m, step_m)
+    bounds = [min(FIRST_RADIUS_M, range_m.min())]
+    while bounds[-1] <= range_m.max():
+        bounds.append(bounds[-1] + DCVC_START_RADIUS_M - len(bounds) * DCVC_RADIUS_STEP_M)
+    radial = np.searchsorted(bounds[1:], range_m, side="right")
     pitch = _nearest_bin(elevation - min(0.0, elevation.min()), math.radians(pitch_deg))
+    num_azimuth = round(360.0 / DCVC_AZIMUTH_DEG)
     azimuth = _nearest_bin(turn, math.tau / num_azimuth) % num_azimuth
     num_radial = int(radial.max()) + 2  # one more than occupied: neighbours of the outermost bin have keys of their own
     keys, voxel = np.unique((pitch * num_radial + radial) * num_azimuth + azimuth, return_inverse=True)
-    return _components(keys, num_radial, num_azimuth)[voxel]
+    _, component = np.unique(_first_connected(keys, num_radial, num_azimuth), return_inverse=True)
+    return component[voxel]
 
 
 def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, Covariances]:
@@ -96,13 +98,7 @@ def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, 
 
 
 def _class_clusters(points: Points, label: Label, min_points: int, config: SegregatorConfig) -> Clusters:
-    cluster = curved_voxel_clusters(
-        points,
-        start_m=DCVC_START_RADIUS_M,
-        step_m=DCVC_RADIUS_STEP_M,
-        pitch_deg=config.dcvc_pitch_deg,
-        azimuth_deg=DCVC_AZIMUTH_DEG,
-    )
+    cluster = curved_voxel_clusters(points, pitch_deg=config.dcvc_pitch_deg)
     sizes = np.bincount(cluster)
     large = sizes >= min_points
     renumbered = np.cumsum(large) - 1
@@ -117,15 +113,6 @@ def _nearest_bin(values: Vector, width: float) -> Indices:
     return np.floor(values / width + 0.5).astype(np.int64)
 
 
-def _radial_bins(distance: Vector, start_m: float, step_m: float) -> Indices:
-    """The radial bin of each distance. The bins start at the nearest, but no farther than `FIRST_RADIUS_M`."""
-    farthest = distance.max()
-    bounds = [min(FIRST_RADIUS_M, distance.min())]
-    while bounds[-1] <= farthest:
-        bounds.append(bounds[-1] + start_m - len(bounds) * step_m)
-    return np.searchsorted(bounds[1:], distance, side="right")
-
-
 @kernel("int64(int64[:], int64)")
 def _root(parent, node):
     while parent[node] != node:
@@ -134,29 +121,9 @@ def _root(parent, node):
     return node
 
 
-@kernel("void(int64[:], int64, int64)")
-def _join(parent, a, b):
-    a, b = _root(parent, a), _root(parent, b)
-    parent[max(a, b)] = min(a, b)
-
-
-@kernel("int64[:](int64[:])")
-def _numbered(parent):
-    number = np.empty(len(parent), np.int64)
-    count = 0
-    for node in range(len(parent)):
-        root = _root(parent, node)
-        if root == node:
-            number[node] = count
-            count += 1
-        else:
-            number[node] = number[root]
-    return number
-
-
 @kernel("int64[:](int64[:], int64, int64)")
-def _components(keys, num_radial, num_azimuth):
-    """The connected component of each voxel, numbered from 0 by its first voxel.
+def _first_connected(keys, num_radial, num_azimuth):
+    """The first voxel of the connected component of each voxel.
 
     Keys are distinct: (pitch * num_radial + radial) * num_azimuth + azimuth. Azimuth wraps.
     """
@@ -171,5 +138,8 @@ def _components(keys, num_radial, num_azimuth):
                     neighbour_azimuth = (azimuth + azimuth_step) % num_azimuth
                     neighbour = find_key(table, keys, neighbour_row * num_azimuth + neighbour_azimuth)
                     if neighbour != EMPTY:
-                        _join(parent, voxel, neighbour)
-    return _numbered(parent)
+                        a, b = _root(parent, voxel), _root(parent, neighbour)
+                        parent[max(a, b)] = min(a, b)
+    for voxel in range(len(keys)):
+        parent[voxel] = _root(parent, voxel)
+    return parent

@@ -30,7 +30,6 @@ MODULES = (
     "registration.segregator.clusters",
     "registration.segregator.plan",
     "registration.segregator.correspondences",
-    "registration.segregator.gaussians",
     "graph.closure_pairs",
     "output.map.views",
     "scans.pcd",

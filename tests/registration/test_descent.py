@@ -8,15 +8,18 @@ from scipy.spatial.transform import Rotation
 from segslam.core import geometry
 from segslam.core.types import Transform
 from segslam.registration.segregator.descent import (
+    CENTROID_NOISE_M,
+    CENTROID_NOISE_SHARE,
     GATE,
+    GROUND_NOISE_M,
     GROUND_SLOPE,
+    GROUND_WEIGHT,
     MAX_STEPS,
     STEP_DONE,
     least_cost,
     squared_distances,
 )
 
-NOISE, SHARE, GROUND_NOISE, GROUND_WEIGHT = 0.07, 0.35, 0.1, 0.3
 T_TRUE = geometry.transform(geometry.yaw(0.8), [4.0, -7.0, 0.5])
 
 
@@ -50,19 +53,21 @@ def scene(seed: int, *, centroid_noise_m: float = 0.1, plane_noise_m: float = 0.
 
 
 def solve(s: dict[str, np.ndarray], T_start: Transform) -> tuple[Transform, np.ndarray]:
-    return least_cost(*s.values(), T_start, NOISE, SHARE, GROUND_NOISE, GROUND_WEIGHT)
+    return least_cost(*s.values(), T_start)
 
 
 def plain_squared(s: dict[str, np.ndarray], T_target_source: Transform) -> np.ndarray:
     R = T_target_source[:3, :3]
     gaps = s["target"] - geometry.apply(T_target_source, s["source"])
-    covariances = SHARE**2 * (R @ s["source_covariances"] @ R.T + s["target_covariances"]) + 2 * NOISE**2 * np.eye(3)
+    covariances = CENTROID_NOISE_SHARE**2 * (
+        R @ s["source_covariances"] @ R.T + s["target_covariances"]
+    ) + 2 * CENTROID_NOISE_M**2 * np.eye(3)
     return np.einsum("ni,nij,nj->n", gaps, np.linalg.inv(covariances), gaps)
 
 
 def plane_cost(points: np.ndarray, centres: np.ndarray, normals: np.ndarray) -> float:
     gaps = np.sum(normals * (centres - points), axis=1)
-    variances = GROUND_NOISE**2 + GROUND_SLOPE**2 * np.sum((centres - points) ** 2, axis=1)
+    variances = GROUND_NOISE_M**2 + GROUND_SLOPE**2 * np.sum((centres - points) ** 2, axis=1)
     return float(np.sum(GROUND_WEIGHT * np.log1p(gaps**2 / variances)))
 
 
@@ -80,9 +85,7 @@ def plain_cost(s: dict[str, np.ndarray], T_target_source: Transform) -> float:
 def test_squared_distances_are_those_of_plain_numpy(seed: int) -> None:
     s = scene(seed, centroid_noise_m=0.6)
     T_near = T_TRUE @ geometry.exp(geometry.tangent(rotation_rad=0.01, translation_m=0.1))
-    found = squared_distances(
-        s["source"], s["target"], s["source_covariances"], s["target_covariances"], T_near, NOISE, SHARE
-    )
+    found = squared_distances(s["source"], s["target"], s["source_covariances"], s["target_covariances"], T_near)
     expected = plain_squared(s, T_near)
     near = np.isfinite(found)
     assert near.sum() > 6
@@ -142,7 +145,7 @@ def plain_rows(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def plain_weights(gaps: np.ndarray, points: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    variances = GROUND_NOISE**2 + GROUND_SLOPE**2 * np.sum((points - centres) ** 2, axis=1)
+    variances = GROUND_NOISE_M**2 + GROUND_SLOPE**2 * np.sum((points - centres) ** 2, axis=1)
     return GROUND_WEIGHT / (variances + gaps**2)
 
 
@@ -153,7 +156,7 @@ def plain_least_cost(s: dict[str, np.ndarray], T: Transform) -> tuple[Transform,
         T_back = geometry.inverse(T)
         errors = geometry.apply(T_back, s["target"]) - s["source"]
         spread = s["source_covariances"] + R.T @ s["target_covariances"] @ R
-        W = np.linalg.inv(SHARE**2 * spread + 2 * NOISE**2 * np.eye(3))
+        W = np.linalg.inv(CENTROID_NOISE_SHARE**2 * spread + 2 * CENTROID_NOISE_M**2 * np.eye(3))
         W /= 1.0 + np.einsum("ni,nij,nj->n", errors, W, errors)[:, None, None] / 3.0
         J = np.tile(np.hstack([np.zeros((3, 3)), np.eye(3)]), (len(errors), 1, 1))
         J[:, :, :3] = np.cross(s["source"][:, None], np.eye(3))

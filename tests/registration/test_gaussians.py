@@ -6,7 +6,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Label, RejectReason, Transform
-from segslam.registration.segregator import gaussians
+from segslam.registration.segregator import descent, gaussians
 from segslam.registration.segregator.correspondences import cluster_correspondences
 from segslam.registration.segregator.gaussians import align_gaussians, nearest_pairs, nearest_planes
 from segslam.registration.segregator.pose_solver import PoseFit
@@ -76,7 +76,7 @@ def test_each_cluster_is_paired_at_most_once_and_with_the_nearest() -> None:
 
 
 def test_pairs_beyond_the_gate_are_none() -> None:
-    sigma = np.sqrt(2 * gaussians.CENTROID_NOISE_M**2 + 2 * (gaussians.CENTROID_NOISE_SHARE * 0.3) ** 2)
+    sigma = np.sqrt(2 * descent.CENTROID_NOISE_M**2 + 2 * (descent.CENTROID_NOISE_SHARE * 0.3) ** 2)
     source = scan(np.zeros((1, 3)), NO_GROUND)
     for sigmas, expected in [(3.3, 1), (3.4, 0)]:  # the gate is at sqrt(11.345) = 3.37
         target = scan(np.array([[sigmas * sigma, 0, 0]]), NO_GROUND)
@@ -86,9 +86,9 @@ def test_pairs_beyond_the_gate_are_none() -> None:
 def test_ground_is_paired_with_the_nearest_patch_within_reach() -> None:
     here = scan(trees(0), np.array([[0.0, 0, 0], [100.0, 0, 0]]))
     there = scan(trees(0), np.array([[3.0, 0, 0], [-1.0, 0, 0], [200.0, 0, 0]]))
-    planes = nearest_planes(here, there, np.eye(4))
-    assert planes.points.tolist() == [[0, 0, 0]]
-    assert planes.centres.tolist() == [[-1, 0, 0]]
+    points, centres, _ = nearest_planes(here, there, np.eye(4))
+    assert points.tolist() == [[0, 0, 0]]
+    assert centres.tolist() == [[-1, 0, 0]]
 
 
 def test_swapping_the_scans_inverts_the_pose() -> None:

@@ -11,7 +11,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Label, Registration, Rejected, RejectReason, Transform
-from segslam.registration.segregator import gaussians
+from segslam.registration.segregator import descent, gaussians
 from segslam.registration.segregator.match import hypotheses, match, vertical
 
 MATCH = import_module("segslam.registration.segregator.match")
@@ -99,8 +99,8 @@ def seen_again(scan: Description, seed: int, noise_m: float = 0.05, lost: int = 
 
 def disturbed(scan: Description, rng: np.random.Generator) -> Description:
     extents = np.linalg.cholesky(scan.covariances + 1e-12 * np.eye(3))
-    shifts = gaussians.CENTROID_NOISE_M * rng.normal(size=scan.means.shape)
-    shifts += gaussians.CENTROID_NOISE_SHARE * np.einsum("nij,nj->ni", extents, rng.normal(size=scan.means.shape))
+    shifts = descent.CENTROID_NOISE_M * rng.normal(size=scan.means.shape)
+    shifts += descent.CENTROID_NOISE_SHARE * np.einsum("nij,nj->ni", extents, rng.normal(size=scan.means.shape))
     return description(scan.means + shifts, scan.covariances, scan.classes)
 
 

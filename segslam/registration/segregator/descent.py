@@ -12,6 +12,14 @@ from segslam.core.kernels import kernel
 
 GATE = 11.345
 """0.99 quantile of chi-square with 3 degrees of freedom."""
+CENTROID_NOISE_M = 0.07
+"""Measured (simulated truth): noise of a centroid in each direction (m)."""
+CENTROID_NOISE_SHARE = 0.35
+"""Measured (simulated truth): additional noise of a centroid, as a share of its cluster's standard deviation."""
+GROUND_NOISE_M = 0.1
+"""Chosen: noise of the distance between two ground patches (m)."""
+GROUND_WEIGHT = 0.3
+"""Chosen: weight of such a distance; below 1 because the errors of neighbours are correlated."""
 GROUND_SLOPE = 0.04
 """Chosen: noise of a plane's height at 1 m from the middle of its patch (m)."""
 MAX_STEPS = 10
@@ -19,8 +27,8 @@ STEP_DONE = 1e-6
 """Chosen: the search stops after a step smaller than this (rad, m)."""
 
 
-@kernel("void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64, float64, float64[:, ::1])")
-def _weight_matrix(source_covariance, target_covariance, R, noise, share, W):
+@kernel("void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1])")
+def _weight_matrix(source_covariance, target_covariance, R, W):
     """Writes the inverse covariance of the difference of two centroids, in the source frame. R: R_target_source.
 
     R may be a transform, of which only the rotation is used.
@@ -31,7 +39,8 @@ def _weight_matrix(source_covariance, target_covariance, R, noise, share, W):
             for u in range(3):
                 for v in range(3):
                     extent += R[u, row] * target_covariance[u, v] * R[v, column]
-            W[row, column] = share * share * extent + (2.0 * noise * noise if row == column else 0.0)
+            noise = 2.0 * CENTROID_NOISE_M * CENTROID_NOISE_M if row == column else 0.0
+            W[row, column] = CENTROID_NOISE_SHARE * CENTROID_NOISE_SHARE * extent + noise
     xx, yy, zz, xy, xz, yz = W[0, 0], W[1, 1], W[2, 2], W[1, 0], W[2, 0], W[2, 1]
     W[0, 0], W[1, 1], W[2, 2] = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
     W[0, 1], W[0, 2], W[1, 2] = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
@@ -61,11 +70,8 @@ def _squared(W, e):
     return total
 
 
-@kernel(
-    "float64[::1](float64[:, ::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1],"
-    "float64, float64)"
-)
-def squared_distances(source, target, source_covariances, target_covariances, T_target_source, noise, share):
+@kernel("float64[::1](float64[:, ::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1])")
+def squared_distances(source, target, source_covariances, target_covariances, T_target_source):
     """Squared Mahalanobis distance of matched centroids; infinite if it certainly exceeds the gate."""
     squared = np.full(len(source), np.inf)
     W, e = np.empty((3, 3)), np.empty(3)
@@ -76,8 +82,9 @@ def squared_distances(source, target, source_covariances, target_covariances, T_
             e[k] -= source[i, k]
             length += e[k] * e[k]
             extent += source_covariances[i, k, k] + target_covariances[i, k, k]
-        if length <= GATE * (6.0 * noise * noise + share * share * extent):  # the trace bounds every variance
-            _weight_matrix(source_covariances[i], target_covariances[i], T_target_source, noise, share, W)
+        trace = 6.0 * CENTROID_NOISE_M * CENTROID_NOISE_M + CENTROID_NOISE_SHARE * CENTROID_NOISE_SHARE * extent
+        if length <= GATE * trace:  # the trace bounds every variance
+            _weight_matrix(source_covariances[i], target_covariances[i], T_target_source, W)
             squared[i] = _squared(W, e)
     return squared
 
@@ -98,9 +105,14 @@ def _add_centroid(H, g, a, W, e):
                     H[r, c] += lever * J[v, c]
 
 
-@kernel("void(float64[:, ::1], float64[::1], float64[::1], float64[::1], float64, float64)")
-def _add_plane(H, g, lever, normal, gap, weight):
-    """One row of the normal equations: a point at `lever` is `gap` below a plane."""
+@kernel("void(float64[:, ::1], float64[::1], float64[::1], float64[::1], float64, float64[::1])")
+def _add_plane(H, g, lever, normal, gap, other):
+    """One row of the normal equations: a point at `lever` is `gap` below a plane; `other` is what it is compared with.
+
+    The Cauchy weight divided by the variance of a distance from a plane is weight / (sigma^2 + gap^2).
+    """
+    away = (lever[0] - other[0]) ** 2 + (lever[1] - other[1]) ** 2 + (lever[2] - other[2]) ** 2
+    weight = GROUND_WEIGHT / (GROUND_NOISE_M * GROUND_NOISE_M + GROUND_SLOPE * GROUND_SLOPE * away + gap * gap)
     row = np.empty(6)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -110,13 +122,6 @@ def _add_plane(H, g, lever, normal, gap, weight):
         g[r] += weight * gap * row[r]
         for c in range(6):
             H[r, c] += weight * row[r] * row[c]
-
-
-@kernel("float64(float64, float64[::1], float64[::1], float64, float64)")
-def _plane_weight(gap, point, centre, noise, weight):
-    """Cauchy weight divided by the variance of a distance from a plane: weight / (sigma^2 + gap^2)."""
-    away = (point[0] - centre[0]) ** 2 + (point[1] - centre[1]) ** 2 + (point[2] - centre[2]) ** 2
-    return weight / (noise * noise + GROUND_SLOPE * GROUND_SLOPE * away + gap * gap)
 
 
 @kernel("void(float64[:, ::1], float64[::1])")
@@ -158,11 +163,11 @@ def _move(T, step):
 @kernel(
     "Tuple((float64[:, ::1], float64[:, ::1]))(float64[:, ::1], float64[:, ::1], float64[:, :, ::1],"
     "float64[:, :, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1],"
-    "float64[:, ::1], float64[:, ::1], float64, float64, float64, float64)"
+    "float64[:, ::1], float64[:, ::1])"
 )
 def least_cost(
     source, target, source_covariances, target_covariances, source_patches, target_planes, target_normals,
-    target_patches, source_planes, source_normals, T_target_source, noise, share, ground_noise, ground_weight,
+    target_patches, source_planes, source_normals, T_target_source,
 ):  # fmt: skip
     """Gauss-Newton with Cauchy weights until convergence; returns the pose and the last J^T W J."""
     T = T_target_source.copy()
@@ -174,7 +179,7 @@ def least_cost(
             _to_source(T, target[i], e)
             for k in range(3):
                 e[k] -= source[i, k]
-            _weight_matrix(source_covariances[i], target_covariances[i], T, noise, share, W)
+            _weight_matrix(source_covariances[i], target_covariances[i], T, W)
             _add_centroid(H, g, source[i], W, e)
         for i in range(len(source_patches)):
             _to_source(T, target_planes[i], point)
@@ -184,15 +189,13 @@ def least_cost(
                 for u in range(3):
                     normal[k] += T[u, k] * target_normals[i, u]
                 gap += normal[k] * (point[k] - source_patches[i, k])
-            weight = _plane_weight(gap, source_patches[i], point, ground_noise, ground_weight)
-            _add_plane(H, g, source_patches[i], normal, gap, weight)
+            _add_plane(H, g, source_patches[i], normal, gap, point)
         for i in range(len(target_patches)):
             _to_source(T, target_patches[i], point)
             gap = 0.0
             for k in range(3):
                 gap += source_normals[i, k] * (point[k] - source_planes[i, k])
-            weight = _plane_weight(gap, point, source_planes[i], ground_noise, ground_weight)
-            _add_plane(H, g, point, source_normals[i], gap, weight)
+            _add_plane(H, g, point, source_normals[i], gap, source_planes[i])
         _solve(H, g)
         _move(T, g)
         largest = 0.0

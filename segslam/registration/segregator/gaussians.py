@@ -12,13 +12,12 @@ ground adds the same cost for the distances of each scan's patches from the plan
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
-from segslam.core.kernels import kernel
 from segslam.core.types import (
     Description,
     Indices,
@@ -33,30 +32,14 @@ from segslam.registration.segregator.correspondences import Correspondences
 from segslam.registration.segregator.descent import GATE, least_cost, squared_distances
 from segslam.registration.segregator.pose_solver import PoseFit
 
-CENTROID_NOISE_M = 0.07
-"""Measured (simulated truth): noise of a centroid in each direction (m)."""
-CENTROID_NOISE_SHARE = 0.35
-"""Measured (simulated truth): additional noise of a centroid, as a share of its cluster's standard deviation."""
 SHARED_NOISE_M = 0.045
 """Measured (simulated truth): noise common to all centroids, in the information matrix only (m)."""
 SHARED_NOISE_DEG = 0.05
 """Measured (simulated truth): rotation noise common to all centroids, for example from sensor calibration (degrees)."""
-GROUND_NOISE_M = 0.1
-"""Chosen: noise of the distance between two ground patches (m)."""
-GROUND_WEIGHT = 0.3
-"""Chosen: weight of such a distance; below 1 because the errors of neighbours are correlated."""
 
 MAX_ROUNDS = 8
 GROUND_REACH_M = 4.0
 """Chosen: largest distance of compared patches: the next cell of `ground_patches` (m)."""
-
-
-class Planes(NamedTuple):
-    """Points of one scan, and the matching patch of the other scan for each; both in the frames of their scans."""
-
-    points: Points
-    centres: Points
-    normals: Points
 
 
 def align_gaussians(
@@ -81,7 +64,15 @@ def align_gaussians(
         if np.array_equal(rows, previous):
             break
         pairs = correspondences.take(rows)
-        T_target_source, information = descend(pairs, source, target, T_target_source)
+        T_target_source, information = least_cost(
+            pairs.source,
+            pairs.target,
+            pairs.source_covariances,
+            pairs.target_covariances,
+            *nearest_planes(source, target, T_target_source),
+            *nearest_planes(target, source, geometry.inverse(T_target_source)),
+            T_target_source,
+        )
         if _leaves_open(information):
             return Rejected(RejectReason.DEGENERATE, "clusters and ground leave the pose open")
     gaps = pairs.target - geometry.apply(T_target_source, pairs.source)
@@ -101,38 +92,25 @@ def align_gaussians(
 def nearest_pairs(correspondences: Correspondences, T_target_source: Transform) -> Indices:
     """Rows, ascending, within the gate that have the smallest distance among all rows sharing one of their ends."""
     squared = _squared(correspondences, T_target_source)
-    return _least_at_both_ends(squared, correspondences.source_index, correspondences.target_index)
+    bound = np.full(len(squared), GATE)
+    for ends in (correspondences.source_index, correspondences.target_index):
+        best = np.full(ends.max(initial=0) + 1, GATE)
+        np.minimum.at(best, ends, squared)
+        bound = np.minimum(bound, best[ends])
+    return np.flatnonzero((squared < GATE) & (squared <= bound))
 
 
-def nearest_planes(scan: Description, other: Description, T_other_scan: Transform) -> Planes:
-    """The ground of `scan`: the centre of each patch, with the nearest patch of `other` at this pose."""
-    points = geometry.apply(T_other_scan, scan.ground_points)
-    nearest = _nearest_within(points, other.ground_points.astype(np.float64), GROUND_REACH_M)
-    met = nearest >= 0
+def nearest_planes(scan: Description, other: Description, T_other_scan: Transform) -> tuple[Points, Points, Points]:
+    """The ground of `scan` that meets that of `other` at this pose: the centre of each patch, and the centre and the
+    normal of the nearest patch of `other`, in the frames of their scans.
+    """
+    if not len(other.ground_points):
+        return (np.empty((0, 3)),) * 3
+    apart = cdist(geometry.apply(T_other_scan, scan.ground_points), other.ground_points, "sqeuclidean")
+    nearest, met = apart.argmin(axis=1), apart.min(axis=1) < GROUND_REACH_M**2
     sides = scan.ground_points[met], other.ground_points[nearest[met]], other.ground_normals[nearest[met]]
-    return Planes(*(side.astype(np.float64) for side in sides))
-
-
-def descend(
-    pairs: Correspondences,
-    source: Description,
-    target: Description,
-    T_target_source: Transform,
-) -> tuple[Transform, Information]:
-    """The pose of least cost for these pairs and the current pairs of ground patches, and the Hessian there."""
-    return least_cost(
-        pairs.source,
-        pairs.target,
-        pairs.source_covariances,
-        pairs.target_covariances,
-        *nearest_planes(source, target, T_target_source),
-        *nearest_planes(target, source, geometry.inverse(T_target_source)),
-        T_target_source,
-        CENTROID_NOISE_M,
-        CENTROID_NOISE_SHARE,
-        GROUND_NOISE_M,
-        GROUND_WEIGHT,
-    )
+    centres, planes, normals = (side.astype(np.float64) for side in sides)
+    return centres, planes, normals
 
 
 def _squared(correspondences: Correspondences, T_target_source: Transform) -> Vector:
@@ -142,8 +120,6 @@ def _squared(correspondences: Correspondences, T_target_source: Transform) -> Ve
         correspondences.source_covariances,
         correspondences.target_covariances,
         T_target_source,
-        CENTROID_NOISE_M,
-        CENTROID_NOISE_SHARE,
     )
 
 
@@ -154,30 +130,3 @@ def _leaves_open(information: Information) -> bool:
         return True
     sigma = np.sqrt(np.sum(axes**2 / values, axis=1))
     return bool(np.any(sigma > geometry.tangent(rotation_rad=np.radians(5.0), translation_m=2.0)))
-
-
-def _least_at_both_ends(squared: Vector, source_index: Indices, target_index: Indices) -> Indices:
-    """Rows below the gate with the smallest distance among all rows that share one of their ends."""
-    bound = np.full(len(squared), GATE)
-    for ends in (source_index, target_index):
-        best = np.full(ends.max(initial=0) + 1, GATE)
-        np.minimum.at(best, ends, squared)
-        bound = np.minimum(bound, best[ends])
-    return np.flatnonzero((squared < GATE) & (squared <= bound))
-
-
-@kernel("int64[::1](float64[:, ::1], float64[:, ::1], float64)")
-def _nearest_within(points, others, reach):
-    """Row of the nearest other point for each point, -1 if none is within reach."""
-    nearest = np.full(len(points), -1)
-    for i in range(len(points)):
-        best = reach * reach
-        for k in range(len(others)):
-            gap = (
-                (others[k, 0] - points[i, 0]) ** 2
-                + (others[k, 1] - points[i, 1]) ** 2
-                + (others[k, 2] - points[i, 2]) ** 2
-            )
-            if gap < best:
-                nearest[i], best = k, gap
-    return nearest

@@ -8,15 +8,18 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from segslam.core import geometry
+from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Label
-from segslam.registration.segregator.correspondences import (
-    all_to_all,
-    cluster_correspondences,
-    concatenate,
-    feature_correspondences,
-    mutual_nearest,
-    tuple_test,
-)
+from segslam.registration.segregator import correspondences
+from segslam.registration.segregator.correspondences import Correspondences, feature_pairs, mutual_nearest, tuple_test
+from segslam.registration.segregator.match import putative
+
+
+@pytest.fixture
+def _lenient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tuple test that random features pass."""
+    monkeypatch.setattr(correspondences, "TUPLE_SIMILARITY", 0.5)
+    monkeypatch.setattr(correspondences, "TUPLE_TRIALS_PER_PAIR", 20)
 
 
 def description(num_clusters: int, num_features: int, seed: int) -> Description:
@@ -43,10 +46,11 @@ def as_set(pairs: np.ndarray) -> set[tuple[int, int]]:
     return {(int(i), int(j)) for i, j in pairs}
 
 
-def test_all_to_all_pairs_every_two_rows_of_one_class_and_no_others() -> None:
-    source = np.array([1, 16, 1], np.uint8)
-    target = np.array([16, 1, 18, 1], np.uint8)
-    assert all_to_all(source, target).tolist() == [[0, 1], [0, 3], [1, 0], [2, 1], [2, 3]]
+def test_every_two_clusters_of_one_class_are_paired_and_no_others() -> None:
+    source = replace(description(3, 0, 0), classes=np.array([1, 16, 1], np.uint8))
+    target = replace(description(4, 0, 1), classes=np.array([16, 1, 18, 1], np.uint8))
+    (pairs,) = putative(source, target, config=SegregatorConfig())
+    assert list(zip(pairs.source_index, pairs.target_index, strict=True)) == [(0, 1), (0, 3), (1, 0), (2, 1), (2, 3)]
 
 
 @pytest.mark.parametrize("rows", [1, 7, 300, 1000])
@@ -73,7 +77,7 @@ def test_tuple_test_keeps_rigidly_moved_rows_and_drops_the_others() -> None:
     source = rng.uniform(-30, 30, size=(60, 3))
     target = geometry.apply(geometry.transform(geometry.yaw(1.0), [3.0, 4.0, 5.0]), source)
     target[40:] = rng.uniform(-30, 30, size=(20, 3))
-    kept = tuple_test(source, target, similarity=0.95, trials_per_pair=100, rng=np.random.default_rng(1))
+    kept = tuple_test(source, target, rng=np.random.default_rng(1))
     assert set(range(40)) <= set(kept.tolist())
     # A triple with one stranger passes if two of its edges happen to agree to 5 %: a few strangers do.
     assert len(kept) < 60
@@ -82,17 +86,18 @@ def test_tuple_test_keeps_rigidly_moved_rows_and_drops_the_others() -> None:
 @pytest.mark.parametrize("rows", [0, 1, 2])
 def test_tuple_test_has_nothing_to_test_below_three_rows(rows: int) -> None:
     points = np.arange(3.0 * rows).reshape(rows, 3)
-    assert len(tuple_test(points, points, similarity=0.95, trials_per_pair=10, rng=np.random.default_rng(0))) == 0
+    assert len(tuple_test(points, points, rng=np.random.default_rng(0))) == 0
 
 
 def test_tuple_test_drops_rows_that_all_lie_in_one_spot() -> None:
     points = np.zeros((5, 3))
-    assert len(tuple_test(points, points, similarity=0.95, trials_per_pair=10, rng=np.random.default_rng(0))) == 0
+    assert len(tuple_test(points, points, rng=np.random.default_rng(0))) == 0
 
 
+@pytest.mark.usefixtures("_lenient")
 def test_features_never_pair_across_classes_and_are_counted_after_clusters() -> None:
     source, target = description(4, 80, 0), description(6, 90, 1)
-    pairs = feature_correspondences(source, target, similarity=0.5, trials_per_pair=20, seed=0)
+    pairs = Correspondences.of(source, target, feature_pairs(source, target))
     i, j = pairs.source_index - 4, pairs.target_index - 6
     assert len(pairs) > 0
     assert np.array_equal(source.feature_classes[i], target.feature_classes[j])
@@ -100,33 +105,31 @@ def test_features_never_pair_across_classes_and_are_counted_after_clusters() -> 
     assert np.allclose(pairs.target, target.feature_points[j])
 
 
-def test_features_depend_on_the_seed_alone_and_not_on_which_scan_is_the_source() -> None:
+@pytest.mark.usefixtures("_lenient")
+def test_features_do_not_depend_on_which_scan_is_the_source() -> None:
     source, target = description(0, 200, 2), description(0, 200, 3)
-    forth = feature_correspondences(source, target, similarity=0.7, trials_per_pair=2, seed=0)
-    back = feature_correspondences(target, source, similarity=0.7, trials_per_pair=2, seed=0)
-    pairs = as_set(np.column_stack([forth.source_index, forth.target_index]))
-    assert len(pairs) > 0
-    assert pairs == as_set(np.column_stack([back.target_index, back.source_index]))
+    forth, back = feature_pairs(source, target), feature_pairs(target, source)
+    assert len(forth) > 0
+    assert as_set(forth) == as_set(back[:, ::-1])
 
 
+@pytest.mark.usefixtures("_lenient")
 def test_key_points_without_neighbours_are_not_paired() -> None:
     blank = replace(description(0, 30, 6), feature_descriptors=np.zeros((30, 33), np.float32))
-    assert len(feature_correspondences(blank, blank, similarity=0.5, trials_per_pair=20, seed=0)) == 0
+    assert len(feature_pairs(blank, blank)) == 0
 
 
 def test_scans_without_features_have_none_in_common() -> None:
-    assert len(feature_correspondences(description(3, 0, 0), description(3, 50, 1),
-                                       similarity=0.9, trials_per_pair=5, seed=0)) == 0  # fmt: skip
+    assert len(feature_pairs(description(3, 0, 0), description(3, 50, 1))) == 0
 
 
-def test_concatenated_correspondences_are_the_rows_of_both() -> None:
+@pytest.mark.usefixtures("_lenient")
+def test_features_are_tried_together_with_all_clusters() -> None:
     source, target = description(5, 60, 4), description(5, 60, 5)
-    clusters = cluster_correspondences(source, target)
-    features = feature_correspondences(source, target, similarity=0.5, trials_per_pair=20, seed=0)
-    both = concatenate(clusters, features)
-    assert len(both) == len(clusters) + len(features)
-    assert np.array_equal(both.source, np.concatenate([clusters.source, features.source]))
-    assert np.array_equal(both.target_index, np.concatenate([clusters.target_index, features.target_index]))
+    clusters, both = putative(source, target, config=SegregatorConfig())
+    assert len(both) == len(clusters) + len(feature_pairs(source, target))
+    assert np.array_equal(both.source[: len(clusters)], clusters.source)
+    assert np.array_equal(both.target_index[: len(clusters)], clusters.target_index)
 
 
 @pytest.mark.data

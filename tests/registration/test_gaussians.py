@@ -7,8 +7,9 @@ from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Label, RejectReason, Transform
 from segslam.registration.segregator import descent, gaussians
-from segslam.registration.segregator.correspondences import cluster_correspondences
+from segslam.registration.segregator.correspondences import Correspondences
 from segslam.registration.segregator.gaussians import align_gaussians, nearest_pairs, nearest_planes
+from segslam.registration.segregator.match import putative
 from segslam.registration.segregator.pose_solver import PoseFit
 
 CONFIG = SegregatorConfig()
@@ -51,8 +52,12 @@ def trees(seed: int, count: int = 12) -> np.ndarray:
     return np.random.default_rng(seed).uniform([-30, -30, -1.5], [30, 30, 1.0], size=(count, 3))
 
 
+def all_pairs(source: Description, target: Description) -> Correspondences:
+    return next(putative(source, target, config=SegregatorConfig()))
+
+
 def align(source: Description, target: Description, T_start: Transform, config: SegregatorConfig = CONFIG):
-    return align_gaussians(cluster_correspondences(source, target), source, target, T_start, config=config)
+    return align_gaussians(all_pairs(source, target), source, target, T_start, config=config)
 
 
 @pytest.mark.parametrize("ground", [flat_ground(), NO_GROUND], ids=["ground", "no ground"])
@@ -69,7 +74,7 @@ def test_an_exact_copy_is_laid_on_itself_from_a_rough_pose(ground: np.ndarray) -
 def test_each_cluster_is_paired_at_most_once_and_with_the_nearest() -> None:
     source = scan(np.array([[0.0, 0, 0], [0.3, 0, 0], [9.0, 0, 0]]), NO_GROUND)
     target = scan(np.array([[0.1, 0, 0], [9.2, 0, 0], [9.1, 0, 0], [50.0, 0, 0]]), NO_GROUND)
-    correspondences = cluster_correspondences(source, target)
+    correspondences = all_pairs(source, target)
     rows = nearest_pairs(correspondences, np.eye(4))
     pairs = list(zip(correspondences.source_index[rows], correspondences.target_index[rows], strict=True))
     assert pairs == [(0, 0), (2, 2)]
@@ -80,7 +85,7 @@ def test_pairs_beyond_the_gate_are_none() -> None:
     source = scan(np.zeros((1, 3)), NO_GROUND)
     for sigmas, expected in [(3.3, 1), (3.4, 0)]:  # the gate is at sqrt(11.345) = 3.37
         target = scan(np.array([[sigmas * sigma, 0, 0]]), NO_GROUND)
-        assert len(nearest_pairs(cluster_correspondences(source, target), np.eye(4))) == expected
+        assert len(nearest_pairs(all_pairs(source, target), np.eye(4))) == expected
 
 
 def test_ground_is_paired_with_the_nearest_patch_within_reach() -> None:

@@ -14,7 +14,6 @@ program. Correspondences that share an end are never joined, because an object c
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,19 +24,13 @@ from segslam.registration.cliques import Bits, lowest_bit, pack_flags, pairs, pa
 from segslam.registration.segregator.correspondences import Correspondences
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ConsistencyGraph:
-    """A vertex for each correspondence."""
-
-    adjacency: Bits
-    edges: IndexPairs
-    """Joined pairs i < j, in ascending order."""
-
-
 def consistency_graph(
     correspondences: Correspondences, *, length_bound_m: float, config: SegregatorConfig
-) -> ConsistencyGraph:
-    """The graph from the length test (l-TRIM) and the gate `config.gate`."""
+) -> tuple[Bits, IndexPairs]:
+    """The graph from the length test (l-TRIM) and the gate `config.gate`, with a vertex for each correspondence.
+
+    Its adjacency, and its edges: joined pairs i < j, in ascending order.
+    """
     adjacency = _length_consistent(
         correspondences.source,
         correspondences.target,
@@ -51,7 +44,7 @@ def consistency_graph(
         kept = _distances(joined, *covariances, config.gate == "invariant") <= config.shape_bound_m2
         part(adjacency, joined[~kept])
         joined = joined[kept]
-    return ConsistencyGraph(adjacency, joined)
+    return adjacency, joined
 
 
 @kernel("uint64[:, ::1](float64[:, ::1], float64[:, ::1], int64[::1], int64[::1], float64)")

@@ -10,7 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from segslam.core.kernels import kernel
-from segslam.core.types import Covariances, Description, IndexPairs, Indices, Labels, Points
+from segslam.core.types import Covariances, Description, IndexPairs, Indices, Points
+
+TUPLE_SIMILARITY = 0.95
+"""Authors: edge ratio of the tuple test."""
+TUPLE_TRIALS_PER_PAIR = 100
+"""Authors: random triples drawn for each mutual pair."""
+TUPLE_SEED = 0
+"""Chosen: random seed of these triples."""
 
 Descriptors = Float[np.ndarray, "_ 33"]
 
@@ -32,14 +39,21 @@ class Correspondences:
     def __len__(self) -> int:
         return len(self.source)
 
+    @staticmethod
+    def of(source: Description, target: Description, pairs: IndexPairs) -> "Correspondences":
+        """The Gaussians of two scans in these pairs."""
+        sides = []
+        for side in (source, target):
+            means = np.concatenate([side.means, side.feature_points])
+            covariances = np.concatenate([side.covariances, side.feature_covariances])
+            sides.append((means.astype(np.float64), covariances.astype(np.float64)))
+        (source_means, source_covariances), (target_means, target_covariances) = sides
+        i, j = np.ascontiguousarray(pairs.T)
+        return Correspondences(source_means[i], target_means[j], source_covariances[i], target_covariances[j], i, j)
+
     def take(self, rows: Indices) -> "Correspondences":
         """The correspondences in these rows."""
         return Correspondences(*(getattr(self, name)[rows] for name in self.__slots__))
-
-
-def all_to_all(source_classes: Labels, target_classes: Labels) -> IndexPairs:
-    """Every pair of rows whose class is the same, ordered by source row, then by target row."""
-    return np.argwhere(source_classes[:, None] == target_classes[None, :])
 
 
 def mutual_nearest(source: Descriptors, target: Descriptors) -> IndexPairs:
@@ -58,33 +72,26 @@ def mutual_nearest(source: Descriptors, target: Descriptors) -> IndexPairs:
     return pairs[np.argsort(squared[mutual], kind="stable")]
 
 
-def tuple_test(
-    source: Points, target: Points, *, similarity: float, trials_per_pair: int, rng: np.random.Generator
-) -> Indices:
+def tuple_test(source: Points, target: Points, *, rng: np.random.Generator) -> Indices:
     """Rows, ascending, that are in a random triple whose three edges have nearly equal lengths in both scans.
 
-    Row i of `source` matches row i of `target`. An edge passes if the shorter length is more than `similarity` times
-    the longer length. Returns no rows for fewer than three.
+    Row i of `source` matches row i of `target`. An edge passes if the shorter length is more than `TUPLE_SIMILARITY`
+    times the longer length. Returns no rows for fewer than three.
     """
     num_pairs = len(source)
     if num_pairs < 3:
         return np.empty(0, np.int64)
-    triples = rng.integers(num_pairs, size=(trials_per_pair * num_pairs, 3))
-    return np.flatnonzero(
-        _in_similar_triangles(source.astype(np.float64), target.astype(np.float64), triples, similarity)
-    )
+    triples = rng.integers(num_pairs, size=(TUPLE_TRIALS_PER_PAIR * num_pairs, 3))
+    similar = _in_similar_triangles(source.astype(np.float64), target.astype(np.float64), triples, TUPLE_SIMILARITY)
+    return np.flatnonzero(similar)
 
 
-def cluster_correspondences(source: Description, target: Description) -> Correspondences:
-    """All pairs of clusters of one class."""
-    return _collect(source, target, all_to_all(source.classes, target.classes))
+def feature_pairs(source: Description, target: Description) -> IndexPairs:
+    """Mutual nearest features of one class that pass the tuple test, class after class in ascending order.
 
-
-def feature_correspondences(
-    source: Description, target: Description, *, similarity: float, trials_per_pair: int, seed: int
-) -> Correspondences:
-    """Mutual nearest features of one class that pass the tuple test, class after class in ascending order."""
-    rng = np.random.default_rng(seed)
+    They are numbered as by `Correspondences`.
+    """
+    rng = np.random.default_rng(TUPLE_SEED)
     kept = [np.empty((0, 2), np.int64)]
     for label in np.intersect1d(source.feature_classes, target.feature_classes):
         source_rows, target_rows = (
@@ -94,35 +101,9 @@ def feature_correspondences(
         )
         pairs = mutual_nearest(source.feature_descriptors[source_rows], target.feature_descriptors[target_rows])
         pairs = np.column_stack([source_rows[pairs[:, 0]], target_rows[pairs[:, 1]]])
-        rows = tuple_test(
-            source.feature_points[pairs[:, 0]],
-            target.feature_points[pairs[:, 1]],
-            similarity=similarity,
-            trials_per_pair=trials_per_pair,
-            rng=rng,
-        )
+        rows = tuple_test(source.feature_points[pairs[:, 0]], target.feature_points[pairs[:, 1]], rng=rng)
         kept.append(pairs[rows])
-    return _collect(source, target, np.concatenate(kept) + np.array([len(source.means), len(target.means)]))
-
-
-def concatenate(first: Correspondences, second: Correspondences) -> Correspondences:
-    """The rows of both, in this order."""
-    return Correspondences(
-        *(np.concatenate([getattr(first, name), getattr(second, name)]) for name in Correspondences.__slots__)
-    )
-
-
-def _collect(source: Description, target: Description, pairs: IndexPairs) -> Correspondences:
-    source_means, source_covariances = _gaussians(source)
-    target_means, target_covariances = _gaussians(target)
-    i, j = pairs[:, 0], pairs[:, 1]
-    return Correspondences(source_means[i], target_means[j], source_covariances[i], target_covariances[j], i, j)
-
-
-def _gaussians(description: Description) -> tuple[Points, Covariances]:
-    means = np.concatenate([description.means, description.feature_points])
-    covariances = np.concatenate([description.covariances, description.feature_covariances])
-    return means.astype(np.float64), covariances.astype(np.float64)
+    return np.concatenate(kept) + np.array([len(source.means), len(target.means)])
 
 
 @kernel("boolean[::1](float64[:, ::1], float64[:, ::1], int64[:, ::1], float64)")

@@ -25,21 +25,10 @@ from segslam.core.types import (
 )
 from segslam.registration.cliques import maximum_cliques
 from segslam.registration.segregator.consistency_graph import consistency_graph
-from segslam.registration.segregator.correspondences import (
-    Correspondences,
-    cluster_correspondences,
-    concatenate,
-    feature_correspondences,
-)
+from segslam.registration.segregator.correspondences import Correspondences, feature_pairs
 from segslam.registration.segregator.gaussians import align_gaussians
 from segslam.registration.segregator.pose_solver import PoseFit, solve_level, solve_pose
 
-TUPLE_SIMILARITY = 0.95
-"""Authors: edge ratio of the tuple test."""
-TUPLE_TRIALS_PER_PAIR = 100
-"""Authors: random triples drawn for each mutual pair."""
-TUPLE_SEED = 0
-"""Chosen: random seed of these triples."""
 CLIQUE_MAX_NODES = 200_000
 """Chosen: search nodes after which the search stops with the best clique found."""
 CERTAIN_INLIERS = 12
@@ -95,8 +84,8 @@ def _attempts(
             yield Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
             continue
         for bound_m in config.noise_bounds_m:
-            graph = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
-            search = maximum_cliques(graph.adjacency, max_cliques=config.max_cliques, max_nodes=CLIQUE_MAX_NODES)
+            adjacency, edges = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
+            search = maximum_cliques(adjacency, max_cliques=config.max_cliques, max_nodes=CLIQUE_MAX_NODES)
             size = len(search.cliques[0])
             if size < config.min_clique:
                 yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} consistent correspondences")
@@ -112,30 +101,23 @@ def _attempts(
                     num_inliers=int(fit.inliers.sum()),
                     rms_m=fit.rms_m,
                     information=fit.information,
-                    num_edges=len(graph.edges),
+                    num_edges=len(edges),
                 )
                 yield fit.score, registration
 
 
 def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Iterator[Correspondences]:
-    """Sets of correspondences to try: clusters; then clusters and features, if both scans have features.
+    """Sets of correspondences to try: all pairs of clusters of one class; then also features, if both scans have any.
 
     With `features` set to `always`, the first set contains features.
     """
-    clusters = cluster_correspondences(source, target)
+    clusters = np.argwhere(source.classes[:, None] == target.classes)
     if config.features != "always":
-        yield clusters
+        yield Correspondences.of(source, target, clusters)
     if config.features == "always" or (
         config.features != "never" and len(source.feature_points) and len(target.feature_points)
     ):
-        features = feature_correspondences(
-            source,
-            target,
-            similarity=TUPLE_SIMILARITY,
-            trials_per_pair=TUPLE_TRIALS_PER_PAIR,
-            seed=TUPLE_SEED,
-        )
-        yield concatenate(clusters, features)
+        yield Correspondences.of(source, target, np.concatenate([clusters, feature_pairs(source, target)]))
 
 
 def _solve(

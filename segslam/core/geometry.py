@@ -4,7 +4,7 @@ Tangents are [rotation rad; translation m]; `exp` and `log` are those of SE(3), 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
@@ -159,6 +159,12 @@ def raising(points: Points) -> Points:
     horizontal = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
     x, y, z = points.T
     return np.column_stack([-z * x / horizontal, -z * y / horizontal, horizontal])
+
+
+def is_near(T: Transform, others: Iterable[Transform], *, within_m: float, within_rad: float) -> bool:
+    """True if a pose is close to one of the others in the same frame."""
+    apart = [inverse(other) @ T for other in others]
+    return any(distance(one) < within_m and angle(one) < within_rad for one in apart)
 
 
 def displacement_m(points: Points, T_a_points: Transform, T_a_other: Transform) -> float:

@@ -85,7 +85,7 @@ def _ranked_plans(source: PreparedScan, target: PreparedScan) -> Iterator[Regist
 
 @lru_cache(NUM_FLOOR_PLANS)
 def _floor_plan(scan: PreparedScan) -> segregator.FloorPlan:
-    return segregator.FloorPlan(scan.surface.standing, segregator.vertical(scan.description))
+    return segregator.FloorPlan(scan.surface.standing()[0], segregator.vertical(scan.description))
 
 
 def _is_possible(coarse: Registration, pair: Pair) -> bool:

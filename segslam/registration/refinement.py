@@ -78,14 +78,8 @@ class Surface:
         """(n, 3), of unit length."""
         return self.cloud.normals()[:, :3]
 
-    @property
-    def standing(self) -> Points:
-        """(k, 3) points on surfaces steeper than 45 degrees; the scan's z points up."""
-        return self.standing_with_normals[0]
-
-    @property
-    def standing_with_normals(self) -> tuple[Points, Points]:
-        """(k, 3) each: these points, and their unit normals."""
+    def standing(self) -> tuple[Points, Points]:
+        """(k, 3) points on surfaces steeper than 45 degrees, and their unit normals; the scan's z points up."""
         normals = self.normals
         stands = _stands(normals)
         return self.points[stands], normals[stands]

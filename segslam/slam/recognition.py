@@ -17,9 +17,8 @@ from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import Alignment, Record, Rejected, RejectReason, Transform
 from segslam.registration.hypotheses import Gate, anywhere
 from segslam.registration.prepared import PreparedScan
-from segslam.verification import score
 from segslam.verification.pair import tried_poses
-from segslam.verification.trial import Found, Trial
+from segslam.verification.trial import Found, Trial, judged
 
 MAX_PLACES = 6
 """Chosen: number of places tried until one is found; each takes about 100 ms."""
@@ -61,7 +60,7 @@ def recognise(
     """
     watch = watch or Stopwatch()
 
-    def tried(place_id: int, T_world_found: Transform | None = None) -> tuple[Trial, list[Found] | Rejected]:
+    def tried(place_id: int, T_world_found: Transform | None = None) -> list[Found] | Rejected:
         """The poses at a place; after one was found, those that are elsewhere."""
         with watch("prepare"):
             place = places(place_id)
@@ -74,29 +73,28 @@ def recognise(
             is_same = _apart_m(T_world_here @ T_target_source, T_world_found) < ELSEWHERE_M
             return Rejected(RejectReason.FAR_FROM_PRIOR, "the same place") if is_same else None
 
-        trial = Trial(scan, place, config, allowed, watch, score.shipped())
-        return trial, tried_poses(trial)
+        return tried_poses(Trial(scan, place, config, allowed, watch))
 
     def found_elsewhere(T_world_found: Transform, place_ids: Sequence[int]) -> list[Found]:
         """The best poses at other places, by what the patches of the scan show there."""
-        outcomes = [tried(place_id, T_world_found)[1] for place_id in place_ids]
+        outcomes = [tried(place_id, T_world_found) for place_id in place_ids]
         best = [found[0] for found in outcomes if not isinstance(found, Rejected)]
         return [one._replace(agreement=one.agreement._replace(of_target=NO_PATCHES)) for one in best]
 
     rejections = []
     for place_id in islice(_spread(candidates, T_world_place, SPREAD_M), max_places):
-        trial, found = tried(place_id)
+        found = tried(place_id)
         if isinstance(found, Rejected):
             rejections.append(found)
             continue
-        outcome = trial.judge(found[0], found[1:])
+        outcome = judged(found[0], found[1:], config=config)
         if isinstance(outcome, Rejected):
             rejections.append(outcome)
             continue
         T_world_lidar = T_world_place(place_id) @ found[0].T_target_source
         others = list(islice(_spread(candidates, T_world_place, ELSEWHERE_M, [T_world_lidar]), MAX_RIVALS))
         halves = at_once(*(partial(found_elsewhere, T_world_lidar, half) for half in (others[0::2], others[1::2])))
-        outcome = trial.judge(found[0], [*found[1:], *halves[0], *halves[1]])
+        outcome = judged(found[0], [*found[1:], *halves[0], *halves[1]], config=config)
         return outcome if isinstance(outcome, Rejected) else Recognised(place_id, T_world_lidar, outcome)
     return rejections[0] if rejections else Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, "no place to compare with")
 

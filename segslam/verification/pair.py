@@ -15,8 +15,8 @@ from segslam.registration import refinement
 from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Gate, anywhere, coarse_poses
 from segslam.registration.prepared import Observed, PreparedScan, prepare_scan
 from segslam.verification import patches, score
-from segslam.verification.rivals import differs, rivals_of
-from segslam.verification.trial import EQUAL_M, EQUAL_RAD, Found, Trial, is_near
+from segslam.verification.rivals import is_same, rivals_of
+from segslam.verification.trial import EQUAL_M, EQUAL_RAD, Found, Trial, judged
 
 KNOWN_M, KNOWN_RAD = 1.0, math.radians(3.0)
 """Chosen: largest error of a known pose. A rival this near is mostly the same pose (`rivals.SAME_POSE_M`)."""
@@ -63,12 +63,12 @@ def register_prepared(
     `verify.max_false_share` asks. `gate` may reject a pose before and after refinement. If no hypothesis leads
     anywhere, the rejection of the best one is returned.
     """
-    trial = Trial(source, target, config, gate, watch or Stopwatch(), score.shipped())
+    trial = Trial(source, target, config, gate, watch or Stopwatch())
     tried = tried_poses(trial)
     if isinstance(tried, Rejected):
         return tried
     best, *others = tried
-    return trial.judge(best, others)
+    return judged(best, others, config=config)
 
 
 def tried_poses(trial: Trial) -> list[Found] | Rejected:
@@ -78,7 +78,7 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
     """
     rejections: list[Rejected] = []
     found: list[Found] = []
-    for coarse in coarse_poses(trial.pair):
+    for coarse in coarse_poses(trial):
         outcome = coarse if isinstance(coarse, Rejected) else _outcome(trial, coarse, found)
         if isinstance(outcome, Found):
             found.append(outcome)
@@ -90,13 +90,13 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
     if not allowed:
         excluded = [trial.gate(pose.T_target_source, slack_m=0.0) for pose in found]
         return [*(rejected for rejected in excluded if rejected is not None), *rejections][0]
-    best = max(allowed, key=trial.mean_ratio)
+    best = max(allowed, key=lambda pose: pose.mean_ratio)
     if trial.fits(best):
         rivals = rivals_of(best, found, trial)
         found += rivals
         allowed += [pose for pose in rivals if trial.gate(pose.T_target_source, slack_m=0.0) is None]
-        best = max(allowed, key=trial.mean_ratio)
-    return [best, *(pose for pose in found if differs(pose, best))]
+        best = max(allowed, key=lambda pose: pose.mean_ratio)
+    return [best, *(pose for pose in found if not is_same(pose.T_target_source, best))]
 
 
 def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Found | Rejected | None:
@@ -104,7 +104,7 @@ def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Foun
     begun = trial.begin(coarse)
     if isinstance(begun, Rejected):
         return begun
-    if is_near(begun, [pose.T_target_source for pose in found], within_m=EQUAL_M, within_rad=EQUAL_RAD):
+    if geometry.is_near(begun, [pose.T_target_source for pose in found], within_m=EQUAL_M, within_rad=EQUAL_RAD):
         return None
     outcome = trial.refined(coarse, begun)
     if isinstance(outcome, Found):
@@ -127,7 +127,7 @@ def register_near(
 
     Rejects FAR_FROM_PRIOR if refinement moves the pose farther.
     """
-    trial = Trial(source, target, config, anywhere, watch, score.shipped())
+    trial = Trial(source, target, config, anywhere, watch)
     with watch("refine"):
         fine = refinement.refine(source.surface, target.surface, T_target_source, config=config.refine)
     if isinstance(fine, Rejected):
@@ -137,7 +137,7 @@ def register_near(
         detail = f"moved {geometry.distance(moved):.2f} m, {math.degrees(geometry.angle(moved)):.1f} degrees"
         return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
     coarse = replace(fine, T_target_source=T_target_source, num_inliers=0, num_correspondences=0)
-    return trial.judge(trial.found(coarse, fine), None)
+    return judged(trial.found(coarse, fine), None, config=config)
 
 
 def chance_of_wrong(source: Observed, target: Observed, T_target_source: Transform) -> float:

@@ -77,9 +77,7 @@ class Agreement(NamedTuple):
 @lru_cache(NUM_SCANS)
 def patches_of(surface: Surface) -> Patches:
     """The patches of a scan."""
-    points, normals = surface.standing_with_normals
-    if not len(points):
-        return Patches(points, np.empty(0, np.int64), np.empty(0))
+    points, normals = surface.standing()
     keys, _ = cell_keys(points, PATCH_M)
     _, patch = np.unique(3 * keys + np.abs(normals).argmax(axis=1), return_inverse=True)
     return Patches(points, patch, np.bincount(patch).astype(np.float64))
@@ -87,9 +85,8 @@ def patches_of(surface: Surface) -> Patches:
 
 def agreement(source: Observed, target: Observed, T_target_source: Transform) -> Agreement:
     """Agreement of two scans at this pose of the source in the target."""
-    roughness_m = max(source[0].roughness_m, target[0].roughness_m)
     ways = [
-        (*_seen_from(b, a, T_b_a, roughness_m), violation(a[0].points, b[1], T_b_a))
+        (*_seen_from(b, a, T_b_a), violation(a[0].points, b[1], T_b_a))
         for a, b, T_b_a in ((source, target, T_target_source), (target, source, geometry.inverse(T_target_source)))
     ]
     overlaps, residuals_m, shown, violations = zip(*ways, strict=True)
@@ -98,8 +95,7 @@ def agreement(source: Observed, target: Observed, T_target_source: Transform) ->
 
 def first_look(source: Observed, target: Observed, T_target_source: Transform) -> Shown:
     """The patches of the source alone, in half of the time: a first look at a pose that may still be refined."""
-    roughness_m = max(source[0].roughness_m, target[0].roughness_m)
-    return _seen_from(target, source, T_target_source, roughness_m)[2]
+    return _seen_from(target, source, T_target_source)[2]
 
 
 def counted(shown: Shown) -> Counts:
@@ -107,16 +103,15 @@ def counted(shown: Shown) -> Counts:
     return np.bincount(shown[shown >= 0], minlength=len(BINS)).astype(np.float64)
 
 
-def _seen_from(b: Observed, a: Observed, T_b_a: Transform, roughness_m: float) -> tuple[float, float, Shown]:
+def _seen_from(b: Observed, a: Observed, T_b_a: Transform) -> tuple[float, float, Shown]:
     """Overlap, residual (m) and patches of a's standing points in the view of b."""
-    surface, standing = b[0], patches_of(a[0])
+    standing = patches_of(a[0])
     moved = geometry.apply(T_b_a, standing.points)
     within = within_range(moved, 0.0, MAX_RANGE_M)
     points = moved[within]
     if not len(points):
         return 0.0, math.inf, np.full(len(standing.size), -1, np.int8)
-    rows, apart_m = surface.nearest(points)
-    to_plane_m = np.einsum("ij,ij->i", points - surface.points[rows], surface.normals[rows])
+    apart_m, to_plane_m = b[0].distances_m(points)
     is_near = apart_m < INLIER_M
     rms_m = float(np.sqrt(np.mean(to_plane_m[is_near] ** 2))) if is_near.any() else math.inf
     fate = fates(points, b[1])
@@ -125,7 +120,7 @@ def _seen_from(b: Observed, a: Observed, T_b_a: Transform, roughness_m: float) -
         for weights in (
             is_near | (fate == IN_FRONT) | (fate == AT_RETURN),
             is_near,
-            is_near * (to_plane_m / roughness_m) ** 2,
+            is_near * (to_plane_m / max(a[0].roughness_m, b[0].roughness_m)) ** 2,
             fate == IN_FRONT,
             ~is_near & (fate == BEHIND),
             ~is_near & (fate == NO_RETURN),

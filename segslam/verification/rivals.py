@@ -12,7 +12,7 @@ from segslam.core.types import Direction, Registration, Rejected, Transform
 from segslam.registration import refinement
 from segslam.registration.hypotheses import anywhere, plans_near
 from segslam.verification import score
-from segslam.verification.trial import FEW_PRECISION_M, Found, Trial, few_points, is_near
+from segslam.verification.trial import FEW_PRECISION_M, Found, Trial, few_points
 
 MAX_RIVALS = 6
 """Chosen: number of floor-plan poses tried as rivals, besides shifts along the weak direction."""
@@ -41,7 +41,7 @@ def rivals_of(found: Found, known: Sequence[Found], trial: Trial) -> list[Found]
     done = [pose.T_target_source for pose in known]
     starts: list[_Start] = []
     for start in sorted(_starts(found, free), key=lambda start: start.lead):
-        if not is_near(start.coarse.T_target_source, done, within_m=NEW_M, within_rad=NEW_RAD):
+        if not geometry.is_near(start.coarse.T_target_source, done, within_m=NEW_M, within_rad=NEW_RAD):
             done.append(start.coarse.T_target_source)
             starts.append(start)
     refined = [  # where the scans let a pose slide, a rival need not converge to fit as well
@@ -50,10 +50,10 @@ def rivals_of(found: Found, known: Sequence[Found], trial: Trial) -> list[Found]
     return [rival for rival in refined if isinstance(rival, Found)]
 
 
-def differs(pose: Found, other: Found) -> bool:
-    """True unless two poses are so close that they are the same."""
-    near = [other.T_target_source]
-    return not is_near(pose.T_target_source, near, within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
+def is_same(T_target_source: Transform, found: Found) -> bool:
+    """True if a pose is so close to a found one that they are the same."""
+    near = [found.T_target_source]
+    return geometry.is_near(T_target_source, near, within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
 
 
 class _Start(NamedTuple):
@@ -68,13 +68,10 @@ def _starts(found: Found, trial: Trial) -> list[_Start]:
     """Poses to which few points lead from shifts along the weak direction, and from floor plans."""
     weakest = refinement.weakest_level(found.fine.information)
     shifted = [start for sign in (-1.0, 1.0) for start in _shifted(found, sign * weakest, trial)]
-    plans = [_led(coarse, found, trial) for coarse in plans_near(trial.pair, num_poses=MAX_RIVALS)]
-    return [start for start in (*shifted, *plans) if start is not None and not _is_found(start.coarse, found)]
-
-
-def _is_found(coarse: Registration, found: Found) -> bool:
-    near = [found.T_target_source]
-    return is_near(coarse.T_target_source, near, within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
+    plans = [_led(coarse, found, trial) for coarse in plans_near(trial, num_poses=MAX_RIVALS)]
+    return [
+        start for start in (*shifted, *plans) if start is not None and not is_same(start.coarse.T_target_source, found)
+    ]
 
 
 def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
@@ -84,10 +81,9 @@ def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
         return None
     with trial.watch("refine"):
         T_begun = refinement.approach(*surfaces, coarse.T_target_source, config=trial.config.refine)
-    begun = replace(coarse, T_target_source=T_begun)
-    if _is_found(begun, found):
-        return _Start(begun, 0.0)
-    most = trial.table.most_lead(found.agreement.counts, trial.least_odds)
+    if is_same(T_begun, found):
+        return _Start(replace(coarse, T_target_source=T_begun), 0.0)
+    most = score.shipped().most_lead(found.agreement.counts, trial.least_odds)
     if _lead(found, T_begun, trial) > most + APPROACH_LEAD:
         return None
     with trial.watch("refine"):
@@ -103,7 +99,7 @@ def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
 def _lead(found: Found, T_target_source: Transform, trial: Trial) -> float:
     """Lead of the found pose over another, by the patches of the source."""
     shown = trial.first_look(T_target_source)
-    return score.paired_lead(trial.table.ratios, [(found.agreement.of_source, shown)])
+    return score.paired_lead(score.shipped().ratios, [(found.agreement.of_source, shown)])
 
 
 def _shifted(found: Found, direction: Direction, trial: Trial) -> Iterator[_Start]:

@@ -1,4 +1,4 @@
-"""One pose between two scans: refined with few points, then with all, and what the scans show there."""
+"""One pose between two scans: refined with few points, then with all, what the scans show there, and its verdict."""
 
 import math
 from collections.abc import Sequence
@@ -7,13 +7,11 @@ from typing import NamedTuple
 
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig
-from segslam.core.threads import Stopwatch
-from segslam.core.types import Alignment, Registration, Rejected, RejectReason, Transform
+from segslam.core.types import Alignment, Registration, Rejected, RejectReason, Transform, probability_text
 from segslam.registration import refinement
-from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Gate, Pair
+from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Pair
 from segslam.registration.prepared import PreparedScan
 from segslam.verification import patches, score
-from segslam.verification.verdict import judged
 
 MIN_INLIERS = 3
 """Chosen: smallest number of clique members consistent with a coarse pose."""
@@ -52,26 +50,19 @@ class Found(NamedTuple):
         """The refined pose, (4, 4)."""
         return self.fine.T_target_source
 
-
-class Trial(NamedTuple):
-    """Two scans, and what is known about the pose between them."""
-
-    source: PreparedScan
-    target: PreparedScan
-    config: Config
-    gate: Gate
-    watch: Stopwatch
-    table: score.Table
-
     @property
-    def pair(self) -> Pair:
-        """Input of the registration without initial guess."""
-        return Pair(self.source, self.target, self.config, self.gate, self.watch)
+    def mean_ratio(self) -> float:
+        """Mean log ratio of the patches (nats)."""
+        return score.shipped().mean_ratio(self.agreement.counts)
+
+
+class Trial(Pair):
+    """Two scans, and what is known about the pose between them; its methods try poses."""
 
     @property
     def least_odds(self) -> float:
         """Log odds that an accepted pose has at least."""
-        return self.table.least_odds(self.config.verify)
+        return score.shipped().least_odds(self.config.verify)
 
     def begin(self, coarse: Registration) -> Transform | Rejected:
         """The pose to which few points of the source lead from a hypothesis; `Rejected` if it is hopeless with all.
@@ -102,8 +93,8 @@ class Trial(NamedTuple):
             return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m with few points")
         # the patches of the target are taken to show the same
         counts = 2.0 * patches.counted(self.first_look(led.T_target_source))
-        if self.table.log_odds(counts) < self.least_odds - FEW_NATS:
-            judgement = self.table.judge_patches(counts)
+        if score.shipped().log_odds(counts) < self.least_odds - FEW_NATS:
+            judgement = score.shipped().judge_patches(counts)
             detail = f"{judgement.log_odds:.1f} < {self.least_odds - FEW_NATS:.1f} nats with few points"
             return Rejected(RejectReason.IMPROBABLE, detail, judgement.probability, judgement.evidence)
         return led.T_target_source
@@ -130,19 +121,29 @@ class Trial(NamedTuple):
     def fits(self, pose: Found) -> bool:
         """True for a pose that the prior allows and that is probable enough if no other pose fits as well."""
         is_allowed = self.gate(pose.T_target_source, slack_m=0.0) is None
-        return is_allowed and self.table.log_odds(pose.agreement.counts) >= self.least_odds
-
-    def mean_ratio(self, pose: Found) -> float:
-        """Mean log ratio of the patches at a pose (nats)."""
-        return self.table.mean_ratio(pose.agreement.counts)
-
-    def judge(self, pose: Found, others: Sequence[Found] | None) -> Alignment | Rejected:
-        """The pose with its probability, `Rejected` if too improbable; `others`: as for `score.Table.judge`."""
-        agreements = None if others is None else [other.agreement for other in others]
-        return judged(pose.coarse, pose.fine, pose.agreement, agreements, config=self.config, table=self.table)
+        return is_allowed and score.shipped().log_odds(pose.agreement.counts) >= self.least_odds
 
 
-def is_near(T_target_source: Transform, others: Sequence[Transform], *, within_m: float, within_rad: float) -> bool:
-    """True if a pose is close to one of the others."""
-    apart = [geometry.inverse(other) @ T_target_source for other in others]
-    return any(geometry.distance(T) < within_m and geometry.angle(T) < within_rad for T in apart)
+def judged(found: Found, others: Sequence[Found] | None, *, config: Config) -> Alignment | Rejected:
+    """A pose with its probability; `Rejected` if it is wrong more often than `verify.max_false_share`.
+
+    `others` that were tried: as for `score.Table.judge`.
+    """
+    table, shown = score.shipped(), found.agreement
+    judgement = table.judge(shown, None if others is None else [other.agreement for other in others])
+    least = table.least_odds(config.verify)
+    if judgement.log_odds < least:
+        reason = RejectReason.AMBIGUOUS if table.log_odds(shown.counts) >= least else RejectReason.IMPROBABLE
+        detail = probability_text(judgement.probability, judgement.evidence)
+        return Rejected(reason, detail, judgement.probability, judgement.evidence)
+    observability, _ = refinement.observability(found.fine.information)
+    return Alignment(
+        found.coarse,
+        found.fine,
+        shown.overlap,
+        shown.rms_m,
+        shown.free_space_violation,
+        observability=observability,
+        probability=judgement.probability,
+        evidence=judgement.evidence,
+    )

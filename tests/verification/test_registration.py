@@ -15,7 +15,7 @@ from segslam.registration.free_space import observe_free_space
 from segslam.registration.hypotheses import MAX_COARSE_FINE_M, MAX_HYPOTHESES, anywhere, coarse_poses
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import open_dataset
-from segslam.verification import register, register_near, register_prepared, rivals, score
+from segslam.verification import register, register_near, register_prepared, rivals
 from segslam.verification.trial import Found, Trial
 from tools.benchmarks.altered import ALTERATIONS
 
@@ -153,7 +153,7 @@ def test_the_first_iterations_decide_whether_a_rival_is_refined(
 ) -> None:
     """The pose from which refinement starts is beside the one to which it leads; `least` is added to its lead."""
     trial, found = _found_pose()
-    monkeypatch.setattr(rivals, "_is_found", lambda *_: False)
+    monkeypatch.setattr(rivals, "is_same", lambda *_: False)
     lead = rivals._lead
     monkeypatch.setattr(rivals, "_lead", lambda *given: lead(*given) + least)
     refined = []
@@ -166,8 +166,8 @@ def test_the_first_iterations_decide_whether_a_rival_is_refined(
 
 def _found_pose() -> tuple[Trial, Found]:
     source, target, _ = _round_pair()
-    trial = Trial(source, target, CONFIG, anywhere, Stopwatch(), score.shipped())
-    (coarse, *_) = (one for one in coarse_poses(trial.pair) if isinstance(one, Registration))
+    trial = Trial(source, target, CONFIG, anywhere, Stopwatch())
+    (coarse, *_) = (one for one in coarse_poses(trial) if isinstance(one, Registration))
     found = trial.refined(coarse, coarse.T_target_source)
     assert isinstance(found, Found)
     return trial, found

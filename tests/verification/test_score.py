@@ -11,7 +11,7 @@ from segslam.core.config import VerifyConfig, load_config
 from segslam.core.types import Alignment, Registration, Rejected, RejectReason
 from segslam.verification.patches import BINS, Agreement
 from segslam.verification.score import NO_OTHER, RIVAL_NATS, Table, Weights, shipped, table_of
-from segslam.verification.verdict import judged
+from segslam.verification.trial import Found, judged
 
 STORED = Path(__file__).with_name("judged_pairs.npz")
 """Best poses of pairs of scenes and real drives: patches in each bin, lead over other poses, right or not."""
@@ -112,6 +112,7 @@ def test_the_patches_of_another_place_are_not_compared() -> None:
 def test_the_share_of_false_loops_is_the_one_threshold() -> None:
     fine = Registration(np.eye(4), 9, 9, 0.1, np.eye(6))
     found = _agreement(198, 1)
+    pose = Found(fine, fine, found)
     tried = ([_agreement(198 - more, 1 + more)] for more in range(30))
     others = next(other for other in tried if shipped().judge(found, other).probability > 0.9)
     probability = shipped().judge(found, others).probability
@@ -119,7 +120,7 @@ def test_the_share_of_false_loops_is_the_one_threshold() -> None:
     odds, margin = shipped().judge(found, others).log_odds, shipped().margin
     for least, is_accepted in ((odds + margin - 0.1, True), (odds + margin + 0.1, False)):
         config = load_config(overrides=[f"verify.max_false_share={1.0 / (1.0 + math.exp(least))}"])
-        outcome = judged(fine, fine, found, others, config=config)
+        outcome = judged(pose, [Found(fine, fine, other) for other in others], config=config)
         assert isinstance(outcome, Alignment) == is_accepted
         assert outcome.probability == pytest.approx(probability)
         if isinstance(outcome, Rejected):

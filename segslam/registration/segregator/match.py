@@ -72,7 +72,11 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
         return rejections[0]
     ranked = [registration for _, registration in sorted(found, key=lambda attempt: -attempt[0])]
     poses = [registration.T_target_source for registration in ranked]
-    return [registration for k, registration in enumerate(ranked) if not _is_among(poses[k], poses[:k])]
+    return [
+        registration
+        for k, registration in enumerate(ranked)
+        if not geometry.is_near(poses[k], poses[:k], within_m=SAME_PLACE_M, within_rad=SAME_TURN_RAD)
+    ]
 
 
 def _attempts(
@@ -176,11 +180,3 @@ def _middle(normals: Points) -> Direction:
     """Unit vector of the medians of the components: patches of slopes and walls do not move it, as they do the mean."""
     middle = np.median(normals.astype(np.float64), axis=0)
     return middle / np.linalg.norm(middle)
-
-
-def _is_among(T_target_source: Transform, poses: list[Transform]) -> bool:
-    differences = [geometry.inverse(T_target_other) @ T_target_source for T_target_other in poses]
-    return any(
-        geometry.distance(difference) <= SAME_PLACE_M and geometry.angle(difference) <= SAME_TURN_RAD
-        for difference in differences
-    )

@@ -25,7 +25,7 @@ from segslam.registration.hypotheses import MAX_COARSE_FINE_M
 from segslam.registration.prepared import Observed, prepare_observed
 from segslam.run.locator import Locator
 from segslam.verification.patches import agreement
-from segslam.verification.verdict import judged
+from segslam.verification.trial import Found, judged
 
 REACH_M = 12.0
 """Chosen: the map's keyframes within this distance of a prediction are used for registration."""
@@ -127,7 +127,7 @@ class Placer:
         with watch("verify"):
             found = agreement(own, target, fine.T_target_source)
         coarse = replace(fine, T_target_source=T_target_predicted, num_inliers=0, num_correspondences=0)
-        alignment = judged(coarse, fine, found, None, config=self._config)
+        alignment = judged(Found(coarse, fine, found), None, config=self._config)
         if isinstance(alignment, Rejected):
             return alignment
         return Placement(keyframe_id, target_id, T_world_keyframe, fine.information, alignment, is_found=False)

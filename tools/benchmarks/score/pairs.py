@@ -18,7 +18,7 @@ from segslam.labels import geometric_labels
 from segslam.registration.hypotheses import Gate, anywhere
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import Dataset, open_dataset
-from segslam.verification import register_prepared, score
+from segslam.verification import register_prepared
 from segslam.verification.pair import tried_poses
 from segslam.verification.patches import agreement
 from segslam.verification.trial import Trial
@@ -68,7 +68,7 @@ def described(task: Task, config: Config) -> Pair:
     if isinstance(found, Alignment) and is_right(found.fine.T_target_source):
         verdict = "right"
     searching = config.model_copy(update={"verify": config.verify.model_copy(update={"max_false_share": SEARCH_SHARE})})
-    trial = Trial(task.source, task.target, searching, task.gate, Stopwatch(), score.shipped())
+    trial = Trial(task.source, task.target, searching, task.gate, Stopwatch())
     tried = tried_poses(trial)
     tried = [] if isinstance(tried, Rejected) else tried
     poses = [

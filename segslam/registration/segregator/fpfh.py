@@ -84,16 +84,6 @@ def _pair_columns(points, normals, source, target):
     return theta, BINS + _bin(0.5 * alpha + 0.5), 2 * BINS + _bin(0.5 * phi + 0.5)
 
 
-@kernel("boolean[:](int64, int64[:], int64[:], int32[:], int64[:])")
-def _neighbours_of(num_points, starts, ends, rows, chosen):
-    """(n,) whether each point is a neighbour of a chosen point."""
-    found = np.zeros(num_points, np.bool_)
-    for row in chosen:
-        for at in range(starts[row], ends[row]):
-            found[rows[at]] = True
-    return found
-
-
 @kernel("float32[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int32[:], boolean[:])")
 def simple_histograms(points, normals, starts, ends, rows, wanted):
     """(n, 33) SPFH of each wanted point; zeros for other points and for points without neighbours.
@@ -143,6 +133,8 @@ def fpfh(points: Points, normals: Points, neighbours: Neighbours, chosen: Indice
 
     Neighbours are those within a radius. The points must be distinct.
     """
-    wanted = _neighbours_of(len(points), *neighbours, chosen)
+    wanted = np.zeros(len(points), bool)
+    for row in chosen:
+        wanted[neighbours.rows[neighbours.starts[row] : neighbours.ends[row]]] = True
     simple = simple_histograms(points, normals, *neighbours, wanted)
     return simple[chosen] + neighbour_histograms(points, simple, *neighbours, chosen)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Complex, Float
 from scipy.fft import ifft, irfft, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter
 
@@ -71,13 +71,14 @@ def plan_hypotheses(source: FloorPlan, target: FloorPlan, *, num_poses: int) -> 
     for yaw_index, i, j in _peaks(volume, num_poses):
         R_yaw = geometry.yaw(math.tau * yaw_index / NUM_YAWS)
         T_flat = geometry.transform(R_yaw, CELL_M * np.array([steps[i], steps[j], 0.0]))
-        rise_m, num_filled = _rise(geometry.apply(T_flat, source.points), filled)
-        shift = T_flat[:3, 3] + [0.0, 0.0, rise_m]
+        rows, columns, slices = _slots(geometry.apply(T_flat, source.points))
+        num_filled = _count_filled(rows, columns, slices, filled)
+        shift = T_flat[:3, 3] + [0.0, 0.0, SLICE_M * float(num_filled.argmax() - MAX_RISE_SLICES)]
         R_scan_level = target.R_level_scan.T
         yield Registration(
             T_target_source=geometry.transform(R_scan_level @ R_yaw @ source.R_level_scan, R_scan_level @ shift),
             num_correspondences=source.num_points,
-            num_inliers=num_filled,
+            num_inliers=int(num_filled.max()),
             rms_m=CELL_M,
             information=INFORMATION,
         )
@@ -93,18 +94,17 @@ def _correlation(source: FloorPlan, target: FloorPlan) -> tuple[Float[np.ndarray
 
 def _plans(points: Points, yaws_rad: Vector) -> Float[np.ndarray, "plans size size"]:
     """Points in each cell, up to MAX_COUNT, after each rotation."""
-    flat = np.ascontiguousarray(points[:, :2], dtype=np.float64)
-    return _counts(flat, np.cos(yaws_rad), np.sin(yaws_rad), CELL_M, HALF, SIZE, MAX_COUNT)
+    return _counts(np.ascontiguousarray(points[:, :2], dtype=np.float64), np.cos(yaws_rad), np.sin(yaws_rad))
 
 
-@kernel("float32[:, :, ::1](float64[:, ::1], float64[:], float64[:], float64, int64, int64, int64)")
-def _counts(points, cosines, sines, cell_m, half, size, most):
-    counts = np.zeros((len(cosines), size, size), np.float32)
+@kernel("float32[:, :, ::1](float64[:, ::1], float64[:], float64[:])")
+def _counts(points, cosines, sines):
+    counts = np.zeros((len(cosines), SIZE, SIZE), np.float32)
     for k in range(len(cosines)):
         for x, y in points:
-            i = math.floor((cosines[k] * x - sines[k] * y) / cell_m) + half
-            j = math.floor((sines[k] * x + cosines[k] * y) / cell_m) + half
-            if 0 <= i < 2 * half and 0 <= j < 2 * half and counts[k, i, j] < most:
+            i = math.floor((cosines[k] * x - sines[k] * y) / CELL_M) + HALF
+            j = math.floor((sines[k] * x + cosines[k] * y) / CELL_M) + HALF
+            if 0 <= i < 2 * HALF and 0 <= j < 2 * HALF and counts[k, i, j] < MAX_COUNT:
                 counts[k, i, j] += 1.0
     return counts
 
@@ -124,20 +124,13 @@ def _peaks(volume: Float[np.ndarray, "yaws shifts shifts"], num_peaks: int) -> I
         largest[around] = flat[around, places[around]]
 
 
-def _rise(source: Points, filled: Bool[np.ndarray, "size size slices"]) -> tuple[float, int]:
-    """Height offset (m) at which most source points fall into occupied cells of the target, and their number."""
-    rows, columns, slices = _slots(source)
-    num_filled = _count_filled(rows, columns, slices, filled, MAX_RISE_SLICES)
-    return SLICE_M * float(num_filled.argmax() - MAX_RISE_SLICES), int(num_filled.max())
-
-
-@kernel("int64[:](int64[:], int64[:], int64[:], boolean[:, :, ::1], int64)")
-def _count_filled(rows, columns, slices, filled, most_rise):
-    """Number of slots that are filled, for each rise from -most_rise to most_rise slices."""
-    num_filled = np.zeros(2 * most_rise + 1, np.int64)
+@kernel("int64[:](int64[:], int64[:], int64[:], boolean[:, :, ::1])")
+def _count_filled(rows, columns, slices, filled):
+    """Number of slots that are filled, for each rise from -MAX_RISE_SLICES to MAX_RISE_SLICES slices."""
+    num_filled = np.zeros(2 * MAX_RISE_SLICES + 1, np.int64)
     for at in range(len(rows)):
-        for k in range(2 * most_rise + 1):
-            height = min(max(slices[at] + k - most_rise, 0), filled.shape[2] - 1)
+        for k in range(2 * MAX_RISE_SLICES + 1):
+            height = min(max(slices[at] + k - MAX_RISE_SLICES, 0), filled.shape[2] - 1)
             num_filled[k] += filled[rows[at], columns[at], height]
     return num_filled
 

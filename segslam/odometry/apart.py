@@ -48,7 +48,7 @@ class OdometryApart(KissOdometry):
         self._apart.close()
 
 
-class _AlignerApart:
+class _AlignerApart(KissAligner):
     """A `KissAligner` in another process, which handles one request at a time."""
 
     def __init__(self, config: OdometryConfig) -> None:
@@ -69,7 +69,7 @@ class _AlignerApart:
             self._pipe.send(("begin", config))
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
-        """T_odom_lidar of the next sweep, `gap` intervals after the previous one."""
+        """As `KissAligner.align`."""
         return self._exchange("align", self._shared_or_sent(points), gap)
 
     def follow(
@@ -78,15 +78,15 @@ class _AlignerApart:
         """As `Odometry.follow`."""
         self._exchange("follow", list(scans), T_odom_lidar, T_before_lidar)
 
-    def align_alone(self, points: Points, gap: float = 1.0) -> None:
-        """As `Aligner.align_alone`; the other process works while this one continues."""
+    def align_alone(self, points: Points, gap: float) -> None:
+        """As `KissAligner.align_alone`; the other process works while this one continues."""
         sent = self._shared_or_sent(points)
         with self._reported():
             self._pipe.send(("align_alone", sent, gap))
         self._is_waiting = True
 
     def alone(self) -> list[Transform]:
-        """As `Aligner.alone`, also after `close`."""
+        """As `KissAligner.alone`, also after `close`."""
         if self._is_waiting:
             self._is_waiting = False
             with self._reported():

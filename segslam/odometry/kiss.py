@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
@@ -19,31 +18,11 @@ RESOLUTION = math.sqrt(1.0 / 20.0)
 """Distance between points in KISS-ICP's map, in voxels: at most 20 points a voxel."""
 
 
-@runtime_checkable
-class Aligner(Protocol):
-    """Aligns consecutive sweeps with a local map of the previous ones, in this process or in another."""
-
-    def align(self, points: Points, gap: float = 1.0) -> Transform:
-        """T_odom_lidar of the next sweep from its points (n, 3), float64, `gap` intervals after the previous one."""
-        ...
-
-    def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
-    ) -> None:
-        """As `Odometry.follow`."""
-        ...
-
-    def align_alone(self, points: Points, gap: float = 1.0) -> None:
-        """Align a sweep as well with KISS-ICP as it was before the first `follow`; `alone` returns the pose."""
-        ...
-
-    def alone(self) -> list[Transform]:
-        """The pose of each sweep passed to `align_alone`."""
-        ...
-
-
 class KissAligner:
-    """KISS-ICP's aligner. Its threads sum in any order: poses repeat to 1e-9 m, with one thread exactly."""
+    """Aligns consecutive sweeps with KISS-ICP's map of the previous ones.
+
+    Its threads sum in any order: poses repeat to 1e-9 m, with one thread exactly.
+    """
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
@@ -61,19 +40,19 @@ class KissAligner:
         kiss.last_delta = np.array(T_before_lidar)
 
     def align(self, points: Points, gap: float = 1.0) -> Transform:
-        """T_odom_lidar of the next sweep from its points (n, 3), float64.
+        """T_odom_lidar of the next sweep from its points (n, 3), float64, `gap` intervals after the previous one.
 
         KISS-ICP predicts with the last motion; here it is scaled to `gap` intervals, and back to one interval
         afterwards.
         """
         return _registered(self._kiss, points, gap)
 
-    def align_alone(self, points: Points, gap: float = 1.0) -> None:
-        """As `Aligner.align_alone`."""
+    def align_alone(self, points: Points, gap: float) -> None:
+        """Align a sweep as well with KISS-ICP as it was before the first `follow`; `alone` returns the pose."""
         self._alone.append(_registered(self._first, points, gap))
 
     def alone(self) -> list[Transform]:
-        """As `Aligner.alone`."""
+        """The pose of each sweep passed to `align_alone`."""
         return self._alone
 
 
@@ -89,7 +68,9 @@ class KissOdometry:
 
     is_from_scans = True
 
-    def __init__(self, config: OdometryConfig, aligner: Aligner | None = None, *, keeps_alone: bool = False) -> None:
+    def __init__(
+        self, config: OdometryConfig, aligner: KissAligner | None = None, *, keeps_alone: bool = False
+    ) -> None:
         """`keeps_alone`: keep the poses of `alone`, for which each scan is aligned twice after the first `follow`."""
         self._config = config
         self._aligner = aligner or KissAligner(config)

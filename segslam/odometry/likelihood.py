@@ -48,12 +48,6 @@ class Fit:
     """Curvature of the log-likelihood, tangent in the scan's frame."""
 
 
-def num_patches(points: Points, voxel_m: float) -> int:
-    """Number of independent observations in downsampled points (n, 3)."""
-    cells = np.floor(points / (PATCH_VOXELS * voxel_m)).astype(np.int64)
-    return len(np.unique(cells @ np.array([1, 1 << 20, 1 << 40])))
-
-
 def fit(
     points: Points, target: Surface | LightSurface, T_target_source: Transform, *, voxel_m: float, sigma_m: float = 0.0
 ) -> Fit:
@@ -68,23 +62,20 @@ def fit(
     near = np.flatnonzero(apart_m < reach_m)
     normals = target.normals_at(rows[near])
     to_plane = np.einsum("ij,ij->i", moved[near] - target.points[rows[near]], normals)
-    inlier, outlier = _densities(to_plane, sigma_m, reach_m)
+    inlier = (1.0 - OUTLIER_SHARE) / (math.sqrt(2.0 * math.pi) * sigma_m) * np.exp(-0.5 * (to_plane / sigma_m) ** 2)
+    outlier = OUTLIER_SHARE / (2.0 * reach_m)
     total_log = float(np.log(inlier + outlier).sum()) + (len(source) - len(near)) * math.log(outlier)
-    count = num_patches(source, voxel_m)
-    weights = inlier / (inlier + outlier) * (count / max(len(source), 1) / sigma_m**2)
+    cells = np.floor(source / (PATCH_VOXELS * voxel_m)).astype(np.int64)
+    num_patches = len(np.unique(cells @ np.array([1, 1 << 20, 1 << 40])))
+    weights = inlier / (inlier + outlier) * (num_patches / max(len(source), 1) / sigma_m**2)
     return Fit(
         T_target_source,
         total_log / max(len(source), 1),
-        count,
+        num_patches,
         len(near) / max(len(source), 1),
         float(np.sqrt(np.mean(to_plane**2))) if len(near) else 0.0,
         _curvature(source[near], normals @ T_target_source[:3, :3], weights),
     )
-
-
-def _densities(to_plane: Vector, sigma_m: float, reach_m: float) -> tuple[Vector, float]:
-    inlier = (1.0 - OUTLIER_SHARE) / (math.sqrt(2.0 * math.pi) * sigma_m) * np.exp(-0.5 * (to_plane / sigma_m) ** 2)
-    return inlier, OUTLIER_SHARE / (2.0 * reach_m)
 
 
 def _curvature(points: Points, normals: Points, weights: Vector) -> Information:

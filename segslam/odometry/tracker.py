@@ -60,7 +60,11 @@ class Tracker:
         scales the constant-velocity prediction of the odometry. Raises BadScan, and ignores the scan, if it cannot be
         used or is not later than the previous scan.
         """
-        self._check_later(scan)
+        if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:
+            raise BadScan(
+                f"scan {scan.index}: its stamp {scan.stamp_ns} ns is not later than that of the previous scan, "
+                f"{self._last_stamp_ns} ns; give each scan once, in order of time"
+            )
         index = self._num_tracked if scan.index is None else scan.index
         scan = replace(scan, index=index)
         watch = Stopwatch()
@@ -98,10 +102,3 @@ class Tracker:
             T_own_lidar = self._odometry.register(scan).T_odom_lidar
         self._odometry.watch_after(self._noted)
         self._T_odom_own = geometry.nearest_transform(T_odom_lidar[-1] @ geometry.inverse(T_own_lidar))
-
-    def _check_later(self, scan: Scan) -> None:
-        if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:
-            raise BadScan(
-                f"scan {scan.index}: its stamp {scan.stamp_ns} ns is not later than that of the previous scan, "
-                f"{self._last_stamp_ns} ns; give each scan once, in order of time"
-            )

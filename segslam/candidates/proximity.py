@@ -32,8 +32,6 @@ BREAK_TRAVEL_M = 1e5
 """Keyframes this far apart in travel are separated by a break of the odometry."""
 BREAK_STEP_M = 2.0 * BREAK_TRAVEL_M
 """Travel assigned to a break, because the relative pose across it is unknown; rounded, it is still a break."""
-NO_CLOSURES: IndexPairs = np.empty((0, 2), dtype=np.int64)
-
 
 Covariances = Callable[[int, Indices], Float[np.ndarray, "_ 6 6"]]
 """Covariance of the pose of a keyframe in each of others, as a tangent of the keyframe (`graph.covariances`)."""
@@ -47,7 +45,7 @@ class ProximityDetector:
 
     def __init__(self, config: ProximityConfig) -> None:
         self._config = config
-        self._closures = NO_CLOSURES
+        self._closures: IndexPairs = np.empty((0, 2), dtype=np.int64)
         self._kept = np.empty(0, dtype=bool)
 
     def note_closure(self, closure: LoopClosure) -> None:
@@ -81,8 +79,11 @@ class ProximityDetector:
         is_open = near.probability >= LEAST_PROBABILITY
         is_open[is_open] &= ~self._is_closed(source_id, older[is_open], travel_m, near.reach_m[is_open])
         nearest_first = np.flatnonzero(is_open)[np.argsort(near.distance_m[is_open], kind="stable")]
-        rows = _spread_out(nearest_first, travel_m, SPREAD_M, MAX_CANDIDATES)
-        return tuple(near.candidate(row) for row in rows)
+        chosen: list[int] = []
+        for row in nearest_first.tolist():
+            if len(chosen) < MAX_CANDIDATES and all(abs(travel_m[row] - travel_m[k]) >= SPREAD_M for k in chosen):
+                chosen.append(row)
+        return tuple(near.candidate(row) for row in chosen)
 
     def _is_closed(self, source_id: int, ids: Indices, travel_m: Vector, reach_m: Vector) -> Bool[np.ndarray, " k"]:
         """True for targets near a loop closed within the last `MIN_GAP_M`: closer to its target, in travel, than
@@ -148,14 +149,3 @@ def nearness(
     probability[np.abs(offset[:, 2]) > HEIGHT_M + FARTHEST * height_m] = 0.0
     reach_m = radius_m + FARTHEST * np.maximum(along_m, across_m)
     return Nearness(source_id, ids, T_world_keyframes, found, distance_m, probability, reach_m)
-
-
-def _spread_out(ranked: Indices, travel_m: Vector, spread_m: float, most: int) -> list[int]:
-    """At most `most` rows by rank, skipping rows within `spread_m` of travel of a better one."""
-    chosen: list[int] = []
-    for keyframe_id in ranked:
-        if len(chosen) == most:
-            break
-        if all(abs(travel_m[keyframe_id] - travel_m[other]) >= spread_m for other in chosen):
-            chosen.append(int(keyframe_id))
-    return chosen

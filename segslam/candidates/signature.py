@@ -77,7 +77,11 @@ def signatures_around(points: Points, labels: Labels) -> tuple[PlaceSignature, .
     The weight of a point decreases with its distance, so the signature changes over 10 m.
     """
     standing = _standing(points, labels, reach_m=REACH_M + CIRCLES[-1][0])
-    return tuple(signature_of_standing(standing - centre) for centre in _centres())
+    return tuple(
+        signature_of_standing(standing - [radius_m * math.cos(angle), radius_m * math.sin(angle), 0.0])
+        for radius_m, number in CIRCLES
+        for angle in math.tau * np.arange(number) / number
+    )
 
 
 def _standing(points: Points, labels: Labels, *, reach_m: float) -> Points:
@@ -94,18 +98,6 @@ def _standing(points: Points, labels: Labels, *, reach_m: float) -> Points:
     near = level.compress((np.abs(level[:, 0]) <= edge_m) & (np.abs(level[:, 1]) <= edge_m), axis=0)
     heights = heights_above_ground(near, max_range_m=min(MAX_RANGE_M, edge_m + GROUND_CELL_M))
     return near[heights > GROUND_M]
-
-
-@cache
-def _centres() -> Points:
-    """Additional viewpoints around the sensor."""
-    return np.array(
-        [
-            [radius_m * math.cos(angle), radius_m * math.sin(angle), 0.0]
-            for radius_m, number in CIRCLES
-            for angle in math.tau * np.arange(number) / number
-        ]
-    )
 
 
 def signature_of_standing(points: Points) -> PlaceSignature:

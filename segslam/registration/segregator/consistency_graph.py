@@ -120,15 +120,15 @@ def _root_eigenvalues(trace, minors, determinant):
     return (math.sqrt(first), math.sqrt(max(trace - first - last, 0.0)), math.sqrt(max(last, 0.0)))
 
 
+@kernel("UniTuple(float64, 3)(UniTuple(float64, 6))")
+def _roots(m):
+    adjugate = _adjugate(m)
+    return _root_eigenvalues(m[0] + m[1] + m[2], adjugate[0] + adjugate[1] + adjugate[2], _inner(m, adjugate) / 3.0)
+
+
 @kernel("float64(UniTuple(float64, 6), UniTuple(float64, 6))")
 def _spectral_distance(a, b):
-    adjugate_a, adjugate_b = _adjugate(a), _adjugate(b)
-    roots_a = _root_eigenvalues(
-        a[0] + a[1] + a[2], adjugate_a[0] + adjugate_a[1] + adjugate_a[2], _inner(a, adjugate_a) / 3.0
-    )
-    roots_b = _root_eigenvalues(
-        b[0] + b[1] + b[2], adjugate_b[0] + adjugate_b[1] + adjugate_b[2], _inner(b, adjugate_b) / 3.0
-    )
+    roots_a, roots_b = _roots(a), _roots(b)
     return (roots_a[0] - roots_b[0]) ** 2 + (roots_a[1] - roots_b[1]) ** 2 + (roots_a[2] - roots_b[2]) ** 2
 
 

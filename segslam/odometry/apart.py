@@ -113,7 +113,11 @@ class _AlignerApart(KissAligner):
         try:
             yield
         except (EOFError, OSError) as error:
-            raise self._ended() from error
+            self._process.join(timeout=1.0)
+            raise SegslamError(
+                f"the odometry process has ended (exit code {self._process.exitcode}; -9 is often a lack of memory, 1 "
+                'a script without `if __name__ == "__main__":`); continue with `segslam map --resume`'
+            ) from error
 
     def close(self) -> None:
         """End the process."""
@@ -122,13 +126,6 @@ class _AlignerApart(KissAligner):
         note_peak_of(self._process.pid)
         self._pipe.close()
         self._process.join()
-
-    def _ended(self) -> SegslamError:
-        self._process.join(timeout=1.0)
-        return SegslamError(
-            f"the odometry process has ended (exit code {self._process.exitcode}; -9 is often a lack of memory, 1 a "
-            'script without `if __name__ == "__main__":`); continue with `segslam map --resume`'
-        )
 
 
 def _room_for_points(context: SpawnContext) -> Any:

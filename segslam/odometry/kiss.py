@@ -88,8 +88,8 @@ class KissOdometry:
         T_odom_lidar = self._aligner.align(points, gap)
         if self._keeps_alone:
             self._register_alone(scan, points, T_odom_lidar, gap)
-        self._now_at(T_odom_lidar)
-        self._T_last_lidar = geometry.scaled(self._T_last_lidar, 1 / gap)
+        self._T_last_lidar = geometry.scaled(_since(self._T_odom_last, T_odom_lidar), 1 / gap)
+        self._T_odom_last = T_odom_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
     def follow(
@@ -115,10 +115,6 @@ class KissOdometry:
                 points = deskew_scan(scan, T_last_lidar, self._config)[0]
             self._aligner.align_alone(points, gap)
         self._last_gap = gap
-
-    def _now_at(self, T_odom_lidar: Transform) -> None:
-        self._T_last_lidar = _since(self._T_odom_last, T_odom_lidar)
-        self._T_odom_last = T_odom_lidar
 
 
 def _since(T_odom_last: Transform, T_odom_lidar: Transform) -> Transform:

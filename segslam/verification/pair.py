@@ -109,9 +109,8 @@ def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Foun
     outcome = trial.refined(coarse, begun)
     if isinstance(outcome, Found):
         moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ outcome.T_target_source)
-        most_m = MAX_COARSE_FINE_M
-        if moved_m > most_m:
-            return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {most_m} m")
+        if moved_m > MAX_COARSE_FINE_M:
+            return Rejected(RejectReason.REFINEMENT_DIVERGED, f"moved {moved_m:.2f} m > {MAX_COARSE_FINE_M} m")
     return outcome
 
 

@@ -83,16 +83,10 @@ def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) 
     for label in FEATURE_CLASSES:
         cloud = points[labels == label]
         cloud = cloud[within_range(cloud, MIN_RANGE_M, MAX_RANGE_M)].astype(np.float32)
-        parts.append(_class_features(_voxelised(cloud, config.feature_voxel_m), int(label), config))
+        cloud = voxel_means(cloud, config.feature_voxel_m)
+        nearest = np.argsort(np.linalg.norm(cloud, axis=1), kind="stable")[:MAX_CLOUD_POINTS]
+        parts.append(_class_features(cloud[np.sort(nearest)], int(label), config))
     return Features(*(np.concatenate(columns) for columns in zip(NO_FEATURES, *parts, strict=True)))
-
-
-def _voxelised(cloud: Points, voxel_m: float) -> Points:
-    means = voxel_means(cloud, voxel_m)
-    if len(means) <= MAX_CLOUD_POINTS:
-        return means
-    nearest = np.argsort(np.linalg.norm(means, axis=1), kind="stable")[:MAX_CLOUD_POINTS]
-    return means[np.sort(nearest)]
 
 
 def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Features:

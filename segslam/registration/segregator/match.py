@@ -132,25 +132,22 @@ def _solve(
     bound_m: float,
     config: SegregatorConfig,
 ) -> PoseFit | Rejected:
-    """The pose from the correspondences of one clique, by `config.solver`."""
-    if config.solver != "gaussians":
-        members = correspondences.take(clique)
-        return solve_pose(members.source, members.target, bound_m=bound_m, config=config)
-    rough = _rough_pose(source, target, correspondences.take(clique), bound_m, config)
+    """The pose from the correspondences of one clique, by `config.solver`.
+
+    The initial pose of `gaussians` has the verticals aligned, if both are known.
+    """
+    members = correspondences.take(clique)
+    source_up, target_up = upward(source), upward(target)
+    if config.solver != "gaussians" or source_up is None or target_up is None:
+        fit = solve_pose(members.source, members.target, bound_m=bound_m, config=config)
+        if config.solver != "gaussians" or isinstance(fit, Rejected):
+            return fit
+        rough: Transform | Rejected = fit.T_target_source
+    else:
+        rough = solve_level(members.source, members.target, source_up, target_up, bound_m=bound_m, config=config)
     if isinstance(rough, Rejected):
         return rough
     return align_gaussians(correspondences, source, target, rough, config=config)
-
-
-def _rough_pose(
-    source: Description, target: Description, members: Correspondences, bound_m: float, config: SegregatorConfig
-) -> Transform | Rejected:
-    """Initial pose: with the verticals aligned, if both are known."""
-    source_up, target_up = upward(source), upward(target)
-    if source_up is None or target_up is None:
-        fit = solve_pose(members.source, members.target, bound_m=bound_m, config=config)
-        return fit if isinstance(fit, Rejected) else fit.T_target_source
-    return solve_level(members.source, members.target, source_up, target_up, bound_m=bound_m, config=config)
 
 
 def upward(description: Description) -> Direction | None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SHOWN = (
     *("num_scans", "num_keyframes", "length_m", "duration_s", "num_candidates", "num_loops_accepted"),
-    *("num_motions_repaired", "ate_m", "odometry_ate_m", "kiss_icp_ate_m", "map_thickness_m"),
+    *("num_motions_repaired", "num_motions_broken", "ate_m", "odometry_ate_m", "kiss_icp_ate_m", "map_thickness_m"),
 )
 """Figures of the run that are shown, if known."""
 

@@ -81,7 +81,7 @@ def test_info_shows_data_state_settings_and_files(
     assert run("info", out) == 0
     shown = capsys.readouterr().out
     size = f"{(out / 'config.yaml').stat().st_size / 1e3:.1f} kB  config.yaml"
-    for text in ("finished", "verify.max_false_share=0.01", "loops accepted", "log.mcap", size):
+    for text in ("finished", "verify.max_false_share=0.01", "loops accepted", "breaks: ", "log.mcap", size):
         assert text in shown
 
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from statistics import median
 
 import numpy as np
+from scipy.linalg import eigh
 
 from segslam.core import geometry
 from segslam.core.types import Information, Motion, Transform, Vector
@@ -127,7 +128,7 @@ class MotionModel:
         The covariance is the increase of that of the position: errors of predicted motions add up linearly.
         """
         T_fused, gain, prior = self._fuse(T_last_lidar, measured, gap)
-        regained = self._regained(T_fused, gap)
+        regained = np.zeros(6) if prior is None else self._regained(T_fused, prior, gap)
         if gap == 1.0:
             self._learn(geometry.log(geometry.inverse(self.T_step) @ T_last_lidar), measured, prior)
         left = np.eye(6) - gain
@@ -143,17 +144,18 @@ class MotionModel:
         self._unseen = deque([turn @ covariance @ turn.T for covariance in self._unseen], MAP_SCANS)
         return T_fused, total + np.outer(regained, regained)
 
-    def _regained(self, T_fused: Transform, gap: float) -> Vector:
-        """(6,) the part of the change of the motion by which the scan probably corrects the last position instead.
+    def _regained(self, T_fused: Transform, prior: Information, gap: float) -> Vector:
+        """(6,) by how much the scan may correct the last position instead of showing another motion.
 
-        The change has two causes, in proportion to their covariances: the motion changed, or the position was wrong.
+        The change has two causes: the motion changed, with covariance `prior`, or the last position was wrong. The
+        share of its square in each direction is the probability of the second, by their covariances.
         """
-        expected = self._predicted_covariance(gap)
-        if expected is None or not self._unseen:
+        if not self._unseen:
             return np.zeros(6)
-        unseen = sum(self._unseen)
+        ratios, directions = eigh(sum(self._unseen), prior)
         change = geometry.log(geometry.inverse(self.predicted(gap)) @ T_fused)
-        return unseen @ np.linalg.pinv(unseen + expected) @ change
+        probability = np.maximum(ratios, 0.0) / (1.0 + np.maximum(ratios, 0.0))
+        return prior @ directions @ (np.sqrt(probability) * (directions.T @ change))
 
     def _fuse(
         self, T_last_lidar: Transform, measured: Information, gap: float

@@ -22,7 +22,7 @@ CAMERA_UP = (0.0, -1.0, 0.0)
 Up = Literal["z", "-y"]
 UP: dict[Up, tuple[float, float, float]] = {"z": Z_UP, "-y": CAMERA_UP}
 """Upward axes that pose files have, by name."""
-FLAT = 3.0  # chosen: a path lies in a plane if it is this much wider than high; 20 real drives are 5 times at least
+FLAT = 3.0  # chosen: a path is flat if it is this much wider than high; 20 real drives are 5 times at least
 ALONG = 0.8  # chosen: smallest component of a direction along its axis; 0.96 or more in these drives
 MIN_POSES = 3  # fewer poses are always aligned without error
 LINE_TOLERANCE = 1e-6  # smallest extent across a line, relative to that along it; above rounding

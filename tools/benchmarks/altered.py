@@ -1,24 +1,31 @@
 """Real drives, altered, with default settings: driven backwards, thinned, cut, turned, with noise.
 
     python -m tools.benchmarks.altered SCANS [ALTERATION ...] [--poses POSES.txt] [--frames 0:560] [--out altered.json]
+    python -m tools.benchmarks.altered SCANS view-40 view-70 --pairs 3 6
 
 SCANS is a folder of scans (and of `poses.txt`, LiDAR to world, in KITTI format; `times.txt`). Each row is a run of
-`segslam map` on a copy with the alteration; all alterations by default.
+`segslam map` on a copy with the alteration; all alterations by default. With `--pairs`, each scan is registered alone
+with those so many scans before, without an initial guess. `--noise-m 0.001 --seed 1` moves all points a little, to see
+how much runs differ.
 """
 
 import json
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.trajectory import read_poses
-from segslam.core.types import Points, Rotation
-from segslam.output.finished import read_metrics
+from segslam.core.trajectory import Poses, read_poses
+from segslam.core.types import Alignment, Points, Rotation, Vector
+from segslam.output.finished import read_run
 from segslam.scans import open_dataset
+from segslam.verification import register
 from tools.benchmarks import common
+from tools.benchmarks.real import within_covariance
 
 Rows = list[int]
 FIGURES = ("odometry_ate_m", "ate_m", "num_motions_repaired", "num_motions_broken", "num_loops_accepted")
@@ -87,29 +94,60 @@ def _true_poses(alteration: str, T_world_lidar: np.ndarray) -> np.ndarray:
     return poses
 
 
-def row(scans: Path, poses: Path, frames: str | None, alteration: str) -> common.Row:
-    """The figures of a run on the altered drive."""
+class Altered(NamedTuple):
+    """An altered drive."""
+
+    points_of: Callable[[int], Points]
+    stamps_s: Vector
+    T_world_lidar: Poses
+
+
+def altered(scans: Path, poses: Path, frames: str | None, alteration: str, noise_m: float, seed: int) -> Altered:
+    """The drive with the alteration, and normal noise of `noise_m` added to its points."""
     data = open_dataset(scans)
     choose, alter = ALTERATIONS[alteration]
     first, last = (int(part) for part in frames.split(":")) if frames else (0, len(data))
     rows = choose(list(range(first, min(last, len(data)))))
-    T_world_lidar = _true_poses(alteration, read_poses(poses).T_a_b)[rows]
     times = scans / "times.txt"
-    stamps = np.sort(np.loadtxt(times)[rows]) if times.exists() else np.arange(len(rows)) / 10.0
+    stamps_s = np.sort(np.loadtxt(times)[rows]) if times.exists() else np.arange(len(rows)) / 10.0
     if alteration == "backwards" and times.exists():
-        stamps = (np.loadtxt(times)[rows[0]] - np.loadtxt(times)[rows]).round(6)
+        stamps_s = (np.loadtxt(times)[rows[0]] - np.loadtxt(times)[rows]).round(6)
+
+    def points_of(number: int) -> Points:
+        points = alter(data[rows[number]].points.astype(np.float64), rows[number])
+        return (points + np.random.default_rng([seed, number]).normal(0.0, noise_m, points.shape)).astype(np.float32)
+
+    return Altered(points_of, stamps_s, _true_poses(alteration, read_poses(poses).T_a_b)[rows])
+
+
+def mapped(drive: Altered) -> common.Row:
+    """The figures of a run on the drive."""
     with TemporaryDirectory() as folder:
-        altered = Path(folder) / "drive"
-        altered.mkdir()
-        for number, original in enumerate(rows):
-            points = alter(data[original].points.astype(np.float64), original).astype(np.float32)
-            np.column_stack([points, np.zeros(len(points), np.float32)]).tofile(altered / f"{number:06d}.bin")
-        np.savetxt(altered / "times.txt", stamps, fmt="%.6f")
-        np.savetxt(altered / "poses.txt", T_world_lidar[:, :3].reshape(-1, 12), fmt="%.9g")
-        common.segslam("map", altered, "--out", f"{folder}/run")
-        metrics = read_metrics(Path(folder) / "run")
-    found = {name: metrics.get(name) for name in (*FIGURES, *LOOPS)}
-    return {"drive": scans.name, "alteration": alteration, "scans": len(rows), **found}
+        copy = Path(folder) / "drive"
+        copy.mkdir()
+        for number in range(len(drive.stamps_s)):
+            points = drive.points_of(number)
+            np.column_stack([points, np.zeros(len(points), np.float32)]).tofile(copy / f"{number:06d}.bin")
+        np.savetxt(copy / "times.txt", drive.stamps_s, fmt="%.6f")
+        np.savetxt(copy / "poses.txt", drive.T_world_lidar[:, :3].reshape(-1, 12), fmt="%.9g")
+        common.segslam("map", copy, "--out", f"{folder}/run")
+        run = read_run(Path(folder) / "run")
+        return {name: run.metrics.get(name) for name in (*FIGURES, *LOOPS)} | within_covariance(run)
+
+
+def registered(drive: Altered, steps: Sequence[int]) -> common.Row:
+    """How many pairs of scans, each alone, so many scans apart, are registered rightly and wrongly."""
+    counts = Counter[str]()
+    for source in range(max(steps), len(drive.stamps_s)):
+        for target in (source - step for step in steps):
+            found = register(drive.points_of(source), drive.points_of(target))
+            T_true = geometry.inverse(drive.T_world_lidar[target]) @ drive.T_world_lidar[source]
+            outcome = "rejected"
+            if isinstance(found, Alignment):
+                is_right = common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
+                outcome = "right" if is_right else "wrong"
+            counts[outcome] += 1
+    return {"pairs": counts.total(), **{name: counts[name] for name in ("right", "wrong", "rejected")}}
 
 
 def run_benchmark() -> None:
@@ -119,11 +157,17 @@ def run_benchmark() -> None:
     options.add_argument("alterations", nargs="*", metavar="ALTERATION", help=", ".join(ALTERATIONS))
     options.add_argument("--poses", type=Path)
     options.add_argument("--frames")
+    options.add_argument("--noise-m", type=float, default=0.0)
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--pairs", type=int, nargs="+", metavar="SCANS_APART")
     options.add_argument("--out", type=Path, default=Path("altered.json"))
     given = options.parse_args()
     rows = []
     for alteration in given.alterations or ALTERATIONS:
-        rows.append(row(given.scans, given.poses or given.scans / "poses.txt", given.frames, alteration))
+        poses = given.poses or given.scans / "poses.txt"
+        drive = altered(given.scans, poses, given.frames, alteration, given.noise_m, given.seed)
+        found = registered(drive, given.pairs) if given.pairs else mapped(drive)
+        rows.append({"drive": given.scans.name, "alteration": alteration, "scans": len(drive.stamps_s), **found})
         print(json.dumps(rows[-1]), flush=True)
     common.write_report(given.out, {"rows": rows})
 

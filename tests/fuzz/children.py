@@ -1,5 +1,6 @@
 """Readers on damaged files, in child processes: a signal, a hang or a greedy reader ends the child only."""
 
+import gc
 import json
 import os
 import resource
@@ -20,7 +21,7 @@ MAX_MEMORY, SPARE_BYTES = 2, 64 * 2**20
 """Most memory: twice the size of the file, and what libraries take on the way."""
 ADDRESS_BYTES = 8 * 2**30
 """Limit of the address space above the present, so that a greedy reader does not harm the machine."""
-HANG_S = 60.0
+HANG, HANG_S = "hang", 60.0
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -36,7 +37,10 @@ class _TooLong(BaseException):
 
 
 def defects(read: Callable[[Path], Any], file: Path, contents: Sequence[bytes]) -> list[Defect]:
-    """The defects of a reader on these contents of a file. A SegslamError that names the file is none."""
+    """The defects of a reader on these contents of a file. A SegslamError that names the file is none.
+
+    A file at which the child stands still is read again by another: machines stand still as well.
+    """
     found: list[Defect] = []
     at = 0
     while at < len(contents):
@@ -44,16 +48,23 @@ def defects(read: Callable[[Path], Any], file: Path, contents: Sequence[bytes]) 
         found += [Defect(kind, data) for kind, data in zip(outcomes, contents[at:], strict=False) if kind]
         at += len(outcomes)
         if at < len(contents):
-            found.append(Defect(end, contents[at]))
+            if end == HANG:
+                outcomes, end = _in_child(read, file, contents[at : at + 1])
+                end = outcomes[0] if outcomes else end
+            found += [Defect(end, contents[at])] if end else []
             at += 1
     return found
 
 
 def _in_child(read: Callable[[Path], Any], file: Path, contents: Sequence[bytes]) -> tuple[list[str], str]:
-    """The outcome of each content until the child ended, and how it ended."""
+    """The outcome of each content until the child ended, and how it ended.
+
+    The child does not delete what the parent no longer needs: threads that it would wait for do not exist there.
+    """
     source, sink = os.pipe()
     child = os.fork()
     if child == 0:
+        gc.freeze()
         os.close(source)
         try:
             _work(read, file, contents, sink)
@@ -64,7 +75,7 @@ def _in_child(read: Callable[[Path], Any], file: Path, contents: Sequence[bytes]
     if hangs:
         os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
-    return outcomes, "hang" if hangs else f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else "exit"
+    return outcomes, HANG if hangs else f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else "exit"
 
 
 def _received(source: int) -> tuple[list[str], bool]:

@@ -63,3 +63,16 @@ def test_a_defect_is_found_and_the_files_after_it_are_tried(tmp_path: Path, cont
     found = defects(_fail, tmp_path / "file", [b"good", content, b"exception"])
     assert [data for _, data in found] == [content, b"exception"]
     assert re.fullmatch(kind, found[0].kind)
+
+
+def test_a_hang_counts_if_it_repeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fuzz.children.HANG_S", 0.3)
+
+    def read(file: Path) -> None:
+        seen = tmp_path / "seen"
+        if file.read_bytes() == b"always" or (file.read_bytes() == b"once" and not seen.exists()):
+            seen.touch()
+            time.sleep(30)
+
+    found = defects(read, tmp_path / "file", [b"good", b"once", b"good", b"always", b"good"])
+    assert [(kind, data) for kind, data in found] == [("hang", b"always")]

@@ -295,11 +295,16 @@ class Run:
 
     def _vertical_angle(self, result: SlamResult) -> dict[str, float]:
         """The remaining vertical angle of the scans as figures; empty if too few scans show it."""
-        found = measure_vertical_angle(
-            lambda keyframe_id: self._log.cloud(keyframe_id)[0],
-            result.odometry.T_world_lidar[result.keyframe_rows],
-            self._slam.graph.travel_m,
-            config=self.config.refine,
+        known = self._slam.known
+        found = (
+            known.angle
+            if known
+            else measure_vertical_angle(
+                lambda keyframe_id: self._log.cloud(keyframe_id)[0],
+                result.odometry.T_world_lidar[result.keyframe_rows],
+                self._slam.graph.travel_m,
+                config=self.config.refine,
+            )
         )
         return {} if found is None else {"vertical_deg": found.angle_deg, "vertical_sigma_deg": found.sigma_deg}
 

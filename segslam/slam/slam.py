@@ -61,7 +61,7 @@ class Slam:
         several are repeated as one.
         """
         self.config = config or Config()
-        self._known = known
+        self.known = known
         self._tracker = Tracker(self.config, odometry=odometry)
         self._labeller = labeller
         self.graph = self._new_graph()
@@ -154,7 +154,7 @@ class Slam:
                 lambda keyframe_id: self._clouds.cloud(keyframe_id)[0],
                 velocities_of(odometry, rows, self._motions),
                 config=self.config,
-                known=self._known,
+                known=self.known,
                 progress=progress,
             )
         T_world_lidar = corrected_poses(

@@ -24,7 +24,6 @@ from segslam.run.fleets import workers
 from segslam.run.fleets.drives import Drive, read_drives
 from segslam.run.fleets.orchestrate import FILE, FleetResult, fleet
 from segslam.run.fleets.steps import map_drive
-from segslam.run.sessions import session_pose
 from segslam.scans import open_dataset
 from segslam.slam.adjustment import submaps
 from segslam.slam.slam import Slam
@@ -69,10 +68,8 @@ def _on_globe(data: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def joined(recordings: list[Path], tmp_path_factory: pytest.TempPathFactory) -> FleetResult:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session_pose, "NUM_ENOUGH", 5)
-        out = tmp_path_factory.mktemp("fleets") / "city é"
-        return fleet(_drives(recordings), out, same_reference=True, settings=SETTINGS)
+    out = tmp_path_factory.mktemp("fleets") / "city é"
+    return fleet(_drives(recordings), out, same_reference=True, settings=SETTINGS)
 
 
 def test_drives_that_share_places_are_in_one_frame_and_the_others_alone(joined: FleetResult) -> None:
@@ -136,7 +133,6 @@ def _made(folder: Path) -> dict[str, int]:
 def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
     joined: FleetResult, recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_pose, "NUM_ENOUGH", 5)
     folder = tmp_path / "again"
     shutil.copytree(joined.folder, folder)
     (folder / "runs" / ".friday.0123.part").mkdir()
@@ -168,7 +164,6 @@ def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
 def test_an_added_drive_needs_its_own_loops_and_alignments_only_and_the_component_is_the_same(
     recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_pose, "NUM_ENOUGH", 5)
     aligned: list[int] = []
     searched: list[int] = []
     align, take = submaps.align, Slam.take

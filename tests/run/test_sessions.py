@@ -22,7 +22,6 @@ from segslam.core.types import LoopClosure, MotionState, Trajectory
 from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.log import read_log
-from segslam.run.sessions import session_pose
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 
@@ -52,9 +51,7 @@ def days(tmp_path_factory: pytest.TempPathFactory) -> Days:
 @pytest.fixture(scope="module")
 def merged(days: Days, tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
     out = tmp_path_factory.mktemp("merged") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session_pose, "NUM_ENOUGH", 5)  # so few places take less time
-        return segslam.merge([days.monday.folder, days.friday.folder], out, config=Config(), same_reference=True)
+    return segslam.merge([days.monday.folder, days.friday.folder], out, config=Config(), same_reference=True)
 
 
 def _errors(estimate: Trajectory, truth: Trajectory, T_true_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,7 +128,6 @@ def _off_globe_m(folder: Path, truth: Trajectory) -> np.ndarray:
 def test_a_merged_run_is_placed_by_the_fixes_of_all_sessions(
     on_globe: Days, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_pose, "NUM_ENOUGH", 5)
     made = segslam.merge([on_globe.monday.folder, on_globe.friday.folder], tmp_path / "both", same_reference=True)
     values = json.loads((made.folder / "georeference.json").read_text())
     assert values["num_fixes"] == len(made.result.trajectory)

@@ -31,7 +31,7 @@ from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_folder, open_scans
 from segslam.run.sessions.merge import Before, arranged, write_merged
 from segslam.run.sessions.recorded import Session, read_session
-from segslam.run.sessions.session_pose import NUM_ENOUGH, Relation, SessionPose, find_session
+from segslam.run.sessions.session_pose import Relation, SessionPose, find_session
 from segslam.scans import DataSource
 from segslam.scans.presets import SETTINGS, Preset, extent_m, preset, preset_for
 
@@ -40,6 +40,8 @@ RUNS, INDEX, PROPOSALS, PAIRS, ALIGNMENTS = "runs", "index", "proposals", "pairs
 KEY = "fleet.key"
 """File in a run folder of a fleet: the key that it was made with."""
 UNFINISHED = ".part"
+MOST_LIKELY = 12
+"""Chosen: largest number of keyframes that are searched in another drive, those that look most like a place there."""
 ONE_THREAD = "odometry.max_num_threads=1"
 Likely = dict[str, list[tuple[int, float]]]
 """By the name of an earlier drive: keyframes of a drive and their largest similarities to a place there, best first."""
@@ -144,7 +146,7 @@ def _proposed(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
         for similar in places.shortlist(PlaceSignature(np.asarray(spectrum))):
             likely.setdefault(owners[similar.place_id], {}).setdefault(keyframe_id, similar.score)  # best first
     return {
-        name: sorted(scores.items(), key=lambda one: -one[1])[:NUM_ENOUGH] for name, scores in sorted(likely.items())
+        name: sorted(scores.items(), key=lambda one: -one[1])[:MOST_LIKELY] for name, scores in sorted(likely.items())
     }
 
 

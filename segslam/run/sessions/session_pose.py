@@ -22,10 +22,8 @@ from segslam.slam.recognition import MAX_PLACES
 
 NUM_QUERIES = 60
 """Chosen: number of keyframes of a session that are searched in another, spread over its travel."""
-NUM_ENOUGH = 12
-"""Chosen: the search ends when this many are found; further loops are found by proximity."""
 MIN_FOUND = 3
-"""Chosen: smallest number of consistent locations that relate two sessions."""
+"""Chosen: smallest number of consistent locations that relate two sessions; further loops are found by proximity."""
 MOST_FAILED = 4
 """Chosen on two fleets: the search for the pose of a session ends when so many of its likely keyframes, the first ones,
 were not found; in each of 16 pairs of drives that share places the first was, at the place that it looks like most."""
@@ -68,9 +66,10 @@ def find_session(
 ) -> Relation:
     """The pose of a session in an earlier one.
 
-    At most `NUM_QUERIES` keyframes, spread over the session, are searched; sparse ones together with their neighbours.
-    `likely`: these keyframes are searched instead, in this order, and those before and after each that is found, until
-    the first `MOST_FAILED` were not. They look like a place of the earlier session, and no other place is tried.
+    Keyframes are searched until `MIN_FOUND` consistent ones, `MIN_SPREAD_M` apart, are found: at most `NUM_QUERIES`,
+    spread over the session; sparse ones together with their neighbours. `likely`: these keyframes are searched instead,
+    in this order, and those before and after each that is found, until the first `MOST_FAILED` were not. They look like
+    a place of the earlier session, and no other place is tried.
     """
     recorded = session.log.keyframes()
     submaps = submaps_of([recorded[number] for number in range(len(recorded))], recorded, config)
@@ -81,6 +80,8 @@ def find_session(
         if likely is None
         else _with_neighbours(likely, count, lambda: found[-1].source_id if found else None)
     )
+    graph, first_id = _both(earlier, session, config)
+    kept: list[LoopClosure] = []
     num_tried = 0
     for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
         num_tried += 1
@@ -88,23 +89,25 @@ def find_session(
         place = locator.locate(submap.points, submap.labels, max_places=MAX_PLACES if likely is None else 1)
         if not isinstance(place, Rejected):
             found.append(LoopClosure.of(keyframe_id, place.keyframe_id, place.alignment))
-        if len(found) == NUM_ENOUGH or (likely is not None and not found and num_tried == MOST_FAILED):
+            consistent = graph.consistent([shifted(one, first_id, 0) for one in found])
+            kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
+        if _is_enough(kept, session) or (likely is not None and not found and num_tried == MOST_FAILED):
             break
-    summary = f"{len(found)} of {num_tried} keyframes were found there"
-    if len(found) < MIN_FOUND:
-        return Relation(None, (), f"{summary}, {MIN_FOUND} are needed")
-    graph, first_id = _both(earlier, session, config)
-    consistent = graph.consistent([shifted(one, first_id, 0) for one in found])
-    kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
-    travel_m = session.travel_m[[one.source_id for one in kept]]
-    if len(kept) < MIN_FOUND or np.ptp(travel_m) < MIN_SPREAD_M:
-        why = f"{summary}, but no {MIN_FOUND} of them, {MIN_SPREAD_M:g} m apart, are consistent with the odometry"
-        return Relation(None, (), why)
+    if not _is_enough(kept, session):
+        why = f"{MIN_FOUND} are needed"
+        if len(found) >= MIN_FOUND:
+            why = f"but no {MIN_FOUND} of them, {MIN_SPREAD_M:g} m apart, are consistent with the odometry"
+        return Relation(None, (), f"{len(found)} of {num_tried} keyframes were found there, {why}")
     for one in kept:
         graph.add_closure(shifted(one, first_id, 0))
     graph.optimize()
     T_earlier_first = graph.T_world_keyframes[first_id]
     return Relation(T_earlier_first @ geometry.inverse(session.T_world_keyframe[0]), tuple(kept))
+
+
+def _is_enough(kept: Sequence[LoopClosure], session: Session) -> bool:
+    """True if consistent locations of keyframes determine the pose of their session."""
+    return len(kept) >= MIN_FOUND and bool(np.ptp(session.travel_m[[one.source_id for one in kept]]) >= MIN_SPREAD_M)
 
 
 def _spread(count: int) -> list[int]:

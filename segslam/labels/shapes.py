@@ -46,8 +46,9 @@ def on_thin_uprights(
     away. The remaining slices must span `min_slices` and be a share `min_share` of the slices before removal. Points
     outside the grid or the slices 0 to NUM_SLICES - 1 are ignored, as are columns within `ring` cells of the border.
     """
-    chosen = ((cells >= 0) & (cells < shape)).all(axis=1) & (slices >= 0) & (slices < NUM_SLICES)
-    column, bits = cells[chosen] @ [shape[1], 1], (1 << slices[chosen]).astype(np.uint16)
+    row, column = cells.T
+    chosen = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1]) & (slices >= 0) & (slices < NUM_SLICES)
+    column, bits = (row * shape[1] + column)[chosen], (1 << slices[chosen]).astype(np.uint16)
     masks, thin = np.zeros(shape[0] * shape[1], np.uint16), np.zeros(shape[0] * shape[1], np.uint16)
     np.bitwise_or.at(masks, column, bits)
     a, b = np.mgrid[-ring : ring + 1, -ring : ring + 1].reshape(2, -1)
@@ -128,12 +129,10 @@ def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
     starts = np.searchsorted(of_point[rows], np.arange(num_pieces))
     num_points = np.diff(starts, append=len(rows))
     x, y = points[rows, 0], points[rows, 1]
-    turned = [np.outer(COSINES, x) + np.outer(SINES, y), np.outer(COSINES, y) - np.outer(SINES, x)]
-    sides_m = np.array(
-        [np.maximum.reduceat(u, starts, axis=1) - np.minimum.reduceat(u, starts, axis=1) for u in turned]
-    )
-    tightest = sides_m.prod(axis=0).argmin(axis=0)
-    width_m, length_m = np.sort(sides_m[:, tightest, np.arange(num_pieces)], axis=0)
+    turned = ((c * x + s * y, c * y - s * x) for c, s in zip(COSINES, SINES, strict=True))
+    sides_m = np.array([[np.maximum.reduceat(u, starts) - np.minimum.reduceat(u, starts) for u in uv] for uv in turned])
+    tightest = sides_m.prod(axis=1).argmin(axis=0)
+    width_m, length_m = np.sort(sides_m[tightest, :, np.arange(num_pieces)], axis=1).T
     return Pieces(of_point, num_points, np.maximum.reduceat(heights[rows], starts), length_m, width_m)
 
 

@@ -94,7 +94,13 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
     if trial.fits(best):
         rivals = rivals_of(best, found, trial)
         found += rivals
-        allowed += [pose for pose in rivals if trial.gate(pose.T_target_source, slack_m=0.0) is None]
+        better = [pose for pose in rivals if pose.mean_ratio > best.mean_ratio]
+        settled = [trial.refined(pose.coarse, pose.T_target_source) for pose in better]  # rivals need not converge
+        allowed += [
+            pose
+            for pose in settled
+            if isinstance(pose, Found) and trial.gate(pose.T_target_source, slack_m=0.0) is None
+        ]
         best = max(allowed, key=lambda pose: pose.mean_ratio)
     return [best, *(pose for pose in found if not is_same(pose.T_target_source, best))]
 

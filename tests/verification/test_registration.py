@@ -16,6 +16,7 @@ from segslam.registration.hypotheses import MAX_COARSE_FINE_M, MAX_HYPOTHESES, a
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import open_dataset
 from segslam.verification import register, register_near, register_prepared, rivals
+from segslam.verification.pair import tried_poses
 from segslam.verification.trial import Found, Trial
 from tools.benchmarks.altered import ALTERATIONS
 
@@ -200,6 +201,21 @@ def test_scans_without_usable_points_are_rejected(points: np.ndarray) -> None:
     labels = np.ones(len(points), dtype=np.uint8)
     assert isinstance(register(points, points, source_labels=labels, target_labels=labels), Rejected)
     assert isinstance(register(points, points), Rejected)
+
+
+def test_a_rival_that_does_not_converge_where_it_is_rivals_but_is_not_returned(monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target, T_true = _round_pair()
+
+    def far(found: Found, known: object, trial: Trial) -> list[Found]:
+        T_target_source = geometry.transform(np.eye(3), [0.0, 0.0, 30.0]) @ found.T_target_source
+        return [found._replace(fine=replace(found.fine, T_target_source=T_target_source))]
+
+    monkeypatch.setattr("segslam.verification.pair.rivals_of", far)
+    monkeypatch.setattr(Found, "mean_ratio", property(lambda pose: pose.T_target_source[2, 3]))
+    tried = tried_poses(Trial(source, target, CONFIG, anywhere, Stopwatch()))
+    assert not isinstance(tried, Rejected)
+    assert _error(T_true, tried[0].T_target_source)[0] < 0.05
+    assert [_error(T_true, other.T_target_source)[0] > 29.0 for other in tried[1:]].count(True) == 1
 
 
 @pytest.mark.data

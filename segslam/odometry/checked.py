@@ -95,7 +95,7 @@ class CheckedOdometry:
         T_odom_predicted = self._T_odom_last @ self._motion.predicted(gap)
         if not self._is_due(T_odom_proposed, T_odom_predicted, scan, gap):
             self._num_unchecked += 1
-            self._motion.T_step = geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_proposed, 1.0 / gap)
+            self._motion.follow(geometry.inverse(self._T_odom_last) @ T_odom_proposed, gap)
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
         if len(scan.thinned) < MIN_POINTS:
@@ -186,6 +186,7 @@ class CheckedOdometry:
         if is_lost:
             self._lost = self._lost or (self._map, 0)
             self._map = LocalMap(self._refine)
+            self._motion.begin_map()
         self._map.add(T_odom_lidar, scan)
         if state in (MotionState.REPAIRED, MotionState.BROKEN):
             self._inner.follow(self._map.scans, T_odom_lidar, self._motion.T_step)

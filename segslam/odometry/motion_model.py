@@ -134,15 +134,24 @@ class MotionModel:
         left = np.eye(6) - gain
         posterior, carried = measured, np.zeros((6, 6))
         if prior is not None:
-            posterior, carried = left @ prior, self._accumulated @ left.T
+            posterior = left @ prior @ left.T + gain @ measured @ gain.T  # of Joseph: positive after any rounding
+            carried = self._accumulated @ left.T
         self._covariance, self._accumulated = posterior / gap**2, carried + posterior
-        self.T_step = geometry.scaled(T_fused, 1.0 / gap)
         total = posterior + carried + carried.T
         total = (total + total.T) / 2
         self._unseen.append(left @ total @ left.T)
-        turn = np.kron(np.eye(2), T_fused[:3, :3].T)
-        self._unseen = deque([turn @ covariance @ turn.T for covariance in self._unseen], MAP_SCANS)
+        self.follow(T_fused, gap)
         return T_fused, total + np.outer(regained, regained)
+
+    def follow(self, T_last_lidar: Transform, gap: float) -> None:
+        """Continue with the motion of a scan; its covariance remains that of the motions before."""
+        self.T_step = geometry.scaled(T_last_lidar, 1.0 / gap)
+        turn = np.kron(np.eye(2), T_last_lidar[:3, :3].T)
+        self._unseen = deque([turn @ covariance @ turn.T for covariance in self._unseen], MAP_SCANS)
+
+    def begin_map(self) -> None:
+        """Continue with a map of the last scan alone, which shows nothing of the positions before."""
+        self._unseen.clear()
 
     def _regained(self, T_fused: Transform, prior: Information, gap: float) -> Vector:
         """(6,) by how much the scan may correct the last position instead of showing another motion.

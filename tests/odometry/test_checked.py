@@ -516,6 +516,30 @@ def test_a_scan_that_shows_the_position_again_makes_the_last_motion_as_unsure_as
     assert covariance[3, 3] ** 0.5 < 0.05
 
 
+def test_a_scan_that_shows_nothing_early_in_a_drive_does_no_harm() -> None:
+    model = MotionModel()
+    T_last_lidar = geometry.transform(np.eye(3), [0.3, 0.0, 0.0])
+    for number in range(12):
+        measured = np.eye(6) * (1e17 if number == 4 else 1e-6)
+        _, covariance = model.update(T_last_lidar, measured, 1.0)
+        assert np.linalg.eigvalsh(covariance)[0] > 0.0
+
+
+def test_motions_that_were_not_shown_turn_with_the_sensor_until_a_new_map_begins() -> None:
+    model = MotionModel()
+    for moved_m in np.random.default_rng(0).normal([0.3, 0.0, 0.0], [0.02, 0.2, 0.02], (20, 3)):
+        model.update(geometry.transform(np.eye(3), moved_m), 1e-6 * np.eye(6), 1.0)
+    model.update(geometry.transform(np.eye(3), [0.3, 0.0, 0.0]), np.diag([*4 * [1e-6], 100.0, 1e-6]), 1.0)
+    before = sum(model._unseen)
+    model.follow(geometry.transform(geometry.yaw(np.pi / 2), [0.3, 0.0, 0.0]), 1.0)
+    after = sum(model._unseen)
+    np.testing.assert_allclose(np.diag(after)[3:], np.diag(before)[[4, 3, 5]], atol=1e-9)
+    assert after[3, 3] > 10.0 * after[4, 4]
+    model.begin_map()
+    _, covariance = model.update(geometry.transform(geometry.yaw(np.pi / 2), [2.3, 0.0, 0.0]), 1e-6 * np.eye(6), 1.0)
+    assert covariance[3, 3] < 0.01, "not the last position but the motion changed"
+
+
 @pytest.mark.parametrize("is_better", [True, False])
 def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_better: bool) -> None:
     scans, truth = round_drive()

@@ -28,10 +28,10 @@ SPREAD_M = 8.0
 MIN_GAP_M = 8.0
 """Chosen: distance travelled after an accepted loop before the next search (m)."""
 
-BREAK_TRAVEL_M = 1e5
-"""Keyframes this far apart in travel are separated by a break of the odometry."""
-BREAK_STEP_M = 2.0 * BREAK_TRAVEL_M
-"""Travel assigned to a break, because the relative pose across it is unknown; rounded, it is still a break."""
+BREAK_STEP_M = 1e5
+"""Travel assigned to a break, because the relative pose across it is unknown."""
+BREAK_TRAVEL_M = BREAK_STEP_M / 2.0
+"""Keyframes this far apart in travel are separated by a break of the odometry, however the step was rounded."""
 
 Covariances = Callable[[int, Indices], Float[np.ndarray, "_ 6 6"]]
 """Covariance of the pose of a keyframe in each of others, as a tangent of the keyframe (`graph.covariances`)."""

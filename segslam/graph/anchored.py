@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core.config import GraphConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
@@ -50,7 +50,7 @@ class AnchoredGraph:
     @property
     def travel_m(self) -> Vector:
         """(n,) travel of each keyframe, by id."""
-        return self._graph.travel_m[1:] - BREAK_TRAVEL_M
+        return self._graph.travel_m[1:] - BREAK_STEP_M
 
     @property
     def motion_variance(self) -> Vector:
@@ -79,7 +79,7 @@ class AnchoredGraph:
         """As `PoseGraph.add_keyframe`."""
         if keyframe_id == 0:
             information = np.zeros((6, 6))
-        at_m = travel_m + BREAK_TRAVEL_M
+        at_m = travel_m + BREAK_STEP_M
         self._graph.add_keyframe(keyframe_id + 1, T_odom_keyframe, at_m, information=information, stamp_ns=stamp_ns)
 
     def add_closure(self, closure: LoopClosure, others: Sequence[LoopClosure] = ()) -> Any:

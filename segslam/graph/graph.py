@@ -111,7 +111,11 @@ class PoseGraph:
 
     @property
     def motion_variance(self) -> Vector:
-        """(n,) largest variance of the motion that leads to each keyframe, in any direction (m^2); 0 for the first."""
+        """(n,) largest variance of the motion that leads to each keyframe, in any direction (m^2); 0 for the first.
+
+        Where the motion has no information of its own, the variance is by the configured noise: the noise that loops
+        raise covers the drift of a whole drive, not of a motion.
+        """
         return self._motion_variance.all()
 
     @property
@@ -150,21 +154,26 @@ class PoseGraph:
             expected = f"expected {self.num_keyframes}, got {keyframe_id}"
             raise ValueError(f"keyframe ids count from 0 without gaps: {expected}")
         if keyframe_id == 0:
+            variance = 0.0
             pose = gtsam.Pose3(geometry.nearest_transform(T_odom_keyframe))
             self._prior.add(gtsam.PriorFactorPose3(0, pose, noise.first_pose()))
             self._backbone.push_back(self._prior)
         else:
             # Rounding in a long chain would stop the solver far from the optimum.
             T_last_new = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
-            if information is None:
-                known = noise.odometry_information(travel_m - self.travel_m[-1], T_last_new, self._config)
-            else:
-                known = noise.motion_information(information)
+            way_m = travel_m - self.travel_m[-1]
+            known, configured = (
+                noise.motion_information(information)
+                if information is not None
+                else noise.odometry_information(way_m, T_last_new, config)
+                for config in (self._config, self._configured)
+            )
             edge = Edge(keyframe_id - 1, keyframe_id, T_last_new, known)
             self._has_own_information.append(information is not None)
             self._has_breaks |= is_break(edge)
             self._odometry.append(edge)
             self._backbone.add(edge.factor())
+            variance = largest_variances(replace(edge, information=configured))[1]
             pose = self._values.atPose3(keyframe_id - 1).compose(gtsam.Pose3(T_last_new))
         self._values.insert(keyframe_id, pose)
         self._T_world.append(pose.matrix())
@@ -172,7 +181,7 @@ class PoseGraph:
             self._chains.add(pose.matrix(), self._odometry[-1])
         self._T_odom_last = T_odom_keyframe
         self._travel_m.append(travel_m)
-        self._motion_variance.append(largest_variances(self._odometry[-1])[1] if keyframe_id else 0.0)
+        self._motion_variance.append(variance)
         self._time_s.append(np.nan if stamp_ns is None else 1e-9 * stamp_ns)
 
     def add_closure(self, closure: LoopClosure) -> None:

@@ -498,3 +498,13 @@ def test_an_optimisation_that_fails_leaves_all_poses(
     found = graph.optimize()
     assert "the poses remain" in caplog.text
     np.testing.assert_allclose(np.array(list(found.T_world_keyframe.values())), DRIFT, atol=1e-9)
+
+
+def test_noise_that_loops_raise_does_not_make_later_motions_unsure() -> None:
+    graph = PoseGraph(CONFIG)
+    for number in range(6):
+        if number == 3:
+            graph.use_odometry_noise(30.0 * CONFIG.odometry_sigma_m, CONFIG.odometry_sigma_deg)
+        graph.add_keyframe(number, geometry.transform(np.eye(3), [2.0 * number, 0.0, 0.0]), 2.0 * number)
+    assert graph.motion_variance[0] == 0.0
+    np.testing.assert_allclose(graph.motion_variance[2:], graph.motion_variance[1])

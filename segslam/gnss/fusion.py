@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse.linalg import SuperLU
 
 from segslam.core.trajectory import Poses, travelled_m
-from segslam.core.types import Mask, Points, Vector
+from segslam.core.types import Mask, Points, SegslamError, Vector
 from segslam.gnss.alignment import Placement, moved, refined
 from segslam.gnss.evidence import Estimate, drift_solver, estimated
 from segslam.gnss.matching import Drive, Matched, Prepared
@@ -63,6 +63,10 @@ def calibrate(
     arm_m, measured_s = np.zeros(3), 0.0
     clock_free = arm_free = True
     for _ in range(CONSTANT_ROUNDS):
+        if not (placement.weights[:, 0] >= KEPT_WEIGHT).any():
+            raise SegslamError(
+                f"{prepared.fixes.source}: the fixes contradict each other, and none is kept; use better ones"
+            )
         found = estimated(solver, drive, matched, placement, axis=0, free=(clock_free, arm_free))
         clock, arm = found.constants[6], found.constants[7:9]
         total_s, total_m = abs(measured_s + clock), np.abs(arm_m[:2] + arm)

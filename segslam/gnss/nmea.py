@@ -39,7 +39,7 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
             continue
         at = _time(file, number, words[1])
         if last is not None and datetime.combine(day, last) - datetime.combine(day, at) > timedelta(hours=12):
-            day += timedelta(days=kind == "GGA")  # midnight, before the next RMC
+            day += timedelta(days=_date(words) is None)  # midnight, before the next date
         last = at
         found[kind].append(_row(file, number, kind, words, datetime.combine(day, at, tzinfo=UTC)))
     left_out = f"; {num_wrong} lines with wrong checksums left out" if num_wrong else ""

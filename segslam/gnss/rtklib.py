@@ -1,5 +1,6 @@
 """Fixes from RTKLIB's .pos files: geodetic or ECEF, GPS time or UTC, with weeks or dates."""
 
+import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -19,6 +20,8 @@ LEAPS = [
     )
 ]
 """Days (UTC) that begin after a leap second since GPS began (IERS Bulletin C)."""
+AHEAD_OF_UTC = {"UTC": timedelta(0), "JST": timedelta(hours=9)}
+"""Clocks of a header without leap seconds between them; the other is that of GPS."""
 
 
 def is_rtklib(lines: Sequence[str]) -> bool:
@@ -28,22 +31,31 @@ def is_rtklib(lines: Sequence[str]) -> bool:
 
 def read_rtklib(file: Path, lines: Sequence[str]) -> list[Row]:
     """The fixes of a solution. Raises SegslamError, naming file and line, for a line that is none."""
-    rows, is_ecef, is_gpst = [], False, True
+    rows, is_ecef, is_in_parts, clock = [], False, False, "GPST"
     for number, line in enumerate(lines, 1):
         if line.startswith("%"):
             if "latitude" in line or "x-ecef" in line:
-                is_ecef, is_gpst = "x-ecef" in line, "UTC" not in line.split()[1:2] and "JST" not in line
+                is_ecef, is_in_parts = "x-ecef" in line, "(d'" in line
+                clock = next((name for name in AHEAD_OF_UTC if name in line.lstrip("% ").split()[:1]), "GPST")
             continue
         words = line.replace(",", " ").split()
         if not words:
             continue
+        if is_in_parts and len(words) >= 8:
+            words[2:8] = (_degrees(file, number, words[first : first + 3]) for first in (2, 5))
         if len(words) < 7:
             raise bad_line(file, number, f"{len(words)} columns; time, position and quality are needed")
-        rows.append(_row(file, number, words, is_ecef=is_ecef, is_gpst=is_gpst))
+        rows.append(_row(file, number, words, is_ecef=is_ecef, clock=clock))
     return rows
 
 
-def _row(file: Path, number: int, words: Sequence[str], *, is_ecef: bool, is_gpst: bool) -> Row:
+def _degrees(file: Path, number: int, parts: Sequence[str]) -> str:
+    """Degrees, minutes and seconds as degrees; the sign of the first is that of all."""
+    whole, minutes, seconds = (number_in(file, number, word, "coordinate") for word in parts)
+    return repr(math.copysign(abs(whole) + minutes / 60.0 + seconds / 3600.0, whole))
+
+
+def _row(file: Path, number: int, words: Sequence[str], *, is_ecef: bool, clock: str) -> Row:
     position = np.array([number_in(file, number, word, "coordinate") for word in words[2:5]])
     errors = np.full(3, np.nan)
     if len(words) >= 10:
@@ -56,23 +68,28 @@ def _row(file: Path, number: int, words: Sequence[str], *, is_ecef: bool, is_gps
         sigma_m = np.sqrt((rotation.T**2) @ errors**2)  # without the correlations of the axes of ECEF
     latitude, longitude, height_m = position.tolist()
     check_degrees(file, number, latitude, longitude)
-    stamp_ns = _stamp(file, number, words[0], words[1], is_gpst=is_gpst)
+    stamp_ns = _stamp(file, number, words[0], words[1], clock=clock)
     return Row(stamp_ns, latitude, longitude, height_m, tuple(sigma_m.tolist()), words[5] != "0")
 
 
-def _stamp(file: Path, number: int, first: str, second: str, *, is_gpst: bool) -> int:
-    """Time (ns) of a GPS week and second of the week, or of a date and time."""
+def _stamp(file: Path, number: int, first: str, second: str, *, clock: str) -> int:
+    """Time (ns) of a week since GPS began and a second of the week, or of a date and time."""
     try:
         if "/" not in first:
             week, seconds = int(first), float(second)
             moment = GPS_EPOCH + timedelta(weeks=week, seconds=int(seconds))
-            return stamp_of(_utc_of_gps(moment)) + round((seconds - int(seconds)) * 1e9)
+            return stamp_of(_utc(moment, clock)) + round((seconds - int(seconds)) * 1e9)
         form = "%Y/%m/%d %H:%M:%S.%f" if "." in second else "%Y/%m/%d %H:%M:%S"
         moment = datetime.strptime(f"{first} {second}", form).replace(tzinfo=UTC)
-        return stamp_of(_utc_of_gps(moment) if is_gpst else moment)
+        return stamp_of(_utc(moment, clock))
     except (ValueError, OverflowError) as error:
         what = f"time {first[:20]} {second[:20]} is neither week and seconds nor a date"
         raise bad_line(file, number, what) from error
+
+
+def _utc(moment: datetime, clock: str) -> datetime:
+    """The moment in UTC of one by the clock of a header."""
+    return moment - AHEAD_OF_UTC[clock] if clock in AHEAD_OF_UTC else _utc_of_gps(moment)
 
 
 def _utc_of_gps(moment: datetime) -> datetime:

@@ -154,3 +154,13 @@ def test_fixes_without_heights_place_a_drive_horizontally() -> None:
     found = georeference(motions(truth), _drive(truth), replace(fixes, places=places))
     assert _error_m(found, truth) < 0.3
     assert not np.isfinite(found.position_sigma_m[2])
+
+
+def test_fixes_that_contradict_each_other_are_refused() -> None:
+    truth = _truth()
+    off = np.zeros((NUM, 3))
+    rng = np.random.default_rng(0)
+    for first in range(0, NUM, 10):
+        off[first : first + 6, :2] = rng.uniform(-400.0, 400.0, 2)
+    with pytest.raises(SegslamError, match="fixes: the fixes contradict each other"):
+        georeference(motions(truth), _drive(truth), _fixes(truth, off_m=off))

@@ -295,3 +295,38 @@ def test_a_real_receiver_in_a_city_is_as_wrong_as_known(data_dir: Path) -> None:
     origin = Origin(*places[0])
     off_m = np.hypot(*(enu_from_geodetic(fixes.places, origin) - enu_from_geodetic(places, origin))[:, :2].T)
     assert np.median(off_m) == pytest.approx(11.0, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("clock", "at"),
+    [
+        ("GPST", "2024/05/01 00:00:18.000"),
+        ("UTC", "2024/05/01 00:00:00.000"),
+        ("JST", "2024/05/01 09:00:00.000"),
+        ("GPST", "2312 259218.000"),
+        ("UTC", "2312 259200.000"),
+    ],
+)
+def test_rtklib_may_write_other_clocks_and_degrees_in_parts(clock: str, at: str, tmp_path: Path) -> None:
+    rest = "100.0 1 9 0.01 0.01 0.02 0 0 0 0.0 0.0"
+    texts = {
+        "degrees.pos": f"%  {clock}  latitude(deg) longitude(deg)\n{at} -48.1375 11.5819444444 {rest}\n",
+        "parts.pos": f"%  {clock}  latitude(d'\") longitude(d'\")\n{at} -48  8 15.0 11 34 55.0 {rest}\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+        fixes = read_fixes(tmp_path / name)
+        assert fixes.stamp_ns[0] == stamp_of(datetime(2024, 5, 1, tzinfo=UTC))
+        np.testing.assert_allclose(fixes.places[0], [-48.1375, 11.581944444, 100.0], atol=1e-8)
+
+
+def test_midnight_is_passed_without_a_fix(tmp_path: Path) -> None:
+    fix = "4800.0,N,00800.0,E,1,8,1,100,M,48,M,,"
+    sentences = (
+        f"GPGGA,235958.00,{fix}",
+        "GPRMC,235958.00,A,4800.0,N,00800.0,E,0,0,310124,,",
+        "GPRMC,000000.00,V,,,,,,,,,",
+        f"GPGGA,000001.00,{fix}",
+    )
+    (tmp_path / "a.nmea").write_text("\n".join(map(sentence, sentences)))
+    assert np.diff(read_fixes(tmp_path / "a.nmea").stamp_ns) == [3_000_000_000]

@@ -56,6 +56,13 @@ class LabelSource:
         return read_labels(file, len(points), self.encoding)
 
 
+def whole_source(source: str, folder: Path = Path()) -> str:
+    """The value of `--labels` for use elsewhere: a relative network starts at `folder`, by default the present one."""
+    if not source.startswith(NETWORK):
+        return source
+    return NETWORK + str((folder / expanded(source.removeprefix(NETWORK))).resolve())
+
+
 def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encoding: Encoding | None) -> LabelSource:
     """Open the value of `--labels`: `auto`, `none`, `geometric`, `network:MODEL.onnx`, or a folder of `.label` files.
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from segslam.core.types import BadScan, Label, SegslamError
-from segslam.labels.label_files import encoding_of, open_labels, read_ids, read_labels
+from segslam.labels.label_files import encoding_of, open_labels, read_ids, read_labels, whole_source
 
 NAMES = ["000000", "000001"]
 
@@ -152,3 +152,10 @@ def test_files_without_any_label_do_not_decide_the_encoding(tmp_path: Path) -> N
     (tmp_path / "000000.label").write_bytes(b"123")
     with pytest.raises(SegslamError, match="cannot be detected"):
         encoding_of([tmp_path / "000000.label"] * 3)
+
+
+def test_a_network_is_named_in_full_for_use_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert whole_source("network:m.onnx") == f"network:{tmp_path / 'm.onnx'}"
+    assert whole_source("network:/a/m.onnx") == "network:/a/m.onnx"
+    assert whole_source("labels") == "labels", "those of a folder start at the data"

@@ -69,3 +69,17 @@ def test_the_key_changes_with_recording_options_and_version_but_not_with_the_nam
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match="nothing: no such file"):
         drives_of([tmp_path / "nothing"])[0].key("1")
+
+
+def test_a_network_is_relative_to_the_list_and_labels_elsewhere_change_the_key(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "m.onnx").write_bytes(b"1")
+    entries = "- {data: a, labels: 'network:m.onnx'}\n- {data: a, labels: " + str(tmp_path / "labels") + "}\n"
+    (tmp_path / "drives.yaml").write_text(entries)
+    drives = read_drives(tmp_path / "drives.yaml")
+    assert drives[0].labels == f"network:{tmp_path.resolve() / 'm.onnx'}"
+    before = [drive.key("1") for drive in drives]
+    (tmp_path / "m.onnx").write_bytes(b"12")
+    (tmp_path / "labels" / "0.label").write_bytes(b"1")
+    assert all(one != drive.key("1") for one, drive in zip(before, drives, strict=True))

@@ -20,7 +20,7 @@ from segslam.core.trajectory import read_poses
 from segslam.core.types import SegslamError, Step
 from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import read_run
-from segslam.run.fleets import workers
+from segslam.run.fleets import steps, workers
 from segslam.run.fleets.drives import Drive, read_drives
 from segslam.run.fleets.orchestrate import FILE, FleetResult, fleet
 from segslam.run.fleets.steps import map_drive
@@ -267,3 +267,15 @@ def test_the_command_shows_steps_and_components_in_a_terminal(recordings: list[P
     assert status == 0, output
     assert "friday is joined to monday by" in output
     assert "component 0: monday, friday" in output
+
+
+def test_what_an_interrupted_step_left_is_removed(tmp_path: Path) -> None:
+    def killed(part: Path) -> None:
+        part.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        steps._replace(tmp_path / "index" / "a-1.npy", killed)
+    assert len(list((tmp_path / "index").iterdir())) == 1
+    steps.remove_unfinished(tmp_path)
+    assert list((tmp_path / "index").iterdir()) == []

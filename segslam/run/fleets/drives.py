@@ -13,6 +13,7 @@ from typing import Any
 from segslam.core.config import parse_yaml, short
 from segslam.core.errors import unreadable
 from segslam.core.types import SegslamError
+from segslam.labels.label_files import NETWORK, whole_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +43,9 @@ class Drive:
         options = {name: value for name, value in asdict(self).items() if name not in ("name", "data")}
         gnss = self.gnss if self.gnss and Path(self.gnss).exists() else ""  # otherwise a topic
         files = [path for path in (self.config, self.odometry, gnss) if path]
+        network = self.labels.removeprefix(NETWORK) if self.labels.startswith(NETWORK) else ""
+        for labels in (network, self.labels):
+            files += [labels] if Path(labels).is_absolute() and Path(labels).exists() else []
         return key_of(version, options, _state(Path(self.data)), *(_state(Path(file)) for file in files))
 
 
@@ -115,6 +119,8 @@ def _drive(value: Any, where: str, folder: Path) -> Drive:
     if not isinstance(settings, list) or not all(isinstance(one, str) for one in settings):
         raise SegslamError(f"{where}: set: expected texts section.key=value, found {short(settings)}")
     texts = {name: _text(one, f"{where}: {name}") for name, one in given.items()}
+    if texts.get("labels", "").startswith(NETWORK):
+        texts["labels"] = whole_source(texts["labels"], folder)
     for name in PATHS:
         if texts.get(name):
             texts[name] = str((folder / Path(texts[name]).expanduser()).resolve())

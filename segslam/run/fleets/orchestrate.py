@@ -63,6 +63,8 @@ def fleet(
     could be mapped, or if a worker cannot take part; a drive that fails is in the result, with the reason.
     """
     listed = read_drives(Path(drives)) if isinstance(drives, str | Path) else drives_of(drives)
+    if not listed:
+        raise SegslamError("fleet: no drive; give recordings, or a list of them")
     folder = Path(out).expanduser().resolve()
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -239,7 +239,8 @@ def _made(part: Path, folder: Path, key: str) -> None:
 def _replace(file: Path, write: Any) -> None:
     """Write a file under another name, then rename it."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = _beside(file).with_suffix(file.suffix)
+    part = _beside(file)
+    part = part.with_name(part.name + file.suffix)
     write(part)
     part.replace(file)
 

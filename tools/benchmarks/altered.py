@@ -1,4 +1,4 @@
-"""Real drives, altered, with default settings: driven backwards, thinned, cut, turned, with noise.
+"""Real drives, altered, with default settings: driven backwards, thinned, with fewer beams, cut, turned, with noise.
 
     python -m tools.benchmarks.altered SCANS [ALTERATION ...] [--poses POSES.txt] [--frames 0:560] [--out altered.json]
     python -m tools.benchmarks.altered SCANS view-40 view-70 --pairs 3 6
@@ -45,6 +45,20 @@ def _view(degrees: float) -> Callable[[Points, int], Points]:
     return lambda points, _: points[np.abs(np.arctan2(points[:, 1], points[:, 0])) <= half]
 
 
+def _beams(apart_deg: float) -> Callable[[Points, int], Points]:
+    """Points of beams so far apart, each 0.4 degrees wide."""
+
+    def kept(points: Points, _: int) -> Points:
+        elevation_deg = np.degrees(np.arctan2(points[:, 2], np.linalg.norm(points[:, :2], axis=1)))
+        return points[np.abs((elevation_deg + apart_deg / 2) % apart_deg - apart_deg / 2) < 0.2]
+
+    return kept
+
+
+def _within(range_m: float) -> Callable[[Points, int], Points]:
+    return lambda points, _: points[np.linalg.norm(points, axis=1) < range_m]
+
+
 def _noise(points: Points, row: int) -> Points:
     near = points[np.linalg.norm(points, axis=1) < 30.0]
     return near + np.random.default_rng(row).normal(scale=0.03, size=near.shape)
@@ -74,6 +88,8 @@ ALTERATIONS: dict[str, tuple[Callable[[Rows], Rows], Callable[[Points, int], Poi
     "tilted": (_same, lambda points, _: points @ _turned(10.0, 30.0).T),
     "upside-down": (_same, lambda points, _: points * [1.0, -1.0, -1.0]),
     "mirrored": (_same, lambda points, _: points * [1.0, -1.0, 1.0]),
+    "beams-2-degrees": (_same, _beams(2.0)),
+    "within-20-m": (_same, _within(20.0)),
     "view-180": (_same, _view(180.0)),
     "view-90": (_same, _view(90.0)),
     "view-70": (_same, _view(70.0)),

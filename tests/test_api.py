@@ -134,9 +134,16 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
         segslam.evaluate(run.result.trajectory.T_world_lidar[:-1], made.truth.T_world_lidar)
     with pytest.raises(segslam.SegslamError, match="no ground truth"):
         segslam.evaluate(run.result.trajectory)
+    with pytest.raises(segslam.SegslamError, match=r"give finite matrices, \(n, 4, 4\)"):
+        segslam.evaluate(np.full((5, 4, 4), np.nan), made.truth.T_world_lidar)
     assert segslam.report(str(made.folder)) == made.folder / "report.html"
     assert segslam.export(made.folder, [tmp_path / "map.ply"])["num_map_points"] > 0
     assert (tmp_path / "map.ply").is_file()
+
+
+def test_odd_arguments_are_refused_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(segslam.SegslamError, match="fleet: no drive"):
+        segslam.fleet([], tmp_path / "city")
 
 
 def test_a_run_is_replayed_with_other_settings(tmp_path: Path) -> None:

@@ -28,9 +28,10 @@ def check_run(run: Path) -> None:
 
 
 def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
-    """Raises SegslamError if one of the files to write exists, unless `overwrite` is set."""
-    for file in files:
-        if file is not None and file.is_file() and not overwrite:
+    """Raises SegslamError if one of the files to write exists, unless `overwrite` is set; a grid (.yaml) has two."""
+    given = [file for file in files if file is not None]
+    for file in (*given, *(file.with_suffix(".pgm") for file in given if file.suffix.lower() == ".yaml")):
+        if file.is_file() and not overwrite:
             raise SegslamError(f"{file}: exists; give another name, or replace it with --overwrite")
 
 
@@ -121,10 +122,14 @@ def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options:
 
 
 def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
-    """True if the run has all its results, for all scans of the data set."""
+    """True if the run has all its results, for all scans of the data set that can be read."""
     result = recorded.result()
-    has_results = (recorded.path.parent / "report.html").is_file()  # the last file that a run writes
-    return has_results and result is not None and bool(result[1].scan_index[-1] == scans.scan_index[-1])
+    if result is None or not (recorded.path.parent / "report.html").is_file():  # the last file that a run writes
+        return False
+    from segslam.cli.dry_run import first_usable
+
+    last_row, _ = first_usable(scans, backwards=True)
+    return bool(result[1].scan_index[-1] == scans.scan_index[last_row])
 
 
 def check_preset(name: str, *, resumes: bool) -> None:

@@ -100,6 +100,9 @@ def locate(
     """
     for scan in scans:
         check_exists(scan, "give scan files")
+    label_files = [] if labels in LABEL_WORDS else [Path(labels) / f"{scan.stem}.label" for scan in scans]
+    for file in label_files:
+        check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
     terminal.announce(f"locate: reading {run}")
     from segslam.run.locator import Locator
 
@@ -111,7 +114,7 @@ def locate(
     for scan in terminal.progress(scans, len(scans), "locate"):
         started = perf_counter()
         try:
-            points, classes = _read_one(scan, scans, labels, files, locator)
+            points, classes = _read_one(scan, label_files, labels, files, locator)
         except SegslamError as error:
             num_bad += 1
             one = NOT_FOUND | {"reason": "unreadable", "detail": str(error).partition("; ")[0]}
@@ -181,7 +184,7 @@ def register(
 
 
 def _read_one(
-    scan: Path, scans: list[Path], labels: str, files: ScanFileOptions, locator: "Locator"
+    scan: Path, label_files: list[Path], labels: str, files: ScanFileOptions, locator: "Locator"
 ) -> tuple["Points", "Labels | None"]:
     """Points of a scan and their labels; None for labels if they are to be computed from geometry."""
     import numpy as np
@@ -191,11 +194,8 @@ def _read_one(
 
     points = read_file(scan).points
     ids = np.zeros(len(points), np.uint8)
-    if labels not in LABEL_WORDS:
-        named = [Path(labels) / f"{one.stem}.label" for one in scans]
-        for file in named:
-            check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
-        numbering = files.encoding or encoding_of(named)
+    if label_files:
+        numbering = files.encoding or encoding_of(label_files)
         ids = read_labels(Path(labels) / f"{scan.stem}.label", len(points), numbering)
     ready = files.ready(scan, points, ids, locator.config)
     return ready.points, None if labels == "geometric" else computed(ready.labels)

@@ -1,5 +1,6 @@
 """`segslam info`, `view` and `report`: what a run contains."""
 
+import shlex
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -106,7 +107,7 @@ def _lines(found: dict[str, Any]) -> str:
     """The content as text, for 80 columns."""
     from segslam.output.finished import FIGURES
 
-    then = f"; continue with: segslam resume {found['run']}" if found["state"] == "interrupted" else ""
+    then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if found["state"] == "interrupted" else ""
     text = [f"{found['run']}: {found['data']}, {found['state']}, {found['num_steps']} scans in the log{then}"]
     text += [with_meaning(f"{figure(value):>10}", FIGURES[key]) for key, value in found["figures"].items()]
     for title, values in (("options", found["options"]), ("settings changed", found["changed_settings"])):

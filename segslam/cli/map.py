@@ -97,17 +97,18 @@ def resume(
     terminal.announce(f"resume: reading {run}")
     recorded = log_to_resume(run)
     chosen: dict[str, Any] = {name: value for name, value in recorded.options.items() if value}
+    again = f"segslam map DATA --out {shlex.quote(str(run))} --resume"
     if "live" in chosen:
         raise SegslamError(
             f"{recorded.path}: a live run cannot be resumed, because its scans were not stored; to make its results: "
-            f"segslam replay {run} --out NEW"
+            f"segslam replay {shlex.quote(str(run))} --out NEW"
         )
+    if "sessions" in chosen:
+        raise SegslamError(f"{recorded.path}: of merged runs; merge them again into a new folder")
     if "data" not in chosen:
-        raise SegslamError(
-            f"{recorded.path}: has no path of the data; resume with: segslam map DATA --out {run} --resume"
-        )
+        raise SegslamError(f"{recorded.path}: has no path of the data; resume with: {again}")
     data = Path(chosen["data"])
-    check_exists(data, f"{recorded.path} was started with it. Restore it, or: segslam map DATA --out {run} --resume")
+    check_exists(data, f"{recorded.path} was started with it. Restore it, or: {again}")
     if "python" in chosen:
         raise SegslamError(
             f"{recorded.path}: made from Python with its own {chosen['python']}; map the data again from there"
@@ -115,7 +116,6 @@ def resume(
     from segslam.labels.encodings import ENCODINGS
 
     if (numbering := chosen.get("encoding", "raw")) not in ENCODINGS:
-        again = "segslam map DATA --out RUN --resume"
         raise SegslamError(f"{recorded.path}: --encoding {numbering}: unknown; resume with: {again}")
     names = ("dataset", "sequence", "frames", "topic", "labels", "encoding")
     options = RunOptions(
@@ -134,7 +134,8 @@ def _map_files(names: str, run: Path, log: Path, terminal: Terminal) -> list[Pat
         files = [Path(str(name)) for name in json_text.loads(names)]
     except (ValueError, TypeError) as error:
         raise SegslamError(
-            f"{log}: damaged list of map files ({names[:80]}); resume with: segslam map DATA --out {run} --resume"
+            f"{log}: damaged list of map files ({names[:80]}); resume with: "
+            f"segslam map DATA --out {shlex.quote(str(run))} --resume"
         ) from error
     folder = run.resolve()
     outside = [file for file in files if folder not in (run / file).resolve().parents]
@@ -190,7 +191,7 @@ def map_data(
         repeated = {name: value for name, value in choices.items() if name not in FREE_OPTIONS}
         check_same(recorded, settings, dataset=scans.name, options=repeated)
         if is_finished(recorded, scans):
-            _show_complete(recorded, map_files, terminal, config=settings.map)
+            _show_complete(recorded, map_files, terminal, config=settings.map, place=place)
             raise typer.Exit(0)
     else:
         make_room(folder, overwrite=output.overwrite, inputs=(data, in_map, options.odometry))
@@ -227,13 +228,25 @@ def _in_map(in_map: Path | None) -> "tuple[SlamOf | None, Callable[[Path], str] 
     return localiser_in(in_map), place
 
 
-def _show_complete(recorded: "RunLog", map_files: Sequence[Path], terminal: Terminal, *, config: "MapConfig") -> None:
-    """Write the missing maps of a finished run, and show its figures."""
+def _show_complete(
+    recorded: "RunLog",
+    map_files: Sequence[Path],
+    terminal: Terminal,
+    *,
+    config: "MapConfig",
+    place: Callable[[Path], str] | None,
+) -> None:
+    """Give a finished run a place on the globe if it has none, write its missing maps, and show its figures."""
     from segslam.output.export import write_maps
     from segslam.output.finished import read_metrics
+    from segslam.output.folder import PLACE_ON_GLOBE
+    from segslam.output.report import write_report
 
     folder = recorded.path.parent
     terminal.say(f"{folder}: the run is already complete; there is nothing to resume")
+    if place is not None and not (folder / PLACE_ON_GLOBE).exists():
+        terminal.say(place(folder))
+        write_report(folder)
     if missing := [file for file in map_files if not file.exists()]:
         made = write_maps(recorded, missing, config=config, show=terminal.progress)
         terminal.say(map_summary(made, missing))

@@ -22,6 +22,8 @@ WITH_MAP = ("map.ply", "map.png")
 """Files that `--map` writes into the run folder."""
 
 GNSS_USES = ("fuse", "align")
+MOST_OFFSET_S = 4e9
+"""As far as the clock of a computer that begins in 1970 can be off."""
 
 DataArgument = Annotated[Path, typer.Argument(help="Folder of scans, recording, or KITTI folder (with sequences/).")]
 LogArgument = Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, finished or not.")]
@@ -221,7 +223,7 @@ class GnssOptions:
         """
         if self.gnss is None:
             return None
-        self._check_use()
+        self._check()
         from segslam.gnss.reading import read_fixes
         from segslam.output.georeferenced import georeference, summary
 
@@ -235,7 +237,7 @@ class GnssOptions:
         """
         if self.gnss is None:
             return None
-        self._check_use()
+        self._check()
         from segslam.output.georeferenced import georeference_if_possible
         from segslam.run.live.ros import FixTopic
 
@@ -244,7 +246,9 @@ class GnssOptions:
             folder, name, topic.rows.copy(), use=self.gnss_use, offset_s=self.gnss_offset
         )
 
-    def _check_use(self) -> None:
+    def _check(self) -> None:
+        if not abs(self.gnss_offset) < MOST_OFFSET_S:
+            raise SegslamError(f"--gnss-offset {self.gnss_offset}: not a difference of clocks in seconds")
         if self.gnss_use not in GNSS_USES:
             raise SegslamError(f"--gnss-use {self.gnss_use}: unknown; known: {', '.join(GNSS_USES)}")
 

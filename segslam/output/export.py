@@ -16,10 +16,11 @@ from segslam.core.config import MapConfig, load_config
 from segslam.core.types import GraphEstimate, Indices, Keyframe, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import cannot_write, whole_file
 from segslam.output.finished import read_corrections
-from segslam.output.folder import PLACE_ON_GLOBE
+from segslam.output.folder import PLACE_ON_GLOBE, read_localised
 from segslam.output.log import RunLog, read_log
 from segslam.output.map.write import check_files, write_map
 from segslam.slam.adjustment import Progress, no_progress
+from segslam.slam.slam_result import TRUSTED_M
 
 if TYPE_CHECKING:
     from segslam.gnss import Origin
@@ -71,7 +72,7 @@ def write_maps(
             if file.name == BEFORE_AFTER:
                 complete.enter_context(whole_file(file)).write_bytes(draw_before_after(folder))
             elif is_track(file):
-                content = track(file, globe, _finished(log)[1].stamp_ns, name=folder.resolve().name)
+                content = track(file, *_localised(log, globe), name=folder.resolve().name)
                 complete.enter_context(whole_file(file)).write_bytes(content)
         if not of_map:
             return {"map_seconds": perf_counter() - started}
@@ -105,6 +106,14 @@ def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tupl
     if num_gathered < len(estimate.T_world_keyframe):
         readable = f"only {num_gathered} of its {len(estimate.T_world_keyframe)} keyframes are readable"
         raise SegslamError(f"{log.path}: damaged, {readable}; the map is not written. Map the data again, or replay it")
+
+
+def _localised(log: RunLog, globe: "Globe | None") -> "tuple[Globe | None, Indices]":
+    """The place on the globe of the scans that are in the map, and their times."""
+    trajectory = _finished(log)[1]
+    from_map_m = read_localised(log.path.parent, len(trajectory))
+    rows = np.arange(len(trajectory)) if from_map_m is None else np.flatnonzero(from_map_m <= TRUSTED_M)
+    return globe and replace(globe, T_enu_lidar=globe.T_enu_lidar[rows]), trajectory.stamp_ns[rows]
 
 
 def is_track(file: Path) -> bool:

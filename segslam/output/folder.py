@@ -103,14 +103,17 @@ def copy_alone(source: Path, target: Path) -> None:
 
 
 def read_alone(folder: Path, scans: Trajectory) -> Trajectory | None:
-    """The poses of all scans by KISS-ICP alone, if known. Raises SegslamError if the file is not one of these scans."""
+    """The poses of scans by KISS-ICP alone, if known; the file may go on after them, where a run was repeated in part.
+
+    Raises SegslamError if the file is not one of these scans.
+    """
     file = folder / f"{ALONE}_tum.txt"
     if not file.is_file():
         return None
     poses = read_poses(file, format="tum")
-    if poses.stamp_ns is None or not np.array_equal(poses.stamp_ns, scans.stamp_ns):
+    if poses.stamp_ns is None or not np.array_equal(poses.stamp_ns[: len(scans)], scans.stamp_ns):
         raise SegslamError(f"{file}: not of the scans of this run; remove the file")
-    return replace(scans, T_world_lidar=poses.T_a_b)
+    return replace(scans, T_world_lidar=poses.T_a_b[: len(scans)])
 
 
 def write_csv(file: Path, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:

@@ -54,10 +54,16 @@ def georeference(
     to the times of the fixes. Raises SegslamError if the run or the fixes cannot be read, or if the fixes do not
     determine a placement.
     """
+    if str(use) not in set(Use):
+        raise SegslamError(f"georeference: use {use!r}: unknown; known: {', '.join(Use)}")
     finished = read_run(run)
     known = fixes if isinstance(fixes, Fixes) else read_fixes(fixes)
     scans = finished.result.trajectory
     drive = Drive(scans.stamp_ns, scans.T_world_lidar, finished.result.keyframe_rows)
+    if in_map := finished.options.get("in_map"):
+        raise SegslamError(
+            f"{finished.folder}: localised in the map of {in_map}; georeference that run, and localise the data again"
+        )
     graph = finished.folder / ADJUSTED_GRAPH
     if not graph.exists():
         raise SegslamError(
@@ -88,6 +94,12 @@ def _not_damaged(file: Path) -> Iterator[None]:
         raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
 
 
+def remove_place(folder: Path) -> None:
+    """Remove the files with the place of a run on the globe, which are not of the scans that are added to it."""
+    for name in (FILE, FIXES, GEODETIC, ENU):
+        (folder / name).unlink(missing_ok=True)
+
+
 def georeference_if_possible(
     folder: Path, source: str, rows: Sequence[Row], *, use: Use | str = Use.FUSE, offset_s: float = 0.0
 ) -> str:
@@ -100,7 +112,9 @@ def georeference_if_possible(
 
 
 def take_over(run: str | Path, map_run: str | Path) -> bool:
-    """Place a run that was localised in the map of a georeferenced run on the globe; False if that has no place.
+    """Place a run that was localised in the map of a georeferenced run on the globe.
+
+    False if that has no place, or no scan was localised.
 
     Each scan keeps its pose relative to the nearest keyframe of the map, so that it moves as the map was bent.
     """
@@ -109,6 +123,8 @@ def take_over(run: str | Path, map_run: str | Path) -> bool:
     if globe is None:
         return False
     made, mapped = read_run(run), read_run(source).result
+    if not made.result.localised().any():
+        return False
     T_world_keyframe = mapped.trajectory.T_world_lidar[mapped.keyframe_rows]
     T_enu_map = globe.T_enu_lidar[mapped.keyframe_rows] @ np.linalg.inv(T_world_keyframe)
     poses = made.result.trajectory.T_world_lidar

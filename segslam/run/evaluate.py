@@ -49,7 +49,10 @@ def _known(given: Given) -> Trajectory | PoseFile:
         return given
     if isinstance(given, str | Path):
         return read_poses(Path(given))
-    return PoseFile(np.asarray(given, dtype=np.float64), None)
+    poses = np.asarray(given, dtype=np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise SegslamError(f"evaluate: poses of shape {poses.shape}; give finite matrices, (n, 4, 4)")
+    return PoseFile(poses, None)
 
 
 def _poses(known: Trajectory | PoseFile) -> Poses:

@@ -14,7 +14,18 @@ from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core.config import Config
 from segslam.core.points import within_range
 from segslam.core.threads import at_once
-from segslam.core.types import Alignment, Found, Keyframe, Labels, Points, Rejected, RejectReason, Transform, as_points
+from segslam.core.types import (
+    Alignment,
+    Found,
+    Keyframe,
+    Labels,
+    Points,
+    Rejected,
+    RejectReason,
+    SegslamError,
+    Transform,
+    as_points,
+)
 from segslam.keyframes import Clouds, Submaps, downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.output.finished import read_run
@@ -93,6 +104,8 @@ class Locator:
         started = perf_counter()
         config = self.config
         near = as_points(points)
+        if labels is not None and len(labels) != len(near):
+            raise SegslamError(f"locate: {len(labels)} labels for {len(near)} points; give one for each")
         usable = within_range(near, config.odometry.min_range_m, config.odometry.max_range_m)
         near = near.compress(usable, axis=0)
         labels = geometric_labels(near) if labels is None else labels[usable]

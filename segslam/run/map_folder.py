@@ -12,7 +12,7 @@ from segslam.core.config import Config, OdometryConfig
 from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError, Step, Trajectory
 from segslam.labels.encodings import Encoding
-from segslam.labels.label_files import unlabelled
+from segslam.labels.label_files import unlabelled, whole_source
 from segslam.odometry import GivenOdometry, KissOdometry, Odometry
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import new_folder
@@ -103,7 +103,7 @@ def resume_options(
         "sequence": source.sequence,
         "frames": source.frames or "",
         "topic": source.topic,
-        "labels": source.labels,
+        "labels": whole_source(source.labels),
         "encoding": source.encoding or "",
         "odometry": str(odometry.resolve()) if odometry else "",
         "map_files": json.dumps([str(name) for name in map_files]),

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import shlex
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -141,15 +142,18 @@ class Run:
             except BadScan as error:
                 raise SegslamError(
                     f"{error}; {recorded.path} has it mapped, so restore it to resume, or: segslam replay "
-                    f"{recorded.path.parent} --out NEW"
+                    f"{shlex.quote(str(recorded.path.parent))} --out NEW"
                 ) from error
             if scan.stamp_ns != stamp_ns:
                 raise _other_data(recorded.path, f"has scan {scan.index} at {stamp_ns} ns, the data {scan.stamp_ns} ns")
             return scan
 
+        from segslam.output.georeferenced import remove_place
+
         self._slam.resume(scan_of)
         self._log.move(recorded.path)
         remove_alone(self.folder)
+        remove_place(self.folder)
         self.num_scans_resumed = len(taken)
         self._started_mapping = perf_counter()
         self._next_row = taken[-1][0] + 1 if taken else 0
@@ -267,7 +271,8 @@ class Run:
 
         `more` adds figures computed from the result. `place` georeferences the folder before the maps are written, and
         returns what it found. `search_s` limits the last search for loops, and `progress` shows the adjustment, as in
-        `Slam.finish`. Raises SegslamError if there was no step. A failure of place or maps leaves a report.
+        `Slam.finish`. Raises SegslamError if there was no step. A failure of place or maps leaves a report, and one of
+        the place the maps.
         """
         from segslam.output.report import write_report
 
@@ -276,11 +281,14 @@ class Run:
             metrics |= accuracy(result, self._reference)
         metrics |= more(result)
         write_metrics(self.folder, metrics)
-        placed = ""
+        placed, failure = "", None
         try:
             if place is not None:
-                placed = place(self.folder)
-                metrics = read_metrics(self.folder)
+                try:
+                    placed = place(self.folder)
+                    metrics = read_metrics(self.folder)
+                except SegslamError as error:  # the maps do not need it
+                    failure = error
             if map_files:
                 from segslam.output.export import write_maps
 
@@ -288,9 +296,13 @@ class Run:
                 metrics |= write_maps(log, map_files, config=log.config.map, show=progress)
                 metrics["peak_rss_mb"] = peak_mb()
                 write_metrics(self.folder, metrics)
+        except SegslamError as error:
+            failure = failure or error
         finally:
             with room_for(self.folder):
                 write_report(self.folder)
+        if failure is not None:
+            raise failure
         return metrics, placed
 
     def _vertical_angle(self, result: SlamResult) -> dict[str, float]:

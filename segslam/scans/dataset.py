@@ -23,7 +23,7 @@ from segslam.core.types import (
     Vector,
 )
 from segslam.core.whole_files import expanded
-from segslam.labels.encodings import Encoding
+from segslam.labels.encodings import ENCODINGS, Encoding
 from segslam.labels.label_files import LabelSource, of_rows
 from segslam.scans.scan_files import sweep_times
 
@@ -126,6 +126,8 @@ class DataSource:
         folder = expanded(self.data)
         if not folder.exists():
             raise SegslamError(f"{folder}: no such file or folder; give the folder with sequences/ or with the scans")
+        if self.encoding not in (None, *ENCODINGS):
+            raise SegslamError(f"encoding {self.encoding}: unknown; known: {', '.join(ENCODINGS)}")
         source = replace(self, data=folder)
         from segslam.scans.kitti import KittiSequence, is_kitti
 

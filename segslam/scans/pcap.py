@@ -21,6 +21,9 @@ ETHERNET, VLAN_TAG = 1, 0x8100
 IPV4, UDP = 4, 17
 FILE_HEADER_BYTES = 24
 UDP_HEADER_BYTES = 8
+REASSEMBLY_BYTES = 2**24
+"""Most bytes of the file between fragments of one datagram; a sensor sends as many in a second, and the 16 bits of a
+datagram's number repeat after 65,536 datagrams."""
 
 Content = bytes | mmap.mmap
 
@@ -50,6 +53,8 @@ def udp_payloads(content: Content, *, num_bytes: int, port: int | None) -> Itera
                 continue
         key = content[start + 12 : start + 20] + content[start + 4 : start + 6]  # source, destination, datagram number
         pieces = waiting.setdefault(key, {})
+        if any(start - piece.start > REASSEMBLY_BYTES for piece in pieces.values()):
+            pieces.clear()  # of an earlier datagram of the same number, which lost a fragment
         pieces[offset] = slice(header_end, end)
         if 0 in pieces and sum(piece.stop - piece.start for piece in pieces.values()) == num_bytes:
             yield [pieces[place] for place in sorted(pieces)]

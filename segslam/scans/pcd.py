@@ -87,7 +87,7 @@ def _compressed_columns(content: bytes, start: int, num_points: int, fields: lis
     data = decompress(memoryview(content)[start : start + num_compressed], num_bytes)
     columns: Columns = {}
     begin = 0
-    for field in fields:
+    for field in (one for one in fields if one.num_values):
         end = begin + num_points * field.dtype.itemsize * field.num_values
         columns |= binary_columns(data[begin:end], 0, num_points, [field], is_last=True)
         begin = end

@@ -53,6 +53,15 @@ def test_a_file_is_replaced_only_if_wanted(
     assert file.read_bytes() != b"mine"
 
 
+def test_the_image_of_a_grid_is_not_replaced_either(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "grid.pgm").write_bytes(b"mine")
+    assert run("export", made, tmp_path / "grid.yaml", "--quiet") == 2
+    assert "grid.pgm: exists" in capsys.readouterr().err
+    assert (tmp_path / "grid.pgm").read_bytes() == b"mine"
+
+
 def test_map_replaces_a_run_only_if_wanted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, out = tmp_path / "data", tmp_path / "run"
     write_kitti_sequence(data, num_scans=3)

@@ -24,7 +24,8 @@ from segslam.core import geometry
 from segslam.core.types import Points, SegslamError
 from segslam.gnss import Origin, enu_from_geodetic, geodetic_from_enu
 from segslam.output.export import track
-from segslam.output.georeferenced import Globe, read_globe
+from segslam.output.folder import write_localised
+from segslam.output.georeferenced import Globe, georeference, read_globe, take_over
 from segslam.output.log import read_log, schema
 from segslam.output.log.locations import write_locations
 from segslam.output.map.projected import _affine, utm
@@ -264,6 +265,45 @@ def test_map_places_a_run_before_its_maps_are_written(tmp_path: Path, capsys: py
     assert laspy.read(out / "map.laz").header.parse_crs().to_epsg() == 32632
     off_m = geometry.apply(T_ENU_MAP, reference.T_world_lidar[:, :3, 3]) - _enu(_geodetic(out))
     assert np.hypot(*off_m[:, :2].T).max() < 0.3
+
+
+@pytest.mark.usefixtures("short_runs")
+def test_fixes_that_place_nothing_leave_the_maps_and_others_place_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, out = write_day(tmp_path / "monday", day=0, first=0, num_scans=22), tmp_path / "run"
+    reference = open_dataset(data).reference
+    assert reference is not None
+    write_fixes(tmp_path / "fixes.csv", reference.stamp_ns, reference.T_world_lidar)
+    write_fixes(tmp_path / "few.csv", reference.stamp_ns[:2], reference.T_world_lidar[:2])
+    options = ("--out", out, "--set", "adjustment.max_minutes=0", "--map-file", "map.ply")
+    assert run("map", data, *options, "--gnss", tmp_path / "few.csv") == 2
+    assert "2 usable fixes are within the drive" in capsys.readouterr().err
+    assert (out / "map.ply").is_file()
+    assert not (out / "georeference.json").exists()
+    assert run("map", data, *options, "--resume", "--gnss", tmp_path / "fixes.csv") == 0
+    assert "map placed: heading known to" in capsys.readouterr().err
+    assert read_globe(out) is not None
+
+
+def test_only_localised_scans_are_in_a_track(made: MadeRun, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(made.folder, copy)
+    trajectory = made.result.trajectory
+    from_map_m = np.where(np.arange(len(trajectory)) < 40, 3.0, np.inf)
+    write_localised(copy, trajectory, from_map_m, from_map_m < 20.0)
+    assert run("export", copy, copy / "a.gpx", "--quiet") == 0
+    assert (copy / "a.gpx").read_text().count("<trkpt") == 40
+    write_localised(copy, trajectory, np.full(len(trajectory), np.inf), np.zeros(len(trajectory), bool))
+    assert not take_over(copy, made.folder), "no scan was localised"
+
+
+def test_a_place_is_refused_with_the_reason(made: MadeRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fixes = made.folder.parent / "fixes.csv"
+    assert run("georeference", made.folder, "--gnss", fixes, "--gnss-offset", "nan") == 2
+    assert "--gnss-offset nan: not a difference of clocks" in capsys.readouterr().err
+    with pytest.raises(SegslamError, match="use 'bend': unknown; known: align, fuse"):
+        georeference(made.folder, fixes, use="bend")
 
 
 def _geodetic(folder: Path) -> Points:

@@ -232,3 +232,14 @@ def _read_pgm(file: Path) -> np.ndarray:
     width, height = (int(number) for number in size.split())
     assert (magic, deepest) == (b"P5", b"255")
     return np.frombuffer(rest, np.uint8).reshape(height, width)
+
+
+def test_a_picture_of_ceilings_only_is_refused(tmp_path: Path) -> None:
+    keyframe, _ = next(iter(placed_keyframes()))
+    points = np.column_stack([np.random.default_rng(0).uniform(-5, 5, (4000, 2)), np.full(4000, 2.5)])
+    ceiling = replace(
+        keyframe, points=points.astype(np.float32), labels=np.full(4000, Label.BUILDING, np.uint8), intensities=None
+    )
+    placed = [(replace(ceiling, id=row), geometry.transform(np.eye(3), [0.5 * row, 0.0, 0.0])) for row in range(12)]
+    with pytest.raises(SegslamError, match="nothing is seen below the ceiling"):
+        write_map(iter(placed), [tmp_path / "a.png"], config=MapConfig())

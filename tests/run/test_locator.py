@@ -133,7 +133,7 @@ def test_poses_are_printed_though_another_scan_is_unreadable(
     [
         (["missing.npy"], "missing.npy: no such file"),
         (["--dataset", "nclt"], "--dataset nclt: only kitti"),
-        (["--labels", "nowhere"], "nowhere/a.label: no such file"),
+        (["--labels", "nowhere"], "nowhere/a.label: no such file or folder; --labels: give geometric"),
     ],
 )
 def test_bad_usage_of_the_command_is_one_line(
@@ -143,6 +143,12 @@ def test_bad_usage_of_the_command_is_one_line(
     np.save(scan, round_drive()[0][55].points)
     assert commands.run("locate", run, scan, *arguments) == 2
     assert output in capsys.readouterr().err
+
+
+def test_labels_of_another_number_are_refused(run: Path) -> None:
+    points = round_drive()[0][55].points
+    with pytest.raises(SegslamError, match=f"3 labels for {len(points)} points"):
+        Locator.from_run(run).locate(points, np.zeros(3, np.uint8))
 
 
 def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,7 @@
 """Ouster's packets in a pcap file, read as scans."""
 
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from helpers.ouster_packets import (
 
 from segslam.core.types import SegslamError
 from segslam.scans import open_dataset
+from segslam.scans.pcap import REASSEMBLY_BYTES, udp_payloads
 
 
 @pytest.mark.parametrize("profile", CHANNEL_BYTES)
@@ -107,3 +109,26 @@ def test_unknown_link_and_empty_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "drive.pcap").write_bytes(b"")
     with pytest.raises(SegslamError, match=r"drive\.pcap: cannot be opened as ouster data"):
         open_dataset(tmp_path / "drive.pcap")
+
+
+def test_a_lost_fragment_does_no_harm_to_the_next_datagram_of_its_number() -> None:
+    num_bytes, head = 2000, b"\xd4\xc3\xb2\xa1" + struct.pack("<HHIIII", 2, 4, 0, 0, 65535, 101)
+
+    def fragment(offset: int, more: bool, body: bytes) -> bytes:
+        place = (0x2000 if more else 0) | offset // 8
+        ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(body), 5, place, 64, 17, 0, b"\x0a\0\0\1", b"\x0a\0\0\2")
+        return struct.pack("<IIII", 0, 0, len(ip + body), len(ip + body)) + ip + body
+
+    def first(fill: bytes) -> bytes:
+        return fragment(0, True, struct.pack(">HHHH", 7502, 7502, num_bytes + 8, 0) + fill * 1472)
+
+    def rest(fill: bytes) -> bytes:
+        return fragment(1480, False, fill * (num_bytes - 1472))
+
+    others = fragment(8, True, bytes(1400)) * (REASSEMBLY_BYTES // 1400 + 1)  # of a datagram that stays incomplete
+    content = head + rest(b"a") + others.replace(b"\x0a\0\0\1", b"\x0a\0\0\3") + first(b"b") + rest(b"b")
+    content += rest(b"c") + first(b"c")
+    found = [
+        b"".join(content[piece] for piece in pieces) for pieces in udp_payloads(content, num_bytes=num_bytes, port=None)
+    ]
+    assert found == [b"b" * num_bytes, b"c" * num_bytes]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from segslam.core.types import Vector
+from segslam.core.types import SegslamError, Vector
 from segslam.labels.encodings import COLORS, Colors
 from segslam.output.map.from_above import Window, visible
 from segslam.output.map.tiles import TILE_M, Extent, Part, corner
@@ -68,6 +68,8 @@ class Picture:
     def _finished(self) -> tuple[np.ndarray, Window, float]:
         """The shaded image (rows, columns, 3) of what has points, its window, and the median height of its pixels."""
         known, margin = np.isfinite(self._height_m), round(MARGIN_M * self._pixels / TILE_M)
+        if not known.any():
+            raise SegslamError("map in top view: nothing is seen below the ceiling; write a cloud (.ply) instead")
         ends = (np.flatnonzero(known.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
         (top, bottom), (left, right) = (
             (max(first - margin, 0), min(last + 1 + margin, size))

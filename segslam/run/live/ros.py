@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 from sensor_msgs.msg import NavSatFix, PointCloud2, PointField
 
 from segslam.core import geometry
+from segslam.core.errors import brief
 from segslam.core.types import BadScan, GraphEstimate, Labels, Points, Scan, SegslamError, Transform
 from segslam.gnss.fixes import Row
 from segslam.gnss.reading import row_of
@@ -274,7 +275,7 @@ def _check_topic(topic: str, option: str, remedy: str) -> None:
     try:
         validate_full_topic_name(topic)
     except (InvalidTopicNameException, ValueError) as error:
-        raise SegslamError(f"{option}: not a topic name ({error}); {remedy}") from error
+        raise SegslamError(f"{option}: not a topic name ({brief(str(error))}); {remedy}") from error
 
 
 def start_node(name: str) -> tuple[Any, Any]:

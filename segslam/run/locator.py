@@ -1,22 +1,21 @@
 """Localisation of single scans in a finished run, without initial guess."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from time import perf_counter
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
-from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core.config import Config
 from segslam.core.points import within_range
 from segslam.core.threads import at_once
 from segslam.core.types import (
     Alignment,
     Found,
+    Information,
     Keyframe,
     Labels,
     Points,
@@ -26,6 +25,7 @@ from segslam.core.types import (
     Transform,
     as_points,
 )
+from segslam.graph import PoseGraph
 from segslam.keyframes import Clouds, Submaps, downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.output.finished import read_run
@@ -69,14 +69,18 @@ class Locator:
         self,
         keyframes: list[Keyframe],
         clouds: Clouds,
+        informations: Sequence[Information | None],
         T_world_keyframe: dict[int, Transform],
         *,
         config: Config,
     ) -> None:
-        """`keyframes`: by id, with or without points; `clouds` provides the points. Missing signatures are computed."""
+        """`keyframes`: by id, with or without points; `clouds` provides the points. Missing signatures are computed.
+
+        `informations`: as `SlamResult.keyframe_informations`.
+        """
         self.config = config
         self.T_world_keyframe = T_world_keyframe
-        self.submaps = submaps_of(keyframes, clouds, config)
+        self.submaps = submaps_of(keyframes, clouds, informations, config)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         """A keyframe by its id, prepared for alignment."""
         self.signatures = [self._signature(keyframe) for keyframe in keyframes]
@@ -90,7 +94,8 @@ class Locator:
         run = read_run(folder)
         recorded = read_log(run.folder).keyframes()
         keyframes = [recorded[number] for number in range(len(recorded))]
-        return cls(keyframes, recorded, run.result.estimate.T_world_keyframe, config=run.config)
+        informations = run.result.keyframe_informations()
+        return cls(keyframes, recorded, informations, run.result.estimate.T_world_keyframe, config=run.config)
 
     def locate(
         self, points: ArrayLike, labels: Labels | None = None, *, max_places: int = MAX_PLACES
@@ -141,12 +146,14 @@ class Locator:
         return signature_of(made.points, made.labels)
 
 
-def submaps_of(keyframes: list[Keyframe], clouds: Clouds, config: Config) -> Submaps:
+def submaps_of(
+    keyframes: list[Keyframe], clouds: Clouds, informations: Sequence[Information | None], config: Config
+) -> Submaps:
     """The submaps of a drive; sparse keyframes are merged with their neighbours. Arguments as for `Locator`."""
-    travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
-    variance = np.where(np.diff(travel_m, prepend=0.0) < BREAK_TRAVEL_M, 0.0, np.inf)
-    submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: variance)
-    for keyframe in keyframes:
+    graph = PoseGraph(config.graph)
+    submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: graph.motion_variance)
+    for keyframe, information in zip(keyframes, informations, strict=True):
+        graph.add_keyframe(keyframe.id, keyframe.T_odom_keyframe, keyframe.travel_m, information=information)
         submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
     return submaps
 

@@ -12,6 +12,7 @@ from segslam.core.trajectory import Poses, camera_from_lidar, rows_of_same_scan,
 from segslam.core.types import (
     GraphEstimate,
     Indices,
+    Information,
     LoopAttempt,
     LoopClosure,
     Mask,
@@ -24,6 +25,7 @@ from segslam.core.types import (
     Vector,
     probability_text,
 )
+from segslam.odometry import information_of
 from segslam.slam.adjustment import Adjusted
 
 if TYPE_CHECKING:
@@ -70,6 +72,17 @@ class SlamResult(Record):
         if self.from_map_m is None:
             return np.ones(len(self.trajectory), dtype=bool)
         return self.from_map_m <= TRUSTED_M
+
+    def keyframe_informations(self) -> list[Information | None]:
+        """Information of the motion from the previous keyframe to each; None for the noise model of odometry.
+
+        None for all if the log has no motions.
+        """
+        if len(self.motions) != len(self.trajectory):
+            return [None] * len(self.keyframe_rows)
+        firsts = [0, *(self.keyframe_rows[:-1] + 1).tolist()]
+        rows = zip(firsts, self.keyframe_rows.tolist(), strict=True)
+        return [information_of(self.motions[first : row + 1]) for first, row in rows]
 
     def to_tum(self, path: str | Path) -> None:
         """Write the corrected LiDAR poses of all scans in TUM format: seconds x y z qx qy qz qw."""

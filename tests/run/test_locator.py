@@ -14,7 +14,7 @@ from segslam.core.config import load_config
 from segslam.core.types import Rejected, SegslamError
 from segslam.odometry import GivenOdometry
 from segslam.output.log import read_log
-from segslam.run.locator import Locator
+from segslam.run.locator import Locator, submaps_of
 
 NUM_MAPPED = 50
 """A round of the drive; the scans after it see it again."""
@@ -156,3 +156,13 @@ def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path, capsys: pyte
     np.save(scan, round_drive()[0][55].points)
     assert commands.run("locate", tmp_path / "nothing", scan) == 2
     assert "nothing: no such file or folder" in capsys.readouterr().err
+
+
+def test_neighbours_whose_motion_is_unsure_are_not_merged(run: Path) -> None:
+    """As while the run was mapped: the information of each motion is in its log."""
+    recorded = read_log(run).keyframes()
+    keyframes = [recorded[number] for number in range(6)]
+    informations = [None, None, 1e-2 * np.eye(6), None, None, None]
+    submaps = submaps_of(keyframes, recorded, informations, load_config(None, []))
+    assert set(submaps._neighbours(1, 5)) == {0}
+    assert 1 not in set(submaps._neighbours(2, 5))

@@ -18,7 +18,6 @@ from segslam.core.types import (
     Transform,
     Vector,
 )
-from segslam.odometry import information_of
 from segslam.output.finished import FinishedRun, read_corrections, read_run
 from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
@@ -75,19 +74,16 @@ def read_session(folder: Path) -> Session:
     run = read_run(folder)
     log = read_log(folder)
     estimate = run.result.estimate.T_world_keyframe
-    T_odom, travel_m, informations = [], [], []
-    since: list[Motion] = []
+    T_odom, travel_m = [], []
     for step in log.steps(clouds=False):
-        since += [step.motion] if step.motion else []
         if step.keyframe is not None:
             T_odom.append(step.keyframe.T_odom_keyframe)
             travel_m.append(step.keyframe.travel_m)
-            informations.append(information_of(since))
-            since = []
     if list(estimate) != list(range(len(T_odom))):
         raise SegslamError(f"{log.path}: damaged, poses of {len(estimate)} keyframes for {len(T_odom)}; replay it")
     poses = np.array([estimate[number] for number in range(len(T_odom))])
-    return Session(run, log, poses, np.array(T_odom), np.array(travel_m), tuple(informations))
+    informations = tuple(run.result.keyframe_informations())
+    return Session(run, log, poses, np.array(T_odom), np.array(travel_m), informations)
 
 
 def read_sessions(folders: list[Path]) -> list[Session]:

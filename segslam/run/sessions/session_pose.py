@@ -72,7 +72,8 @@ def find_session(
     a place of the earlier session, and no other place is tried.
     """
     recorded = session.log.keyframes()
-    submaps = submaps_of([recorded[number] for number in range(len(recorded))], recorded, config)
+    keyframes = [recorded[number] for number in range(len(recorded))]
+    submaps = submaps_of(keyframes, recorded, session.informations, config)
     found: list[LoopClosure] = []
     count = len(session.travel_m)
     queries = (

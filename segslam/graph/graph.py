@@ -7,6 +7,7 @@ several closures are collected before an optimisation.
 
 import logging
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
@@ -264,7 +265,8 @@ class PoseGraph:
             logger.warning("no final optimisation, the estimate under the robust kernel remains: %s", why)
             return robust
         if self._corrects_steady_drift():
-            error = self._solve_final()
+            with suppress(Unsolvable):  # the solution before remains
+                error = self._solve_final()
         return self._estimate(error)
 
     def adjust(self, measured: Sequence[Edge], *, shared_within: int = 0) -> tuple[GraphEstimate, tuple[float, float]]:

@@ -508,3 +508,24 @@ def test_noise_that_loops_raise_does_not_make_later_motions_unsure() -> None:
         graph.add_keyframe(number, geometry.transform(np.eye(3), [2.0 * number, 0.0, 0.0]), 2.0 * number)
     assert graph.motion_variance[0] == 0.0
     np.testing.assert_allclose(graph.motion_variance[2:], graph.motion_variance[1])
+
+
+def test_a_drift_whose_correction_cannot_be_solved_leaves_the_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = PoseGraph(CONFIG)
+    truth = circle(40)
+    for number, (T, at_m) in enumerate(zip(truth, travel_m(truth), strict=True)):
+        graph.add_keyframe(number, T, float(at_m))
+    graph.add_closure(true_closure(truth, 30, 10))
+    solve, calls = graph._solve_final, []
+
+    def once() -> float:
+        calls.append(1)
+        if len(calls) == 2:
+            raise Unsolvable("x")
+        return solve()
+
+    monkeypatch.setattr(graph, "_solve_final", once)
+    monkeypatch.setattr(graph, "_corrects_steady_drift", lambda: True)
+    estimate = graph.finish()
+    assert len(calls) == 2
+    np.testing.assert_allclose(estimate.T_world_keyframe[39], truth[39], atol=1e-3)

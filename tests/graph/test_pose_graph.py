@@ -12,8 +12,8 @@ from scipy.stats import chi2, kstest
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
-from segslam.core.types import Alignment, GraphEstimate, LoopClosure, Registration, SegslamError
-from segslam.graph import PoseGraph, noise
+from segslam.core.types import Alignment, GraphEstimate, LoopClosure, Placement, Registration, SegslamError
+from segslam.graph import AnchoredGraph, PoseGraph, noise
 from segslam.graph.edges import Edge, factor_graph, squared_errors
 from segslam.graph.g2o import read_g2o
 from segslam.graph.levenberg_marquardt import Unsolvable
@@ -529,3 +529,17 @@ def test_a_drift_whose_correction_cannot_be_solved_leaves_the_solution(monkeypat
     estimate = graph.finish()
     assert len(calls) == 2
     np.testing.assert_allclose(estimate.T_world_keyframe[39], truth[39], atol=1e-3)
+
+
+def test_placements_in_a_map_have_the_weights_of_their_keyframes() -> None:
+    graph = AnchoredGraph(CONFIG)
+    for number in range(4):
+        graph.add_keyframe(number, geometry.transform(np.eye(3), [2.0 * number, 0.0, 0.0]), 2.0 * number)
+    known = true_closure(np.tile(np.eye(4), (4, 1, 1)), 1, 0)
+    for number in (1, 3):
+        T_world = geometry.transform(np.eye(3), [5.0 + 2.0 * number, 0.0, 0.0])
+        graph.place(Placement(number, 7, T_world, known.information, known.alignment, is_found=True))
+    estimate = graph.optimize()
+    assert graph.weights.keys() == {1, 3}
+    assert min(graph.weights.values()) > 0.9
+    np.testing.assert_allclose(estimate.T_world_keyframe[0][:3, 3], [5.0, 0.0, 0.0], atol=1e-3)

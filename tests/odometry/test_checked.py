@@ -305,6 +305,16 @@ def test_a_motion_has_information_of_its_own_if_it_is_less_certain_than_the_mode
     own = odometry._own_information(4.0 * model)
     assert own is not None
     np.testing.assert_allclose(own @ (4.0 * model), np.eye(6), atol=1e-6)
+    along = 0.5 * model + np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the scan shows all but the motion along one axis
+    own = odometry._own_information(along)
+    assert own is not None
+    assert np.linalg.inv(own)[3, 3] == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_scan_has_some_hundred_points_for_quick_looks() -> None:
+    points = np.random.default_rng(0).normal(size=(20_000, 3)).astype(np.float32)
+    assert 500 <= len(SeenScan(points, CONFIG.refine).few) <= 510
+    assert len(SeenScan(points[:300], CONFIG.refine).few) == 300
 
 
 def test_a_given_motion_predicts_the_next_one() -> None:

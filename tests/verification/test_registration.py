@@ -203,19 +203,31 @@ def test_scans_without_usable_points_are_rejected(points: np.ndarray) -> None:
     assert isinstance(register(points, points), Rejected)
 
 
-def test_a_rival_that_does_not_converge_where_it_is_rivals_but_is_not_returned(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_better", [True, False])
+def test_a_rival_that_does_not_converge_where_it_is_rivals_but_is_not_returned(
+    is_better: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source, target, T_true = _round_pair()
+    begun: list[np.ndarray] = []
+    refined = Trial.refined
+
+    def noted(self: Trial, coarse: Registration, T_begun: np.ndarray, **options: bool) -> Found | Rejected:
+        begun.append(T_begun)
+        return refined(self, coarse, T_begun, **options)
 
     def far(found: Found, known: object, trial: Trial) -> list[Found]:
         T_target_source = geometry.transform(np.eye(3), [0.0, 0.0, 30.0]) @ found.T_target_source
         return [found._replace(fine=replace(found.fine, T_target_source=T_target_source))]
 
     monkeypatch.setattr("segslam.verification.pair.rivals_of", far)
-    monkeypatch.setattr(Found, "mean_ratio", property(lambda pose: pose.T_target_source[2, 3]))
+    sign = 1.0 if is_better else -1.0
+    monkeypatch.setattr(Found, "mean_ratio", property(lambda pose: sign * pose.T_target_source[2, 3]))
+    monkeypatch.setattr(Trial, "refined", noted)
     tried = tried_poses(Trial(source, target, CONFIG, anywhere, Stopwatch()))
     assert not isinstance(tried, Rejected)
     assert _error(T_true, tried[0].T_target_source)[0] < 0.05
     assert [_error(T_true, other.T_target_source)[0] > 29.0 for other in tried[1:]].count(True) == 1
+    assert any(T_begun[2, 3] > 29.0 for T_begun in begun) == is_better, "only what may be returned is refined on"
 
 
 @pytest.mark.data

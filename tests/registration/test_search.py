@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from segslam.registration.cliques import degeneracy_order, maximum_cliques, pack_rows
+from segslam.registration.cliques import _greedy_clique, degeneracy_order, maximum_cliques, pack_rows
 
 ENOUGH = 10_000_000
 
@@ -128,3 +128,10 @@ def test_clique_of_a_real_graph_has_the_size_that_the_authors_program_found(
     assert search.proved
     assert len(search.cliques[0]) == size
     assert tuple(np.sort(golden["clique"]).tolist()) in as_set(search.cliques)
+
+
+def test_a_clique_that_grows_from_a_vertex_contains_it() -> None:
+    joined = np.zeros((70, 70), bool)
+    joined[np.ix_([3, 20, 66], [3, 20, 66])] = True
+    joined[3, 40] = joined[40, 3] = True
+    assert sorted(_greedy_clique(pack_rows(joined), 3).tolist()) == [3, 20, 66]

@@ -17,6 +17,7 @@ from segslam.core.config import load_config
 from segslam.core.types import Scan, Step, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.odometry import GivenOdometry
+from segslam.output.finished import read_run
 from segslam.output.log import read_log, schema
 from segslam.output.log.container import messages
 from segslam.run.run import Run
@@ -77,9 +78,10 @@ def test_continuous_mapping_has_no_leak_lag_or_lost_record(tmp_path: Path) -> No
         steps = run.map(rounds)
         seconds = [sum(step.stage_seconds.values()) for step in rounds.until_the_end(steps)]
         steps.close()
-        result, _ = run.finish()
+        run.complete()
     recorded = list(read_log(tmp_path / "log.mcap").steps())
-    assert [step.scan_index for step in recorded] == result.trajectory.scan_index.tolist() == list(range(len(recorded)))
+    trajectory = read_run(tmp_path).result.trajectory
+    assert [step.scan_index for step in recorded] == trajectory.scan_index.tolist() == list(range(len(recorded)))
     assert len(recorded) >= len(seconds) > 2 * FULL, "too slow a machine for so short a soak"
 
     rss_mb = _rss_mb(tmp_path / "log.mcap")

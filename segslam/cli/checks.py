@@ -128,8 +128,8 @@ def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
         return False
     from segslam.cli.dry_run import first_usable
 
-    last_row, _ = first_usable(scans, backwards=True)
-    return bool(result[1].scan_index[-1] == scans.scan_index[last_row])
+    last = int(result[1].scan_index[-1])  # scans are read only if the last one is missing
+    return last == int(scans.scan_index[-1]) or last == int(scans.scan_index[first_usable(scans, backwards=True)[0]])
 
 
 def check_preset(name: str, *, resumes: bool) -> None:

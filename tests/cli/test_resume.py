@@ -4,11 +4,16 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.commands import run
 from helpers.drives import write_kitti_sequence
+from helpers.finished_run import make_run
 
+from segslam.cli.checks import is_finished
+from segslam.core.types import BadScan, Scan
 from segslam.output.log import read_log
+from segslam.scans import Dataset
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 
@@ -101,3 +106,26 @@ def test_a_dry_run_shows_what_was_found_and_writes_nothing(
 def test_without_a_folder_to_write_to_nothing_is_mapped(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("map", kitti) == 2
     assert "--out" in capsys.readouterr().err
+
+
+def test_a_run_is_finished_though_its_last_scan_cannot_be_read(tmp_path: Path) -> None:
+    made = make_run(tmp_path / "run")
+    (tmp_path / "run" / "report.html").write_text("")
+    recorded, last = read_log(tmp_path / "run"), int(made.result.trajectory.scan_index[-1])
+
+    class Scans(Dataset):
+        def __init__(self, *more: int) -> None:
+            self.scan_index = np.array([last - 1, last, *more])
+            self.read: list[int] = []
+
+        def __getitem__(self, row: int) -> Scan:
+            self.read.append(row)
+            if row == 2 and self.scan_index[2] == last + 1:
+                raise BadScan("cut")
+            return Scan(np.ones((3, 3), np.float32), stamp_ns=row, index=int(self.scan_index[row]))
+
+    whole, cut, longer = Scans(), Scans(last + 1), Scans(last + 2)
+    assert is_finished(recorded, whole)
+    assert whole.read == [], "a recording would be read to its end"
+    assert is_finished(recorded, cut)
+    assert not is_finished(recorded, longer)

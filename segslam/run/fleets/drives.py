@@ -43,9 +43,8 @@ class Drive:
         options = {name: value for name, value in asdict(self).items() if name not in ("name", "data")}
         gnss = self.gnss if self.gnss and Path(self.gnss).exists() else ""  # otherwise a topic
         files = [path for path in (self.config, self.odometry, gnss) if path]
-        network = self.labels.removeprefix(NETWORK) if self.labels.startswith(NETWORK) else ""
-        for labels in (network, self.labels):
-            files += [labels] if Path(labels).is_absolute() and Path(labels).exists() else []
+        labels = Path(self.labels.removeprefix(NETWORK))
+        files += [str(labels)] if labels.is_absolute() and labels.exists() else []  # others are in the recording
         return key_of(version, options, _state(Path(self.data)), *(_state(Path(file)) for file in files))
 
 

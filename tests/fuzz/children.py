@@ -59,17 +59,21 @@ def defects(read: Callable[[Path], Any], file: Path, contents: Sequence[bytes]) 
 def _in_child(read: Callable[[Path], Any], file: Path, contents: Sequence[bytes]) -> tuple[list[str], str]:
     """The outcome of each content until the child ended, and how it ended.
 
-    The child does not delete what the parent no longer needs: threads that it would wait for do not exist there.
+    The child does not delete what the parent no longer needs: threads that it would wait for do not exist there. It
+    would do so within `fork` already, unless garbage collection is off in the parent.
     """
     source, sink = os.pipe()
+    gc.disable()
     child = os.fork()
     if child == 0:
         gc.freeze()
+        gc.enable()
         os.close(source)
         try:
             _work(read, file, contents, sink)
         finally:
             os._exit(0)
+    gc.enable()
     os.close(sink)
     outcomes, hangs = _received(source)
     if hangs:

@@ -1,5 +1,6 @@
 """Damaged files: an error that names the file or a result, in a second and with little memory, and nothing else."""
 
+import gc
 import mmap
 import os
 import re
@@ -76,3 +77,29 @@ def test_a_hang_counts_if_it_repeats(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     found = defects(read, tmp_path / "file", [b"good", b"once", b"good", b"always", b"good"])
     assert [(kind, data) for kind, data in found] == [("hang", b"always")]
+
+
+def test_a_child_does_not_delete_what_its_parent_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    deleted, fork = tmp_path / "deleted", os.fork
+
+    class Left:
+        def __init__(self) -> None:
+            self.cycle = self
+
+        def __del__(self) -> None:
+            with deleted.open("a") as text:
+                text.write(f"{os.getpid()}\n")
+
+    def collecting_fork() -> int:
+        """Python's own steps after a fork allocate, so that a collection may start in the child within `fork`."""
+        child = fork()
+        if child == 0 and gc.isenabled():
+            gc.collect()
+        return child
+
+    monkeypatch.setattr(os, "fork", collecting_fork)
+    gc.collect()
+    Left()
+    assert not defects(lambda _: gc.collect(), tmp_path / "file", [b"good"])
+    gc.collect()
+    assert deleted.read_text().split() == [str(os.getpid())]

@@ -118,7 +118,7 @@ class Nearness:
             target_id,
             T_target_source,
             geometry.distance(T_target_source),
-            self.covariances[row],
+            self.covariances[row].copy(),  # a view would keep those of all others
             float(self.probability[row]),
         )
 

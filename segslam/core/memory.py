@@ -29,13 +29,13 @@ def give_back() -> None:
         trim(0)
 
 
-_others_mb = 0.0
+_together_mb = 0.0
 
 
 def note_peak_of(pid: int | None) -> None:
     """Note the peak memory of another process, before it ends, for `peak_mb` (Linux only)."""
-    global _others_mb
-    _others_mb = max(_others_mb, status_mb("VmHWM", pid) or 0.0)
+    global _together_mb
+    _together_mb = max(_together_mb, _own_peak_mb() + (status_mb("VmHWM", pid) or 0.0))
 
 
 def status_mb(key: str, pid: int | str | None = "self") -> float | None:
@@ -48,8 +48,12 @@ def status_mb(key: str, pid: int | str | None = "self") -> float | None:
 
 
 def peak_mb() -> float:
-    """Peak memory of this process plus the largest one noted (MB).
+    """Peak memory of this process and those noted, which count until they end (MB).
 
-    `getrusage` is of no use for the other: a new process begins with the peak of the one that started it.
+    `getrusage` is of no use for the others: a new process begins with the peak of the one that started it.
     """
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 + _others_mb
+    return max(_own_peak_mb(), _together_mb)
+
+
+def _own_peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.config import config_to_yaml
-from segslam.core.memory import peak_mb
+from segslam.core.memory import give_back, peak_mb
 from segslam.core.threads import in_other_thread
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import BadScan, MotionState, Scan, SegslamError, Step, Trajectory, Transform
@@ -48,6 +48,9 @@ logger = logging.getLogger(__name__)
 
 MOST_WAITING = 8
 """Chosen: scans by which odometry may lead loop closing, about 2 MB each: the time of a keyframe with two loops."""
+
+TRIM_EVERY = 100
+"""Chosen: scans between two times that freed memory is returned to the system, each of which takes 10 ms."""
 
 
 class Run:
@@ -340,6 +343,8 @@ class Run:
         started = perf_counter()
         self._log.write(step)
         self.num_steps += 1
+        if self.num_steps % TRIM_EVERY == 0:
+            give_back()  # free memory between what is kept would grow with the drive
         while self._unreported:
             self._report(self._unreported.pop(0))
         self._note_ms("log", perf_counter() - started)

@@ -191,3 +191,10 @@ def test_moving_and_turning_the_world_changes_no_candidate() -> None:
 
 def test_the_first_keyframe_has_no_candidate() -> None:
     assert found_by(0, np.eye(4)[None], np.zeros(1)) == ()
+
+
+def test_a_candidate_does_not_keep_the_covariances_of_all_others() -> None:
+    poses, travel = square(3 * ROUND + 13)
+    found = found_by(ROUND + 29, poses, travel)
+    assert found
+    assert all(candidate.covariance.base is None for candidate in found)

@@ -36,7 +36,7 @@ def test_arrays_of_a_scans_size_are_made_of_pages_that_are_there() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
 def test_the_peak_of_another_process_does_not_contain_that_of_this_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "_others_mb", 0.0)  # of larger ones in earlier tests
+    monkeypatch.setattr(memory, "_together_mb", 0.0)  # of larger ones in earlier tests
     program = "import sys; kept = bytearray(40 * 2**20); print(); sys.stdout.flush(); sys.stdin.read()"
     alone_mb = peak_mb()
     with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
@@ -46,4 +46,8 @@ def test_the_peak_of_another_process_does_not_contain_that_of_this_one(monkeypat
         other.communicate()
     assert 40.0 < peak_mb() - alone_mb < 80.0
     note_peak_of(other.pid)  # it has ended
-    assert peak_mb() - alone_mb > 40.0
+    together_mb = peak_mb()
+    assert together_mb - alone_mb > 40.0
+    later = b"x" * (int(together_mb + 20.0 - alone_mb) * 2**20)
+    assert peak_mb() - together_mb < 40.0, "taken after the other process has ended, so not added to its memory"
+    del later

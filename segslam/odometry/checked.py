@@ -3,24 +3,25 @@
 As long as the odometry is sound, a scan every `keyframes.distance_m` is compared with the previous one in a few
 milliseconds. If this contradicts the motion, the scan is registered with the last scans from several proposals: the
 odometry's motion and the last motion; and, if no pose near a proposal explains the scan as scans of this drive usually
-are explained, no motion, poses all around, and place recognition. The most likely pose is kept. Each following scan is
-registered as well, until the odometry agrees with a window of registrations, after the n-th repair with n windows. So
-are the first scans of a drive, where KISS-ICP has few points in its map. After a repair the odometry continues from
-the local map; smaller corrections leave it undisturbed, and are added to its poses.
+are explained, no motion, poses all around, and place recognition. The most likely pose is kept. At the start, after a
+repair, and while its poses differ from the last registrations by more than both are unsure, every scan is registered.
+After a repair the odometry continues from the local map; smaller corrections leave it undisturbed. They are added to
+its following poses while every scan is registered; else they are taken as errors that it corrects itself.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
-from segslam.odometry.kiss import RESOLUTION
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual
@@ -28,8 +29,6 @@ from segslam.odometry.search import PoseSearch, Recover, as_likely
 from segslam.odometry.sweep import Odometry, OdometryResult
 from segslam.registration.refinement import MIN_POINTS, SHARED_NOISE_DEG, SHARED_NOISE_M
 
-ACCURACY = 0.6
-"""Chosen: accuracy of a pose as a share of the resolution of its map; half repairs thin scans of KITTI without need."""
 ELSEWHERE_M = 30.0
 ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
@@ -37,6 +36,10 @@ SIGNIFICANT = 0.001
 """Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans, and less
 likely motions are not considered. The adjustment has the same share of chance for a sweep that scans show, and for
 surfaces that become thicker."""
+MOST_OFF = float(chi2.isf(SIGNIFICANT, 6))
+"""Chi-square above which a pose of the odometry is significantly off the registered one."""
+MOST_OFF_TOGETHER = float(chi2.isf(SIGNIFICANT, 6 * WINDOW))
+"""Sum of these chi-squares above which an odometry is less sure than the registrations of its last scans."""
 MOST_UNCHECKED = 9
 """Chosen: number of scans after which a sensor that seems to stand still is checked."""
 
@@ -50,7 +53,6 @@ class CheckedOdometry:
         self._config = config
         self._refine = config.refine
         self._shared = geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
-        self._tolerance_m = ACCURACY * RESOLUTION * math.hypot(config.odometry.voxel_size_m, config.refine.voxel_m)
         self._map = LocalMap(config.refine)
         self._search = PoseSearch(recover, voxel_m=config.refine.voxel_m)
         self._lost: tuple[LocalMap, int] | None = None
@@ -61,8 +63,9 @@ class CheckedOdometry:
         self._T_odom_last = np.eye(4)
         self._T_odom_inner: Transform = np.eye(4)
         """Pose of the frame in which the inner odometry continues, undisturbed by small corrections."""
-        self._num_unchecked = self._num_repaired = 0
-        self._num_to_watch = WINDOW if inner.is_from_scans else 0
+        self._num_unchecked = 0
+        self._offs: deque[float] = deque(maxlen=WINDOW)
+        """Chi-squares of the odometry's poses, compared with registered ones, since the last repair."""
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
         """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry."""
@@ -73,22 +76,18 @@ class CheckedOdometry:
             return proposed
         seen = SeenScan(proposed.points, self._refine)
         T_odom_proposed = self._T_odom_inner @ proposed.T_odom_lidar
+        is_watched = self._is_watched
         T_odom_lidar, motion = self._checked(T_odom_proposed, seen, gap)
         self._T_odom_last = T_odom_lidar
-        if motion.state is MotionState.REFINED:
+        if is_watched and motion.state is MotionState.REFINED:
             self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(proposed.T_odom_lidar))
         return OdometryResult(T_odom_lidar, proposed.points, proposed.labels, proposed.intensities, motion)
 
-    def watch_after(self, states: Iterable[MotionState]) -> None:
-        """Watch the next scans for as long as after motions with these results, those of a drive so far."""
-        self._num_repaired, self._num_to_watch = 0, WINDOW if self._inner.is_from_scans else 0
-        for state in states:
-            self._note(is_repaired=state in (MotionState.REPAIRED, MotionState.BROKEN))
-
-    def _note(self, *, is_repaired: bool) -> None:
-        """Watch the next scans after a repair; a watched one passed if it was not repaired."""
-        self._num_repaired += is_repaired
-        self._num_to_watch = WINDOW * self._num_repaired if is_repaired else max(self._num_to_watch - 1, 0)
+    @property
+    def _is_watched(self) -> bool:
+        """True while every scan is registered: until the odometry agrees with a window of registrations."""
+        agrees = len(self._offs) == WINDOW and sum(self._offs) < MOST_OFF_TOGETHER
+        return self._inner.is_from_scans and not agrees
 
     def _checked(self, T_odom_proposed: Transform, scan: SeenScan, gap: float) -> tuple[Transform, Motion]:
         """The pose of a scan and the result of its check, if one is due."""
@@ -103,7 +102,7 @@ class CheckedOdometry:
         if len(self._map) == 0:
             self._map.add(T_odom_proposed, scan)
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
-        if self._num_to_watch == 0 and gap == 1.0:
+        if not self._is_watched and gap == 1.0:
             confirmed = self._confirmed(T_odom_proposed, scan, gap)
             if confirmed is not None:
                 return confirmed
@@ -111,7 +110,7 @@ class CheckedOdometry:
 
     def _is_due(self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float) -> bool:
         """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion."""
-        if len(self._map) == 0 or self._num_to_watch > 0 or gap > 1.0 or self._num_unchecked >= MOST_UNCHECKED:
+        if len(self._map) == 0 or self._is_watched or gap > 1.0 or self._num_unchecked >= MOST_UNCHECKED:
             return True
         moved_m = geometry.displacement_m(scan.few, T_odom_proposed, self._map.T_odom_map)
         sudden_m = geometry.displacement_m(scan.few, T_odom_proposed, T_odom_predicted)
@@ -124,19 +123,19 @@ class CheckedOdometry:
         found = self._map.check(scan, T_map_proposed)
         if found is None:
             return None
-        moved_m = geometry.displacement_m(scan.few, found.T_map_lidar, T_map_proposed)
+        off = _off(found.T_map_lidar, self._covariance(found), T_map_proposed)
         is_usual = self._usual_check.includes(found.mean_log, least_spread=found.num_patches**-0.5)
-        if moved_m > self._tolerance_m or not is_usual:
-            if moved_m <= self._tolerance_m:
+        if off > MOST_OFF or not is_usual:
+            if off <= MOST_OFF:
                 self._usual_check.note(found.mean_log)
             return None
         self._usual_check.note(found.mean_log)
         if not self._inner.is_from_scans:
             return self._kept(T_odom_proposed, T_map_proposed, found, scan, gap, is_unsure=False)
         T_last_lidar = geometry.inverse(self._T_odom_last) @ T_odom_proposed
-        T_last_fused = self._motion.fused(T_last_lidar, self._covariance(found), gap)
-        if geometry.displacement_m(scan.few, T_last_fused, T_last_lidar) > self._tolerance_m:
+        if _off(*self._motion.fused(T_last_lidar, self._covariance(found), gap), T_last_lidar) > MOST_OFF:
             return None  # the last motions say more than the scan does
+        self._offs.append(off)
         _, covariance = self._motion.update(T_last_lidar, self._covariance(found), gap)
         self._map.add(T_odom_proposed, scan)
         return T_odom_proposed, self._result(MotionState.CONFIRMED, T_map_proposed, found, covariance)
@@ -176,11 +175,13 @@ class CheckedOdometry:
             return self._kept(T_odom_proposed, T_map_proposed, best, scan, gap, is_unsure=is_unsure)
         is_lost = elsewhere * ELSEWHERE_M**2 > BREAK_M**2 and not is_rejoined
         T_last_lidar = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_map @ best.T_map_lidar)
-        covariance = self._covariance(best)
+        covariance = own = self._covariance(best)
         if by_chance < 0.5:  # a pose by chance does not show the speed
+            own = self._motion.fused(T_last_lidar, covariance, gap)[1]
             T_last_lidar, covariance = self._motion.update(T_last_lidar, covariance, gap)
         T_odom_lidar, covariance = geometry.nearest_transform(self._T_odom_last @ T_last_lidar), covariance + unsure
-        state = self._state(T_odom_proposed, T_odom_lidar, covariance, scan)
+        is_unlikely = as_likely(self._map.fit(scan, T_map_proposed), best) < SIGNIFICANT
+        state = self._state(_off(T_odom_lidar, own + unsure, T_odom_proposed), covariance, is_unlikely=is_unlikely)
         if state is MotionState.CONFIRMED:
             T_odom_lidar = T_odom_proposed
         if is_lost:
@@ -198,7 +199,7 @@ class CheckedOdometry:
         T_last_map = geometry.inverse(self._T_odom_last) @ self._map.T_odom_map
         fused = []
         for fit in fits:
-            T_last_lidar = self._motion.fused(T_last_map @ fit.T_map_lidar, self._covariance(fit), gap)
+            T_last_lidar, _ = self._motion.fused(T_last_map @ fit.T_map_lidar, self._covariance(fit), gap)
             fused.append(replace(fit, T_map_lidar=geometry.inverse(T_last_map) @ T_last_lidar))
         return fused
 
@@ -230,7 +231,6 @@ class CheckedOdometry:
         """The pose of an odometry of other sensors, which the scans do not contradict."""
         self._map.add(T_odom_proposed, scan)
         self._motion.restart(geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_proposed, 1.0 / gap))
-        self._note(is_repaired=False)
         state = MotionState.UNCHECKED if is_unsure else MotionState.CONFIRMED
         return T_odom_proposed, self._result(state, T_map_proposed, best, None)
 
@@ -267,19 +267,23 @@ class CheckedOdometry:
         """True if the most likely pose explains the scan as usual; False if there is none."""
         return bool(fits) and self._usual_fit.includes(fits[0].mean_log, least_spread=fits[0].num_patches ** -0.5)
 
-    def _state(
-        self, T_odom_proposed: Transform, T_odom_lidar: Transform, covariance: Information, scan: SeenScan
-    ) -> MotionState:
-        """Name of the result; the next scans are watched after a repair."""
+    def _state(self, off: float, covariance: Information, *, is_unlikely: bool) -> MotionState:
+        """Name of the result. `off` and `is_unlikely`: how the odometry's pose compares with the one that is kept.
+
+        An odometry that agreed with the last registrations is repaired only where its pose explains the scan worse.
+        """
         is_break = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > BREAK_M**2
-        is_watched = self._num_to_watch > 0
-        is_repaired = geometry.displacement_m(scan.few, T_odom_lidar, T_odom_proposed) > self._tolerance_m
-        self._note(is_repaired=is_repaired)
+        is_watched, is_off = self._is_watched, off > MOST_OFF
+        is_repaired = is_off and (is_watched or is_unlikely)
+        if is_repaired or is_break:
+            self._offs.clear()
+        else:
+            self._offs.append(off)
         if is_break:
             return MotionState.BROKEN
         if is_repaired:
             return MotionState.REPAIRED
-        return MotionState.REFINED if is_watched and self._inner.is_from_scans else MotionState.CONFIRMED
+        return MotionState.REFINED if is_watched or is_off else MotionState.CONFIRMED
 
     def _covariance(self, fit: Fit) -> Information:
         """Covariance of a registered pose: of its likelihood, and of errors that all points share."""
@@ -289,6 +293,8 @@ class CheckedOdometry:
         self, state: MotionState, T_map_proposed: Transform, fit: Fit, covariance: Information | None
     ) -> Motion:
         off = geometry.inverse(T_map_proposed) @ fit.T_map_lidar
+        if covariance is not None and state is MotionState.CONFIRMED:  # the pose is the proposed one, not the fit
+            covariance = covariance + np.outer(geometry.log(off), geometry.log(off))
         return Motion(
             state,
             geometry.distance(off),
@@ -309,6 +315,12 @@ class CheckedOdometry:
             return None
         half = np.linalg.inv(whiten) @ directions
         return np.linalg.inv(model + (half * np.maximum(excess, 0.0)) @ half.T)
+
+
+def _off(T_known: Transform, covariance: Information, T_other: Transform) -> float:
+    """Chi-square of the difference between a pose with this covariance and another one."""
+    offset = geometry.log(geometry.inverse(T_known) @ T_other)
+    return float(offset @ np.linalg.solve(covariance, offset))
 
 
 def _mean_log(fit: Fit) -> float:

@@ -1,6 +1,5 @@
 """KISS-ICP (Vizzo et al., RA-L 2023), using the package of its authors."""
 
-import math
 from collections.abc import Sequence
 from contextlib import suppress
 
@@ -13,9 +12,6 @@ from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.types import BadScan, Points, Scan, Transform
 from segslam.odometry.sweep import OdometryResult, deskew_scan
-
-RESOLUTION = math.sqrt(1.0 / 20.0)
-"""Distance between points in KISS-ICP's map, in voxels: at most 20 points a voxel."""
 
 
 class KissAligner:

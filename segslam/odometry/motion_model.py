@@ -118,9 +118,13 @@ class MotionModel:
             return 0.0
         return math.erfc(reach_m / math.sqrt(2.0 * float(np.linalg.eigvalsh(prior[3:, 3:])[-1])))
 
-    def fused(self, T_last_lidar: Transform, measured: Information, gap: float) -> Transform:
-        """The most likely motion since the last scan, given a measured one with its covariance and the prediction."""
-        return self._fuse(T_last_lidar, measured, gap)[0]
+    def fused(self, T_last_lidar: Transform, measured: Information, gap: float) -> tuple[Transform, Information]:
+        """The most likely motion since the last scan, given a measured one with its covariance and the prediction.
+
+        With the covariance of this motion alone, which has no part in the errors of those before.
+        """
+        T_fused, gain, prior = self._fuse(T_last_lidar, measured, gap)
+        return T_fused, _posterior(gain, prior, measured)
 
     def update(self, T_last_lidar: Transform, measured: Information, gap: float) -> tuple[Transform, Information]:
         """As `fused`, with the covariance of the result; it becomes the motion that predicts the next one.
@@ -132,10 +136,8 @@ class MotionModel:
         if gap == 1.0:
             self._learn(geometry.log(geometry.inverse(self.T_step) @ T_last_lidar), measured, prior)
         left = np.eye(6) - gain
-        posterior, carried = measured, np.zeros((6, 6))
-        if prior is not None:
-            posterior = left @ prior @ left.T + gain @ measured @ gain.T  # of Joseph: positive after any rounding
-            carried = self._accumulated @ left.T
+        posterior = _posterior(gain, prior, measured)
+        carried = np.zeros((6, 6)) if prior is None else self._accumulated @ left.T
         self._covariance, self._accumulated = posterior / gap**2, carried + posterior
         total = posterior + carried + carried.T
         total = (total + total.T) / 2
@@ -184,6 +186,14 @@ class MotionModel:
         """Learn how much motions change, in the directions that the scans observe better than the prediction."""
         if prior is None or (np.diag(measured) < np.diag(prior)).all():
             self._changes.append(change)
+
+
+def _posterior(gain: np.ndarray, prior: Information | None, measured: Information) -> Information:
+    """Covariance of a prediction and a measurement together, in Joseph's form: positive after any rounding."""
+    if prior is None:
+        return measured
+    left = np.eye(6) - gain
+    return left @ prior @ left.T + gain @ measured @ gain.T
 
 
 def information_of(motions: Sequence[Motion]) -> Information | None:

@@ -45,7 +45,6 @@ class Tracker:
         """`odometry` replaces KISS-ICP."""
         self._config = config
         self._inner = odometry or KissOdometry(config.odometry)
-        self._noted: list[MotionState] = []
         self._odometry = CheckedOdometry(self._inner, config, recover=partial(register, config=config))
         self._selector = KeyframeSelector(config.keyframes)
         self._T_odom_own = np.eye(4)
@@ -87,7 +86,6 @@ class Tracker:
         """Note a recorded step; after `resume`, `track` continues from it."""
         motion = recorded.motion or Motion(MotionState.UNCHECKED)
         self._selector.update(recorded.T_odom_lidar, break_m=BREAK_STEP_M * motion.is_break)
-        self._noted.append(motion.state)
         self._last_stamp_ns = recorded.stamp_ns
         self._num_tracked = recorded.scan_index + 1
 
@@ -100,5 +98,4 @@ class Tracker:
         for row in range(max(len(T_odom_lidar) - RESUMED_SCANS, 0), len(T_odom_lidar)):
             scan = replace(scan_of(row), stamp_ns=int(stamps_ns[row]))
             T_own_lidar = self._odometry.register(scan).T_odom_lidar
-        self._odometry.watch_after(self._noted)
         self._T_odom_own = geometry.nearest_transform(T_odom_lidar[-1] @ geometry.inverse(T_own_lidar))

@@ -344,7 +344,7 @@ class Run:
         self._log.write(step)
         self.num_steps += 1
         if self.num_steps % TRIM_EVERY == 0:
-            give_back()  # free memory between what is kept would grow with the drive
+            give_back()  # or gaps of freed memory add up over a drive
         while self._unreported:
             self._report(self._unreported.pop(0))
         self._note_ms("log", perf_counter() - started)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +17,7 @@ from segslam.graph.noise import odometry_information
 from segslam.odometry import CheckedOdometry, GivenOdometry, KissOdometry, OdometryResult, Tracker, information_of
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
-from segslam.odometry.motion_model import Intervals, MotionModel
+from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
 from segslam.odometry.search import PoseSearch
 from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
@@ -27,6 +27,7 @@ from segslam.verification import register
 
 CONFIG = load_config(None, ["proximity.min_travel_m=60"])
 SLIP_AT = 20
+JUMPS_AT = WINDOW + 5
 
 
 def _given(poses: np.ndarray, config: Config = CONFIG) -> GivenOdometry:
@@ -127,6 +128,47 @@ def test_small_corrections_do_not_disturb_an_odometry_and_add_up() -> None:
     assert _worst_step_m(results) < 0.05
     T_true = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[24]
     assert geometry.distance(geometry.inverse(T_true) @ results[24].T_odom_lidar) < 0.2
+
+
+@cache
+def _jittering(sigma_m: float, aside_m: float = 0.0) -> list[OdometryResult]:
+    """Results for an odometry that errs at random by so much along each axis, and aside by more at scan JUMPS_AT."""
+    scans, truth = round_drive()
+    poses = truth.T_world_lidar.copy()
+    poses[:, :3, 3] += np.random.default_rng(1).normal(0.0, sigma_m, (len(poses), 3))
+    poses[JUMPS_AT] = poses[JUMPS_AT] @ geometry.transform(np.eye(3), [0.0, aside_m, 0.0])
+    inner = _LikeKiss(replace(truth, T_world_lidar=poses), CONFIG.odometry)
+    odometry = CheckedOdometry(inner, CONFIG, recover=partial(register, config=CONFIG))
+    return _registered(odometry, scans[: JUMPS_AT + 5])
+
+
+@pytest.mark.parametrize(("sigma_m", "agrees"), [(0.005, True), (0.06, False)])
+def test_every_scan_is_registered_until_the_odometry_agrees_with_a_window_of_registrations(
+    sigma_m: float, agrees: bool
+) -> None:
+    states = [result.motion.state for result in _jittering(sigma_m) if result.motion]
+    registered = {MotionState.REFINED, MotionState.REPAIRED}
+    assert set(states[2:WINDOW]) <= registered
+    if agrees:
+        assert MotionState.REPAIRED not in states
+        assert registered.isdisjoint(states[WINDOW + 1 :])
+    else:
+        assert set(states[WINDOW + 1 :]) <= registered
+
+
+@pytest.mark.parametrize(("metres", "state"), [(0.07, MotionState.CONFIRMED), (0.2, MotionState.REFINED)])
+def test_an_odometry_that_agrees_corrects_its_errors_itself(metres: float, state: MotionState) -> None:
+    results, plain = _jittering(0.005, metres), _jittering(0.005)
+    motion = results[JUMPS_AT].motion
+    assert motion is not None
+    assert motion.state is state
+    off_m = geometry.distance(geometry.inverse(plain[JUMPS_AT].T_odom_lidar) @ results[JUMPS_AT].T_odom_lidar)
+    if state is MotionState.CONFIRMED:
+        assert off_m == pytest.approx(metres, abs=0.001)
+    else:
+        assert off_m < 0.06
+    for after, undisturbed in zip(results[JUMPS_AT + 1 :], plain[JUMPS_AT + 1 :], strict=True):
+        np.testing.assert_allclose(after.T_odom_lidar, undisturbed.T_odom_lidar, atol=0.06)
 
 
 def test_without_the_check_a_jump_remains() -> None:
@@ -309,6 +351,17 @@ def test_a_motion_has_information_of_its_own_if_it_is_less_certain_than_the_mode
     own = odometry._own_information(along)
     assert own is not None
     assert np.linalg.inv(own)[3, 3] == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.parametrize("state", [MotionState.CONFIRMED, MotionState.REFINED])
+def test_a_pose_that_is_kept_is_unsure_by_its_distance_from_the_registered_one(state: MotionState) -> None:
+    odometry = _checked(round_drive()[1].T_world_lidar)
+    at_m = geometry.transform(np.eye(3), [0.0, 0.05, 0.0])
+    known = 1e-4 * np.eye(6)
+    motion = odometry._result(state, np.eye(4), Fit(at_m, 0.0, 100, 1.0, 0.05, 1e4 * np.eye(6)), known)
+    assert motion.covariance is not None
+    expected = known + np.diag([0.0, 0.0, 0.0, 0.0, 0.05**2 * (state is MotionState.CONFIRMED), 0.0])
+    np.testing.assert_allclose(motion.covariance, expected, atol=1e-9)
 
 
 def test_a_scan_has_some_hundred_points_for_quick_looks() -> None:
@@ -498,10 +551,10 @@ def test_a_turn_that_a_scan_shows_does_not_make_a_slide_credible_that_it_does_no
     for step_m in np.random.default_rng(0).normal(1.0, 0.02, 20):
         model.update(geometry.transform(np.eye(3), [step_m, 0.0, 0.0]), 1e-6 * np.eye(6), 1.0)
     measured = np.diag(np.square([0.003, 0.003, 0.003, 0.02, 50.0, 0.02]))
-    fused = model.fused(geometry.transform(geometry.yaw(0.3), [1.0, 3.0, 0.0]), measured, 1.0)
+    fused, _ = model.fused(geometry.transform(geometry.yaw(0.3), [1.0, 3.0, 0.0]), measured, 1.0)
     assert geometry.angle(fused) == pytest.approx(0.3, abs=0.01)
     assert fused[1, 3] == pytest.approx(0.0, abs=0.2)
-    seen = model.fused(geometry.transform(geometry.yaw(0.3), [1.0, 3.0, 0.0]), 1e-6 * np.eye(6), 1.0)
+    seen, _ = model.fused(geometry.transform(geometry.yaw(0.3), [1.0, 3.0, 0.0]), 1e-6 * np.eye(6), 1.0)
     assert seen[1, 3] == pytest.approx(3.0, abs=0.01), "a slide that the scan shows is kept, however large"
 
 

@@ -4,7 +4,7 @@ As long as the odometry is sound, a scan every `keyframes.distance_m` is compare
 milliseconds. If this contradicts the motion, the scan is registered with the last scans from several proposals: the
 odometry's motion and the last motion; and, if no pose near a proposal explains the scan as scans of this drive usually
 are explained, no motion, poses all around, and place recognition. The most likely pose is kept. At the start, after a
-repair, and while its poses differ from the last registrations by more than both are unsure, every scan is registered.
+repair, and while its poses differ from the last registrations by more than these are unsure, every scan is registered.
 After a repair the odometry continues from the local map; smaller corrections leave it undisturbed. They are added to
 its following poses while every scan is registered; else they are taken as errors that it corrects itself.
 """
@@ -34,8 +34,8 @@ ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHE
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
 SIGNIFICANT = 0.001
 """Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans, and less
-likely motions are not considered. The adjustment has the same share of chance for a sweep that scans show, and for
-surfaces that become thicker."""
+likely motions are not considered; and KISS-ICP is off where chance explains its distance from a registration with less.
+The adjustment has the same share of chance for a sweep that scans show, and for surfaces that become thicker."""
 MOST_OFF = float(chi2.isf(SIGNIFICANT, 6))
 """Chi-square above which a pose of the odometry is significantly off the registered one."""
 MOST_OFF_TOGETHER = float(chi2.isf(SIGNIFICANT, 6 * WINDOW))
@@ -268,7 +268,7 @@ class CheckedOdometry:
         return bool(fits) and self._usual_fit.includes(fits[0].mean_log, least_spread=fits[0].num_patches ** -0.5)
 
     def _state(self, off: float, covariance: Information, *, is_unlikely: bool) -> MotionState:
-        """Name of the result. `off` and `is_unlikely`: how the odometry's pose compares with the one that is kept.
+        """Name of the result. `off`, which is noted, and `is_unlikely` compare the odometry's pose with the one kept.
 
         An odometry that agreed with the last registrations is repaired only where its pose explains the scan worse.
         """

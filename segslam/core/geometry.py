@@ -167,6 +167,12 @@ def is_near(T: Transform, others: Iterable[Transform], *, within_m: float, withi
     return any(distance(one) < within_m and angle(one) < within_rad for one in apart)
 
 
+def chance_beyond(reach_m: float, covariance: Information) -> float:
+    """Probability that a pose with this covariance is off by more than `reach_m` in its least known direction."""
+    largest = max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 1e-12)
+    return math.erfc(reach_m / math.sqrt(2.0 * largest))
+
+
 def displacement_m(points: Points, T_a_points: Transform, T_a_other: Transform) -> float:
     """Root mean square distance between the points (n, 3) at two poses: one figure for translation and rotation."""
     T = inverse(T_a_other) @ T_a_points - np.eye(4)

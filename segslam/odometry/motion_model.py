@@ -7,7 +7,6 @@ again, relative to scans from before: the last motion, from a wrong position to 
 the change is large.
 """
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from statistics import median
@@ -116,7 +115,7 @@ class MotionModel:
         prior = self._predicted_covariance(gap)
         if prior is None:
             return 0.0
-        return math.erfc(reach_m / math.sqrt(2.0 * float(np.linalg.eigvalsh(prior[3:, 3:])[-1])))
+        return geometry.chance_beyond(reach_m, prior)
 
     def fused(self, T_last_lidar: Transform, measured: Information, gap: float) -> tuple[Transform, Information]:
         """The most likely motion since the last scan, given a measured one with its covariance and the prediction.

@@ -320,6 +320,7 @@ class Run:
                 result.odometry.T_world_lidar[result.keyframe_rows],
                 self._slam.graph.travel_m,
                 config=self.config.refine,
+                motion_variance=self._slam.graph.motion_variance,
             )
         )
         return {} if found is None else {"vertical_deg": found.angle_deg, "vertical_sigma_deg": found.sigma_deg}

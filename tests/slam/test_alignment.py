@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.yards import seen
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.registration.refinement import LightSurface
@@ -68,7 +67,8 @@ def test_the_gradient_is_the_derivative_of_the_cost() -> None:
     np.testing.assert_allclose(gradient, numeric, rtol=1e-3, atol=1e-3 * np.abs(gradient).max())
 
 
-def test_a_submap_does_not_reach_across_a_break() -> None:
-    travel_m = np.array([0.0, 2.0, 4.0, BREAK_TRAVEL_M + 6.0, BREAK_TRAVEL_M + 8.0])
-    assert members(2, travel_m) == [0, 1, 2]
-    assert members(3, travel_m) == [3, 4]
+def test_a_submap_ends_at_motions_that_are_not_known_to_a_voxel() -> None:
+    motion_variance = np.array([0.0, 0.2, 0.1, 900.0, 0.2])
+    assert members(2, motion_variance, most_m=0.6) == [0, 1, 2]
+    assert members(3, motion_variance, most_m=0.6) == [3, 4]
+    assert members(0, motion_variance, most_m=0.5) == [0, 1], "0.2 and 0.1 are more than 0.25"

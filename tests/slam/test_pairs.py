@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.slam.adjustment import submaps
 from segslam.slam.adjustment.submaps import all_pairs, pairs_along, pairs_between_passes
 
@@ -21,6 +20,11 @@ def poses(places: np.ndarray) -> np.ndarray:
     return T_world
 
 
+def known(source: int, others: np.ndarray) -> np.ndarray:
+    """Covariances of poses that are known."""
+    return np.tile(1e-4 * np.eye(6), (len(others), 1, 1))
+
+
 def there_and_back(*, height_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """100 m ahead and back, 3 m beside."""
     ahead = np.column_stack([np.arange(0.0, 100.0, 2.0), np.zeros((50, 2))])
@@ -29,9 +33,8 @@ def there_and_back(*, height_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     return poses(places), np.arange(len(places)) * 2.0
 
 
-def test_pairs_along_the_drive_have_the_configured_distances_and_no_break_between() -> None:
-    travel_m = np.arange(12) * 2.0
-    assert pairs_along(travel_m).tolist() == [
+def test_pairs_along_the_drive_have_the_configured_distances() -> None:
+    assert pairs_along(12).tolist() == [
         [0, 3],
         [2, 5],
         [4, 7],
@@ -41,8 +44,19 @@ def test_pairs_along_the_drive_have_the_configured_distances_and_no_break_betwee
         [2, 8],
         [4, 10],
     ]
-    travel_m[5:] += BREAK_TRAVEL_M
-    assert pairs_along(travel_m).tolist() == [[0, 3], [6, 9], [8, 11]]
+
+
+def test_a_pair_that_may_be_out_of_reach_of_an_alignment_is_none() -> None:
+    T_world, travel_m = there_and_back()
+    sigma_m = np.where(np.arange(len(travel_m)) < 50, 0.1, 0.4)
+
+    def covariances(source: int, others: np.ndarray) -> np.ndarray:
+        return np.stack([np.diag([0.0, 0.0, 0.0, *[sigma_m[max(source, other)] ** 2] * 3]) for other in others])
+
+    pairs = all_pairs(T_world, travel_m, covariances, min_travel_m=50.0)
+    assert pairs.max() < 50, "with 0.4 m, one in 80 is more than a metre off"
+    assert len(pairs) == len(pairs_along(50))
+    assert len(all_pairs(T_world, travel_m, known, min_travel_m=50.0)) > len(pairs_along(100))
 
 
 def test_each_node_is_paired_with_the_nearest_of_another_pass() -> None:
@@ -62,6 +76,6 @@ def test_passes_on_two_storeys_are_not_paired() -> None:
 
 def test_pairs_are_sorted_by_source_and_too_short_a_drive_has_none() -> None:
     T_world, travel_m = there_and_back()
-    pairs = all_pairs(T_world, travel_m, min_travel_m=50.0)
+    pairs = all_pairs(T_world, travel_m, known, min_travel_m=50.0)
     assert (np.diff(pairs[:, 1]) >= 0).all()
-    assert all_pairs(T_world[:2], travel_m[:2], min_travel_m=50.0).shape == (0, 2)
+    assert all_pairs(T_world[:2], travel_m[:2], known, min_travel_m=50.0).shape == (0, 2)

@@ -67,7 +67,13 @@ def test_keyframes_farther_apart_than_a_pair_give_no_angle() -> None:
 def test_a_drive_with_a_break_shows_the_angle_too() -> None:
     places_m = np.arange(-44.0, 45.0, 2.0)
     travel_m = places_m + 44.0 + np.where(places_m > 0.0, BREAK_TRAVEL_M, 0.0)
-    found = measure_vertical_angle(lambda i: points_at(float(places_m[i])), poses_at(places_m), travel_m, config=CONFIG)
+    found = measure_vertical_angle(
+        lambda i: points_at(float(places_m[i])),
+        poses_at(places_m),
+        travel_m,
+        config=CONFIG,
+        motion_variance=np.where(places_m == 2.0, 900.0, 0.0),
+    )
     assert found is not None
     assert found.angle_deg == pytest.approx(LOW_DEG, abs=0.04)
 

@@ -49,10 +49,10 @@ class Known:
     """Sweep of the scans of all drives together; None if not all have one, or not the same."""
     kept: Kept = nothing_kept
 
-    def aligned(self, points_of: PointsOf, travel_m: Vector, *, config: RefineConfig) -> Aligned:
+    def aligned(self, points_of: PointsOf, motion_variance: Vector, *, config: RefineConfig) -> Aligned:
         """Aligns submaps that are built by the poses of their own drives, from rounded initial guesses."""
-
-        submaps = Submaps(corrected_by(self.corrections, points_of), self.T_own_keyframe, travel_m, config=config)
+        corrected = corrected_by(self.corrections, points_of)
+        submaps = Submaps(corrected, self.T_own_keyframe, motion_variance, config=config)
 
         def aligned(target_id: int, source_id: int, T_target_source: Transform) -> Alignment | None:
             guess = rounded(T_target_source)

@@ -8,6 +8,7 @@ result shows the angle better, and another round corrects the scans by it.
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import takewhile
 from time import monotonic
 from typing import Any, NamedTuple
@@ -193,10 +194,12 @@ def _rounds(
 ) -> _Round | None:
     """The last round in which a pair of submaps could be registered; None if there is none."""
     refine, travel_m = config.refine, graph.travel_m
-    of_drives = known.aligned(points_of, travel_m, config=refine) if known else None
+    motion_variance = graph.motion_variance
+    of_drives = known.aligned(points_of, motion_variance, config=refine) if known else None
     straight_of = corrected_by(corrections_of(0.0, sweep, velocities), points_of)
     T_world = graph.T_world_keyframes
-    angle = known.angle if known else measure_vertical_angle(straight_of, T_world, travel_m, config=refine)
+    measured = partial(measure_vertical_angle, straight_of, travel_m=travel_m, motion_variance=motion_variance)
+    angle = known.angle if known else measured(T_world, config=refine)
     last: _Round | None = None
     for number in range(1, config.adjustment.rounds + 1):
         T_world = graph.T_world_keyframes
@@ -204,15 +207,16 @@ def _rounds(
             again = None
             if angle is not None and angle.is_significant:
                 near_deg = angle.angle_deg
-                again = measure_vertical_angle(straight_of, T_world, travel_m, config=refine, near_deg=near_deg)
+                again = measured(T_world, config=refine, near_deg=near_deg)
             if again is None or not again.is_significant:
                 break
             angle = again
         raised_deg = 0.0 if angle is None else angle.correction_deg
         corrections = known.corrections if known else corrections_of(raised_deg, sweep, velocities)
         shared_within = STEPS[-1] if any(one.raised_deg for one in corrections) else 0
-        aligned = of_drives or Submaps(corrected_by(corrections, points_of), T_world, travel_m, config=refine).aligned
-        pairs = all_pairs(T_world, travel_m, min_travel_m=config.proximity.min_travel_m)
+        submaps = Submaps(corrected_by(corrections, points_of), T_world, motion_variance, config=refine)
+        aligned = of_drives or submaps.aligned
+        pairs = all_pairs(T_world, travel_m, graph.covariances, min_travel_m=config.proximity.min_travel_m)
         in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, aligned, T_world, config=refine))
         tried = list(progress(in_time, len(pairs), f"refine {number}/{config.adjustment.rounds}"))
         registered = [one for one in tried if one is not None]

@@ -9,14 +9,15 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.candidates.proximity import Covariances
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
-from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
+from segslam.core.types import IndexPairs, Indices, Mask, Points, Transform, Vector
+from segslam.odometry.checked import SIGNIFICANT
 from segslam.registration.refinement import LightSurface, downsample
-from segslam.slam.adjustment.alignment import Alignment, PointsOf, align
+from segslam.slam.adjustment.alignment import SEARCH_M, Alignment, PointsOf, align
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
@@ -38,8 +39,9 @@ Aligned = Callable[[int, int, Transform], Alignment | None]
 class Submaps:
     """Submaps by the id of their keyframe, in its frame, made when they are needed."""
 
-    def __init__(self, points_of: PointsOf, T_world: Poses, travel_m: Vector, *, config: RefineConfig) -> None:
-        self._points_of, self._T_world, self._travel_m = points_of, T_world, travel_m
+    def __init__(self, points_of: PointsOf, T_world: Poses, motion_variance: Vector, *, config: RefineConfig) -> None:
+        """`motion_variance` (n,): largest variance of the motion that leads to each keyframe (m^2)."""
+        self._points_of, self._T_world, self._motion_variance = points_of, T_world, motion_variance
         self._refine = config
         self._scan = lru_cache(MOST_SUBMAPS * (2 * REACH + 1))(self._scan_of)  # those of the submaps in memory
         self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
@@ -53,30 +55,46 @@ class Submaps:
 
     def _submap(self, keyframe_id: int) -> LightSurface:
         T_keyframe_world = geometry.inverse(self._T_world[keyframe_id])
-        near = members(keyframe_id, self._travel_m)
+        near = members(keyframe_id, self._motion_variance, most_m=self._refine.voxel_m)
         points = np.vstack([geometry.apply(T_keyframe_world @ self._T_world[one], self._scan(one)) for one in near])
         return LightSurface(voxel_means(points, self._refine.voxel_m))
 
 
-def members(keyframe_id: int, travel_m: Vector) -> list[int]:
-    """The keyframes of a submap: up to `REACH` before and after one, without those beyond a break."""
-    near = range(max(0, keyframe_id - REACH), min(len(travel_m), keyframe_id + REACH + 1))
-    return [other for other in near if abs(travel_m[other] - travel_m[keyframe_id]) < BREAK_TRAVEL_M]
+def members(keyframe_id: int, motion_variance: Vector, *, most_m: float) -> list[int]:
+    """The keyframes of a submap: up to `REACH` before and after one, if motions between err by less than `most_m`."""
+    near = range(max(0, keyframe_id - REACH), min(len(motion_variance), keyframe_id + REACH + 1))
+    between = [slice(min(keyframe_id, other) + 1, max(keyframe_id, other) + 1) for other in near]
+    return [other for other, way in zip(near, between, strict=True) if sum(motion_variance[way]) < most_m**2]
 
 
-def all_pairs(T_world: Poses, travel_m: Vector, *, min_travel_m: float) -> IndexPairs:
-    """(k, 2) target (older) and source of all pairs, sorted by source, so that near rows share submaps."""
+def all_pairs(T_world: Poses, travel_m: Vector, covariances: Covariances, *, min_travel_m: float) -> IndexPairs:
+    """(k, 2) target (older) and source of all pairs, sorted by source, so that near rows share submaps.
+
+    A pair whose pose may be off by more than `SEARCH_M`, with a probability of `SIGNIFICANT`, is left out: an alignment
+    ends at the surfaces that are nearest, and would confirm the error.
+    """
     passes = pairs_between_passes(T_world, travel_m, min_travel_m=min_travel_m)
-    pairs = np.vstack([pairs_along(travel_m), passes])
-    return pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
+    pairs = np.vstack([pairs_along(len(travel_m)), passes])
+    pairs = pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
+    return pairs[_are_known(pairs, covariances)]
 
 
-def pairs_along(travel_m: Vector) -> IndexPairs:
-    """(k, 2) target (older) and source of pairs along the drive, without those across a break."""
-    nodes = _nodes(travel_m)
+def _are_known(pairs: IndexPairs, covariances: Covariances) -> Mask:
+    """(k,) the pairs whose pose is known to the search distance of an alignment."""
+    return np.array(
+        [
+            geometry.chance_beyond(SEARCH_M[0], covariances(source, np.array([target]))[0]) < SIGNIFICANT
+            for target, source in pairs.tolist()
+        ],
+        dtype=bool,
+    )
+
+
+def pairs_along(num_keyframes: int) -> IndexPairs:
+    """(k, 2) target (older) and source of pairs along the drive."""
+    nodes = _nodes(num_keyframes)
     pairs = np.vstack([np.column_stack([nodes, nodes + step]) for step in STEPS])
-    pairs = pairs[pairs[:, 1] < len(travel_m)]
-    return pairs[travel_m[pairs[:, 1]] - travel_m[pairs[:, 0]] < BREAK_TRAVEL_M]
+    return pairs[pairs[:, 1] < num_keyframes]
 
 
 def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: float) -> IndexPairs:
@@ -84,7 +102,7 @@ def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: floa
 
     Each node is paired with the nearest node of each earlier pass within the radius.
     """
-    nodes = _nodes(travel_m)
+    nodes = _nodes(len(travel_m))
     places = T_world[nodes, :3, 3]
     near = cKDTree(places[:, :2]).query_ball_point(places[:, :2], RADIUS_M)
     pairs = []
@@ -99,5 +117,5 @@ def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: floa
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _nodes(travel_m: Vector) -> Indices:
-    return np.arange(0, len(travel_m), EVERY)
+def _nodes(num_keyframes: int) -> Indices:
+    return np.arange(0, num_keyframes, EVERY)

@@ -80,13 +80,21 @@ def described(found: VerticalAngle) -> str:
 
 
 def measure_vertical_angle(
-    points_of: PointsOf, T_world: Poses, travel_m: Vector, *, config: RefineConfig, near_deg: float | None = None
+    points_of: PointsOf,
+    T_world: Poses,
+    travel_m: Vector,
+    *,
+    config: RefineConfig,
+    motion_variance: Vector | None = None,
+    near_deg: float | None = None,
 ) -> VerticalAngle | None:
     """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
 
     An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
     none, by the method of secants, from no correction and `near_deg`, by default twice the angle that they show.
+    `motion_variance` (n,): as of `Submaps`, by default of exact poses.
     """
+    variance = np.zeros(len(travel_m)) if motion_variance is None else motion_variance
     thinned = cache(lambda keyframe_id: downsample(points_of(keyframe_id), config=config))
     pairs = _pairs(T_world, travel_m)
 
@@ -96,7 +104,7 @@ def measure_vertical_angle(
         def raised(keyframe_id: int) -> Points:
             return geometry.raise_beams(thinned(keyframe_id), correction_deg)
 
-        submap_of = Submaps(raised, T_world, travel_m, config=config).submap
+        submap_of = Submaps(raised, T_world, variance, config=config).submap
         return shown(pairs, submap_of, T_world, lambda _, points: np.radians(geometry.raising(points))[None])
 
     found = left_of(0.0)

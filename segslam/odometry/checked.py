@@ -146,7 +146,13 @@ class CheckedOdometry:
     ) -> tuple[Transform, Motion]:
         """The most likely pose of the scan in the local map."""
         T_map_odom = geometry.inverse(self._map.T_odom_map)
-        fits = self._search.near(self._map, scan, [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted])
+        T_last_map = geometry.inverse(self._T_odom_last) @ self._map.T_odom_map
+
+        def prior(fit: Fit) -> float:
+            return self._motion.log_prior(T_last_map @ fit.T_map_lidar, self._covariance(fit), gap)
+
+        proposals = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted]
+        fits = self._search.near(self._map, scan, proposals, prior=prior)
         rejoined = self._rejoined(T_odom_proposed, T_odom_predicted, scan, fits)
         fits, is_rejoined = rejoined or fits, bool(rejoined)
         T_odom_map = self._map.T_odom_map
@@ -157,10 +163,10 @@ class CheckedOdometry:
         starts = [T_map_proposed, T_map_odom @ T_odom_predicted]
         if not is_rejoined and not self._is_found(fits, starts, scan):
             starts.append(T_map_last)
-            fits = self._search.near(self._map, scan, [T_map_last], fits)
+            fits = self._search.near(self._map, scan, [T_map_last], fits, prior=prior)
         if not is_rejoined and not self._is_found(fits, starts, scan):
             T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
-            fits = self._search.around(self._map, scan, T_map_last, T_step, fits)
+            fits = self._search.around(self._map, scan, T_map_last, T_step, fits, prior=prior)
         if not is_rejoined and not self._is_usual(fits):
             by_chance = self._by_chance(scan, fits, gap)
             elsewhere = max(self._search.elsewhere(scan, self._fused(fits, gap)), by_chance)
@@ -181,7 +187,7 @@ class CheckedOdometry:
             own = self._motion.fused(T_last_lidar, covariance, gap)[1]
             T_last_lidar, covariance = self._motion.update(T_last_lidar, covariance, gap)
         T_odom_lidar, covariance = geometry.nearest_transform(self._T_odom_last @ T_last_lidar), covariance + unsure
-        is_unlikely = as_likely(self._map.fit(scan, T_map_proposed), best) < SIGNIFICANT
+        is_unlikely = as_likely(self._map.fit(scan, T_map_proposed), replace(best, log_prior=0.0)) < SIGNIFICANT
         state = self._state(_off(T_odom_lidar, own + unsure, T_odom_proposed), covariance, is_unlikely=is_unlikely)
         if state is MotionState.CONFIRMED:
             T_odom_lidar = T_odom_proposed

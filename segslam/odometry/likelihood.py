@@ -46,6 +46,13 @@ class Fit:
     """Root mean square distance of these points to the planes; 0 without any."""
     information: Information
     """Curvature of the log-likelihood, tangent in the scan's frame."""
+    log_prior: float = 0.0
+    """Log of the probability of the motion to this pose; 0 if nothing is known of it."""
+
+    @property
+    def mean_odds(self) -> float:
+        """The mean log-likelihood of a point, with the prior, which counts as the likelihood of all patches does."""
+        return self.mean_log + self.log_prior / math.sqrt(max(self.num_patches, 1))
 
 
 def fit(

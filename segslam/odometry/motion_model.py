@@ -7,6 +7,7 @@ again, relative to scans from before: the last motion, from a wrong position to 
 the change is large.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from statistics import median
@@ -106,6 +107,19 @@ class MotionModel:
         noise = np.diag(np.median(np.square(self._changes), axis=0) / CHI_SQUARE_MEDIAN)
         before = np.zeros((6, 6)) if self._covariance is None else self._covariance
         return gap**2 * (before + gap * noise)
+
+    def log_prior(self, T_last_lidar: Transform, measured: Information, gap: float) -> float:
+        """Log of the largest probability of a motion, measured with this covariance, as unlike the predicted one.
+
+        By Markov's inequality for its chi-square, whose mean is 6 whatever the distribution of changes: they are often
+        small and sometimes large. 0 while nothing is known of the motion.
+        """
+        prior = self._predicted_covariance(gap)
+        if prior is None:
+            return 0.0
+        change = geometry.log(geometry.inverse(self.predicted(gap)) @ T_last_lidar)
+        chi_square = float(change @ np.linalg.solve(prior + measured, change))
+        return min(0.0, math.log(len(change) / max(chi_square, 1.0)))
 
     def may_exceed(self, reach_m: float, gap: float) -> float:
         """Probability that the motion over `gap` intervals ends farther than `reach_m` from the predicted one.

@@ -19,7 +19,7 @@ from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
-from segslam.odometry.search import PoseSearch
+from segslam.odometry.search import PoseSearch, as_likely
 from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
 from segslam.registration.refinement import refine as refined
 from segslam.slam.slam import Slam
@@ -286,6 +286,40 @@ def test_a_sudden_turn_is_found_by_the_search_around_the_last_pose(degrees: floa
     assert np.degrees(geometry.angle(T_true_found)) < 0.3
 
 
+def test_of_two_poses_that_explain_a_scan_nearly_as_well_the_usual_motion_is_more_likely() -> None:
+    model = MotionModel()
+    step = geometry.transform(np.eye(3), [1.0, 0.0, 0.0])
+    exact = 1e-6 * np.eye(6)
+    assert model.log_prior(step, exact, 1.0) == 0.0, "nothing is known yet"
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        model.update(step @ geometry.exp(0.02 * rng.standard_normal(6)), exact, 1.0)
+    turned = step @ geometry.exp(np.radians(70.0) * np.eye(6)[2])
+    assert model.log_prior(step, exact, 1.0) == 0.0
+    assert -8.0 < model.log_prior(turned, exact, 1.0) < -4.0, "large changes are rare, not impossible"
+    fits = [
+        Fit(pose, mean_log, 100, 0.5, 0.1, np.eye(6), model.log_prior(pose, exact, 1.0))
+        for pose, mean_log in ((turned, -2.44), (step, -2.47), (turned, -1.4))
+    ]
+    assert as_likely(fits[1], fits[0]) == 1.0, "the usual motion is more likely"
+    assert as_likely(fits[1], fits[2]) < 0.01, "unless the scan shows the turn"
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_scan_that_no_proposal_explains_is_tried_with_turns_about_each_axis(axis: int) -> None:
+    starts: list[np.ndarray] = []
+
+    class Nothing(LocalMap):
+        def approach(self, scan: SeenScan, T_map_guess: np.ndarray) -> None:
+            starts.append(T_map_guess)
+
+    search = PoseSearch(lambda source, target: Rejected(RejectReason.HIGH_RESIDUAL), voxel_m=0.5)
+    scan = SeenScan(np.zeros((1, 3), np.float32), CONFIG.refine)
+    assert search.around(Nothing(CONFIG.refine), scan, np.eye(4), np.eye(4), []) == []
+    turned = geometry.exp(np.radians(-30.0) * np.eye(6)[axis])
+    assert any(np.allclose(start, turned) for start in starts)
+
+
 @pytest.mark.slow
 def test_a_keyframe_follows_a_break_and_its_motion_has_nearly_no_information() -> None:
     scans, _ = round_drive()
@@ -307,7 +341,9 @@ def test_a_registration_that_leads_away_from_its_start_is_compared_with_others(m
 
     before, now = truth.T_world_lidar[SLIP_AT - 1 : SLIP_AT + 1]
 
-    def slides(search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = ()) -> list[Fit]:
+    def slides(
+        search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = (), **_: object
+    ) -> list[Fit]:
         beside = geometry.inverse(before) @ now @ geometry.transform(np.eye(3), [0.0, 2.0, 0.0])
         fit = local.fit(scan, beside)
         return [replace(fit, mean_log=usual - 2.0 * fit.num_patches**-0.5)]
@@ -327,7 +363,9 @@ def test_a_motion_is_unsure_by_the_distance_of_two_poses_that_explain_the_scan_a
     usual = float(np.median(odometry._usual_fit._values))
     T_before_now = geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
 
-    def two(search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = ()) -> list[Fit]:
+    def two(
+        search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = (), **_: object
+    ) -> list[Fit]:
         places = [T_before_now @ geometry.transform(np.eye(3), [0.0, left_m, 0.0]) for left_m in (0.0, 1.2)]
         return [replace(local.fit(scan, T), mean_log=usual, information=1e4 * np.eye(6)) for T in places]
 

@@ -3,10 +3,11 @@
 As long as the odometry is sound, a scan every `keyframes.distance_m` is compared with the previous one in a few
 milliseconds. If this contradicts the motion, the scan is registered with the last scans from several proposals: the
 odometry's motion and the last motion; and, if no pose near a proposal explains the scan as scans of this drive usually
-are explained, no motion, poses all around, and place recognition. The most likely pose is kept. At the start, after a
-repair, and while its poses differ from the last registrations by more than these are unsure, every scan is registered.
-After a repair the odometry continues from the local map; smaller corrections leave it undisturbed. They are added to
-its following poses while every scan is registered; else they are taken as errors that it corrects itself.
+are explained, no motion, poses all around, and place recognition. The most likely pose is kept; where several explain
+the scan nearly as well, that is the one with the usual motion. At the start, after a repair, and while its poses differ
+from the last registrations by more than these are unsure, every scan is registered. After a repair the odometry
+continues from the local map; smaller corrections leave it undisturbed. They are added to its following poses while
+every scan is registered; else they are taken as errors that it corrects itself.
 """
 
 import math

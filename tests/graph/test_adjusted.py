@@ -4,7 +4,8 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
 from segslam.graph import Edge, PoseGraph
-from segslam.graph.adjusted import without_shared_rotation
+from segslam.graph.adjusted import weighted_edges, without_shared_rotation
+from segslam.graph.edges import relinked, values_of
 
 NUM, STEP_M = 120, 2.0
 INFORMATION = np.diag(geometry.tangent(rotation_rad=1e-3, translation_m=0.02) ** -2.0)
@@ -55,3 +56,26 @@ def test_a_rotation_that_all_motions_share_is_removed_and_a_break_keeps_its_moti
         assert geometry.angle(after.T_a_b) == pytest.approx(geometry.angle(before.T_a_b) if one == broken else 0.0)
     for kept in (without_shared_rotation(odometry, [far], within=10), without_shared_rotation(odometry, measured, 0)):
         np.testing.assert_allclose([edge.T_a_b for edge in kept], [edge.T_a_b for edge in odometry], atol=1e-12)
+
+
+def test_edges_are_written_with_the_noise_that_each_kind_has() -> None:
+    T_step = geometry.transform(np.eye(3), [STEP_M, 0.0, 0.0])
+    broken = Edge(1, 2, T_step, 1e-9 * INFORMATION)
+    odometry = [Edge(0, 1, T_step, INFORMATION), broken]
+    loop, measured = Edge(0, 2, T_step @ T_step, INFORMATION), Edge(0, 2, T_step @ T_step, INFORMATION)
+    values = values_of([np.linalg.matrix_power(T_step, power) for power in range(3)])
+    found = weighted_edges(odometry, [loop], [measured], (2.0, 5.0), values, None)
+    expected = [INFORMATION / 4.0, broken.information, INFORMATION, INFORMATION / 25.0]
+    np.testing.assert_allclose([edge.information for edge in found], expected)
+
+
+def test_parts_of_a_drive_are_joined_from_the_first_one_on() -> None:
+    """The closure between the second and the third part comes first; it cannot place them before the second is."""
+    T_step = geometry.transform(np.eye(3), [STEP_M, 0.0, 0.0])
+    odometry = [Edge(row, row + 1, T_step, INFORMATION * (1e-9 if row in (1, 3) else 1.0)) for row in range(5)]
+    beside = geometry.transform(np.eye(3), [0.0, 30.0, 0.0])
+    closures = [Edge(2, 4, beside, INFORMATION), Edge(0, 2, beside, INFORMATION)]
+    T_world = np.stack([np.linalg.matrix_power(T_step, row) for row in range(6)])
+    found = relinked(odometry, closures, T_world, np.ones(2, dtype=bool))
+    places = [[0, 0], [2, 0], [0, 30], [2, 30], [0, 60], [2, 60]]
+    np.testing.assert_allclose(found[:, :2, 3], places, atol=1e-9)

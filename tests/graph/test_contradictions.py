@@ -1,13 +1,16 @@
 """Several edges between the same neighbours, one of them false: the rest of the graph decides."""
 
+import gtsam
 import numpy as np
 import pytest
 
 from segslam.core import geometry
+from segslam.graph import batch_search
 from segslam.graph.batch import optimize_graph
 from segslam.graph.batch_search import contradicting
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph
+from segslam.graph.levenberg_marquardt import Search
 
 TIGHT = np.diag(geometry.tangent(rotation_rad=0.01, translation_m=0.05) ** -2.0)
 NUM = 24
@@ -68,3 +71,17 @@ def test_repeated_edges_that_agree_are_odometry() -> None:
     graph, _ = ring()
     assert contradicting([graph.edges[3], backwards(graph.edges[3]), false_edge(graph.edges[3], 0.1)]) == []
     assert len(contradicting([graph.edges[3], false_edge(graph.edges[3], 0.5)])) == 1
+
+
+@pytest.mark.parametrize("errors", [(90.0, 80.0), (80.0, 90.0)])
+def test_of_the_optima_near_two_starts_the_better_one_is_returned(
+    monkeypatch: pytest.MonkeyPatch, errors: tuple[float, float]
+) -> None:
+    near, chordal = gtsam.Values(), gtsam.Values()
+    found = iter([Search(near, errors[0], 3), Search(chordal, errors[1], 4)])
+    monkeypatch.setattr(batch_search, "search", lambda factors, start: next(found))
+    monkeypatch.setattr(batch_search, "deeply", lambda size, compute: chordal)
+    best = batch_search.least_squares(gtsam.NonlinearFactorGraph(), near, redundancy=6)
+    assert best.error == min(errors)
+    assert best.values is (chordal if errors[1] < errors[0] else near)
+    assert best.iterations == 7

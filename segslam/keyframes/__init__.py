@@ -108,6 +108,14 @@ class Submap:
     seen_from_here: Points
 
 
+def is_known(motion_variance: Vector, a: int, b: int, *, within_m: float) -> bool:
+    """True if the motions between two keyframes together err by less than `within_m`.
+
+    `motion_variance` (n,): largest variance of the motion that leads to each keyframe (m^2).
+    """
+    return bool(sum(motion_variance[min(a, b) + 1 : max(a, b) + 1]) < within_m**2)
+
+
 class Submaps:
     """Submaps of the keyframes of a drive, computed on use."""
 
@@ -116,7 +124,7 @@ class Submaps:
     ) -> None:
         """`clouds` provides the points of keyframes by id, `labeller` geometric labels.
 
-        `motion_variance` (n,) is the largest variance of the motion that leads to each keyframe (m^2).
+        `motion_variance`: as of `is_known`.
         """
         self._config, self._clouds, self._labeller = config, clouds, labeller
         self._motion_variance = motion_variance
@@ -162,6 +170,6 @@ class Submaps:
         variance = self._motion_variance()
         for step in range(1, MAX_GATHERED // 2 + 1):
             for first, last in ((keyframe_id - step, keyframe_id), (keyframe_id, keyframe_id + step)):
-                is_known = sum(variance[first + 1 : last + 1]) < self._config.refine.voxel_m**2
-                if first >= 0 and last <= newest_id and is_known:
+                is_there = first >= 0 and last <= newest_id
+                if is_there and is_known(variance, first, last, within_m=self._config.refine.voxel_m):
                     yield first + last - keyframe_id

@@ -146,28 +146,11 @@ class CheckedOdometry:
         self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float
     ) -> tuple[Transform, Motion]:
         """The most likely pose of the scan in the local map."""
-        T_map_odom = geometry.inverse(self._map.T_odom_map)
-        T_last_map = geometry.inverse(self._T_odom_last) @ self._map.T_odom_map
-
-        def prior(fit: Fit) -> float:
-            return self._motion.log_prior(T_last_map @ fit.T_map_lidar, self._covariance(fit), gap)
-
-        proposals = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted]
-        fits = self._search.near(self._map, scan, proposals, prior=prior)
-        rejoined = self._rejoined(T_odom_proposed, T_odom_predicted, scan, fits)
-        fits, is_rejoined = rejoined or fits, bool(rejoined)
+        fits, is_rejoined = self._poses(T_odom_proposed, T_odom_predicted, scan, gap)
         T_odom_map = self._map.T_odom_map
-        T_map_odom = geometry.inverse(T_odom_map)
-        T_map_proposed, T_map_last = T_map_odom @ T_odom_proposed, T_map_odom @ self._T_odom_last
+        T_map_proposed = geometry.inverse(T_odom_map) @ T_odom_proposed
         by_chance = 0.0
         elsewhere = float(is_rejoined)  # the scan before is not in the map before a break
-        starts = [T_map_proposed, T_map_odom @ T_odom_predicted]
-        if not is_rejoined and not self._is_found(fits, starts, scan):
-            starts.append(T_map_last)
-            fits = self._search.near(self._map, scan, [T_map_last], fits, prior=prior)
-        if not is_rejoined and not self._is_found(fits, starts, scan):
-            T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
-            fits = self._search.around(self._map, scan, T_map_last, T_step, fits, prior=prior)
         if not is_rejoined and not self._is_usual(fits):
             by_chance = self._by_chance(scan, fits, gap)
             elsewhere = max(self._search.elsewhere(scan, self._fused(fits, gap)), by_chance)
@@ -201,6 +184,30 @@ class CheckedOdometry:
             self._inner.follow(self._map.scans, T_odom_lidar, self._motion.T_step)
             self._T_odom_inner = np.eye(4)
         return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
+
+    def _poses(
+        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float
+    ) -> tuple[list[Fit], bool]:
+        """Poses in the local map, the most likely first, and whether this is the map before a break again."""
+        T_map_odom = geometry.inverse(self._map.T_odom_map)
+        T_last_map = geometry.inverse(self._T_odom_last) @ self._map.T_odom_map
+
+        def prior(fit: Fit) -> float:
+            return self._motion.log_prior(T_last_map @ fit.T_map_lidar, self._covariance(fit), gap)
+
+        proposals = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted]
+        fits = self._search.near(self._map, scan, proposals, prior=prior)
+        rejoined = self._rejoined(T_odom_proposed, T_odom_predicted, scan, fits)
+        if rejoined:
+            return rejoined, True
+        T_map_last = T_map_odom @ self._T_odom_last
+        if not self._is_found(fits, proposals, scan):
+            proposals.append(T_map_last)
+            fits = self._search.near(self._map, scan, [T_map_last], fits, prior=prior)
+        if not self._is_found(fits, proposals, scan):
+            T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
+            fits = self._search.around(self._map, scan, T_map_last, T_step, fits, prior=prior)
+        return fits, False
 
     def _fused(self, fits: Sequence[Fit], gap: float) -> list[Fit]:
         """The poses fused with the last motions: those along a wall are one where the scan shows no motion along it."""

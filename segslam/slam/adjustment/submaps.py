@@ -15,6 +15,7 @@ from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Mask, Points, Transform, Vector
+from segslam.keyframes import is_known
 from segslam.odometry.checked import SIGNIFICANT
 from segslam.registration.refinement import LightSurface, downsample
 from segslam.slam.adjustment.alignment import SEARCH_M, Alignment, PointsOf, align
@@ -40,7 +41,7 @@ class Submaps:
     """Submaps by the id of their keyframe, in its frame, made when they are needed."""
 
     def __init__(self, points_of: PointsOf, T_world: Poses, motion_variance: Vector, *, config: RefineConfig) -> None:
-        """`motion_variance` (n,): largest variance of the motion that leads to each keyframe (m^2)."""
+        """`motion_variance`: as of `is_known`."""
         self._points_of, self._T_world, self._motion_variance = points_of, T_world, motion_variance
         self._refine = config
         self._scan = lru_cache(MOST_SUBMAPS * (2 * REACH + 1))(self._scan_of)  # those of the submaps in memory
@@ -63,8 +64,7 @@ class Submaps:
 def members(keyframe_id: int, motion_variance: Vector, *, most_m: float) -> list[int]:
     """The keyframes of a submap: up to `REACH` before and after one, if motions between err by less than `most_m`."""
     near = range(max(0, keyframe_id - REACH), min(len(motion_variance), keyframe_id + REACH + 1))
-    between = [slice(min(keyframe_id, other) + 1, max(keyframe_id, other) + 1) for other in near]
-    return [other for other, way in zip(near, between, strict=True) if sum(motion_variance[way]) < most_m**2]
+    return [other for other in near if is_known(motion_variance, keyframe_id, other, within_m=most_m)]
 
 
 def all_pairs(T_world: Poses, travel_m: Vector, covariances: Covariances, *, min_travel_m: float) -> IndexPairs:

@@ -61,7 +61,7 @@ def short_runs() -> Iterator[None]:
     from helpers.short_odometry import OdometryHere
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("segslam.odometry.OdometryApart", OdometryHere)
+        patch.setattr("segslam.odometry.apart.OdometryApart", OdometryHere)
         patch.setattr("segslam.output.report.write_report", write_blank_report)
         yield
 

@@ -10,7 +10,8 @@ from helpers.commands import run
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import trajectory_metrics
-from segslam.odometry import CheckedOdometry, KissOdometry
+from segslam.odometry.checked import CheckedOdometry
+from segslam.odometry.kiss import KissOdometry
 from segslam.output.finished import read_run
 from segslam.scans import open_dataset
 from segslam.verification import register

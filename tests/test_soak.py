@@ -16,7 +16,7 @@ from helpers.drives import round_drive
 from segslam.core.config import load_config
 from segslam.core.types import Scan, Step, Trajectory
 from segslam.labels.label_files import open_labels
-from segslam.odometry import GivenOdometry
+from segslam.odometry.sweep import GivenOdometry
 from segslam.output.finished import read_run
 from segslam.output.log import read_log, schema
 from segslam.output.log.container import messages

@@ -48,6 +48,12 @@ def test_a_wrong_option_file_or_setting_is_reported_before_large_libraries_are_i
     assert not modules & HEAVY
 
 
+def test_the_process_that_aligns_scans_imports_no_large_library_but_kiss_icp() -> None:
+    code = "import json, sys; import segslam.odometry.aligner; print(json.dumps(sorted(sys.modules)))"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(json.loads(ended.stdout)) & HEAVY == {"kiss_icp"}
+
+
 FIRST_WORD = """
 import io, os, sys, json
 from segslam.cli import main

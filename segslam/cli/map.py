@@ -31,7 +31,7 @@ from segslam.core.interrupts import EXIT_STATUS, when_stopped
 if TYPE_CHECKING:
     from segslam.core.config import Config, MapConfig
     from segslam.core.types import BadScan, Step
-    from segslam.odometry import Odometry
+    from segslam.odometry.sweep import Odometry
     from segslam.output.log import Mirror, RunLog
     from segslam.run.map_folder import SlamOf
     from segslam.scans import Dataset
@@ -276,7 +276,7 @@ def map_scans(
     each message of the log; `slam_of` creates the pipeline, `place` georeferences the run. Raises typer.Exit(130) if
     Ctrl-C ended the run early; `go_on`, the command that continues it, is then printed.
     """
-    from segslam.odometry import OdometryApart
+    from segslam.odometry.apart import OdometryApart
     from segslam.output.folder import new_folder
     from segslam.run.map_folder import begun, in_effect
     from segslam.slam.slam import Slam

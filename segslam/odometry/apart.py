@@ -1,19 +1,18 @@
 """KISS-ICP in a separate process, because it holds Python's global lock while it aligns a scan."""
 
 import multiprocessing
-import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from typing import Any
 
-import numpy as np
+from kiss_icp.config.parser import KISSConfig
 
 from segslam.core.config import OdometryConfig
-from segslam.core.memory import keep_freed_memory, note_peak_of
+from segslam.core.memory import note_peak_of
 from segslam.core.types import Points, SegslamError, Transform
-from segslam.odometry.kiss import KissAligner, KissOdometry
+from segslam.odometry.aligner import KissAligner, as_points, serve
+from segslam.odometry.kiss import KissOdometry, kiss_config
 
 MOST_SHARED = 2**18
 """Points that the two processes exchange in shared memory, 6 MB; larger sweeps are sent through the pipe."""
@@ -29,12 +28,12 @@ class OdometryApart(KissOdometry):
 
     def __init__(self, config: OdometryConfig, *, keeps_alone: bool = False) -> None:
         """`keeps_alone` as for `KissOdometry`; the other process aligns these scans while this one continues."""
-        self._apart = _AlignerApart(config)
+        self._apart = _AlignerApart(kiss_config(config))
         super().__init__(config, self._apart, keeps_alone=keeps_alone)
 
     def begin(self, config: OdometryConfig) -> None:
         """Start again with other settings, in the same process."""
-        self._apart.begin(config)
+        self._apart.begin(kiss_config(config))
         super().__init__(config, self._apart, keeps_alone=self._keeps_alone)
 
     def __enter__(self) -> "OdometryApart":
@@ -51,38 +50,36 @@ class OdometryApart(KissOdometry):
 class _AlignerApart(KissAligner):
     """A `KissAligner` in another process, which handles one request at a time."""
 
-    def __init__(self, config: OdometryConfig) -> None:
+    def __init__(self, config: KISSConfig) -> None:
         self._alone: list[Transform] = []
         self._is_waiting = False
         """True while an answer to `align_alone` has not been received."""
         context = multiprocessing.get_context("spawn")  # a fork would copy locks held by other threads
         self._pipe, theirs = context.Pipe()
         shared = _room_for_points(context)
-        self._shared = _as_points(shared)
-        self._process = context.Process(target=_serve, args=(theirs, shared, config), name="odometry", daemon=True)
+        self._shared = as_points(shared)
+        self._process = context.Process(target=serve, args=(theirs, shared, config), name="odometry", daemon=True)
         self._process.start()
         theirs.close()
 
-    def begin(self, config: OdometryConfig) -> None:
+    def begin(self, config: KISSConfig) -> None:
         """Replace the aligner by a new one."""
         with self._reported():
             self._pipe.send(("begin", config))
 
-    def align(self, points: Points, gap: float = 1.0) -> Transform:
+    def align(self, points: Points, T_last_predicted: Transform) -> Transform:
         """As `KissAligner.align`."""
-        return self._exchange("align", self._shared_or_sent(points), gap)
+        return self._exchange("align", self._shared_or_sent(points), T_last_predicted)
 
-    def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
-    ) -> None:
-        """As `Odometry.follow`."""
-        self._exchange("follow", list(scans), T_odom_lidar, T_before_lidar)
+    def follow(self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform) -> None:
+        """As `KissAligner.follow`."""
+        self._exchange("follow", list(scans), T_odom_lidar)
 
-    def align_alone(self, points: Points, gap: float) -> None:
+    def align_alone(self, points: Points, T_last_predicted: Transform) -> None:
         """As `KissAligner.align_alone`; the other process works while this one continues."""
         sent = self._shared_or_sent(points)
         with self._reported():
-            self._pipe.send(("align_alone", sent, gap))
+            self._pipe.send(("align_alone", sent, T_last_predicted))
         self._is_waiting = True
 
     def alone(self) -> list[Transform]:
@@ -134,30 +131,3 @@ def _room_for_points(context: SpawnContext) -> Any:
         return context.RawArray("d", 3 * MOST_SHARED)
     except OSError:
         return None
-
-
-def _as_points(shared: Any) -> Points:
-    """The shared memory as rows of float64 coordinates; no rows without shared memory."""
-    return np.empty((0, 3)) if shared is None else np.frombuffer(shared).reshape(-1, 3)
-
-
-def _serve(pipe: Connection, shared: Any, config: OdometryConfig) -> None:
-    """Answer requests until the other side closes the pipe: the name of a method of the aligner, and its arguments.
-
-    `begin` gets no answer, and `align_alone` the pose. Points of a sweep are sent themselves or, if they are in the
-    shared memory, as their number.
-    """
-    keep_freed_memory()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and then closes the pipe
-    aligner = KissAligner(config)
-    shared_points = _as_points(shared)
-    try:
-        while True:
-            name, first, *rest = pipe.recv()
-            if name == "begin":
-                aligner = KissAligner(first)
-                continue
-            answer = getattr(aligner, name)(shared_points[:first] if isinstance(first, int) else first, *rest)
-            pipe.send(aligner.alone().pop() if name == "align_alone" else answer)
-    except (EOFError, OSError):
-        return

@@ -6,57 +6,12 @@ from contextlib import suppress
 import numpy as np
 from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
 from kiss_icp.config.parser import KISSConfig
-from kiss_icp.kiss_icp import KissICP
 
 from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.types import BadScan, Points, Scan, Transform
+from segslam.odometry.aligner import KissAligner
 from segslam.odometry.sweep import OdometryResult, deskew_scan
-
-
-class KissAligner:
-    """Aligns consecutive sweeps with KISS-ICP's map of the previous ones.
-
-    Its threads sum in any order: poses repeat to 1e-9 m, with one thread exactly.
-    """
-
-    def __init__(self, config: OdometryConfig) -> None:
-        self._config = config
-        self._kiss = self._first = KissICP(_kiss_config(config))
-        self._alone: list[Transform] = []
-
-    def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
-    ) -> None:
-        """As `Odometry.follow`: the previous state is discarded."""
-        self._kiss = kiss = KissICP(_kiss_config(self._config))
-        for T_odom_scan, points in scans:
-            kiss.local_map.update(points.astype(np.float64), T_odom_scan)
-        kiss.last_pose = np.array(T_odom_lidar)
-        kiss.last_delta = np.array(T_before_lidar)
-
-    def align(self, points: Points, gap: float = 1.0) -> Transform:
-        """T_odom_lidar of the next sweep from its points (n, 3), float64, `gap` intervals after the previous one.
-
-        KISS-ICP predicts with the last motion; here it is scaled to `gap` intervals, and back to one interval
-        afterwards.
-        """
-        return _registered(self._kiss, points, gap)
-
-    def align_alone(self, points: Points, gap: float) -> None:
-        """Align a sweep as well with KISS-ICP as it was before the first `follow`; `alone` returns the pose."""
-        self._alone.append(_registered(self._first, points, gap))
-
-    def alone(self) -> list[Transform]:
-        """The pose of each sweep passed to `align_alone`."""
-        return self._alone
-
-
-def _registered(kiss: KissICP, points: Points, gap: float) -> Transform:
-    kiss.last_delta = geometry.scaled(kiss.last_delta, gap)
-    kiss.register_frame(points, np.empty(0))
-    kiss.last_delta = geometry.scaled(kiss.last_delta, 1 / gap)
-    return np.array(kiss.last_pose)
 
 
 class KissOdometry:
@@ -69,7 +24,7 @@ class KissOdometry:
     ) -> None:
         """`keeps_alone`: keep the poses of `alone`, for which each scan is aligned twice after the first `follow`."""
         self._config = config
-        self._aligner = aligner or KissAligner(config)
+        self._aligner = aligner or KissAligner(kiss_config(config))
         self._keeps_alone, self._has_followed = keeps_alone, False
         self._before_following: list[Transform] = []
         self._last_gap = 1.0
@@ -81,7 +36,7 @@ class KissOdometry:
         Raises BadScan, and ignores the scan, if none of its points is within range.
         """
         points, labels, intensities = deskew_scan(scan, self._T_last_lidar, self._config)
-        T_odom_lidar = self._aligner.align(points, gap)
+        T_odom_lidar = self._aligner.align(points, geometry.scaled(self._T_last_lidar, gap))
         if self._keeps_alone:
             self._register_alone(scan, points, T_odom_lidar, gap)
         self._T_last_lidar = geometry.scaled(_since(self._T_odom_last, T_odom_lidar), 1 / gap)
@@ -93,7 +48,7 @@ class KissOdometry:
     ) -> None:
         """Continue from another pose of the last scan, with a local map of these scans alone."""
         self._has_followed = True
-        self._aligner.follow(scans, T_odom_lidar, T_before_lidar)
+        self._aligner.follow(scans, T_odom_lidar)
         self._T_odom_last, self._T_last_lidar = T_odom_lidar, T_before_lidar
 
     def alone(self) -> Sequence[Transform]:
@@ -109,7 +64,7 @@ class KissOdometry:
             T_last_lidar = geometry.scaled(_since(before, last), 1 / self._last_gap)
             with suppress(BadScan):
                 points = deskew_scan(scan, T_last_lidar, self._config)[0]
-            self._aligner.align_alone(points, gap)
+            self._aligner.align_alone(points, geometry.scaled(T_last_lidar, gap))
         self._last_gap = gap
 
 
@@ -119,7 +74,7 @@ def _since(T_odom_last: Transform, T_odom_lidar: Transform) -> Transform:
     return T_last_lidar
 
 
-def _kiss_config(config: OdometryConfig) -> KISSConfig:
+def kiss_config(config: OdometryConfig) -> KISSConfig:
     """The configuration of KISS-ICP with all sections: it would read missing ones from the environment."""
     return KISSConfig(
         data=DataConfig(max_range=config.max_range_m, min_range=config.min_range_m, deskew=False),

@@ -13,7 +13,8 @@ from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError, Step, Trajectory
 from segslam.labels.encodings import Encoding
 from segslam.labels.label_files import unlabelled, whole_source
-from segslam.odometry import GivenOdometry, KissOdometry, Odometry
+from segslam.odometry.kiss import KissOdometry
+from segslam.odometry.sweep import GivenOdometry, Odometry
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import new_folder
 from segslam.output.log import Mirror

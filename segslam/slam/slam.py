@@ -30,8 +30,10 @@ from segslam.graph import Graph, PoseGraph
 from segslam.keyframes import Clouds, CloudStore, downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.labels.label_files import computed
-from segslam.odometry import Odometry, OdometryResult, Tracker, information_of
-from segslam.odometry import Tracked as Tracked
+from segslam.odometry.motion_model import information_of
+from segslam.odometry.sweep import Odometry, OdometryResult
+from segslam.odometry.tracker import Tracked as Tracked
+from segslam.odometry.tracker import Tracker
 from segslam.registration.prepared import Labeller
 from segslam.slam.adjustment import Known, Progress, adjust, no_progress, velocities_of
 from segslam.slam.loop_edits import NO_EDITS, LoopEdits

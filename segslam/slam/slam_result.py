@@ -25,7 +25,7 @@ from segslam.core.types import (
     Vector,
     probability_text,
 )
-from segslam.odometry import information_of
+from segslam.odometry.motion_model import information_of
 from segslam.slam.adjustment import Adjusted
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from helpers.yards import seen
 from segslam.core import geometry
 from segslam.core.trajectory import write_kitti
 from segslam.core.types import Trajectory
-from segslam.odometry import GivenOdometry
+from segslam.odometry.sweep import GivenOdometry
 from segslam.output.log import read_log
 from segslam.slam.adjustment import vertical_angle
 

@@ -15,7 +15,7 @@ from segslam.core.config import Config
 from segslam.core.types import Alignment, Information, Transform
 from segslam.graph.noise import closure_information, odometry_information
 from segslam.keyframes import KeyframeSelector
-from segslam.odometry import KissOdometry
+from segslam.odometry.kiss import KissOdometry
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register, register_prepared
 

@@ -17,7 +17,7 @@ from segslam.core.config import load_config
 from segslam.core.trajectory import Poses, camera_from_lidar, write_kitti
 from segslam.core.types import Scan, Trajectory, Vector
 from segslam.labels.encodings import RAW_OF_LABEL
-from segslam.odometry import GivenOdometry
+from segslam.odometry.sweep import GivenOdometry
 from segslam.scans.kitti import read_calibration
 from segslam.slam.slam import Slam
 

@@ -1,6 +1,6 @@
 """KISS-ICP in this process, with the interface of one in a process of its own, which takes a second to start."""
 
-from segslam.odometry import KissOdometry
+from segslam.odometry.kiss import KissOdometry
 
 
 class OdometryHere(KissOdometry):

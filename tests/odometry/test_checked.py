@@ -14,12 +14,15 @@ from segslam.core.config import Config, load_config
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Step, Trajectory
 from segslam.graph.noise import odometry_information
-from segslam.odometry import CheckedOdometry, GivenOdometry, KissOdometry, OdometryResult, Tracker, information_of
+from segslam.odometry.checked import CheckedOdometry
+from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
-from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
+from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
 from segslam.odometry.search import PoseSearch, as_likely
+from segslam.odometry.sweep import GivenOdometry, OdometryResult
+from segslam.odometry.tracker import Tracker
 from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
 from segslam.registration.refinement import refine as refined
 from segslam.slam.slam import Slam

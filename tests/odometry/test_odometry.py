@@ -12,8 +12,9 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.types import BadScan, Scan, SegslamError, Trajectory
-from segslam.odometry import GivenOdometry, KissOdometry, OdometryApart
-from segslam.odometry.sweep import deskew_scan
+from segslam.odometry.apart import OdometryApart
+from segslam.odometry.kiss import KissOdometry
+from segslam.odometry.sweep import GivenOdometry, deskew_scan
 
 CONFIG = OdometryConfig()
 ONE_THREAD = OdometryConfig(max_num_threads=1)  # the first odometry of a process sets how many all of it have
@@ -145,7 +146,7 @@ def test_a_script_that_runs_again_when_imported_ends_with_the_remedy(tmp_path: P
     script = tmp_path / "script.py"
     script.write_text(
         "import numpy as np\nfrom segslam.core.config import OdometryConfig\nfrom segslam.core.types import Scan\n"
-        "from segslam.odometry import OdometryApart\n"
+        "from segslam.odometry.apart import OdometryApart\n"
         "OdometryApart(OdometryConfig()).register(Scan(np.full((9, 3), 9.0), 0, 0))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)

@@ -18,7 +18,8 @@ from segslam.core import geometry
 from segslam.core.config import Config, OdometryConfig
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.types import BadScan, LoopClosure, Scan, SegslamError
-from segslam.odometry import KissOdometry, OdometryApart
+from segslam.odometry.apart import OdometryApart
+from segslam.odometry.kiss import KissOdometry
 from segslam.output.finished import read_run
 from segslam.output.log import LogWriter, read_log
 from segslam.run.live.folder import FolderSource, stamp_of_name

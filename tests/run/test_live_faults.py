@@ -20,7 +20,7 @@ from helpers.live_command import LiveCommand, record, write_scan
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import BadScan, Scan, SegslamError
-from segslam.odometry import Tracked, Tracker
+from segslam.odometry.tracker import Tracked, Tracker
 from segslam.output.log import read_log
 from segslam.run.live.folder import FolderSource
 from segslam.run.live.front import Front

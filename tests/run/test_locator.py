@@ -12,7 +12,7 @@ import segslam
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.types import Rejected, SegslamError
-from segslam.odometry import GivenOdometry
+from segslam.odometry.sweep import GivenOdometry
 from segslam.output.log import read_log
 from segslam.run.locator import Locator, submaps_of
 

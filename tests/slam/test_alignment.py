@@ -1,5 +1,8 @@
 """Submaps of a yard."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from helpers.yards import seen
@@ -8,7 +11,7 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.registration.refinement import LightSurface
 from segslam.slam.adjustment.alignment import _normal_equations, align
-from segslam.slam.adjustment.submaps import Submaps, members
+from segslam.slam.adjustment.submaps import members, submaps_of
 
 WAY_M = 12.0
 
@@ -16,8 +19,7 @@ WAY_M = 12.0
 def submap(x_m: float, *, low_deg: float = 0.0, pitch_deg: float = 0.0, seed: int = 0) -> LightSurface:
     """One scan."""
     points = seen(x_m, low_deg=low_deg, pitch_deg=pitch_deg, seed=seed).astype(np.float32)
-    made = Submaps(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())
-    return made.submap(0)
+    return submaps_of(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())(0)
 
 
 def guess() -> np.ndarray:
@@ -72,3 +74,16 @@ def test_a_submap_ends_at_motions_that_are_not_known_to_a_voxel() -> None:
     assert members(2, motion_variance, most_m=0.6) == [0, 1, 2]
     assert members(3, motion_variance, most_m=0.6) == [3, 4]
     assert members(0, motion_variance, most_m=0.5) == [0, 1], "0.2 and 0.1 are more than 0.25"
+
+
+def test_submaps_are_freed_at_once_with_the_function_that_returns_them() -> None:
+    points = seen(0.0).astype(np.float32)
+    gc.disable()
+    try:
+        submap_of = submaps_of(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())
+        kept = weakref.ref(submap_of(0))
+        assert kept() is submap_of(0)
+        del submap_of
+        assert kept() is None
+    finally:
+        gc.enable()

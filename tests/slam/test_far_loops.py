@@ -22,7 +22,7 @@ from segslam.core.types import (
     Scan,
     Trajectory,
 )
-from segslam.odometry import GivenOdometry, OdometryResult
+from segslam.odometry.sweep import GivenOdometry, OdometryResult
 from segslam.registration.prepared import PreparedScan
 from segslam.slam.slam import Slam
 from segslam.slam.slam_result import SlamResult

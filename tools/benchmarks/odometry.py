@@ -16,7 +16,8 @@ from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.types import Points, SegslamError, Transform
-from segslam.odometry.kiss import KissAligner
+from segslam.odometry.aligner import KissAligner
+from segslam.odometry.kiss import kiss_config
 from segslam.odometry.sweep import deskew_scan
 from segslam.scans import Dataset, open_dataset
 from tools.benchmarks import common
@@ -29,8 +30,8 @@ a wider reach for fast motions."""
 class Aligner(Protocol):
     """Aligns sweep after sweep."""
 
-    def align(self, points: Points, /) -> Transform:
-        """T_odom_lidar of the next sweep."""
+    def align(self, points: Points, T_last_predicted: Transform, /) -> Transform:
+        """T_odom_lidar of the next sweep, which probably moved so since the last."""
         ...
 
 
@@ -39,18 +40,17 @@ class VoxelMap:
 
     def __init__(self) -> None:
         self._map = small_gicp.GaussianVoxelMap(GICP_VOXEL_M)
-        self._T_odom_lidar = self._T_last_lidar = np.eye(4)
+        self._T_odom_lidar = np.eye(4)
 
-    def align(self, points: Points) -> Transform:
+    def align(self, points: Points, T_last_predicted: Transform) -> Transform:
         """T_odom_lidar of the next sweep; the map gets its points."""
         cloud, _ = small_gicp.preprocess_points(points, downsampling_resolution=THINNED_M, num_threads=1)
-        before = self._T_odom_lidar
         if len(self._map):
+            T_odom_predicted = self._T_odom_lidar @ T_last_predicted
             found = small_gicp.align(
-                self._map, cloud, before @ self._T_last_lidar, max_correspondence_distance=REACH_M, max_iterations=30
+                self._map, cloud, T_odom_predicted, max_correspondence_distance=REACH_M, max_iterations=30
             )
             self._T_odom_lidar = np.array(found.T_target_source)
-            self._T_last_lidar = geometry.inverse(before) @ self._T_odom_lidar
         self._map.insert(cloud, self._T_odom_lidar)
         return self._T_odom_lidar
 
@@ -64,7 +64,7 @@ def measured(name: str, aligner: Aligner, scans: Dataset, config: OdometryConfig
         T_last_lidar = geometry.inverse(poses[-2]) @ poses[-1] if len(poses) > 1 else np.eye(4)
         points, _, _ = deskew_scan(scans[row], T_last_lidar, config)
         started = process_time()
-        poses.append(aligner.align(points))
+        poses.append(aligner.align(points, T_last_lidar))
         times_ms.append(1000 * (process_time() - started))
     errors = trajectory_metrics(np.stack(poses[1:]), scans.reference.T_world_lidar)
     return {
@@ -87,7 +87,7 @@ def main() -> None:
     scans = open_dataset(options.data, frames=options.frames, labels="none", **choose)
     config = OdometryConfig(max_num_threads=1)
     aligners: dict[str, Aligner] = {
-        f"KISS-ICP, {size} m": KissAligner(config.model_copy(update={"voxel_size_m": float(size)}))
+        f"KISS-ICP, {size} m": KissAligner(kiss_config(config.model_copy(update={"voxel_size_m": float(size)})))
         for size in options.voxels.split(",")
     }
     aligners["small_gicp VGICP"] = VoxelMap()

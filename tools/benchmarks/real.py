@@ -20,7 +20,7 @@ from segslam.core import geometry
 from segslam.core.evaluation import align_positions, trajectory_metrics
 from segslam.core.trajectory import Poses, rows_of_same_scan
 from segslam.core.types import Points
-from segslam.odometry import KissOdometry
+from segslam.odometry.kiss import KissOdometry
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import LOG
 from segslam.output.log import read_log

@@ -16,7 +16,7 @@ from segslam.core.config import Config, load_config
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.types import Scan, Trajectory
 from segslam.labels.label_files import of_rows
-from segslam.odometry import GivenOdometry
+from segslam.odometry.sweep import GivenOdometry
 from segslam.output.accuracy import accuracy
 from segslam.scans import open_dataset
 from segslam.slam.slam import Slam

@@ -19,7 +19,7 @@ from typing import Any
 from segslam.core.config import Config
 from segslam.core.memory import note_peak_of
 from segslam.core.types import SegslamError, Step
-from segslam.odometry import Tracked
+from segslam.odometry.tracker import Tracked
 from segslam.run.live.serve import END_S, READY, Chosen, Ended, Past, Placed, serve
 from segslam.run.live.waiting import Gaps, Source, Tally
 from segslam.scans.presets import Preset

@@ -17,7 +17,9 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.memory import keep_freed_memory
 from segslam.core.types import BadScan, Points, Scan, SegslamError, Step
-from segslam.odometry import KissOdometry, OdometryApart, Tracked, Tracker
+from segslam.odometry.apart import OdometryApart
+from segslam.odometry.kiss import KissOdometry
+from segslam.odometry.tracker import Tracked, Tracker
 from segslam.run.live.waiting import Arrival, Gaps, Source, Tally, Waiting
 from segslam.scans.presets import Preset, extent_of, preset_for
 

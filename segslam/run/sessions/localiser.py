@@ -13,7 +13,7 @@ from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import nearest_rows, travelled_m
 from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
 from segslam.graph import AnchoredGraph, Graph
-from segslam.odometry import Odometry
+from segslam.odometry.sweep import Odometry
 from segslam.output.finished import FinishedRun
 from segslam.output.georeferenced import take_over
 from segslam.registration.prepared import Labeller

@@ -37,28 +37,32 @@ Aligned = Callable[[int, int, Transform], Alignment | None]
 """The alignment of a target and a source, by their ids, near an initial guess."""
 
 
-class Submaps:
-    """Submaps by the id of their keyframe, in its frame, made when they are needed."""
+def submaps_of(
+    points_of: PointsOf, T_world: Poses, motion_variance: Vector, *, config: RefineConfig
+) -> Callable[[int], LightSurface]:
+    """Returns the submap of a keyframe by its id, in its frame; made when it is needed, and kept for a while.
 
-    def __init__(self, points_of: PointsOf, T_world: Poses, motion_variance: Vector, *, config: RefineConfig) -> None:
-        """`motion_variance`: as of `is_known`."""
-        self._points_of, self._T_world, self._motion_variance = points_of, T_world, motion_variance
-        self._refine = config
-        self._scan = lru_cache(MOST_SUBMAPS * (2 * REACH + 1))(self._scan_of)  # those of the submaps in memory
-        self.submap = lru_cache(MOST_SUBMAPS)(self._submap)
+    `motion_variance`: as of `is_known`. No object here refers to itself, so that the submaps are freed at once when the
+    function is no longer needed.
+    """
 
-    def aligned(self, target_id: int, source_id: int, T_target_source: Transform) -> Alignment | None:
-        """The alignment of two submaps near an initial guess."""
-        return align(self.submap(source_id), self.submap(target_id), T_target_source)
+    @lru_cache(MOST_SUBMAPS * (2 * REACH + 1))  # those of the submaps in memory
+    def scan(keyframe_id: int) -> Points:
+        return downsample(points_of(keyframe_id), config=config).astype(np.float64)
 
-    def _scan_of(self, keyframe_id: int) -> Points:
-        return downsample(self._points_of(keyframe_id), config=self._refine).astype(np.float64)
+    @lru_cache(MOST_SUBMAPS)
+    def submap(keyframe_id: int) -> LightSurface:
+        T_keyframe_world = geometry.inverse(T_world[keyframe_id])
+        near = members(keyframe_id, motion_variance, most_m=config.voxel_m)
+        points = np.vstack([geometry.apply(T_keyframe_world @ T_world[one], scan(one)) for one in near])
+        return LightSurface(voxel_means(points, config.voxel_m))
 
-    def _submap(self, keyframe_id: int) -> LightSurface:
-        T_keyframe_world = geometry.inverse(self._T_world[keyframe_id])
-        near = members(keyframe_id, self._motion_variance, most_m=self._refine.voxel_m)
-        points = np.vstack([geometry.apply(T_keyframe_world @ self._T_world[one], self._scan(one)) for one in near])
-        return LightSurface(voxel_means(points, self._refine.voxel_m))
+    return submap
+
+
+def aligned_by(submap_of: Callable[[int], LightSurface]) -> Aligned:
+    """Returns the alignment of two submaps near an initial guess."""
+    return lambda target_id, source_id, T_guess: align(submap_of(source_id), submap_of(target_id), T_guess)
 
 
 def members(keyframe_id: int, motion_variance: Vector, *, most_m: float) -> list[int]:

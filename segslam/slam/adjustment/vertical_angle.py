@@ -21,10 +21,11 @@ from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Scan, Transform, Vector
 from segslam.keyframes import KeyframeSelector, downsample_keyframe
 from segslam.labels.label_files import unlabelled
-from segslam.odometry import KissOdometry, Odometry
+from segslam.odometry.kiss import KissOdometry
+from segslam.odometry.sweep import Odometry
 from segslam.registration.refinement import downsample
 from segslam.slam.adjustment.alignment import MIN_PAIRS, MOST_PAIRS, PointsOf, Shown, shown
-from segslam.slam.adjustment.submaps import Submaps
+from segslam.slam.adjustment.submaps import submaps_of
 
 APART_M = (20.0, 30.0)
 """Travel between the two submaps of a pair, in turn. Chosen on KITTI 00, thin and dense scans; between single scans the
@@ -92,7 +93,7 @@ def measure_vertical_angle(
 
     An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
     none, by the method of secants, from no correction and `near_deg`, by default twice the angle that they show.
-    `motion_variance` (n,): as of `Submaps`, by default of exact poses.
+    `motion_variance` (n,): as of `is_known`, by default of exact poses.
     """
     variance = np.zeros(len(travel_m)) if motion_variance is None else motion_variance
     thinned = cache(lambda keyframe_id: downsample(points_of(keyframe_id), config=config))
@@ -104,7 +105,7 @@ def measure_vertical_angle(
         def raised(keyframe_id: int) -> Points:
             return geometry.raise_beams(thinned(keyframe_id), correction_deg)
 
-        submap_of = Submaps(raised, T_world, variance, config=config).submap
+        submap_of = submaps_of(raised, T_world, variance, config=config)
         return shown(pairs, submap_of, T_world, lambda _, points: np.radians(geometry.raising(points))[None])
 
     found = left_of(0.0)

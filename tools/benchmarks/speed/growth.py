@@ -30,7 +30,7 @@ from segslam.graph.chains import Chains
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph
 from segslam.graph.noise import closure_information, odometry_information
-from segslam.odometry import GivenOdometry
+from segslam.odometry.sweep import GivenOdometry
 from segslam.output.log import LogWriter
 from segslam.output.log.drawing import Drawing
 from segslam.slam.slam import Slam

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from segslam.core import geometry
+from segslam.core.trajectory import Poses
 from segslam.core.types import Points, SegslamError, Transform, Vector
-from segslam.gnss.matching import Drive, Matched, Prepared
+from segslam.gnss.matching import Matched, Prepared
 from segslam.gnss.statistics import Weights, correlated, fix_noise, longest_chain, robust_weights, sigmas, weight
+from segslam.graph.closure_pairs import adjoints
 
 NUM_GUESSES = 400
 """Chosen: pairs of fixes that propose a heading; half of the fixes may be wrong, and 100 good pairs are left."""
@@ -32,8 +34,9 @@ PRIOR = np.array([*2 * [np.radians(PRIOR_TILT_DEG)], 0.1, 10.0, 10.0, 10.0, PRIO
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """Pose of the map in the local frame, with the two constants of the receiver."""
+    """Pose of the map in the local frame, by matched fixes of a receiver."""
 
+    matched: Matched
     T_enu_map: Transform
     arm_m: Vector
     """(3,) position of the antenna in the LiDAR frame (m); 0 where it is not significant."""
@@ -46,13 +49,23 @@ class Placement:
     """How many fixes in a row count as one."""
     heading_sigma_deg: float
 
+    @property
+    def T_enu_keyframe(self) -> Poses:  # noqa: N802  (a transform)
+        """(k, 4, 4) poses of the keyframes of the placed drive."""
+        return self.T_enu_map @ self.matched.drive.T_map_keyframe
 
-def place(prepared: Prepared, drive: Drive, *, offset_s: float = 0.0) -> tuple[Matched, Placement]:
-    """Place the drive in the frame of its fixes, `offset_s` added to their times; returns the matched fixes, too.
+    def residual(self, T_enu_keyframe: Poses) -> Points:
+        """(n, 3) measured less estimated positions of the antenna, for these poses of the keyframes (k, 4, 4)."""
+        T_enu_lidar = T_enu_keyframe[self.matched.keyframe] @ self.matched.T_keyframe_lidar
+        return self.matched.enu_m - antennas(T_enu_lidar, self.arm_m)
+
+
+def place(prepared: Prepared, *, offset_s: float = 0.0) -> Placement:
+    """Place the drive in the frame of its fixes, `offset_s` added to their times.
 
     Raises SegslamError with the reason if the fixes do not determine a placement.
     """
-    matched = prepared.matched(drive, offset_s)
+    matched = prepared.matched(offset_s)
     source, span_m = prepared.fixes.source, float(np.hypot(*np.ptp(matched.enu_m[:, :2], axis=0)))
     if len(matched) < LEAST_FIXES:
         raise SegslamError(
@@ -64,20 +77,19 @@ def place(prepared: Prepared, drive: Drive, *, offset_s: float = 0.0) -> tuple[M
             f"{source}: all fixes are within {span_m:.2f} m, so they show no heading; use fixes of a longer part of "
             "the drive"
         )
-    placement = refined(drive, matched, _start(prepared, drive, matched), np.zeros(3))
+    placement = refined(matched, _start(matched, source), np.zeros(3))
     if placement.heading_sigma_deg > MOST_HEADING_DEG:
         raise SegslamError(
             f"{source}: the fixes determine the heading of the map to {placement.heading_sigma_deg:.1f} degrees only "
             f"({span_m:.0f} m of drive, errors of {placement.sigma_m[0]:.1f} m): a map is placed if it is known to "
             f"{MOST_HEADING_DEG:.0f}; use fixes of a longer part of the drive"
         )
-    return matched, placement
+    return placement
 
 
-def _start(prepared: Prepared, drive: Drive, matched: Matched) -> Transform:
+def _start(matched: Matched, source: str) -> Transform:
     """Heading and position by the pairs of fixes whose heading suits most fixes (least sum of square roots)."""
-    estimated = matched.positions(drive.T_map_keyframe, np.zeros(3))
-    measured = matched.enu_m
+    estimated, measured = matched.T_map_lidar[:, :3, 3], matched.enu_m
     rng = np.random.default_rng(0)
     pairs = rng.integers(0, len(matched), (20 * NUM_GUESSES, 2))
     vectors = [(points[pairs[:, 1]] - points[pairs[:, 0]])[:, :2] for points in (estimated, measured)]
@@ -87,7 +99,7 @@ def _start(prepared: Prepared, drive: Drive, matched: Matched) -> Transform:
     chosen = chosen[np.argsort(np.abs(np.log(np.maximum(lengths[0], 1e-6) / np.maximum(lengths[1], 1e-6)))[chosen])]
     if lengths[0][chosen[0]] < LEAST_SPAN_M:
         raise SegslamError(
-            f"{prepared.fixes.source}: the sensor moved by less than {LEAST_SPAN_M:g} m between the fixes, so they "
+            f"{source}: the sensor moved by less than {LEAST_SPAN_M:g} m between the fixes, so they "
             "show no heading; use fixes of a longer part of the drive"
         )
     best = (np.inf, 0.0, np.zeros(2))
@@ -105,14 +117,14 @@ def _start(prepared: Prepared, drive: Drive, matched: Matched) -> Transform:
     return geometry.transform(rotation, [*best[2], float(np.median(up[known])) if known.any() else 0.0])
 
 
-def refined(drive: Drive, matched: Matched, start: Transform, arm_m: Vector) -> Placement:
+def refined(matched: Matched, start: Transform, arm_m: Vector) -> Placement:
     """The placement near `start` by iteratively reweighted least squares on the largest chain of consistent fixes.
 
     `arm_m` (3,): position of the antenna in the LiDAR frame.
     """
     T_enu_map = start
     for _ in range(ROUNDS):
-        residual, columns = linearised(drive, matched, T_enu_map, arm_m)
+        residual, columns = linearised(matched, T_enu_map, arm_m)
         chain = longest_chain(residual, matched.travel_m, sigma_m=fix_noise(residual))
         sigma = sigmas(residual, chain, chain & np.isfinite(residual[:, 2]))
         many = correlated(residual[chain][:, :2])
@@ -127,30 +139,31 @@ def refined(drive: Drive, matched: Matched, start: Transform, arm_m: Vector) -> 
         right = np.einsum("nij,ni,ni->j", six, precision, np.nan_to_num(residual)) - prior * tilt
         covariance = np.linalg.inv(system)
         T_enu_map = moved(T_enu_map, covariance @ right)
-    residual = matched.enu_m - matched.positions(T_enu_map @ drive.T_map_keyframe, arm_m)
+    residual, _ = linearised(matched, T_enu_map, arm_m)
     weights = robust_weights(residual, sigma, matched.time_s) * chain[:, None]
     heading_deg = float(np.degrees(np.sqrt(covariance[2, 2])))
-    return Placement(T_enu_map, arm_m, weights, sigma, many, heading_deg)
+    return Placement(matched, T_enu_map, arm_m, weights, sigma, many, heading_deg)
 
 
-def linearised(drive: Drive, matched: Matched, T_enu_map: Transform, arm_m: Vector) -> tuple[Points, np.ndarray]:
+def linearised(matched: Matched, T_enu_map: Transform, arm_m: Vector) -> tuple[Points, np.ndarray]:
     """(n, 3) residuals, and (n, 3, 9) derivatives of the positions by the constants.
 
     The constants are a rotation about the first keyframe (rad) and a shift (m) of the map in the local frame, seconds
     added to the times of the fixes, and the first two components of the lever arm (m).
     """
-    T_enu_keyframe = T_enu_map @ drive.T_map_keyframe
-    R_enu_keyframe = T_enu_keyframe[matched.keyframe, :3, :3]
-    estimated = matched.positions(T_enu_keyframe, arm_m)
-    x, y, z = (estimated - T_enu_map[:3, 3]).T
-    zero = np.zeros_like(x)
-    rotation = np.stack([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 0, 1)
-    shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-    velocity = np.einsum("nij,nj->ni", R_enu_keyframe, matched.velocity)
-    arm = (R_enu_keyframe @ matched.T_keyframe_lidar[:, :3, :3])[:, :, :2]
-    columns = np.concatenate([rotation, shift, velocity[:, :, None], arm], axis=2)
+    T_enu_lidar = T_enu_map @ matched.T_map_lidar
+    estimated = antennas(T_enu_lidar, arm_m)
+    T_antenna_map = np.tile(np.eye(4), (len(estimated), 1, 1))  # with the axes of the local frame
+    T_antenna_map[:, :3, 3] = T_enu_map[:3, 3] - estimated
+    velocity = matched.velocity @ T_enu_map[:3, :3].T
+    columns = np.dstack([adjoints(T_antenna_map)[:, 3:], velocity, T_enu_lidar[:, :3, :2]])
     columns[~np.isfinite(matched.enu_m)] = 0.0
     return matched.enu_m - estimated, columns
+
+
+def antennas(T_a_lidar: Poses, arm_m: Vector) -> Points:
+    """(n, 3) positions of the antenna in frame a, for poses (n, 4, 4) and the lever arm (3,) (LiDAR, m)."""
+    return T_a_lidar[:, :3, :3] @ arm_m + T_a_lidar[:, :3, 3]
 
 
 def moved(T_enu_map: Transform, step: Vector) -> Transform:

@@ -21,26 +21,18 @@ A standard deviation claimed by the receiver is not used: it is often wrong by a
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import coo_array
-from scipy.sparse.linalg import SuperLU, splu
 
-from segslam.core import geometry
-from segslam.core.trajectory import Poses
-from segslam.core.types import Vector
+from segslam.core.types import Indices, Vector
 from segslam.gnss.alignment import PRIOR, Placement, linearised
-from segslam.gnss.matching import Drive, Matched
 from segslam.gnss.statistics import KEPT_WEIGHT, fix_noise
-from segslam.graph import Edge
 from segslam.graph.closure_pairs import adjoints
+from segslam.graph.position_fixes import PositionedGraph
 
 MOST_FIXES = 150
 """Chosen: fixes compared, spread over the drive; the result differs little from 100 on."""
-HELD = geometry.tangent(rotation_rad=1e-4, translation_m=1e-2)
-"""Standard deviations that hold the first pose, since the placement is among the unknowns of A."""
 DRIFT_FACTORS = np.array([1.0, 2.0, 4.0, 8.0])
 TIME_CONSTANTS_S = np.array([1.0, 5.0, 20.0, 60.0, 200.0, 600.0])
 RECEIVER_FACTORS = 2.0 ** np.arange(-5.0, 1.5)
@@ -83,46 +75,27 @@ class Estimate:
     """(c,) their standard deviations."""
 
 
-def drift_solver(edges: Sequence[Edge], T: Poses) -> SuperLU:
-    """The factorised information of the poses of a drive; `T` (k, 4, 4): the optimum of the edges, in any frame."""
-    rows, columns, blocks = [0], [0], [np.diag(HELD**-2.0)]
-    for edge in edges:
-        T_b_a = geometry.inverse(T[edge.b]) @ T[edge.a]
-        derivatives = (edge.a, -adjoints(T_b_a[None])[0]), (edge.b, np.eye(6))
-        for (row, left), (column, right) in product(derivatives, repeat=2):
-            rows.append(row)
-            columns.append(column)
-            blocks.append(left.T @ edge.information @ right)
-    inner = np.arange(6)
-    at_row = 6 * np.array(rows)[:, None, None] + inner[:, None]
-    at_column = 6 * np.array(columns)[:, None, None] + inner
-    values = np.array(blocks)
-    shape = (6 * len(T), 6 * len(T))
-    where = [np.broadcast_to(place, values.shape).ravel() for place in (at_row, at_column)]
-    return splu(coo_array((values.ravel(), where), shape=shape).tocsc())
-
-
 def estimated(
-    solver: SuperLU, drive: Drive, matched: Matched, placement: Placement, *, axis: int, free: Sequence[bool]
+    graph: PositionedGraph, placement: Placement, *, axis: int, free: Sequence[bool] = (False, False)
 ) -> Estimate:
     """The noise of largest likelihood for the kept fixes, horizontally (`axis` 0) or in height (1).
 
-    `solver`: that of the drive's graph. `free`: whether the clock and the lever arm are among the unknowns. The points
-    on the LiDAR are compared: its distance to the antenna changes nothing here.
+    `free`: whether the clock and the lever arm are among the unknowns. The points on the LiDAR are compared: its
+    distance to the antenna changes nothing here.
     """
     axes = [2] if axis else [0, 1]
     prior = PRIOR * np.repeat([True, *free], [6, 1, 2])
-    residual, columns = linearised(drive, matched, placement.T_enu_map, placement.arm_m)
+    residual, columns = linearised(placement.matched, placement.T_enu_map, placement.arm_m)
     kept = np.flatnonzero(placement.weights[:, axis] >= KEPT_WEIGHT)
     white_m = fix_noise(residual[kept, 2] if axis else residual[kept])
     chosen = kept[np.unique(np.linspace(0, len(kept) - 1, min(MOST_FIXES, len(kept))).round().astype(int))]
-    some = matched.some(chosen)
-    P = _covariance(solver, placement.T_enu_map @ drive.T_map_keyframe, some, axes)
+    P = _covariance(graph, placement, chosen, axes)
     r = residual[chosen][:, axes].T.ravel()
     A = columns[chosen][:, axes].transpose(1, 0, 2).reshape(len(r), -1)
     fixed = (A * prior**2) @ A.T + white_m**2 * np.eye(len(r))
     scale = max(float(np.sqrt(np.mean(r**2))), white_m)
-    apart_s = np.abs(some.time_s[:, None] - some.time_s)
+    time_s = placement.matched.time_s[chosen]
+    apart_s = np.abs(time_s[:, None] - time_s)
     best = -np.inf
     for tau in TIME_CONSTANTS_S:
         K = np.kron(np.eye(len(axes)), np.exp(-apart_s / tau))
@@ -139,16 +112,11 @@ def estimated(
     return Estimate(noise, gain @ cho_solve(factor, r), np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
-def _covariance(solver: SuperLU, T_enu_keyframe: Poses, matched: Matched, axes: Sequence[int]) -> np.ndarray:
+def _covariance(graph: PositionedGraph, placement: Placement, chosen: Indices, axes: Sequence[int]) -> np.ndarray:
     """(n d, n d) covariance of the positions of the LiDAR by the drive, along d axes, one after the other."""
-    R = T_enu_keyframe[matched.keyframe, :3, :3]
-    x, y, z = matched.points(np.zeros(3)).T
-    zero = np.zeros_like(x)
-    cross = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    jacobian = np.concatenate([-R @ cross, R], axis=2)  # (n, 3, 6)
-    dense = np.zeros((len(axes), len(matched), solver.shape[0]))
-    for row, key in enumerate(matched.keyframe):
-        dense[:, row, 6 * key : 6 * key + 6] = jacobian[row, axes]
-    dense = dense.reshape(-1, solver.shape[0])
-    covariance = dense @ solver.solve(np.ascontiguousarray(dense.T))
-    return (covariance + covariance.T) / 2
+    matched = placement.matched
+    keys, T_enu_lidar = matched.keyframe[chosen], placement.T_enu_map @ matched.T_map_lidar[chosen]
+    moved = T_enu_lidar[:, :3, :3] @ adjoints(np.linalg.inv(matched.T_keyframe_lidar[chosen]))[:, 3:]
+    derivatives = np.zeros((len(axes), len(keys), len(matched.drive.keyframe_rows), 6))
+    derivatives[:, np.arange(len(keys)), keys] = moved[:, axes].transpose(1, 0, 2)
+    return graph.covariance(derivatives.reshape(len(axes) * len(keys), -1))

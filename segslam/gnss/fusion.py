@@ -9,18 +9,15 @@ without fixes: the solution is used there, too, and between fixes that are near 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.linalg import SuperLU
 
 from segslam.core.trajectory import Poses, travelled_m
 from segslam.core.types import Mask, Points, SegslamError, Vector
-from segslam.gnss.alignment import Placement, moved, refined
-from segslam.gnss.evidence import Estimate, drift_solver, estimated
-from segslam.gnss.matching import Drive, Matched, Prepared
+from segslam.gnss.alignment import Placement, antennas, moved, refined
+from segslam.gnss.evidence import Estimate, Noise, estimated
+from segslam.gnss.matching import Prepared
 from segslam.gnss.statistics import KEPT_WEIGHT, Weights, axis_sigma, horizontal_sigma, robust_weights, sigmas
-from segslam.graph import Edge
 from segslam.graph.position_fixes import PositionedGraph
 
 NUM_WINDOWS = 6
@@ -42,24 +39,13 @@ CONSTANT_ROUNDS = 3
 """Chosen: repetitions of placement and constants; the third changes the lever arm by less than its noise."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Constants:
-    """Placement of the drive with the clock and the lever arm of the receiver."""
-
-    matched: Matched
-    placement: Placement
-    measured_offset_s: float
-    """Seconds added to the times of the fixes, beyond those given; 0 if they are not significant."""
-    level: Estimate
-    solver: SuperLU
-    """That of `evidence`."""
-
-
 def calibrate(
-    edges: Sequence[Edge], drive: Drive, prepared: Prepared, matched: Matched, placement: Placement, *, offset_s: float
-) -> Constants:
-    """Clock and lever arm, where they are significant, and the placement with them."""
-    solver = drift_solver(edges, drive.T_map_keyframe)
+    graph: PositionedGraph, prepared: Prepared, placement: Placement, *, offset_s: float
+) -> tuple[Placement, float, Estimate]:
+    """The placement with the clock and the lever arm of the receiver where they are significant.
+
+    Also the seconds added to the times of the fixes beyond `offset_s`, 0 if not significant, and the horizontal noise.
+    """
     arm_m, measured_s = np.zeros(3), 0.0
     clock_free = arm_free = True
     for _ in range(CONSTANT_ROUNDS):
@@ -67,83 +53,68 @@ def calibrate(
             raise SegslamError(
                 f"{prepared.fixes.source}: the fixes contradict each other, and none is kept; use better ones"
             )
-        found = estimated(solver, drive, matched, placement, axis=0, free=(clock_free, arm_free))
+        found = estimated(graph, placement, axis=0, free=(clock_free, arm_free))
         clock, arm = found.constants[6], found.constants[7:9]
         total_s, total_m = abs(measured_s + clock), np.abs(arm_m[:2] + arm)
         clock_free = clock_free and bool(total_s > SIGNIFICANT * found.sigma[6])
         arm_free = arm_free and bool((total_m > SIGNIFICANT * found.sigma[7:9]).any())
         measured_s = measured_s + float(clock) if clock_free else 0.0
         arm_m = arm_m + np.array([*arm, 0.0]) if arm_free else np.zeros(3)
-        matched = prepared.matched(drive, offset_s + measured_s)
-        placement = refined(drive, matched, moved(placement.T_enu_map, found.constants[:6]), arm_m)
-    return Constants(matched, placement, measured_s, found, solver)
+        start = moved(placement.T_enu_map, found.constants[:6])
+        placement = refined(prepared.matched(offset_s + measured_s), start, arm_m)
+    return placement, measured_s, found
 
 
-def fuse(edges: Sequence[Edge], drive: Drive, constants: Constants) -> tuple[Poses, Weights, Vector, tuple[bool, bool]]:
-    """Bend the placed drive by its fixes as far as they are better than it. Raises Unsolvable.
+def fuse(
+    graph: PositionedGraph, placement: Placement, level: Noise
+) -> tuple[Poses, Weights, Vector, tuple[bool, bool]]:
+    """Bend the placed drive by its fixes as far as they are better than it; `level`: the horizontal noise.
 
     Returns the poses (k, 4, 4) of the keyframes in the local frame, the robust weights (n, 2) of the fixes, the
     standard deviations (3,) of single fixes about the drive, and whether it is bent horizontally and in height.
+    Raises Unsolvable.
     """
-    matched, placement = constants.matched, constants.placement
-    T_start = placement.T_enu_map @ drive.T_map_keyframe
-    problem = _Problem(PositionedGraph(edges, drive.T_map_keyframe), matched, placement, T_start)
-    interval_s = float(np.median(np.diff(matched.time_s)))
-    noises = [constants.level.noise]
+    interval_s = float(np.median(np.diff(placement.matched.time_s)))
+    noises = [level]
     if np.sum(placement.weights[:, 1] >= KEPT_WEIGHT) >= NUM_WINDOWS:
-        noises.append(estimated(constants.solver, drive, matched, placement, axis=1, free=(False, False)).noise)
+        noises.append(estimated(graph, placement, axis=1).noise)
     sigma = np.full(3, RIGID_M)  # with which the fixes act
-    for axis, noise in enumerate(noises if len(matched) >= LEAST_FUSED else []):
+    for axis, noise in enumerate(noises if len(placement.matched) >= LEAST_FUSED else []):
         is_of_axis = np.array([axis == 0, axis == 0, axis == 1])
         stiffnesses = (RIGID_M, noise.effective_sigma_m(interval_s), noise.white_m)
-        sigma = _best(problem, [np.where(is_of_axis, one, sigma) for one in stiffnesses], axis)
-    T, weights, _ = _solved(problem, sigma)
+        sigma = _best(graph, placement, [np.where(is_of_axis, one, sigma) for one in stiffnesses], axis)
+    T, weights, _ = _solved(graph, placement, sigma)
     return (
         T,
         weights,
-        sigmas(problem.residual(T), *(weights >= KEPT_WEIGHT).T),
+        sigmas(placement.residual(T), *(weights >= KEPT_WEIGHT).T),
         (bool(sigma[0] < RIGID_M), bool(sigma[2] < RIGID_M)),
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
-    graph: PositionedGraph
-    matched: Matched
-    placement: Placement
-    T_start: Poses
-
-    def residual(self, T: Poses) -> Points:
-        return self.matched.enu_m - self.matched.positions(T, self.placement.arm_m)
-
-    def solve(self, start: Poses, precisions: Points) -> Poses:
-        points = self.matched.points(self.placement.arm_m)
-        return self.graph.solve(start, self.matched.keyframe, points, self.matched.enu_m, precisions)
-
-
-def _best(problem: _Problem, candidates: Sequence[Vector], axis: int) -> Vector:
+def _best(graph: PositionedGraph, placement: Placement, candidates: Sequence[Vector], axis: int) -> Vector:
     """The stiffest of three candidates, rigid, soft and close, whose cost is not significantly above the least one.
 
     `axis`: 0 horizontally, 1 vertically.
     """
-    reference = problem.residual(problem.T_start)
-    windows = _windows(problem, problem.placement.weights[:, axis] >= KEPT_WEIGHT)
+    reference = placement.residual(placement.T_enu_keyframe)
+    windows = _windows(placement, placement.weights[:, axis] >= KEPT_WEIGHT)
     known = reference[np.isfinite(_along(reference, axis))]
     scale = axis_sigma(known[:, 2]) if axis else horizontal_sigma(known)
-    costs = np.array([_held_out(problem, one, windows, axis, scale) for one in candidates])
+    costs = np.array([_held_out(graph, placement, one, windows, axis, scale) for one in candidates])
     means = costs.mean(axis=1)
     more = costs - costs[means.argmin()]
     is_as_good = more.mean(axis=1) <= SIGNIFICANT_T * more.std(axis=1, ddof=1) / np.sqrt(NUM_WINDOWS)
     return candidates[int(is_as_good.argmax())]
 
 
-def _windows(problem: _Problem, used: Mask) -> list[slice]:
+def _windows(placement: Placement, used: Mask) -> list[slice]:
     """Fixes in a row to hold out, spread over the drive; each window is as long as the largest gap between used fixes.
 
     The gap is a share of the travel, with the fixes that remain as the whole.
     """
-    total_m = float(travelled_m(problem.T_start)[-1])
-    gaps_m = np.diff([0.0, *problem.matched.travel_m[used], total_m])
+    total_m = float(travelled_m(placement.T_enu_keyframe)[-1])
+    gaps_m = np.diff([0.0, *placement.matched.travel_m[used], total_m])
     gap = min(float(gaps_m.max()) / max(total_m, 1e-9), MOST_HELD_OUT)
     share = float(np.clip(gap / (1.0 - gap), 1.0 / NUM_WINDOWS, MOST_HELD_OUT))
     n = len(used)
@@ -151,35 +122,43 @@ def _windows(problem: _Problem, used: Mask) -> list[slice]:
     return [slice(first, first + size) for first in np.linspace(0, n - size, NUM_WINDOWS).astype(int).tolist()]
 
 
-def _held_out(problem: _Problem, sigma: Vector, windows: Sequence[slice], axis: int, scale: float) -> Vector:
+def _held_out(
+    graph: PositionedGraph, placement: Placement, sigma: Vector, windows: Sequence[slice], axis: int, scale: float
+) -> Vector:
     """(w,) mean cost of the fixes of each window about the drive that was solved without them.
 
     In units of `scale`, the standard deviation about the placed drive; far ones count little more.
     """
-    T, _, precisions = _solved(problem, sigma)
+    T, _, precisions = _solved(graph, placement, sigma)
     costs = []
     for window in windows:
         without = precisions.copy()
         without[window] = 0.0
-        T_without = problem.solve(T, without) if without.any() else problem.T_start
-        values = _along(problem.residual(T_without)[window], axis)
+        T_without = _solve(graph, placement, T, without) if without.any() else placement.T_enu_keyframe
+        values = _along(placement.residual(T_without)[window], axis)
         known = values[np.isfinite(values)]
         costs.append(float(np.mean(np.log1p(known**2 / scale**2))) if len(known) else 0.0)
     return np.array(costs)
 
 
-def _solved(problem: _Problem, sigma: Vector) -> tuple[Poses, Weights, Points]:
+def _solved(graph: PositionedGraph, placement: Placement, sigma: Vector) -> tuple[Poses, Weights, Points]:
     """Poses, weights (n, 2) and precisions (n, 3) by iteratively reweighted least squares.
 
     It starts from the largest chain of consistent fixes; later rounds weight all fixes by their residuals.
     """
-    T, weights = problem.T_start, problem.placement.weights
+    T, weights = placement.T_enu_keyframe, placement.weights
     for _ in range(ROUNDS):
-        precisions = np.column_stack([weights[:, 0], weights[:, 0], weights[:, 1]]) / sigma**2
-        T = problem.solve(T, precisions)
-        residual = problem.residual(T)
-        weights = robust_weights(residual, sigmas(residual, *(weights >= KEPT_WEIGHT).T), problem.matched.time_s)
+        precisions = weights.take([0, 0, 1], axis=1) / sigma**2
+        T = _solve(graph, placement, T, precisions)
+        residual = placement.residual(T)
+        weights = robust_weights(residual, sigmas(residual, *(weights >= KEPT_WEIGHT).T), placement.matched.time_s)
     return T, weights, precisions
+
+
+def _solve(graph: PositionedGraph, placement: Placement, start: Poses, precisions: Points) -> Poses:
+    matched = placement.matched
+    points = antennas(matched.T_keyframe_lidar, placement.arm_m)
+    return graph.solve(start, matched.keyframe, points, matched.enu_m, precisions)
 
 
 def _along(residual: Points, axis: int) -> Vector:

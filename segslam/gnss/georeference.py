@@ -15,6 +15,7 @@ from segslam.gnss.geodesy import Origin
 from segslam.gnss.matching import Drive, prepare
 from segslam.gnss.statistics import KEPT_WEIGHT, Weights, robust_weights
 from segslam.graph import Edge
+from segslam.graph.position_fixes import PositionedGraph
 
 CONTRADICTED = "contradicts_drive"
 """Reason for which a fix is not kept: the drive and other fixes contradict it."""
@@ -78,18 +79,16 @@ def georeference(
     placement, Unsolvable if the graph cannot be solved.
     """
     prepared = prepare(fixes, drive, offset_s=offset_s)
-    matched, placement = place(prepared, drive, offset_s=offset_s)
-    constants = calibrate(edges, drive, prepared, matched, placement, offset_s=offset_s)
-    matched, placement = constants.matched, constants.placement
-    T_enu_keyframe = placement.T_enu_map @ drive.T_map_keyframe
-    is_bent, sigma_m = (False, False), placement.sigma_m
-    weights = robust_weights(
-        matched.enu_m - matched.positions(T_enu_keyframe, placement.arm_m), sigma_m, matched.time_s
-    )
+    placement = place(prepared, offset_s=offset_s)
+    graph = PositionedGraph(edges, drive.T_map_keyframe)
+    placement, measured_offset_s, level = calibrate(graph, prepared, placement, offset_s=offset_s)
+    matched, T_enu_keyframe = placement.matched, placement.T_enu_keyframe
+    sigma_m, is_bent = placement.sigma_m, (False, False)
+    weights = robust_weights(placement.residual(T_enu_keyframe), sigma_m, matched.time_s)
     if use is Use.FUSE:
-        T_enu_keyframe, weights, sigma_m, is_bent = fuse(edges, drive, constants)
+        T_enu_keyframe, weights, sigma_m, is_bent = fuse(graph, placement, level.noise)
     residual = np.full((len(fixes), 3), np.nan)
-    residual[matched.rows] = matched.enu_m - matched.positions(T_enu_keyframe, placement.arm_m)
+    residual[matched.rows] = placement.residual(T_enu_keyframe)
     all_weights = np.zeros((len(fixes), 2))
     all_weights[matched.rows] = weights
     against = np.full(len(fixes), OUTSIDE, object)
@@ -101,13 +100,13 @@ def georeference(
         origin=prepared.origin,
         T_enu_map=placement.T_enu_map,
         T_enu_keyframe=T_enu_keyframe,
-        heading_sigma_deg=float(np.degrees(constants.level.sigma[2])),
-        position_sigma_m=np.array([*constants.level.sigma[3:5], up_sigma_m]),
+        heading_sigma_deg=float(np.degrees(level.sigma[2])),
+        position_sigma_m=np.array([*level.sigma[3:5], up_sigma_m]),
         fix_sigma_m=sigma_m,
         arm_m=placement.arm_m,
-        arm_sigma_m=constants.level.sigma[7:9],
-        measured_offset_s=constants.measured_offset_s,
-        offset_sigma_s=float(constants.level.sigma[6]),
+        arm_sigma_m=level.sigma[7:9],
+        measured_offset_s=measured_offset_s,
+        offset_sigma_s=float(level.sigma[6]),
         is_bent=is_bent,
         reasons=tuple(reason or other for reason, other in zip(fixes.reasons, against.tolist(), strict=True)),
         measured_enu_m=prepared.enu_m,

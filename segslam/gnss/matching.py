@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 from segslam.core.trajectory import Poses, nearest_rows, travelled_m
 from segslam.core.types import Indices, Mask, Points, SegslamError, Vector
 from segslam.gnss.fixes import Fixes
-from segslam.gnss.geodesy import Geodetic, Origin, enu_from_geodetic
+from segslam.gnss.geodesy import Origin, enu_from_geodetic
 
 LONGEST_GAP_S = 2.0
 """Chosen: a fix between two scans farther apart than this, or so long before the first scan, has no pose."""
@@ -37,6 +37,7 @@ class Drive:
 class Matched:
     """The fixes with a pose of the drive, a row for each, in the order of time."""
 
+    drive: Drive
     rows: Indices
     """(n,) row of each in the `Fixes`."""
     time_s: Vector
@@ -45,65 +46,52 @@ class Matched:
     """(n, 3) measured position, east, north, up; NaN for an unknown height."""
     keyframe: Indices
     """(n,) the keyframe nearest in time."""
+    T_map_lidar: Poses
+    """(n, 4, 4) pose of the LiDAR in the map at the time of the fix."""
     T_keyframe_lidar: Poses
-    """(n, 4, 4) pose of the LiDAR at the time of the fix in that keyframe."""
+    """(n, 4, 4) the same in that keyframe."""
     velocity: Points
-    """(n, 3) velocity of the LiDAR in the frame of that keyframe (m/s)."""
+    """(n, 3) velocity of the LiDAR in the map (m/s)."""
     travel_m: Vector
     """(n,) travel of the LiDAR at the time of the fix."""
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def positions(self, T_enu_keyframe: Poses, arm_m: Vector) -> Points:
-        """(n, 3) positions of the antenna, for poses of the keyframes (k, 4, 4) and the lever arm (3,) (LiDAR, m)."""
-        T_enu = T_enu_keyframe[self.keyframe]
-        return np.einsum("nij,nj->ni", T_enu[:, :3, :3], self.points(arm_m)) + T_enu[:, :3, 3]
-
-    def points(self, arm_m: Vector) -> Points:
-        """(n, 3) positions of the antenna in the frames of the keyframes."""
-        return self.T_keyframe_lidar[:, :3, :3] @ arm_m + self.T_keyframe_lidar[:, :3, 3]
-
-    def some(self, chosen: Mask | Indices) -> "Matched":
-        """The chosen rows."""
-        return Matched(*(getattr(self, name)[chosen] for name in self.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """Fixes in the local frame, before they are matched for one offset of the clocks."""
+    """A drive and its fixes in the local frame, before they are matched for one offset of the clocks."""
 
+    drive: Drive
     fixes: Fixes
     origin: Origin
     enu_m: Points
     """(n, 3) positions of all fixes; NaN for those that cannot be used."""
 
-    def matched(self, drive: Drive, offset_s: float) -> Matched:
+    def matched(self, offset_s: float) -> Matched:
         """The usable fixes within the time of the drive, after `offset_s` is added to their times."""
+        drive = self.drive
         stamps = self.fixes.stamp_ns + round(1e9 * offset_s)
         rows = np.flatnonzero(self.fixes.usable & has_pose(drive, stamps))
         begin = int(drive.stamp_ns[0])
         time_s = 1e-9 * (stamps[rows] - begin)
         scan_s = 1e-9 * (drive.stamp_ns - begin)
         keyframe = nearest_rows(scan_s[drive.keyframe_rows], time_s)
-        T_map_keyframe = drive.T_map_keyframe[keyframe]
-        R_map_keyframe = T_map_keyframe[:, :3, :3]
         T_map_lidar = interpolated(drive, scan_s, time_s)
-        T_keyframe_lidar = np.tile(np.eye(4), (len(rows), 1, 1))
-        T_keyframe_lidar[:, :3, :3] = R_map_keyframe.transpose(0, 2, 1) @ T_map_lidar[:, :3, :3]
-        T_keyframe_lidar[:, :3, 3] = _rotated_into(R_map_keyframe, T_map_lidar[:, :3, 3] - T_map_keyframe[:, :3, 3])
-        path = drive.T_map_lidar[:, :3, 3].T
         before, after = (
-            np.column_stack([np.interp(time_s + sign * SPEED_OVER_S / 2, scan_s, axis) for axis in path])
-            for sign in (-1, 1)
+            np.column_stack([np.interp(time_s + half_s, scan_s, axis) for axis in drive.T_map_lidar[:, :3, 3].T])
+            for half_s in (-SPEED_OVER_S / 2, SPEED_OVER_S / 2)
         )
         return Matched(
+            drive=drive,
             rows=rows,
             time_s=time_s,
             enu_m=self.enu_m[rows],
             keyframe=keyframe,
-            T_keyframe_lidar=T_keyframe_lidar,
-            velocity=_rotated_into(R_map_keyframe, (after - before) / SPEED_OVER_S),
+            T_map_lidar=T_map_lidar,
+            T_keyframe_lidar=np.linalg.inv(drive.T_map_keyframe[keyframe]) @ T_map_lidar,
+            velocity=(after - before) / SPEED_OVER_S,
             travel_m=np.interp(time_s, scan_s, travelled_m(drive.T_map_lidar)),
         )
 
@@ -124,17 +112,13 @@ def prepare(fixes: Fixes, drive: Drive, *, offset_s: float = 0.0) -> Prepared:
             f"{begin - first + offset_s:.1f} lets them begin together"
         )
     latitude, longitude = fixes.places[within][0, :2].tolist()
-    heights = fixes.places[within, 2]
-    known = heights[np.isfinite(heights)].tolist()
-    origin = Origin(latitude, longitude, known[0] if known else 0.0)
-    places: Geodetic = fixes.places.copy()
-    no_height = ~np.isfinite(places[:, 2])
-    places[no_height, 2] = origin.height_m
-    enu_m = np.full((len(fixes), 3), np.nan)
-    usable = fixes.usable
-    enu_m[usable] = enu_from_geodetic(places[usable], origin)
-    enu_m[no_height, 2] = np.nan
-    return Prepared(fixes, origin, enu_m)
+    has_height = np.isfinite(fixes.places[:, 2])
+    heights = fixes.places[within & has_height, 2].tolist()
+    origin = Origin(latitude, longitude, heights[0] if heights else 0.0)
+    enu_m = enu_from_geodetic(np.where(np.isfinite(fixes.places), fixes.places, origin), origin)
+    enu_m[~fixes.usable] = np.nan
+    enu_m[~has_height, 2] = np.nan
+    return Prepared(drive, fixes, origin, enu_m)
 
 
 def has_pose(drive: Drive, stamp_ns: Indices) -> Mask:
@@ -155,7 +139,3 @@ def interpolated(drive: Drive, scan_s: Vector, time_s: Vector) -> Poses:
     poses[:, :3, :3] = (before * ScipyRotation.from_rotvec(share[:, None] * motion.as_rotvec())).as_matrix()
     poses[:, :3, 3] += share[:, None] * (drive.T_map_lidar[after, :3, 3] - poses[:, :3, 3])
     return poses
-
-
-def _rotated_into(rotations: np.ndarray, vectors: Points) -> Points:
-    return np.einsum("nji,nj->ni", rotations, vectors)

@@ -14,6 +14,7 @@ from typing import Any
 import gtsam
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import csc_array
 
 from segslam.core import geometry
 from segslam.core.types import Indices, Information, Mask, Transform, Vector
@@ -61,6 +62,14 @@ def joined(*graphs: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
 def squared_errors(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Vector:
     """Squared whitened error (chi-square, twice GTSAM's error) of each factor; none may have a robust kernel."""
     return np.array([2.0 * graph.at(i).error(values) for i in range(graph.size())])
+
+
+def jacobian(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[csc_array, Vector]:
+    """(6 f, 6 k) whitened derivatives of f factors by the tangents of all poses, sorted by key; (6 f,) their errors."""
+    rows, columns, entries = graph.linearize(values).sparseJacobian_()
+    shape = 6 * graph.size(), 6 * values.size() + 1
+    whole = csc_array((entries, (rows.astype(int) - 1, columns.astype(int) - 1)), shape=shape)
+    return whole[:, :-1], whole[:, -1:].toarray()[:, 0]
 
 
 def values_of(T_world: Iterable[Transform], keys: Iterable[int] | None = None) -> gtsam.Values:

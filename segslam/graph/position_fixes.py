@@ -5,15 +5,18 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+from scipy.sparse.linalg import splu
 
 from segslam.core import geometry
 from segslam.core.types import Indices, Points
-from segslam.graph.edges import Edge, Transforms, factor_graph, poses_by_id, values_of
+from segslam.graph.edges import Edge, Transforms, factor_graph, jacobian, poses_by_id, values_of
 from segslam.graph.levenberg_marquardt import search
 
 GAUGE = geometry.tangent(rotation_rad=[0.1, 0.1, 10.0], translation_m=1e4)
 """Standard deviations of the first pose. Chosen: more than the start is off by, so that it only holds what no fix
 determines; 0.1 rad of tilt where heights are unknown."""
+HELD = geometry.tangent(rotation_rad=1e-4, translation_m=1e-2)
+"""The same where the placement of the drive is among the unknowns: they hold the first pose."""
 LEAST_PRECISION = 1e-12
 
 
@@ -30,6 +33,15 @@ class PositionedGraph:
             replace(edge, T_a_b=geometry.nearest_transform(geometry.inverse(T_map[edge.a]) @ T_map[edge.b]))
             for edge in edges
         )
+        held, values = gtsam.NonlinearFactorGraph(self._factors), values_of(T_map)
+        held.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Diagonal.Sigmas(HELD)))
+        derivatives, _ = jacobian(held, values)
+        self._information = splu((derivatives.T @ derivatives).tocsc())
+
+    def covariance(self, derivatives: np.ndarray) -> np.ndarray:
+        """(m, m) covariance, by the graph alone, of values with these `derivatives` (m, 6 k) by the poses' tangents."""
+        covariance = derivatives @ self._information.solve(np.ascontiguousarray(derivatives.T))
+        return (covariance + covariance.T) / 2
 
     def solve(
         self, start: Transforms, keys: Indices, points: Points, positions: Points, precisions: Points

@@ -16,14 +16,13 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from segslam.core import geometry
 from segslam.core.types import Vector
 from segslam.graph import noise
 from segslam.graph.closure_pairs import pairwise_chi2
-from segslam.graph.edges import Edge, factor_graph, is_break, joined
+from segslam.graph.edges import Edge, factor_graph, is_break, jacobian, joined
 from segslam.graph.levenberg_marquardt import search
 
 MUCH_LESS = 0.5
@@ -125,16 +124,12 @@ def _rates(
     values: gtsam.Values,
 ) -> Vector:
     """(k,) heading (rad) missing in the motions per unit of each column of `growth`, linearised at `values`."""
-    graph = joined(factor_graph(odometry), prior, factor_graph(closures))
-    rows, columns, entries = graph.linearize(values).sparseJacobian_()
-    size = 6 * graph.size(), 6 * values.size() + 1
-    whole = csc_array((entries, (rows.astype(int) - 1, columns.astype(int) - 1)), shape=size)
-    jacobian, errors = whole[:, :-1], whole[:, -1:].toarray()[:, 0]
+    derivatives, errors = jacobian(joined(factor_graph(odometry), prior, factor_graph(closures)), values)
     whitened = np.stack([np.linalg.cholesky(edge.information)[2] for edge in odometry])  # of the heading
-    rates = np.zeros((size[0], growth.shape[1]))
+    rates = np.zeros((len(errors), growth.shape[1]))
     rates[: 6 * len(odometry)] = -(whitened[:, :, None] * growth[:, None, :]).reshape(-1, growth.shape[1])
-    poses = splu((jacobian.T @ jacobian).tocsc())
-    rest = rates - jacobian @ poses.solve(jacobian.T @ rates)
+    poses = splu((derivatives.T @ derivatives).tocsc())
+    rest = rates - derivatives @ poses.solve(derivatives.T @ rates)
     scale = np.maximum(np.linalg.norm(growth, axis=0), 1e-9)
     normal, right = (rates.T @ rest) / np.outer(scale, scale), (rest.T @ errors) / scale
     return np.linalg.pinv((normal + normal.T) / 2, rcond=INDEPENDENT, hermitian=True) @ right / scale

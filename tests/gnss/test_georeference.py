@@ -13,9 +13,8 @@ from segslam.core.types import Points, SegslamError
 from segslam.gnss import Drive, Fixes, Origin, Use, enu_from_geodetic, geodetic_from_enu, georeference, utm_epsg
 from segslam.gnss.alignment import place
 from segslam.gnss.fixes import Row, make_fixes
-from segslam.gnss.fusion import _Problem, _windows
+from segslam.gnss.fusion import _windows
 from segslam.gnss.matching import prepare
-from segslam.graph.position_fixes import PositionedGraph
 
 NUM, STEP_M, PERIOD_S = 240, 2.0, 1.0
 
@@ -134,14 +133,10 @@ def test_held_out_windows_are_as_long_as_the_longest_part_without_fixes(first: i
     truth = _truth()
     off = np.zeros((NUM, 3))
     off[first:last] = [25.0, -20.0, 0.0]
-    drive = _drive(truth)
-    prepared = prepare(_fixes(truth, sigma_m=0.05, off_m=off), drive)
-    matched, placement = place(prepared, drive)
-    T_start = placement.T_enu_map @ drive.T_map_keyframe
-    problem = _Problem(PositionedGraph(motions(truth), drive.T_map_keyframe), matched, placement, T_start)
+    placement = place(prepare(_fixes(truth, sigma_m=0.05, off_m=off), _drive(truth)))
     good = np.ones(NUM, dtype=bool)
     good[first:last] = False
-    windows = _windows(problem, good)
+    windows = _windows(placement, good)
     assert [window.stop - window.start for window in windows] == pytest.approx([share * NUM] * 6, abs=0.03 * NUM)
     assert (windows[0].start, windows[-1].stop) == (0, NUM)
 

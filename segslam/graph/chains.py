@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from segslam.core import geometry
-from segslam.core.config import Config
+from segslam.core.config import Config, GraphConfig
 from segslam.core.trajectory import Rows
 from segslam.core.types import Indices, Information, LoopCandidate, Rejected, RejectReason, Transform, Vector
 from segslam.graph import noise
@@ -113,14 +113,14 @@ def _length(edge: Edge) -> float:
 
 
 def far_from_prior(
-    T_target_source: Transform, candidate: LoopCandidate, *, error_allowance: float, slack_m: float
+    T_target_source: Transform, candidate: LoopCandidate, config: GraphConfig, *, slack_m: float = 0.0
 ) -> Rejected | None:
     """Rejects with FAR_FROM_PRIOR a pose that contradicts the motions and loops between two keyframes; None otherwise.
 
     It is the test that a loop has to pass in the graph (`noise.inlier_bound`). `slack_m`: distance by which refinement
     may still move the pose; a radian counts as `noise.TURN_M` metres.
     """
-    bound = noise.inlier_bound(noise.INLIER_PROBABILITY, error_allowance=error_allowance)
+    bound = noise.inlier_bound(error_allowance=config.error_allowance)
     slack = geometry.tangent(rotation_rad=slack_m / noise.TURN_M, translation_m=slack_m) ** 2 / bound
     off = geometry.log(geometry.inverse(candidate.T_target_source_prior) @ T_target_source)
     covariance = candidate.covariance + np.diag(noise.closure_sigmas() ** 2 + slack)
@@ -133,7 +133,6 @@ def far_from_prior(
 
 def prior_gate(candidate: LoopCandidate, config: Config) -> Gate:
     """Excludes poses that even a drift far beyond the noise of the odometry cannot explain."""
-    radius_m, allowance = config.proximity.base_radius_m, config.graph.error_allowance
     return lambda T_target_source, *, slack_m: far_from_prior(
-        T_target_source, candidate, error_allowance=allowance, slack_m=radius_m + slack_m
+        T_target_source, candidate, config.graph, slack_m=config.proximity.base_radius_m + slack_m
     )

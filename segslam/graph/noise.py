@@ -74,9 +74,8 @@ def closure_information(information: Information) -> Information:
     Raises ValueError if `information` is not symmetric positive semidefinite.
     """
     _check(information, "closure")
-    least = np.diag(closure_sigmas() ** -2.0)
-    total = information @ np.linalg.solve(information + least, least)  # inverse(inverse(I) + inverse(L)), I may be flat
-    return (total + total.T) / 2 + 1e-10 * least
+    covariance = np.diag(closure_sigmas() ** 2)
+    return geometry.with_covariance(information, covariance) + 1e-10 * np.linalg.inv(covariance)
 
 
 def closure_sigmas() -> Tangent:
@@ -94,7 +93,7 @@ def _check(information: Information, what: str) -> None:
     raise ValueError(f"the information of a {what} must be finite, symmetric and positive semidefinite")
 
 
-def inlier_bound(probability: float, *, error_allowance: float = 1.0) -> float:
+def inlier_bound(probability: float = INLIER_PROBABILITY, *, error_allowance: float = 1.0) -> float:
     """Squared whitened error (chi-square, not half of it) that a correct edge is below with this probability.
 
     `error_allowance`: tolerated ratio of real to modelled errors.

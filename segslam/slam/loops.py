@@ -166,8 +166,7 @@ class LoopCloser:
         """
         if found.probability is not None and 1.0 - found.probability > self._config.verify.max_false_share:
             return False
-        allowance = self._config.graph.error_allowance
-        if far_from_prior(found.T_target_source, candidate, error_allowance=allowance, slack_m=0.0) is not None:
+        if far_from_prior(found.T_target_source, candidate, self._config.graph) is not None:
             return False
         near = candidate.near_probability
         return MISLED * (1.0 - near) <= LEAST_PROBABILITY * near

@@ -111,7 +111,7 @@ def outcome(T_prior_pose: np.ndarray, *, sigma_m: float = 0.3, slack_m: float = 
     prior = geometry.transform(geometry.yaw(0.7), [5.0, -3.0, 0.2])
     sigmas = geometry.tangent(rotation_rad=np.radians(1.0), translation_m=sigma_m)
     candidate = LoopCandidate(1, 0, prior, 5.0, np.diag(sigmas**2))
-    return far_from_prior(prior @ T_prior_pose, candidate, error_allowance=3.0, slack_m=slack_m)
+    return far_from_prior(prior @ T_prior_pose, candidate, GraphConfig(error_allowance=3.0), slack_m=slack_m)
 
 
 def test_a_pose_within_the_tolerated_errors_passes() -> None:

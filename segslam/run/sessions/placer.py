@@ -157,8 +157,7 @@ class Placer:
         moved_m = geometry.distance(T_earlier_later)
         prior = LoopCandidate(keyframe_id, earlier.keyframe_id, T_earlier_later, moved_m, covariance)
         T_earlier_found = geometry.inverse(earlier.T_world_keyframe) @ T_world_keyframe
-        allowance = self._config.graph.error_allowance
-        return far_from_prior(T_earlier_found, prior, error_allowance=allowance, slack_m=0.0)
+        return far_from_prior(T_earlier_found, prior, self._config.graph)
 
     def _taken(self, placements: tuple[Placement, ...]) -> tuple[Placement, ...]:
         for placement in placements:

@@ -5,6 +5,7 @@ information, row by row. g2o puts translation before rotation, segslam after it:
 Like GTSAM, it uses the rotational part of the information as it is.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +47,7 @@ class _Table:
     path: Path
     line_numbers: list[int]
     ids: list[list[int]]
-    numbers: np.ndarray
+    numbers: list[list[float]]
 
     def refusal(self, row: SupportsIndex, what: str) -> SegslamError:
         return SegslamError(f"{self.path}:{self.line_numbers[row]}: {what}; correct or remove the line")
@@ -58,8 +59,7 @@ def read_g2o(path: Path) -> G2oGraph:
     Raises SegslamError that names file and line: an unknown tag, a broken line, a vertex missing or twice there,
     an information that is not positive definite, a vertex without a chain of edges to the first, no vertex at all.
     """
-    lines = _read_lines(path)
-    vertices, edges, fixes = (_table(path, tag, lines[tag]) for tag in (VERTEX, EDGE, FIX))
+    vertices, edges, fixes = _read_tables(path)
     if not vertices.ids:
         raise SegslamError(f"{path}: holds no vertex; a graph needs lines of {VERTEX}")
     row_of: dict[int, int] = {}
@@ -101,20 +101,31 @@ def parts(vertices: Iterable[int], edges: Iterable[Edge]) -> Indices:
     return connected_components(adjacency, directed=False)[1]
 
 
-def _read_lines(path: Path) -> dict[str, list[tuple[int, list[str]]]]:
-    """The lines of each tag: their numbers, and the fields after the tag."""
+def _read_tables(path: Path) -> tuple[_Table, _Table, _Table]:
+    """The lines with vertices, edges and fixed vertices, each line checked by itself."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise SegslamError(f"{unreadable(path, 'pose graph', error)}; give a g2o file") from error
-    lines: dict[str, list[tuple[int, list[str]]]] = {tag: [] for tag in NUM_FIELDS}
+    tables = {tag: _Table(path, [], [], []) for tag in (VERTEX, EDGE, FIX)}
     for number, line in enumerate(text.split("\n"), start=1):
-        tag, *rest = line.partition("#")[0].split() or [""]
-        if len(rest) == NUM_FIELDS.get(tag):
-            lines[tag].append((number, rest))
-        elif tag:
-            raise SegslamError(f"{path}:{number}: {_complaint(tag, len(rest))}")
-    return lines
+        tag, *texts = line.partition("#")[0].split() or [""]
+        if not tag:
+            continue
+        if len(texts) != NUM_FIELDS.get(tag):
+            raise SegslamError(f"{path}:{number}: {_complaint(tag, len(texts))}")
+        table, num_ids = tables[tag], 2 if tag == EDGE else 1
+        table.line_numbers.append(number)
+        try:
+            table.ids.append([int(text) for text in texts[:num_ids]])
+            table.numbers.append([float(text) for text in texts[num_ids:]])
+        except ValueError as error:
+            raise table.refusal(-1, brief(str(error))) from error
+        if not 0 <= min(table.ids[-1]) <= max(table.ids[-1]) < 2**63:
+            raise table.refusal(-1, "ids are at least 0 and below 2**63")
+        if not all(map(math.isfinite, table.numbers[-1])):
+            raise table.refusal(-1, "every number must be finite")
+    return tables[VERTEX], tables[EDGE], tables[FIX]
 
 
 def _complaint(tag: str, num_fields: int) -> str:
@@ -125,37 +136,21 @@ def _complaint(tag: str, num_fields: int) -> str:
     return f"{tag} takes {NUM_FIELDS[tag]} numbers, found {num_fields}; correct or remove the line"
 
 
-def _table(path: Path, tag: str, lines: list[tuple[int, list[str]]]) -> _Table:
-    num_ids = 2 if tag == EDGE else 1
-    numbers = np.empty((len(lines), NUM_FIELDS[tag] - num_ids))
-    table = _Table(path, [number for number, _ in lines], [], numbers)
-    for row, (_, texts) in enumerate(lines):
-        try:
-            table.ids.append([int(text) for text in texts[:num_ids]])
-            table.numbers[row] = texts[num_ids:]
-        except ValueError as error:
-            raise table.refusal(row, brief(str(error))) from error
-        if not 0 <= min(table.ids[row]) <= max(table.ids[row]) < 2**63:
-            raise table.refusal(row, "ids are at least 0 and below 2**63")
-    for broken in np.flatnonzero(~np.isfinite(table.numbers).all(axis=1)):
-        raise table.refusal(broken, "every number must be finite")
-    return table
-
-
 def _poses(table: _Table) -> Transforms:
     """Those of the first seven numbers of each row."""
-    off = np.abs(np.linalg.norm(table.numbers[:, 3:7], axis=1) - 1.0)
+    numbers = np.array([row[:7] for row in table.numbers]).reshape(-1, 7)
+    off = np.abs(np.linalg.norm(numbers[:, 3:], axis=1) - 1.0)
     for row in np.flatnonzero(off > QUATERNION_TOLERANCE):
         raise table.refusal(row, f"the quaternion's length is off by {off[row]:.3g}")
     poses = np.tile(np.eye(4), (len(off), 1, 1))
-    poses[:, :3, :3] = ScipyRotation.from_quat(table.numbers[:, 3:7]).as_matrix()
-    poses[:, :3, 3] = table.numbers[:, :3]
+    poses[:, :3, :3] = ScipyRotation.from_quat(numbers[:, 3:]).as_matrix()
+    poses[:, :3, 3] = numbers[:, :3]
     return poses
 
 
 def _edges(table: _Table) -> list[Edge]:
     triangles = np.zeros((len(table.ids), 6, 6))
-    triangles[:, *UPPER] = table.numbers[:, 7:]
+    triangles[:, *UPPER] = np.array([row[7:] for row in table.numbers]).reshape(-1, len(UPPER[0]))
     information = triangles + np.triu(triangles, 1).transpose(0, 2, 1)
     smallest = np.linalg.eigvalsh(information)[:, 0]
     for flat in np.flatnonzero(smallest <= 0.0):

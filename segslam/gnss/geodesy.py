@@ -10,11 +10,11 @@ Source: Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Naviga
 from ECEF to geodetic coordinates: Bowring, "The accuracy of geodetic latitude and height equations", 1985.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.types import Points, Rotation
 
@@ -86,15 +86,8 @@ def geodetic_from_enu(enu_m: Points, origin: Origin) -> Geodetic:
 
 def rotation_ecef_enu(origin: Origin) -> Rotation:
     """(3, 3) rotation from the local frame to ECEF: its columns are east, north and up (Groves, eq. (2.150))."""
-    sine, cosine = math.sin(math.radians(origin.latitude_deg)), math.cos(math.radians(origin.latitude_deg))
-    sine_l, cosine_l = math.sin(math.radians(origin.longitude_deg)), math.cos(math.radians(origin.longitude_deg))
-    return np.array(
-        [
-            [-sine_l, -sine * cosine_l, cosine * cosine_l],
-            [cosine_l, -sine * sine_l, cosine * sine_l],
-            [0.0, cosine, sine],
-        ]
-    )
+    angles_deg = [90.0 + origin.longitude_deg, 90.0 - origin.latitude_deg]
+    return ScipyRotation.from_euler("ZX", angles_deg, degrees=True).as_matrix()
 
 
 def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:

@@ -46,8 +46,7 @@ def noise_factor(odometry: Sequence[Edge], certain: Edge) -> float:
     if any(is_break(motion) for motion in odometry[first:last]):
         return 1.0
     at_target = Edge(certain.a, certain.a, np.eye(4), noise.CERTAIN)
-    chi2 = float(pairwise_chi2(odometry, [certain, at_target])[0, 1])
-    return max(1.0, math.sqrt(chi2 / noise.DEGREES_OF_FREEDOM))
+    return _mean_noise_factor(odometry, [certain, at_target])
 
 
 class SteadyDrift(NamedTuple):
@@ -77,7 +76,9 @@ def steady_drift(
     """
     if not closures:
         return None
-    before = _mean_noise_factor(odometry, closures)
+    measured = [closures[row] for row in np.unique(np.linspace(0, len(closures) - 1, MOST_COMPARED).astype(int))]
+    measured.append(Edge(0, 0, np.eye(4), noise.CERTAIN))
+    before = _mean_noise_factor(odometry, measured)
     if before <= tolerated:
         return None
     trials = []
@@ -94,7 +95,7 @@ def steady_drift(
     if not trials:
         return None
     _, rates, corrected, at = min(trials, key=lambda trial: trial[0])
-    factor = _mean_noise_factor(corrected, closures)
+    factor = _mean_noise_factor(corrected, measured)
     return SteadyDrift(rates, factor, at) if factor <= MUCH_LESS * before else None
 
 
@@ -106,13 +107,12 @@ def turned(odometry: Sequence[Edge], growth: Growth, rates: Vector) -> list[Edge
     ]
 
 
-def _mean_noise_factor(odometry: Sequence[Edge], closures: Sequence[Edge]) -> float:
-    """As `noise_factor`, of the drift around each closure and between every two: the root of the mean chi-square.
+def _mean_noise_factor(odometry: Sequence[Edge], measured: Sequence[Edge]) -> float:
+    """As `noise_factor`, of the drift between every two measurements: the root of the mean chi-square.
 
     Two rates explain the drift around one closure whatever its cause; they explain all only if the drift is steady.
     """
-    some = [closures[row] for row in np.unique(np.linspace(0, len(closures) - 1, MOST_COMPARED).astype(int))]
-    chi2 = pairwise_chi2(odometry, [*some, Edge(0, 0, np.eye(4), noise.CERTAIN)])
+    chi2 = pairwise_chi2(odometry, measured)
     return max(1.0, math.sqrt(float(chi2[np.tril_indices(len(chi2), -1)].mean()) / noise.DEGREES_OF_FREEDOM))
 
 

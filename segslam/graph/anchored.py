@@ -82,11 +82,15 @@ class AnchoredGraph:
         at_m = travel_m + BREAK_STEP_M
         self._graph.add_keyframe(keyframe_id + 1, T_odom_keyframe, at_m, information=information, stamp_ns=stamp_ns)
 
-    def add_closure(self, closure: LoopClosure, others: Sequence[LoopClosure] = ()) -> Any:
+    def add_closure(self, closure: LoopClosure) -> Any:
         """Raises SegslamError: a localised drive has no loops of its own."""
         raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 
-    weigh_odometry_by = consistent_with = add_closure
+    weigh_odometry_by = add_closure
+
+    def consistent_pairs(self, closures: Sequence[LoopClosure]) -> Any:
+        """As `add_closure`."""
+        self.add_closure(closures[0])
 
     def covariances(self, keyframe_id: int, others: Indices) -> Matrices:
         """As `PoseGraph.covariances`."""

@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 from segslam.core import geometry
 from segslam.core.types import Mask
 from segslam.graph import gnc, noise
-from segslam.graph.closure_pairs import MAX_PAIRED, adjoints, consistent_pairs, ends_m, largest_consistent, neighbours
+from segslam.graph.closure_pairs import MAX_PAIRED, adjoints, consistent_pairs, largest_consistent, neighbours
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph
 from segslam.graph.gnc import Solution, TruncatedProblem
@@ -119,7 +119,7 @@ def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Value
         return gnc.solve(truncated, start)
     odometry, closures = problem.chain()
     consistent = consistent_pairs(odometry, closures, problem.inlier_bound)
-    near = neighbours(ends_m(closures, np.arange(problem.num_vertices, dtype=float)), NEAR_IDS)
+    near = neighbours(closures, np.arange(problem.num_vertices, dtype=float), NEAR_IDS)
     largest = largest_consistent(consistent)
 
     def settled(likely: Mask) -> Solution:
@@ -128,13 +128,13 @@ def select(problem: FileProblem, truncated: TruncatedProblem, start: gtsam.Value
         return _generous(truncated, gnc.settle(truncated, found.values, found.iterations))
 
     candidates.append(settled(gnc.large_groups(consistent, near, largest)))
-    best = min(candidates, key=lambda solution: solution.truncated_cost)
+    best = gnc.better(*candidates)
     if _is_certain(problem, best):
         return best
     logger.info("the solution is uncertain: searching from other starts")
     candidates += [settled(largest), gnc.solve(truncated, start)]
     exchanged = [gnc.exchange_groups(truncated, solution, consistent, near) for solution in candidates]
-    return _generous(truncated, min(exchanged, key=lambda solution: solution.truncated_cost))
+    return _generous(truncated, gnc.better(*exchanged))
 
 
 def _is_certain(problem: FileProblem, solution: Solution) -> bool:

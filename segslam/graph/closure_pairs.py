@@ -22,6 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 from segslam.core.kernels import kernel
 from segslam.core.types import Indices, Mask, Vector
@@ -74,20 +75,20 @@ def pairwise_chi2(
     return chi2
 
 
-def ends_m(closures: Sequence[Edge], travel_m: Vector) -> Float[np.ndarray, "_ 2"]:
-    """(k, 2) m of travel to the two ends of each closure."""
-    return travel_m[np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64).reshape(-1, 2)]
-
-
-def neighbours(ends_m: Float[np.ndarray, "k 2"], within_m: float) -> Pairs:
+def neighbours(closures: Sequence[Edge], travel_m: Vector, within_m: float) -> Pairs:
     """(k, k) which two closures join the same two places: both ends within so much travel, as are its own."""
-    first, second = (np.abs(column[:, None] - column) <= within_m for column in ends_m.T)
-    return first & second
+    ends_m = _ends_m(closures, travel_m)
+    return cdist(ends_m, ends_m, "chebyshev") <= within_m
 
 
-def num_near(ends_m: Float[np.ndarray, "k 2"], within_m: float) -> Indices:
+def num_near(closures: Sequence[Edge], travel_m: Vector, within_m: float) -> Indices:
     """(k,) how many closures join the same two places as each, itself among them: the row sums of `neighbours`."""
+    ends_m = _ends_m(closures, travel_m)
     return KDTree(ends_m).query_ball_point(ends_m, within_m, p=np.inf, return_length=True)
+
+
+def _ends_m(closures: Sequence[Edge], travel_m: Vector) -> Float[np.ndarray, "_ 2"]:
+    return travel_m[np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64).reshape(-1, 2)]
 
 
 def adjoints(T_a_b: Transforms) -> Matrices:

@@ -101,13 +101,13 @@ def segments(odometry: Sequence[Edge]) -> Indices:
 
 def is_break(edge: Edge) -> bool:
     """True if the standard deviation of a motion is above that of a break in any direction."""
-    rotation, translation = largest_variances(edge)
+    rotation, translation = largest_variances(edge.information)
     return rotation > math.radians(BREAK_DEG) ** 2 or translation > BREAK_M**2
 
 
-def largest_variances(edge: Edge) -> tuple[float, float]:
-    """Variances of the rotation (rad^2) and of the translation (m^2) of an edge in their least certain directions."""
-    known, directions = np.linalg.eigh(edge.information)
+def largest_variances(information: Information) -> tuple[float, float]:
+    """Variances of rotation (rad^2) and translation (m^2), each in its least certain direction."""
+    known, directions = np.linalg.eigh(information)
     covariance = directions / np.maximum(known, np.finfo(float).eps) @ directions.T
     rotation, translation = (np.linalg.eigvalsh(covariance[half, half])[-1] for half in (slice(0, 3), slice(3, 6)))
     return float(rotation), float(translation)

@@ -113,9 +113,9 @@ def solve(problem: TruncatedProblem, start: gtsam.Values) -> Solution:
     return graduated if graduated.weights.all() else better(graduated, settle(problem, start))
 
 
-def better(first: Solution, second: Solution) -> Solution:
-    """The solution with the lower truncated cost."""
-    return second if second.truncated_cost < first.truncated_cost else first
+def better(*solutions: Solution) -> Solution:
+    """The solution with the lowest truncated cost."""
+    return min(solutions, key=lambda solution: solution.truncated_cost)
 
 
 def settle_from(problem: TruncatedProblem, start: gtsam.Values, likely: Mask, iterations: int = 0) -> Solution:

@@ -24,7 +24,6 @@ from segslam.core.types import (
     Indices,
     Information,
     LoopClosure,
-    Mask,
     SegslamError,
     Transform,
     Vector,
@@ -32,7 +31,7 @@ from segslam.core.types import (
 from segslam.graph import noise
 from segslam.graph.adjusted import solve_adjusted, weighted_edges, without_shared_rotation
 from segslam.graph.chains import Chains
-from segslam.graph.closure_pairs import Matrices, consistent_pairs, largest_consistent
+from segslam.graph.closure_pairs import Matrices, Pairs, consistent_pairs, largest_consistent
 from segslam.graph.edges import (
     Edge,
     Transforms,
@@ -47,8 +46,7 @@ from segslam.graph.edges import (
 )
 from segslam.graph.g2o import G2oGraph, write_g2o
 from segslam.graph.levenberg_marquardt import Search, Unsolvable, search
-from segslam.graph.motions import Drive, solve_consistent, solve_gnc, without
-from segslam.graph.noise import INLIER_PROBABILITY
+from segslam.graph.motions import Drive, solve_final, without
 from segslam.graph.steady_drift import noise_factor, steady_drift, turned
 
 logger = logging.getLogger(__name__)
@@ -72,7 +70,7 @@ class PoseGraph:
         self._config = config
         """The configuration with the measured noise of the odometry."""
         self._odometry: list[Edge] = []
-        self._rejected = np.zeros(0, dtype=bool)
+        self._rejected: list[bool] = []
         """For each motion: whether the last final optimisation rejected it."""
         self._has_breaks = False
         self._has_own_information: list[bool] = []
@@ -82,7 +80,7 @@ class PoseGraph:
         """The factor of the first pose."""
         self._backbone = gtsam.NonlinearFactorGraph()
         """The same and the factors of odometry."""
-        self._inlier_bound = noise.inlier_bound(INLIER_PROBABILITY, error_allowance=config.error_allowance)
+        self._inlier_bound = noise.inlier_bound(error_allowance=config.error_allowance)
         self._kernel = noise.robust_kernel(config.robust, self._inlier_bound)
         self._values = gtsam.Values()
         self._T_world = Rows(np.empty((0, 4, 4)))
@@ -129,12 +127,6 @@ class PoseGraph:
         """True if enough closures wait for an optimisation: one, or more if the estimate has hundreds already."""
         return len(self._closures) - len(self._weights) > len(self._weights) // CLOSURES_PER_WAITING
 
-    def T_world_keyframe(self, keyframe_id: int) -> Transform:  # noqa: N802
-        """The current estimate of one pose. Raises SegslamError for an unknown id."""
-        if not self._values.exists(keyframe_id):
-            raise SegslamError(f"the pose graph holds keyframes 0 to {self.num_keyframes - 1}, not {keyframe_id}")
-        return self._values.atPose3(keyframe_id).matrix()
-
     def add_keyframe(
         self,
         keyframe_id: int,
@@ -173,8 +165,9 @@ class PoseGraph:
             self._has_own_information.append(information is not None)
             self._has_breaks |= is_break(edge)
             self._odometry.append(edge)
+            self._rejected.append(False)
             self._backbone.add(edge.factor())
-            variance = largest_variances(replace(edge, information=configured))[1]
+            variance = largest_variances(configured)[1]
             pose = self._values.atPose3(keyframe_id - 1).compose(gtsam.Pose3(T_last_new))
         self._values.insert(keyframe_id, pose)
         self._T_world.append(pose.matrix())
@@ -202,21 +195,12 @@ class PoseGraph:
             self._chains = Chains(self.T_world_keyframes, self._kept_odometry(), list(kept))
         return self._chains.covariances(keyframe_id, others)
 
-    def consistent_with(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
-        """(k,) which other closures are consistent with one and the odometry between their ends.
-
-        None of them needs to be in the graph, but their keyframes must be.
-        """
-        edges = [self._edge(one) for one in (closure, *others)]
-        return consistent_pairs(self._kept_odometry(), edges, self._inlier_bound)[0, 1:]
-
-    def consistent(self, closures: Sequence[LoopClosure]) -> Mask:
-        """(k,) the largest subset in which every two closures are consistent with the odometry between their ends.
+    def consistent_pairs(self, closures: Sequence[LoopClosure]) -> Pairs:
+        """(k, k) which two closures are consistent with each other and the odometry between their ends.
 
         The closures need not be in the graph, but their keyframes must be.
         """
-        edges = [self._edge(closure) for closure in closures]
-        return largest_consistent(consistent_pairs(self._kept_odometry(), edges, self._inlier_bound))
+        return consistent_pairs(self._kept_odometry(), list(map(self._edge, closures)), self._inlier_bound)
 
     def use_odometry_noise(self, sigma_m: float, sigma_deg: float) -> None:
         """Use the odometry noise measured on this drive (per root metre), if it is above the configured noise.
@@ -290,13 +274,10 @@ class PoseGraph:
 
     def _solve_final(self) -> float:
         """Take the final solution; returns its error."""
-        claimed_bound = noise.inlier_bound(INLIER_PROBABILITY)
-        drive = Drive(self._prior, self._closures, self.travel_m, self._inlier_bound, claimed_bound)
-        if self._config.final == "gnc":
-            final = solve_gnc(drive, self._odometry, self._values)
-        else:
-            final = solve_consistent(drive, self._odometry, self._values, self._rejected_motions())
-        self._rejected = final.rejected
+        drive = Drive(self._prior, self._closures, self.travel_m, self._inlier_bound)
+        pairwise = self._config.final != "gnc"
+        final = solve_final(drive, self._odometry, self._values, np.array(self._rejected, bool), pairwise=pairwise)
+        self._rejected = final.rejected.tolist()
         self._rebuild_backbone()
         self._take(final.solution.search.values, final.solution.weights)
         return final.solution.search.error
@@ -304,7 +285,7 @@ class PoseGraph:
     def _corrects_steady_drift(self) -> bool:
         """Correct a steady drift of the heading, if that explains a drift beyond the tolerated errors."""
         growth = np.column_stack([np.diff(self.travel_m), np.nan_to_num(np.diff(self._time_s.all()))])
-        growth[np.array(self._has_own_information, dtype=bool) | self._rejected_motions()] = 0.0
+        growth[np.array([self._has_own_information, self._rejected], dtype=bool).any(axis=0)] = 0.0
         raised = self._config
         self.use_odometry_noise(0.0, 0.0)
         found = steady_drift(
@@ -334,20 +315,17 @@ class PoseGraph:
     def _edge(self, closure: LoopClosure) -> Edge:
         ids = closure.target_id, closure.source_id
         for keyframe_id in ids:
-            self.T_world_keyframe(keyframe_id)
+            if not 0 <= keyframe_id < self.num_keyframes:
+                raise SegslamError(f"the pose graph holds keyframes 0 to {self.num_keyframes - 1}, not {keyframe_id}")
         T_target_source = geometry.nearest_transform(closure.T_target_source)
         return Edge(*ids, T_target_source, noise.closure_information(closure.information))
 
-    def _rejected_motions(self) -> Mask:
-        """(n - 1,) True for motions that the last final optimisation rejected."""
-        return np.concatenate([self._rejected, np.zeros(len(self._odometry) - len(self._rejected), dtype=bool)])
-
     def _kept(self) -> list[Edge]:
         """The closures that the last estimate kept."""
-        return [edge for edge, weight in zip(self._closures, self._weights, strict=True) if weight > 0.0]
+        return list(compress(self._closures, self._weights))
 
     def _kept_odometry(self) -> list[Edge]:
-        return without(self._odometry, self._rejected_motions())
+        return without(self._odometry, self._rejected)
 
     def _multiply_noise(self, factor: float) -> None:
         self.use_odometry_noise(factor * self._config.odometry_sigma_m, factor * self._config.odometry_sigma_deg)
@@ -388,5 +366,5 @@ class PoseGraph:
             dict(enumerate(self.T_world_keyframes)),
             float(error),
             dict(zip(pairs, self._weights, strict=True)),
-            {(int(row), int(row) + 1): 0.0 for row in np.flatnonzero(self._rejected)},
+            {(edge.a, edge.b): 0.0 for edge in compress(self._odometry, self._rejected)},
         )

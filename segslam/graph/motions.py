@@ -20,15 +20,7 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.types import Mask, Transform, Vector
 from segslam.graph import gnc, noise
-from segslam.graph.closure_pairs import (
-    MAX_PAIRED,
-    Pairs,
-    consistent_pairs,
-    ends_m,
-    largest_consistent,
-    neighbours,
-    num_near,
-)
+from segslam.graph.closure_pairs import MAX_PAIRED, Pairs, consistent_pairs, largest_consistent, neighbours, num_near
 from segslam.graph.edges import Edge, chained, factor_graph, joined, poses_by_id, values_of
 from segslam.graph.gnc import MIN_GROUP, select_consistent
 
@@ -55,42 +47,39 @@ class Drive:
     travel_m: Vector
     inlier_bound: float
     """Chi-square of an inlier, with the allowance for errors larger than claimed."""
-    claimed_bound: float
-    """The same without the allowance: within it closures of a group are consistent."""
 
     @cached_property
     def penalties(self) -> Vector:
         """(k,) cost of rejecting each closure."""
-        return np.minimum(1.0, PLACE_PENALTY / num_near(ends_m(self.closures, self.travel_m), PLACE_M))
+        return np.minimum(1.0, PLACE_PENALTY / num_near(self.closures, self.travel_m, PLACE_M))
 
     @cached_property
     def near(self) -> Pairs:
         """(k, k) True for closures that join the same places."""
-        return neighbours(ends_m(self.closures, self.travel_m), PLACE_M)
+        return neighbours(self.closures, self.travel_m, PLACE_M)
 
     def problem(self, odometry: Sequence[Edge]) -> gnc.TruncatedProblem:
         """The truncated least-squares problem with this odometry."""
         backbone = joined(self.prior, factor_graph(odometry))
         return gnc.TruncatedProblem(backbone, self.closures, self.inlier_bound, penalties=self.penalties)
 
-    def solve(self, odometry: Sequence[Edge], start: gtsam.Values) -> gnc.Solution:
-        """Poses and inliers near `start` and near consistent sets of closures."""
+    def solve(self, odometry: Sequence[Edge], start: gtsam.Values, rejected: Mask) -> "MotionSolution":
+        """Poses and inliers near `start` and near consistent sets of closures; this odometry is without `rejected`."""
         consistent = consistent_pairs(odometry, self.closures, self.inlier_bound)
-        return select_consistent(self.problem(odometry), start, consistent, self.near)
+        solution = select_consistent(self.problem(odometry), start, consistent, self.near)
+        penalty = 0.5 * self.inlier_bound * MOTION_PENALTY * int(rejected.sum())
+        return MotionSolution(solution, rejected, solution.truncated_cost + penalty)
 
 
 class MotionSolution(NamedTuple):
-    """A solution and the motions that it rejects (n - 1,)."""
+    """A solution, the motions that it rejects (n - 1,), and its truncated cost with their penalties."""
 
     solution: gnc.Solution
     rejected: Mask
-
-    def cost(self, inlier_bound: float) -> float:
-        """Truncated cost, with the penalties of motions."""
-        return self.solution.truncated_cost + 0.5 * inlier_bound * MOTION_PENALTY * int(self.rejected.sum())
+    cost: float
 
 
-def without(odometry: Sequence[Edge], rejected: Mask) -> list[Edge]:
+def without(odometry: Sequence[Edge], rejected: Mask | Sequence[bool]) -> list[Edge]:
     """Odometry in which rejected motions have next to no information."""
     return [
         replace(edge, information=noise.UNKNOWN_MOTION) if out else edge
@@ -98,25 +87,23 @@ def without(odometry: Sequence[Edge], rejected: Mask) -> list[Edge]:
     ]
 
 
-def solve_gnc(drive: Drive, odometry: Sequence[Edge], start: gtsam.Values) -> MotionSolution:
-    """Poses and inliers by graduated non-convexity; all motions are kept."""
-    return MotionSolution(gnc.solve(drive.problem(odometry), start), np.zeros(len(odometry), dtype=bool))
-
-
-def solve_consistent(drive: Drive, odometry: Sequence[Edge], start: gtsam.Values, rejected: Mask) -> MotionSolution:
+def solve_final(
+    drive: Drive, odometry: Sequence[Edge], start: gtsam.Values, rejected: Mask, *, pairwise: bool
+) -> MotionSolution:
     """Poses and inliers near `start` or the largest pairwise-consistent set.
 
-    Motions that were `rejected` before are rejected again or restored.
+    Motions that were `rejected` before are rejected again or restored. Unless `pairwise`, and for too many closures,
+    graduated non-convexity selects, and all motions are kept.
     """
-    if len(drive.closures) > MAX_PAIRED:
-        return solve_gnc(drive, odometry, start)
     none = np.zeros(len(odometry), dtype=bool)
-    found = _reject(drive, odometry, MotionSolution(drive.solve(odometry, start), none))
+    if not pairwise or len(drive.closures) > MAX_PAIRED:
+        solution = gnc.solve(drive.problem(odometry), start)
+        return MotionSolution(solution, none, solution.truncated_cost)
+    found = _reject(drive, odometry, drive.solve(odometry, start, none))
     if not rejected.any():
         return found
     kept = without(odometry, rejected)
-    again = _reject(drive, kept, MotionSolution(drive.solve(kept, start), rejected))
-    return min(again, found, key=lambda each: each.cost(drive.inlier_bound))
+    return min(_reject(drive, kept, drive.solve(kept, start, rejected)), found, key=lambda each: each.cost)
 
 
 def _reject(drive: Drive, odometry: Sequence[Edge], best: MotionSolution) -> MotionSolution:
@@ -131,7 +118,7 @@ def _reject(drive: Drive, odometry: Sequence[Edge], best: MotionSolution) -> Mot
         if drive.penalties[left].sum() <= MOTION_PENALTY:
             break
         if consistent is None:
-            consistent = consistent_pairs(odometry, drive.closures, drive.claimed_bound)
+            consistent = consistent_pairs(odometry, drive.closures, noise.inlier_bound())
         group = largest_consistent(consistent, left)
         if group.sum() < MIN_GROUP or drive.penalties[group].sum() <= MOTION_PENALTY:
             break
@@ -145,8 +132,8 @@ def _reject(drive: Drive, odometry: Sequence[Edge], best: MotionSolution) -> Mot
         bent = np.concatenate([T_world[: jump.b], T_new_old @ T_world[jump.b :]])  # all later poses move along
         rejected = best.rejected.copy()
         rejected[jump.a] = True
-        trial = MotionSolution(drive.solve(trial_odometry, values_of(bent)), rejected)
-        if trial.cost(drive.inlier_bound) < best.cost(drive.inlier_bound):
+        trial = drive.solve(trial_odometry, values_of(bent), rejected)
+        if trial.cost < best.cost:
             best, consistent, left = trial, None, trial.solution.weights == 0.0
             T_world_a, T_world_b = poses_by_id(trial.solution.search.values)[jump.a : jump.b + 1]
             odometry[jump.a] = replace(jump, T_a_b=geometry.inverse(T_world_a) @ T_world_b)

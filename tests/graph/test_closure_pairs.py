@@ -13,7 +13,6 @@ from segslam.graph.closure_pairs import (
     _log_of_product,
     adjoints,
     consistent_pairs,
-    ends_m,
     largest_consistent,
     neighbours,
     num_near,
@@ -208,9 +207,7 @@ def test_closures_are_neighbours_where_both_ends_are_near() -> None:
     edges = [Edge(a, b, np.eye(4), np.eye(6)) for a, b in ends]
     expected = np.eye(4, dtype=bool)
     expected[0, 1] = expected[1, 0] = True
-    places_m = ends_m(edges, travel_m)
-    np.testing.assert_array_equal(neighbours(places_m, 30.0), expected)
-    np.testing.assert_array_equal(num_near(places_m, 30.0), expected.sum(axis=1))
-    nowhere_m = ends_m([], travel_m)
-    assert neighbours(nowhere_m, 30.0).shape == (0, 0)
-    assert num_near(nowhere_m, 30.0).shape == (0,)
+    np.testing.assert_array_equal(neighbours(edges, travel_m, 30.0), expected)
+    np.testing.assert_array_equal(num_near(edges, travel_m, 30.0), expected.sum(axis=1))
+    assert neighbours([], travel_m, 30.0).shape == (0, 0)
+    assert num_near([], travel_m, 30.0).shape == (0,)

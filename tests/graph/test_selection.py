@@ -7,7 +7,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
-from segslam.graph.closure_pairs import consistent_pairs, ends_m, largest_consistent, neighbours
+from segslam.graph.closure_pairs import consistent_pairs, largest_consistent, neighbours
 from segslam.graph.edges import Edge, factor_graph
 from segslam.graph.gnc import TruncatedProblem, select_consistent, settle, settle_from
 from segslam.graph.noise import first_pose, inlier_bound, odometry_information
@@ -44,7 +44,7 @@ def problem_of(closures: list[Edge]) -> tuple[TruncatedProblem, gtsam.Values, np
     values = gtsam.Values()
     for i, T_world in enumerate(TRUTH):
         values.insert(i, gtsam.Pose3(T_world))
-    near = neighbours(ends_m(closures, 6.0 * np.arange(len(TRUTH))), 59.0)
+    near = neighbours(closures, 6.0 * np.arange(len(TRUTH)), 59.0)
     penalties = np.minimum(1.0, 2.0 / near.sum(axis=1))
     agree = consistent_pairs(odometry, closures, BOUND)
     return TruncatedProblem(trusted, closures, BOUND, penalties=penalties), values, agree, near

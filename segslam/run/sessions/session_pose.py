@@ -15,6 +15,7 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import PoseGraph
+from segslam.graph.closure_pairs import largest_consistent
 from segslam.run.locator import Locator, submaps_of
 from segslam.run.sessions.recorded import FIRST_MOTION, Session
 from segslam.slam.adjustment import Progress, no_progress
@@ -90,7 +91,7 @@ def find_session(
         place = locator.locate(submap.points, submap.labels, max_places=MAX_PLACES if likely is None else 1)
         if not isinstance(place, Rejected):
             found.append(LoopClosure.of(keyframe_id, place.keyframe_id, place.alignment))
-            consistent = graph.consistent([shifted(one, first_id, 0) for one in found])
+            consistent = largest_consistent(graph.consistent_pairs([shifted(one, first_id, 0) for one in found]))
             kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
         if _is_enough(kept, session) or (likely is not None and not found and num_tried == MOST_FAILED):
             break

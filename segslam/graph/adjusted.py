@@ -20,6 +20,7 @@ from segslam.graph.edges import (
     factor_graph,
     is_break,
     joined,
+    kernel_weights,
     poses_by_id,
     squared_errors,
     values_of,
@@ -50,7 +51,7 @@ def solve_adjusted(
 
     Closures and measurements are under the kernel. Breaks of the odometry keep their noise.
     """
-    fixed = [edge for edge in odometry if is_break(edge)]
+    fixed = joined(prior, factor_graph(edge for edge in odometry if is_break(edge)))
     groups = [edge for edge in odometry if not is_break(edge)], list(measured)
     factors = np.ones(2)
     rng = np.random.default_rng(0)
@@ -58,7 +59,7 @@ def solve_adjusted(
     def solved(edges: Sequence[Sequence[Edge]], at: gtsam.Values) -> Search:
         moving, relative, loops = edges
         robust = factor_graph(loops, kernel=kernel), factor_graph(moving), factor_graph(relative, kernel=kernel)
-        return search(joined(prior, factor_graph(fixed), *robust), at)
+        return search(joined(fixed, *robust), at)
 
     for _ in range(ROUNDS):
         scaled = [_scaled(group, float(factor)) for group, factor in zip(groups, factors, strict=True)]
@@ -67,14 +68,10 @@ def solve_adjusted(
         T_world = poses_by_id(start)
         exact = [_simulated(group, T_world, rng) for group in (*scaled, closures)]
         simulated = solved(exact, values_of(T_world))
-        change = np.array(
-            [
-                np.sqrt(_median_chi2(real, start) / _median_chi2(made, simulated.values))
-                for real, made in zip(scaled, exact[:2], strict=True)
-            ]
-        )
+        real = [_median_chi2(group, start) for group in scaled]
+        made = [_median_chi2(group, simulated.values) for group in exact[:2]]
         before = factors
-        factors = np.clip(factors * change, LEAST, MOST)
+        factors = np.clip(factors * np.sqrt(np.divide(real, made)), LEAST, MOST)
         if np.abs(factors / before - 1.0).max() < SETTLED:
             break
     return found, (float(before[0]), float(before[1]))
@@ -115,14 +112,8 @@ def weighted_edges(
     `solve_adjusted`, and the weights of the robust kernel."""
     moving = [edge if is_break(edge) else _scaled([edge], factors[0])[0] for edge in odometry]
     robust = [*closures, *_scaled(measured, factors[1])]
-    if kernel is None or not robust:
-        return [*moving, *robust]
-    errors = np.sqrt(squared_errors(factor_graph(robust), values))
-    weights = [max(kernel.weight(float(error)), LEAST_WEIGHT) for error in errors]
-    return [
-        *moving,
-        *(replace(edge, information=w * edge.information) for edge, w in zip(robust, weights, strict=True)),
-    ]
+    weights = np.maximum(kernel_weights(robust, values, kernel), LEAST_WEIGHT)
+    return moving + [replace(edge, information=w * edge.information) for edge, w in zip(robust, weights, strict=True)]
 
 
 def _scaled(edges: Sequence[Edge], factor: float) -> list[Edge]:

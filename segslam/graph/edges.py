@@ -64,6 +64,13 @@ def squared_errors(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> V
     return np.array([2.0 * graph.at(i).error(values) for i in range(graph.size())])
 
 
+def kernel_weights(edges: Sequence[Edge], values: gtsam.Values, kernel: Kernel | None) -> list[float]:
+    """(k,) weight of each edge at these poses under a robust kernel: 1 (full weight) to 0, and 1 without a kernel."""
+    if kernel is None:
+        return [1.0] * len(edges)
+    return [kernel.weight(error) for error in np.sqrt(squared_errors(factor_graph(edges), values)).tolist()]
+
+
 def jacobian(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[csc_array, Vector]:
     """(6 f, 6 k) whitened derivatives of f factors by the tangents of all poses, sorted by key; (6 f,) their errors."""
     rows, columns, entries = graph.linearize(values).sparseJacobian_()

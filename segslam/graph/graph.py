@@ -38,10 +38,10 @@ from segslam.graph.edges import (
     factor_graph,
     is_break,
     joined,
+    kernel_weights,
     largest_variances,
     poses_by_id,
     relinked,
-    squared_errors,
     values_of,
 )
 from segslam.graph.g2o import G2oGraph, write_g2o
@@ -342,8 +342,7 @@ class PoseGraph:
         except Unsolvable as error:
             logger.warning("the poses remain as they were before the last loops: %s", error)
             found = Search(start, factors.error(start), 0, converged=False)
-        errors = np.sqrt(squared_errors(factor_graph(self._closures), found.values))
-        self._take(found.values, [1.0 if self._kernel is None else self._kernel.weight(float(one)) for one in errors])
+        self._take(found.values, kernel_weights(self._closures, found.values, self._kernel))
         return self._estimate(found.error)
 
     def _linked(self) -> gtsam.Values:

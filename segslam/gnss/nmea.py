@@ -1,5 +1,6 @@
 """Fixes from NMEA 0183: GGA (position, height, quality) and RMC (position, date); others only give the date (ZDA)."""
 
+import re
 from collections.abc import Sequence
 from datetime import UTC, date, datetime, time, timedelta
 from functools import reduce
@@ -12,9 +13,7 @@ from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
 def is_nmea(lines: Sequence[str]) -> bool:
     """True if one of the first lines is a sentence."""
-    return any(
-        line.lstrip().startswith("$") and line[3:6] in ("GGA", "RMC", "GSA", "GSV", "ZDA") for line in lines[:50]
-    )
+    return any(re.match(r"\s*\$..(GGA|RMC|GSA|GSV|ZDA)", line) for line in lines[:50])
 
 
 def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:

@@ -330,3 +330,8 @@ def test_midnight_is_passed_without_a_fix(tmp_path: Path) -> None:
     )
     (tmp_path / "a.nmea").write_text("\n".join(map(sentence, sentences)))
     assert np.diff(read_fixes(tmp_path / "a.nmea").stamp_ns) == [3_000_000_000]
+
+
+def test_blanks_before_a_sentence_are_ignored(tmp_path: Path) -> None:
+    (tmp_path / "a.log").write_text(" " + sentence("GPGGA,235958.00,4800.0,N,00800.0,E,1,8,1,100,M,48,M,,") + "\n")
+    assert read_fixes(tmp_path / "a.log").places.tolist() == [[48.0, 8.0, 148.0]]

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.kernels import kernel
 from segslam.core.types import Indices, Mask, Vector
@@ -71,7 +72,9 @@ def pairwise_chi2(
     summed = np.cumsum(np.concatenate([np.zeros((1, 6, 6)), carried(T_world[1:], odometry)]), axis=0)
     chi2 = np.zeros((len(closures), len(closures)))
     inverses, turns = np.linalg.inv(T_world_drifted), adjoints(T_world_drifted)
-    _fill(T_world_drifted, inverses, turns, own, summed, sources, targets, enough, chi2)
+    rotations = ScipyRotation.from_matrix(T_world_drifted[:, :3, :3])
+    quaternions = rotations.as_quat(), rotations.inv().as_quat()
+    _fill(T_world_drifted, inverses, *quaternions, turns, own, summed, sources, targets, enough, chi2)
     return chi2
 
 
@@ -93,12 +96,9 @@ def _ends_m(closures: Sequence[Edge], travel_m: Vector) -> Float[np.ndarray, "_ 
 
 def adjoints(T_a_b: Transforms) -> Matrices:
     """(k, 6, 6) adjoint matrices, which map tangents of b to tangents of a."""
-    x, y, z = T_a_b[:, :3, 3].T
-    nothing = np.zeros_like(x)
-    cross = np.array([[nothing, -z, y], [z, nothing, -x], [-y, x, nothing]]).transpose(2, 0, 1)
     whole = np.zeros((len(T_a_b), 6, 6))
     whole[:, :3, :3] = whole[:, 3:, 3:] = T_a_b[:, :3, :3]
-    whole[:, 3:, :3] = cross @ T_a_b[:, :3, :3]
+    whole[:, 3:, :3] = np.cross(T_a_b[:, :3, 3, None], T_a_b[:, :3, :3], axis=1)
     return whole
 
 
@@ -108,24 +108,18 @@ def carried(T_world_end: Transforms, edges: Sequence[Edge]) -> Matrices:
     return turns @ np.linalg.inv(np.array([edge.information for edge in edges])) @ turns.transpose(0, 2, 1)
 
 
-@kernel("void(float64[:, ::1], float64[:, ::1], float64[::1])")
-def _log_of_product(T_a_b, T_b_c, tangent):
-    """Writes log(T_a_b T_b_c), by the quaternion of its rotation: exact up to half a turn."""
-    R, t = np.empty((3, 3)), np.empty(3)
+@kernel("void(float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], float64[::1])")
+def _log_of_product(T_a_b, turn_a_b, T_b_c, turn_b_c, tangent):
+    """Writes log(T_a_b T_b_c); `turn`: the quaternions (x, y, z, w) of the rotations. Exact up to half a turn."""
+    t = np.empty(3)
     for i in range(3):
-        for j in range(3):
-            R[i, j] = T_a_b[i, 0] * T_b_c[0, j] + T_a_b[i, 1] * T_b_c[1, j] + T_a_b[i, 2] * T_b_c[2, j]
         t[i] = T_a_b[i, 0] * T_b_c[0, 3] + T_a_b[i, 1] * T_b_c[1, 3] + T_a_b[i, 2] * T_b_c[2, 3] + T_a_b[i, 3]
-    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    w = 1.0 + R[0, 0] + R[1, 1] + R[2, 2]
-    if w < 1.0:  # beyond 120 degrees: by the largest part of the axis, of which the others are products
-        i = 0 if R[0, 0] >= R[1, 1] and R[0, 0] >= R[2, 2] else 1 if R[1, 1] >= R[2, 2] else 2
-        w = x if i == 0 else y if i == 1 else z
-        x = 1.0 + 2.0 * R[0, 0] - R[0, 0] - R[1, 1] - R[2, 2] if i == 0 else R[0, i] + R[i, 0]
-        y = 1.0 + 2.0 * R[1, 1] - R[0, 0] - R[1, 1] - R[2, 2] if i == 1 else R[1, i] + R[i, 1]
-        z = 1.0 + 2.0 * R[2, 2] - R[0, 0] - R[1, 1] - R[2, 2] if i == 2 else R[2, i] + R[i, 2]
-        if w < 0.0:
-            w, x, y, z = -w, -x, -y, -z
+    a, b, c, d = turn_a_b
+    e, f, g, h = turn_b_c
+    x, y, z = d * e + h * a + b * g - c * f, d * f + h * b + c * e - a * g, d * g + h * c + a * f - b * e
+    w = d * h - a * e - b * f - c * g
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
     length = math.sqrt(x * x + y * y + z * z)
     angle = 2.0 * math.atan2(length, w)
     small = angle < 1e-4  # the next terms of the series are below 1e-9
@@ -141,16 +135,16 @@ def _log_of_product(T_a_b, T_b_c, tangent):
 
 
 @kernel(
-    "void(float64[:, :, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[:, :, ::1],"
-    "int64[::1], int64[::1], float64, float64[:, ::1])"
+    "void(float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1], float64[:, :, ::1],"
+    "float64[:, :, ::1], float64[:, :, ::1], int64[::1], int64[::1], float64, float64[:, ::1])"
 )
-def _fill(T_world_drifted, T_drifted_world, turns, own, summed, sources, targets, enough, chi2):
+def _fill(T_world_drifted, T_drifted_world, forwards, backwards, turns, own, summed, sources, targets, enough, chi2):
     """Writes the chi-square of each two closures, by Cholesky's root of the covariance of their loop."""
     error, root, turned = np.empty(6), np.empty((6, 6)), np.empty(6)
     for p in range(len(sources)):
         A = turns[p]
         for q in range(p):
-            _log_of_product(T_world_drifted[p], T_drifted_world[q], error)
+            _log_of_product(T_world_drifted[p], forwards[p], T_drifted_world[q], backwards[q], error)
             s0, s1 = min(sources[p], sources[q]), max(sources[p], sources[q])
             t0, t1 = min(targets[p], targets[q]), max(targets[p], targets[q])
             both0 = max(s0, t0)

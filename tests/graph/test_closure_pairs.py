@@ -5,6 +5,7 @@ import itertools
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation as ScipyRotation
 from scipy.stats import chi2, kstest
 
 from segslam.core import geometry
@@ -146,8 +147,10 @@ def test_the_tangent_of_a_product_is_exact_up_to_half_a_turn(angle_rad: float) -
         rotation = angle_rad * axis / np.linalg.norm(axis)
         tangent = geometry.tangent(rotation_rad=rotation, translation_m=rng.normal(0.0, 5.0, 3))
         T_a_b = geometry.exp(rng.normal(size=6))
+        T_b_c = geometry.inverse(T_a_b) @ geometry.exp(tangent)
+        turns = [ScipyRotation.from_matrix(T[:3, :3]).as_quat() for T in (T_a_b, T_b_c)]
         found = np.empty(6)
-        _log_of_product(T_a_b, geometry.inverse(T_a_b) @ geometry.exp(tangent), found)
+        _log_of_product(T_a_b, turns[0], T_b_c, turns[1], found)
         np.testing.assert_allclose(found, tangent, atol=1e-7)
 
 

@@ -107,16 +107,16 @@ def _solve(
     inlier_probability: float,
 ) -> tuple[Search, Vector]:
     """The poses, and the weight of each closure: 0 if it was rejected."""
-    weights = np.ones(len(problem.closures))
+    everything = np.ones(len(problem.closures))
     if robust in ("gnc", "consistent"):
-        truncated = gnc.TruncatedProblem(backbone, problem.closures, problem.inlier_bound)
+        truncated = gnc.TruncatedProblem(backbone, problem.closures, problem.inlier_bound, everything)
         solution = gnc.solve(truncated, start) if robust == "gnc" else select(problem, truncated, start)
         return solution.search, solution.weights
-    if robust == "none":
-        factors = joined(backbone, factor_graph(problem.closures))
-        return least_squares(factors, start, redundancy=problem.redundancy(len(weights))), weights
     kernel = noise.robust_kernel(robust, noise.inlier_bound(inlier_probability))
-    return search(joined(backbone, factor_graph(problem.closures, kernel=kernel)), start), weights
+    factors = joined(backbone, factor_graph(problem.closures, kernel=kernel))
+    if kernel is None:
+        return least_squares(factors, start, redundancy=problem.redundancy(len(everything))), everything
+    return search(factors, start), everything
 
 
 def _described(

@@ -21,6 +21,7 @@ are consistent too, and lower the cost when they take the place of the outliers.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -59,30 +60,25 @@ class Solution:
     """The error of `search` and, for each rejected closure, half the bound times its penalty."""
 
 
+@dataclass(frozen=True, eq=False)
 class TruncatedProblem:
-    """Factors that are always kept, and closures that are kept or cost their penalty times half of `inlier_bound`.
+    """Factors that are always kept, and closures that are kept or cost their penalty times half of `inlier_bound`."""
 
-    The bound is one of the squared whitened error (chi-square, not half of it).
-    """
+    backbone: gtsam.NonlinearFactorGraph
+    closures: Sequence[Edge]
+    inlier_bound: float
+    """Bound of the squared whitened error (chi-square, not half of it)."""
+    penalties: Vector
+    """(k,) 0 to 1: cost of rejecting each closure; low for closures that may be wrong together."""
 
-    def __init__(
-        self,
-        backbone: gtsam.NonlinearFactorGraph,
-        closures: Sequence[Edge],
-        inlier_bound: float,
-        *,
-        penalties: Vector | None = None,
-    ) -> None:
-        """`penalties` (k,) 0 to 1: cost of rejecting each closure; low for closures that may be wrong together."""
-        self.inlier_bound = inlier_bound
-        self._penalties = np.ones(len(closures)) if penalties is None else penalties
-        self._backbone = backbone
-        self._closures = closures
-        self._factors = factor_graph(closures)
+    @cached_property
+    def factors(self) -> gtsam.NonlinearFactorGraph:
+        """Those of the closures."""
+        return factor_graph(self.closures)
 
     def squared_errors(self, values: gtsam.Values) -> Vector:
         """(k,) chi-square of each closure."""
-        return squared_errors(self._factors, values)
+        return squared_errors(self.factors, values)
 
     def inliers(self, values: gtsam.Values) -> Vector:
         """(k,) 1 for each closure within the bound, else 0."""
@@ -90,14 +86,14 @@ class TruncatedProblem:
 
     def cost(self, error: float, weights: Vector) -> float:
         """The truncated cost of a solution, from the error of the factors that it keeps."""
-        return error + 0.5 * self.inlier_bound * float(self._penalties[weights == 0.0].sum())
+        return error + 0.5 * self.inlier_bound * float(self.penalties[weights == 0.0].sum())
 
     def weighted(self, weights: Vector) -> gtsam.NonlinearFactorGraph:
         """The least-squares problem in which closure i has its information times `weights[i]`."""
-        graph = gtsam.NonlinearFactorGraph(self._backbone)
-        for i, (closure, weight) in enumerate(zip(self._closures, weights, strict=True)):
+        graph = gtsam.NonlinearFactorGraph(self.backbone)
+        for i, (closure, weight) in enumerate(zip(self.closures, weights, strict=True)):
             if weight == 1.0:
-                graph.add(self._factors.at(i))
+                graph.add(self.factors.at(i))
             elif weight > NEGLIGIBLE_WEIGHT:
                 graph.add(closure.factor(weight=float(weight)))
         return graph
@@ -126,7 +122,7 @@ def settle_from(problem: TruncatedProblem, start: gtsam.Values, likely: Mask, it
 
 def _graduate(problem: TruncatedProblem, start: gtsam.Values) -> tuple[gtsam.Values, int]:
     """Algorithm 1: from the optimum of all closures to weights of 0 and 1; the poses, and the number of iterations."""
-    values, _, iterations, _ = search(problem.weighted(np.ones(len(problem.squared_errors(start)))), start)
+    values, _, iterations, _ = search(problem.weighted(np.ones(len(problem.closures))), start)
     worst = problem.squared_errors(values).max(initial=0.0)
     if worst <= problem.inlier_bound:
         return values, iterations

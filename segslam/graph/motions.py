@@ -61,7 +61,7 @@ class Drive:
     def problem(self, odometry: Sequence[Edge]) -> gnc.TruncatedProblem:
         """The truncated least-squares problem with this odometry."""
         backbone = joined(self.prior, factor_graph(odometry))
-        return gnc.TruncatedProblem(backbone, self.closures, self.inlier_bound, penalties=self.penalties)
+        return gnc.TruncatedProblem(backbone, self.closures, self.inlier_bound, self.penalties)
 
     def solve(self, odometry: Sequence[Edge], start: gtsam.Values, rejected: Mask) -> "MotionSolution":
         """Poses and inliers near `start` and near consistent sets of closures; this odometry is without `rejected`."""

@@ -47,7 +47,7 @@ def problem_of(closures: list[Edge]) -> tuple[TruncatedProblem, gtsam.Values, np
     near = neighbours(closures, 6.0 * np.arange(len(TRUTH)), 59.0)
     penalties = np.minimum(1.0, 2.0 / near.sum(axis=1))
     agree = consistent_pairs(odometry, closures, BOUND)
-    return TruncatedProblem(trusted, closures, BOUND, penalties=penalties), values, agree, near
+    return TruncatedProblem(trusted, closures, BOUND, penalties), values, agree, near
 
 
 def test_false_closures_that_outnumber_the_true_ones_of_their_place_are_rejected() -> None:

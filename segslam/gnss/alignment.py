@@ -12,7 +12,7 @@ from segslam.core import geometry
 from segslam.core.trajectory import Poses
 from segslam.core.types import Points, SegslamError, Transform, Vector
 from segslam.gnss.matching import Matched, Prepared
-from segslam.gnss.statistics import Weights, correlated, fix_noise, longest_chain, robust_weights, sigmas, weight
+from segslam.gnss.statistics import Weights, correlated, fix_noise, longest_chain, robust_weights, sigmas
 from segslam.graph.closure_pairs import adjoints
 
 NUM_GUESSES = 400
@@ -128,10 +128,7 @@ def refined(matched: Matched, start: Transform, arm_m: Vector) -> Placement:
         chain = longest_chain(residual, matched.travel_m, sigma_m=fix_noise(residual))
         sigma = sigmas(residual, chain, chain & np.isfinite(residual[:, 2]))
         many = correlated(residual[chain][:, :2])
-        weights = np.column_stack(  # horizontally and vertically apart
-            [weight(np.sum(residual[:, :2] ** 2, axis=1) / sigma[0] ** 2), weight(residual[:, 2] ** 2 / sigma[2] ** 2)]
-        )
-        weights = np.where(np.isfinite(residual[:, 1:]), weights, 0.0) * chain[:, None]
+        weights = robust_weights(residual, sigma) * chain[:, None]
         precision = weights.take([0, 0, 1], axis=1) / sigma**2 / many
         prior, six = PRIOR[:6] ** -2.0, columns[:, :, :6]
         tilt = np.array([-T_enu_map[1, 2], T_enu_map[0, 2], 0.0, 0.0, 0.0, 0.0])  # heading, position: no prior value

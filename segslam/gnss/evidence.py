@@ -41,9 +41,9 @@ PRIOR_DRIFT_FACTOR = 3.0
 """Chosen: the noise of the graph is estimated on the drive, so s is within this factor at one standard deviation."""
 
 
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """The noise of drive and receiver along one axis, or two."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The noise of drive and receiver of largest likelihood, along one axis or two, and the constants with it."""
 
     drift_factor: float
     """s"""
@@ -53,6 +53,10 @@ class Noise:
     """tau"""
     white_m: float
     """w"""
+    constants: Vector
+    """(c,) the most likely constants, as differences to those with which the residuals were computed."""
+    constant_sigma: Vector
+    """(c,) their standard deviations."""
 
     def effective_sigma_m(self, interval_s: float) -> float:
         """Standard deviation of fixes every `interval_s`, if they are treated as independent, relative to the graph.
@@ -62,17 +66,6 @@ class Noise:
         """
         many = max(1.0, 2.0 * self.time_constant_s / max(interval_s, 1e-3))
         return math.sqrt(many * self.sigma_m**2 + self.white_m**2) / self.drift_factor
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
-    """The noise of largest likelihood, and the constants with it."""
-
-    noise: Noise
-    constants: Vector
-    """(c,) the most likely constants, as differences to those with which the residuals were computed."""
-    sigma: Vector
-    """(c,) their standard deviations."""
 
 
 def estimated(
@@ -106,10 +99,11 @@ def estimated(
                 density = -0.5 * r @ cho_solve(tried, r, check_finite=False) - np.log(np.diag(tried[0])).sum()
                 if prior_s + density > best:
                     best, factor = prior_s + density, tried
-                    noise = Noise(float(s), float(q), float(tau), white_m)
+                    likely = float(s), float(q), float(tau)
     gain = (prior**2)[:, None] * A.T
     covariance = np.diag(prior**2) - gain @ cho_solve(factor, gain.T)
-    return Estimate(noise, gain @ cho_solve(factor, r), np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Estimate(*likely, white_m, gain @ cho_solve(factor, r), sigma)
 
 
 def _covariance(graph: PositionedGraph, placement: Placement, chosen: Indices, axes: Sequence[int]) -> np.ndarray:

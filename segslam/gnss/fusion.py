@@ -15,9 +15,9 @@ import numpy as np
 from segslam.core.trajectory import Poses, travelled_m
 from segslam.core.types import Mask, Points, SegslamError, Vector
 from segslam.gnss.alignment import Placement, antennas, moved, refined
-from segslam.gnss.evidence import Estimate, Noise, estimated
+from segslam.gnss.evidence import Estimate, estimated
 from segslam.gnss.matching import Prepared
-from segslam.gnss.statistics import KEPT_WEIGHT, Weights, axis_sigma, horizontal_sigma, robust_weights, sigmas
+from segslam.gnss.statistics import KEPT_WEIGHT, Weights, axis_sigma, robust_weights, sigmas
 from segslam.graph.position_fixes import PositionedGraph
 
 NUM_WINDOWS = 6
@@ -56,8 +56,8 @@ def calibrate(
         found = estimated(graph, placement, axis=0, free=(clock_free, arm_free))
         clock, arm = found.constants[6], found.constants[7:9]
         total_s, total_m = abs(measured_s + clock), np.abs(arm_m[:2] + arm)
-        clock_free = clock_free and bool(total_s > SIGNIFICANT * found.sigma[6])
-        arm_free = arm_free and bool((total_m > SIGNIFICANT * found.sigma[7:9]).any())
+        clock_free = clock_free and bool(total_s > SIGNIFICANT * found.constant_sigma[6])
+        arm_free = arm_free and bool((total_m > SIGNIFICANT * found.constant_sigma[7:9]).any())
         measured_s = measured_s + float(clock) if clock_free else 0.0
         arm_m = arm_m + np.array([*arm, 0.0]) if arm_free else np.zeros(3)
         start = moved(placement.T_enu_map, found.constants[:6])
@@ -66,7 +66,7 @@ def calibrate(
 
 
 def fuse(
-    graph: PositionedGraph, placement: Placement, level: Noise
+    graph: PositionedGraph, placement: Placement, level: Estimate
 ) -> tuple[Poses, Weights, Vector, tuple[bool, bool]]:
     """Bend the placed drive by its fixes as far as they are better than it; `level`: the horizontal noise.
 
@@ -77,7 +77,7 @@ def fuse(
     interval_s = float(np.median(np.diff(placement.matched.time_s)))
     noises = [level]
     if np.sum(placement.weights[:, 1] >= KEPT_WEIGHT) >= NUM_WINDOWS:
-        noises.append(estimated(graph, placement, axis=1).noise)
+        noises.append(estimated(graph, placement, axis=1))
     sigma = np.full(3, RIGID_M)  # with which the fixes act
     for axis, noise in enumerate(noises if len(placement.matched) >= LEAST_FUSED else []):
         is_of_axis = np.array([axis == 0, axis == 0, axis == 1])
@@ -100,7 +100,7 @@ def _best(graph: PositionedGraph, placement: Placement, candidates: Sequence[Vec
     reference = placement.residual(placement.T_enu_keyframe)
     windows = _windows(placement, placement.weights[:, axis] >= KEPT_WEIGHT)
     known = reference[np.isfinite(_along(reference, axis))]
-    scale = axis_sigma(known[:, 2]) if axis else horizontal_sigma(known)
+    scale = axis_sigma(known[:, 2] if axis else known)
     costs = np.array([_held_out(graph, placement, one, windows, axis, scale) for one in candidates])
     means = costs.mean(axis=1)
     more = costs - costs[means.argmin()]

@@ -86,7 +86,7 @@ def georeference(
     sigma_m, is_bent = placement.sigma_m, (False, False)
     weights = robust_weights(placement.residual(T_enu_keyframe), sigma_m, matched.time_s)
     if use is Use.FUSE:
-        T_enu_keyframe, weights, sigma_m, is_bent = fuse(graph, placement, level.noise)
+        T_enu_keyframe, weights, sigma_m, is_bent = fuse(graph, placement, level)
     residual = np.full((len(fixes), 3), np.nan)
     residual[matched.rows] = placement.residual(T_enu_keyframe)
     all_weights = np.zeros((len(fixes), 2))
@@ -100,13 +100,13 @@ def georeference(
         origin=prepared.origin,
         T_enu_map=placement.T_enu_map,
         T_enu_keyframe=T_enu_keyframe,
-        heading_sigma_deg=float(np.degrees(level.sigma[2])),
-        position_sigma_m=np.array([*level.sigma[3:5], up_sigma_m]),
+        heading_sigma_deg=float(np.degrees(level.constant_sigma[2])),
+        position_sigma_m=np.array([*level.constant_sigma[3:5], up_sigma_m]),
         fix_sigma_m=sigma_m,
         arm_m=placement.arm_m,
-        arm_sigma_m=level.sigma[7:9],
+        arm_sigma_m=level.constant_sigma[7:9],
         measured_offset_s=measured_offset_s,
-        offset_sigma_s=float(level.sigma[6]),
+        offset_sigma_s=float(level.constant_sigma[6]),
         is_bent=is_bent,
         reasons=tuple(reason or other for reason, other in zip(fixes.reasons, against.tolist(), strict=True)),
         measured_enu_m=prepared.enu_m,

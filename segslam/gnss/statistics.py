@@ -31,34 +31,23 @@ BOUND = 3.5
 """Chosen: two fixes are consistent within this many standard deviations of their difference."""
 
 
-def horizontal_sigma(residual_m: np.ndarray) -> float:
-    """Robust standard deviation of one axis, from the median length of horizontal residuals (n, 2)."""
-    return max(float(np.median(np.hypot(*residual_m[:, :2].T))) / MEDIAN_OF_NORM2, LEAST_SIGMA_M)
-
-
-def axis_sigma(residual_m: Vector) -> float:
-    """Robust standard deviation of residuals (n,) of one axis, about zero."""
-    return max(float(np.median(np.abs(residual_m))) / MEDIAN_OF_ABS, LEAST_SIGMA_M)
+def axis_sigma(residual_m: np.ndarray) -> float:
+    """Robust standard deviation of one axis about zero, from residuals (n,) of it, or (n, 2 or 3) horizontally."""
+    is_one = residual_m.ndim == 1
+    median = np.median(np.abs(residual_m) if is_one else np.hypot(*residual_m[:, :2].T))
+    return max(float(median) / (MEDIAN_OF_ABS if is_one else MEDIAN_OF_NORM2), LEAST_SIGMA_M)
 
 
 def sigmas(residual: Points, used: Mask, used_up: Mask) -> Vector:
     """(3,) robust standard deviations east, north and up of the used residuals; infinite up if none is used there."""
-    level = horizontal_sigma(residual[used] if used.any() else residual)
+    level = axis_sigma(residual[used] if used.any() else residual)
     return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
 
 
 def fix_noise(residual_m: np.ndarray) -> float:
     """Standard deviation of one axis from fix to fix, from changes of residuals: (n,), or (n, 2 or 3) horizontally."""
     changes = np.diff(residual_m, axis=0)
-    if not len(changes):
-        return LEAST_NOISE_M
-    sigma = axis_sigma(changes) if changes.ndim == 1 else horizontal_sigma(changes)
-    return max(sigma / np.sqrt(2.0), LEAST_NOISE_M)
-
-
-def weight(squared: Vector) -> Vector:
-    """Weight of residuals by Geman and McClure's kernel, for squared normalised residuals: 1 at 0, 1/4 at 9."""
-    return (9.0 / (9.0 + squared)) ** 2
+    return max(axis_sigma(changes) / np.sqrt(2.0), LEAST_NOISE_M) if len(changes) else LEAST_NOISE_M
 
 
 def correlated(residuals: np.ndarray) -> float:
@@ -84,12 +73,15 @@ def correlated(residuals: np.ndarray) -> float:
     return float(np.clip(total, 1.0, n / 4))
 
 
-def robust_weights(residual: Points, sigma: Vector, time_s: Vector) -> Weights:
-    """(n, 2) weights horizontally and vertically; a fix in a run of wrong ones has the weight of the run."""
-    level = np.hypot(*residual[:, :2].T) / sigma[0]
-    up = np.abs(residual[:, 2]) / sigma[2]
-    level, up = (np.maximum(values, _median_near(values, time_s)) for values in (level, up))
-    return np.column_stack([weight(level**2), np.where(np.isfinite(up), weight(np.nan_to_num(up) ** 2), 0.0)])
+def robust_weights(residual: Points, sigma: Vector, time_s: Vector | None = None) -> Weights:
+    """(n, 2) weights horizontally and vertically by Geman and McClure's kernel: 1 at 0, 1/4 at 3 sigma.
+
+    With `time_s` a fix in a run of wrong ones has the weight of the run. Unknown heights have the weight 0.
+    """
+    normal = np.column_stack([np.hypot(*residual[:, :2].T), np.abs(residual[:, 2])]) / sigma[[0, 2]]
+    if time_s is not None:
+        normal = np.column_stack([np.maximum(values, _median_near(values, time_s)) for values in normal.T])
+    return np.nan_to_num((9.0 / (9.0 + normal**2)) ** 2)
 
 
 def _median_near(values: Vector, time_s: Vector) -> Vector:

@@ -80,20 +80,16 @@ def _stamp(file: Path, number: int, first: str, second: str, *, clock: str) -> i
             moment = GPS_EPOCH + timedelta(weeks=week, seconds=int(seconds))
             return stamp_of(_utc(moment, clock)) + round((seconds - int(seconds)) * 1e9)
         form = "%Y/%m/%d %H:%M:%S.%f" if "." in second else "%Y/%m/%d %H:%M:%S"
-        moment = datetime.strptime(f"{first} {second}", form).replace(tzinfo=UTC)
-        return stamp_of(_utc(moment, clock))
+        return stamp_of(_utc(datetime.strptime(f"{first} {second}", form).replace(tzinfo=UTC), clock))
     except (ValueError, OverflowError) as error:
         what = f"time {first[:20]} {second[:20]} is neither week and seconds nor a date"
         raise bad_line(file, number, what) from error
 
 
 def _utc(moment: datetime, clock: str) -> datetime:
-    """The moment in UTC of one by the clock of a header."""
-    return moment - AHEAD_OF_UTC[clock] if clock in AHEAD_OF_UTC else _utc_of_gps(moment)
-
-
-def _utc_of_gps(moment: datetime) -> datetime:
-    """The moment in UTC of one in GPS time, which has no leap seconds: 18 s earlier since 2017."""
+    """The moment in UTC of one by the clock of a header; GPS time has no leap seconds: UTC is 18 s less since 2017."""
+    if clock in AHEAD_OF_UTC:
+        return moment - AHEAD_OF_UTC[clock]
     leaps = bisect_right(LEAPS, moment)
     utc = moment - timedelta(seconds=leaps)
     return utc if bisect_right(LEAPS, utc) == leaps else utc + timedelta(seconds=1)

@@ -53,12 +53,12 @@ class Chains:
         """(k, 6, 6) covariance of the pose of one keyframe in each of others, as a tangent of `source_id`."""
         length, summed = self._odometry(source_id, ids)
         if len(self._ends):
-            starts = [self._ends[row] for row in sorted({int(row[0]) for row in self._beside(np.array([source_id]))})]
+            starts = sorted({int(row[0]) for row in self._beside(np.array([source_id]))})
             for row in self._beside(ids):
                 along, between = self._odometry(self._ends[row], ids)
                 for start in starts:
-                    way, own = self._odometry(source_id, np.array([start]))
-                    lengths, covariances = self._from(int(start))
+                    way, own = self._odometry(source_id, self._ends[[start]])
+                    lengths, covariances = self._from(start)
                     total = way + lengths[row] + along
                     shorter = total < length
                     length = np.where(shorter, total, length)
@@ -90,20 +90,19 @@ class Chains:
                     links[first, last] = length, covariance
         return links
 
-    def _from(self, end: int) -> tuple[Vector, Matrices]:
-        """Lengths and covariances from one end to all ends, cached: successive keyframes mostly start at the same."""
-        if end not in self._found:
+    def _from(self, start: int) -> tuple[Vector, Matrices]:
+        """Lengths and covariances from one row of ends to all; cached: most keyframes in a row start at the same."""
+        if start not in self._found:
             num = len(self._ends)
             pairs = np.array(list(self._links), dtype=np.int64).reshape(-1, 2)
             graph = coo_array(([length for length, _ in self._links.values()], tuple(pairs.T)), shape=(num, num))
-            start = int(np.searchsorted(self._ends, end))
             lengths, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
             covariances = np.zeros((num, 6, 6))
             for row in np.argsort(lengths, kind="stable")[1:].tolist():
                 previous = int(before[row])
                 covariances[row] = covariances[previous] + self._links[min(row, previous), max(row, previous)][1]
-            self._found[end] = lengths, covariances
-        return self._found[end]
+            self._found[start] = lengths, covariances
+        return self._found[start]
 
 
 def _length(edge: Edge) -> float:

@@ -22,6 +22,7 @@ from segslam.graph.edges import (
     joined,
     kernel_weights,
     poses_by_id,
+    rotated,
     squared_errors,
     values_of,
 )
@@ -92,12 +93,7 @@ def without_shared_rotation(odometry: Sequence[Edge], measured: Sequence[Edge], 
             turn = geometry.log(geometry.inverse(reduce(np.matmul, [one.T_a_b for one in between])) @ edge.T_a_b)[:3]
             rates.append(turn / length_m)
     rate = np.median(rates, axis=0) if rates else np.zeros(3)
-
-    def turned(edge: Edge) -> Edge:
-        turn = np.concatenate([rate * geometry.distance(edge.T_a_b), np.zeros(3)])
-        return replace(edge, T_a_b=edge.T_a_b @ geometry.exp(turn))
-
-    return [edge if is_break(edge) else turned(edge) for edge in odometry]
+    return rotated(odometry, [(edge.a in motions) * geometry.distance(edge.T_a_b) * rate for edge in odometry])
 
 
 def weighted_edges(

@@ -7,7 +7,7 @@ body to satisfy one closure.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, compress
 from typing import Any
 
@@ -101,6 +101,14 @@ def chained(odometry: Sequence[Edge]) -> Transforms:
     return np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
 
 
+def rotated(odometry: Sequence[Edge], turns: Iterable[Vector]) -> list[Edge]:
+    """The motions, each followed by a rotation: (n, 3) rotation vectors (rad)."""
+    return [
+        replace(edge, T_a_b=edge.T_a_b @ geometry.exp(geometry.tangent(rotation_rad=turn, translation_m=0.0)))
+        for edge, turn in zip(odometry, turns, strict=True)
+    ]
+
+
 def segments(odometry: Sequence[Edge]) -> Indices:
     """(n,) the segment of each keyframe, counted from 0; a break separates two segments."""
     return np.cumsum([False, *(is_break(edge) for edge in odometry)])
@@ -134,7 +142,7 @@ def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Transf
     while len(placed) <= segment[-1]:
         step = next((edge for edge in joining if (segment[edge.a] in placed) != (segment[edge.b] in placed)), None)
         if step is None:
-            first = next(number for number in range(1, segment[-1] + 1) if number not in placed)
+            first = min({*range(segment[-1] + 1)} - placed)
             row = int(np.argmax(segment == first))
             step = Edge(row - 1, row, geometry.inverse(T_world[row - 1]) @ T_world[row], odometry[row - 1].information)
         if segment[step.a] in placed:

@@ -42,12 +42,13 @@ from segslam.graph.edges import (
     largest_variances,
     poses_by_id,
     relinked,
+    rotated,
     values_of,
 )
 from segslam.graph.g2o import G2oGraph, write_g2o
 from segslam.graph.levenberg_marquardt import Search, Unsolvable, search
 from segslam.graph.motions import Drive, solve_final, without
-from segslam.graph.steady_drift import noise_factor, steady_drift, turned
+from segslam.graph.steady_drift import noise_factor, steady_drift
 
 logger = logging.getLogger(__name__)
 
@@ -294,7 +295,7 @@ class PoseGraph:
         if found is None:
             self.use_odometry_noise(raised.odometry_sigma_m, raised.odometry_sigma_deg)
             return False
-        self._odometry = turned(self._odometry, growth, found.rates)
+        self._odometry = rotated(self._odometry, found.turns)
         self._multiply_noise(found.noise_factor)
         self._take(found.values, self._weights)
         return True

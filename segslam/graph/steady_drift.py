@@ -10,7 +10,6 @@ them adds errors of metres to a drive whose heading alone drifts.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import gtsam
@@ -18,11 +17,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.sparse.linalg import splu
 
-from segslam.core import geometry
-from segslam.core.types import Vector
+from segslam.core.types import Points, Vector
 from segslam.graph import noise
 from segslam.graph.closure_pairs import pairwise_chi2
-from segslam.graph.edges import Edge, factor_graph, is_break, jacobian, joined
+from segslam.graph.edges import Edge, factor_graph, is_break, jacobian, joined, rotated
 from segslam.graph.levenberg_marquardt import search
 
 MUCH_LESS = 0.5
@@ -52,8 +50,8 @@ def noise_factor(odometry: Sequence[Edge], certain: Edge) -> float:
 class SteadyDrift(NamedTuple):
     """A steady drift of the heading, and what is left of the drift without it."""
 
-    rates: Vector
-    """(2,) heading missing in the motions: rad per metre and rad per second."""
+    turns: Points
+    """(n, 3) rotation missing after each motion (rad), about its z axis."""
     noise_factor: float
     """Factor by which the usual noise is too small for the corrected motions, at least 1."""
     values: gtsam.Values
@@ -85,26 +83,18 @@ def steady_drift(
     for model in ([0], [1], [0, 1]):  # rates by travel, by time, by both
         if not growth[:, model].any(axis=0).all():
             continue
-        rates, corrected, at = np.zeros(growth.shape[1]), list(odometry), values
+        turns, corrected, at = np.zeros((len(odometry), 3)), list(odometry), values
         for _ in range(3):  # linear estimates, each from the one before
-            rates[model] += _rates(prior, corrected, closures, growth[:, model], at)
-            corrected = turned(odometry, growth, rates)
+            turns[:, 2] += growth[:, model] @ _rates(prior, corrected, closures, growth[:, model], at)
+            corrected = rotated(odometry, turns)
             found = search(joined(prior, factor_graph(corrected), factor_graph(closures)), at)
             at = found.values
-        trials.append((found.error + RATE_COST * len(model), rates, corrected, at))
+        trials.append((found.error + RATE_COST * len(model), turns, corrected, at))
     if not trials:
         return None
-    _, rates, corrected, at = min(trials, key=lambda trial: trial[0])
+    _, turns, corrected, at = min(trials, key=lambda trial: trial[0])
     factor = _mean_noise_factor(corrected, measured)
-    return SteadyDrift(rates, factor, at) if factor <= MUCH_LESS * before else None
-
-
-def turned(odometry: Sequence[Edge], growth: Growth, rates: Vector) -> list[Edge]:
-    """Odometry corrected by a steady drift of the heading; `rates` as in `SteadyDrift`."""
-    return [
-        replace(edge, T_a_b=edge.T_a_b @ geometry.transform(geometry.yaw(float(angle)), np.zeros(3)))
-        for edge, angle in zip(odometry, growth @ rates, strict=True)
-    ]
+    return SteadyDrift(turns, factor, at) if factor <= MUCH_LESS * before else None
 
 
 def _mean_noise_factor(odometry: Sequence[Edge], measured: Sequence[Edge]) -> float:

@@ -87,7 +87,8 @@ def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: boo
             stamps.append(nanoseconds(fields[0]) if chosen == "tum" else 0)
         except ValueError as error:
             raise SegslamError(f"{path}:{line}: {error}; correct or remove the line") from error
-    poses, off = (_from_matrices if chosen == "kitti" else _from_quaternions)(np.array(numbers))
+    rows = np.array(numbers)
+    poses, off = _from_matrices(rows) if chosen == "kitti" else from_quaternions(rows[:, 1:])
     worst = int(np.argmax(off))
     if off[worst] > ROTATION_TOLERANCE:
         what = "3x3 part" if chosen == "kitti" else "quaternion"
@@ -245,10 +246,10 @@ def _from_matrices(rows: np.ndarray) -> tuple[Poses, Vector]:
     return poses, np.abs(matrices[:, :, :3] - poses[:, :3, :3]).max(axis=(1, 2))
 
 
-def _from_quaternions(rows: np.ndarray) -> tuple[Poses, Vector]:
-    """The poses, and the difference of each quaternion's length from 1."""
-    norms, poses = np.linalg.norm(rows[:, 4:], axis=1), np.tile(np.eye(4), (len(rows), 1, 1))
-    quaternions = np.where(norms[:, None] > 0, rows[:, 4:], [0.0, 0.0, 0.0, 1.0])  # zeros are then rejected
+def from_quaternions(rows: np.ndarray) -> tuple[Poses, Vector]:
+    """The poses of rows (n, 7) x y z qx qy qz qw, and the difference of each quaternion's length from 1."""
+    norms, poses = np.linalg.norm(rows[:, 3:], axis=1), np.tile(np.eye(4), (len(rows), 1, 1))
+    quaternions = np.where(norms[:, None] > 0, rows[:, 3:], [0.0, 0.0, 0.0, 1.0])  # zeros are then rejected
     poses[:, :3, :3] = ScipyRotation.from_quat(quaternions).as_matrix()
-    poses[:, :3, 3] = rows[:, 1:4]
+    poses[:, :3, 3] = rows[:, :3]
     return poses, np.abs(norms - 1.0)

@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.errors import brief, unreadable
+from segslam.core.trajectory import ROTATION_TOLERANCE, from_quaternions
 from segslam.core.types import Indices, SegslamError, Transform
 from segslam.graph.edges import Edge, Transforms
 
@@ -26,7 +27,6 @@ NUM_FIELDS = {VERTEX: 8, EDGE: 30, FIX: 1}
 UPPER = np.triu_indices(6)
 OTHER_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 """Turns [translation; rotation] into [rotation; translation], and back."""
-QUATERNION_TOLERANCE = 0.01  # chosen: above the rounding of any writer met, far below any other four numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,13 +138,9 @@ def _complaint(tag: str, num_fields: int) -> str:
 
 def _poses(table: _Table) -> Transforms:
     """Those of the first seven numbers of each row."""
-    numbers = np.array([row[:7] for row in table.numbers]).reshape(-1, 7)
-    off = np.abs(np.linalg.norm(numbers[:, 3:], axis=1) - 1.0)
-    for row in np.flatnonzero(off > QUATERNION_TOLERANCE):
+    poses, off = from_quaternions(np.array([row[:7] for row in table.numbers]).reshape(-1, 7))
+    for row in np.flatnonzero(off > ROTATION_TOLERANCE):
         raise table.refusal(row, f"the quaternion's length is off by {off[row]:.3g}")
-    poses = np.tile(np.eye(4), (len(off), 1, 1))
-    poses[:, :3, :3] = ScipyRotation.from_quat(numbers[:, 3:]).as_matrix()
-    poses[:, :3, 3] = numbers[:, :3]
     return poses
 
 

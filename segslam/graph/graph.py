@@ -289,9 +289,10 @@ class PoseGraph:
         growth[np.array([self._has_own_information, self._rejected], dtype=bool).any(axis=0)] = 0.0
         raised = self._config
         self.use_odometry_noise(0.0, 0.0)
-        found = steady_drift(
-            self._prior, self._kept_odometry(), self._kept(), growth, self._values, tolerated=raised.error_allowance
-        )
+        found, odometry = None, self._kept_odometry()
+        with suppress(Unsolvable):
+            tolerated = raised.error_allowance
+            found = steady_drift(self._prior, odometry, self._kept(), growth, self._values, tolerated=tolerated)
         if found is None:
             self.use_odometry_noise(raised.odometry_sigma_m, raised.odometry_sigma_deg)
             return False

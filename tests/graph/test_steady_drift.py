@@ -6,8 +6,9 @@ from graph.test_pose_graph import closure, noise_of, travel_m
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
-from segslam.graph import PoseGraph
+from segslam.graph import PoseGraph, steady_drift
 from segslam.graph import graph as graph_module
+from segslam.graph.levenberg_marquardt import Unsolvable
 
 SIDES = ((70, 90.0), (70, 135.0), (100, 135.0))
 """Keyframes on each side of a triangular block, and the turn that follows (degrees). A round of a symmetric block does
@@ -75,3 +76,14 @@ def test_a_random_drift_is_not_taken_for_a_steady_one(monkeypatch: pytest.Monkey
     monkeypatch.setattr(graph_module, "steady_drift", lambda *about, tolerated: None)
     _, without, _ = mapped_ate_m(0.0, 0.0, walk=0.002)
     assert with_it == without
+
+
+def test_a_correction_that_cannot_be_computed_leaves_the_solution_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise Unsolvable("x")
+
+    monkeypatch.setattr(steady_drift, "search", fails)
+    _, found, _ = mapped_ate_m(8e-4, 0.0)
+    monkeypatch.setattr(graph_module, "steady_drift", lambda *about, tolerated: None)
+    _, without, _ = mapped_ate_m(8e-4, 0.0)
+    assert found == without

@@ -232,16 +232,24 @@ class PoseGraph:
         if factor > 1.0:
             self._multiply_noise(factor)
 
-    def optimize(self) -> GraphEstimate:
-        """Optimise under the robust kernel from the last estimate, with a coarse tolerance."""
-        return self._optimize(RUNNING_TOLERANCE)
+    def optimize(self, *, tolerance: float = RUNNING_TOLERANCE) -> GraphEstimate:
+        """Optimise under the robust kernel from the last estimate, to this relative tolerance of the error."""
+        factors = joined(self._backbone, factor_graph(self._closures, kernel=self._kernel))
+        start = self._linked()
+        try:
+            found = search(factors, start, tolerance=tolerance)
+        except Unsolvable as error:
+            logger.warning("the poses remain as they were before the last loops: %s", error)
+            found = Search(start, factors.error(start), 0, converged=False)
+        self._take(found.values, kernel_weights(self._closures, found.values, self._kernel))
+        return self._estimate(found.error)
 
     def finish(self) -> GraphEstimate:
         """Final optimisation, in which each closure is kept or rejected (unless `final` is `none`).
 
         `consistent` also rejects motions of the odometry that closures of more than one place contradict.
         """
-        robust = self._optimize()
+        robust = self.optimize(tolerance=1e-5)
         if self._config.final == "none":
             return robust
         try:
@@ -335,17 +343,6 @@ class PoseGraph:
     def _rebuild_backbone(self) -> None:
         self._backbone = joined(self._prior, factor_graph(self._kept_odometry()))
         self._chains = None
-
-    def _optimize(self, tolerance: float = 1e-5) -> GraphEstimate:
-        factors = joined(self._backbone, factor_graph(self._closures, kernel=self._kernel))
-        start = self._linked()
-        try:
-            found = search(factors, start, tolerance=tolerance)
-        except Unsolvable as error:
-            logger.warning("the poses remain as they were before the last loops: %s", error)
-            found = Search(start, factors.error(start), 0, converged=False)
-        self._take(found.values, kernel_weights(self._closures, found.values, self._kernel))
-        return self._estimate(found.error)
 
     def _linked(self) -> gtsam.Values:
         """The last estimate, with segments between breaks moved to satisfy consistent closures."""

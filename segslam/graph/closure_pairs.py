@@ -54,8 +54,8 @@ def largest_consistent(consistent: Pairs, among: Mask | None = None) -> Mask:
     rows = np.arange(len(consistent)) if among is None else np.flatnonzero(among)
     chosen = np.zeros(len(consistent), dtype=bool)
     if len(rows):
-        found = maximum_cliques(pack_rows(consistent[np.ix_(rows, rows)]), max_cliques=1, max_nodes=MOST_NODES)
-        chosen[rows[found.cliques[0]]] = True
+        (clique,) = maximum_cliques(pack_rows(consistent[np.ix_(rows, rows)]), max_cliques=1, max_nodes=MOST_NODES)
+        chosen[rows[clique]] = True
     return chosen
 
 

@@ -8,8 +8,6 @@ bit-parallel algorithm for the maximum clique problem", C&OR 2011).
 Graphs are adjacency matrices as bits, which consistency graphs share.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, UInt64
 
@@ -65,61 +63,24 @@ def members(row, out):
     return count
 
 
-@kernel("int64[:, ::1](uint64[:, ::1])")
-def pairs(adjacency):
-    """(n, 2) adjacent vertices i < j, in ascending order."""
-    count = len(adjacency)
-    degrees = np.int64(0)
-    for i in range(count):
-        for w in range(adjacency.shape[1]):
-            degrees += np.int64(count_bits(adjacency[i, w]))
-    found = np.empty((degrees // 2, 2), np.int64)
-    neighbours = np.empty(count, np.int64)
-    row = 0
-    for i in range(count):
-        for k in range(members(adjacency[i], neighbours)):
-            if neighbours[k] > i:
-                found[row, 0], found[row, 1] = i, neighbours[k]
-                row += 1
-    return found
-
-
-@kernel("void(uint64[:, ::1], int64[:, ::1])")
-def part(adjacency, parted):
-    """Removes the edges between the two vertices of each row."""
-    for row in range(len(parted)):
-        i, j = parted[row]
-        adjacency[i, j >> 6] &= ~(np.uint64(1) << np.uint64(j & 63))
-        adjacency[j, i >> 6] &= ~(np.uint64(1) << np.uint64(i & 63))
-
-
 _FLOOR, _SIZE, _FOUND, _NODES = range(4)  # in `state`: size to exceed, size and number of found cliques, visited nodes
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CliqueSearch:
-    """The largest cliques found, all of one size, each with its vertices in ascending order."""
-
-    cliques: tuple[Indices, ...]
-    proved: bool
-    """True if no larger clique exists; False if the search stopped at its limit of nodes."""
-
-
-def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> CliqueSearch:
-    """Up to `max_cliques` cliques of the maximum size.
+def maximum_cliques(adjacency: Bits, *, max_cliques: int, max_nodes: int) -> tuple[Indices, ...]:
+    """Up to `max_cliques` cliques of the maximum size, each with its vertices in ascending order.
 
     If fewer are returned, they are all that exist, so the set does not depend on the numbering of the vertices; the
     order is deterministic. `max_nodes` limits the search for the size, and separately the listing; at least one clique
-    is returned if either stops.
+    is returned if either stops; a larger one may exist if the first does.
     """
     if len(adjacency) == 0:
-        return CliqueSearch((), True)
+        return ()
     order, core_numbers = degeneracy_order(adjacency)
     cliques, proved = _search(adjacency, order, core_numbers, 0, 1, max_nodes)
     if proved and max_cliques > 1:
         listed, _ = _search(adjacency, order, core_numbers, cliques.shape[1] - 1, max_cliques, max_nodes)
         cliques = listed if len(listed) else cliques
-    return CliqueSearch(tuple(np.sort(clique) for clique in cliques), proved)
+    return tuple(np.sort(clique) for clique in cliques)
 
 
 @kernel("UniTuple(int64[::1], 2)(uint64[:, ::1])")

@@ -5,24 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from segslam.registration.cliques import (
-    count_bits,
-    lowest_bit,
-    members,
-    pack_flags,
-    pack_rows,
-    pairs,
-    part,
-)
+from segslam.registration.cliques import count_bits, lowest_bit, members, pack_flags, pack_rows
 
 WORDS = st.integers(0, 2**64 - 1)
-
-
-def random_graph(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Adjacency as flags and as bits."""
-    upper = np.triu(np.random.default_rng(seed).random((count, count)) < 0.2, 1)
-    flags = upper | upper.T
-    return flags, pack_rows(flags)
 
 
 @given(word=WORDS)
@@ -42,18 +27,10 @@ def test_flags_are_packed_first_in_the_lowest_bit(word: int) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 200])
-def test_members_and_pairs_are_those_of_the_flags(count: int) -> None:
-    flags, adjacency = random_graph(count, count)
-    out = np.empty(count, np.int64)
+def test_members_are_those_of_the_flags(count: int) -> None:
+    upper = np.triu(np.random.default_rng(count).random((count, count)) < 0.2, 1)
+    flags = upper | upper.T
+    adjacency, out = pack_rows(flags), np.empty(count, np.int64)
     for row in range(count):
         number = members(adjacency[row], out)
         assert out[:number].tolist() == np.flatnonzero(flags[row]).tolist()
-    assert pairs(adjacency).tolist() == np.argwhere(np.triu(flags)).tolist()
-
-
-def test_parted_vertices_are_no_longer_joined_and_all_others_are() -> None:
-    flags, adjacency = random_graph(0, 100)
-    parted = np.argwhere(np.triu(flags))[::3].copy()
-    part(adjacency, parted)
-    flags[parted[:, 0], parted[:, 1]] = flags[parted[:, 1], parted[:, 0]] = False
-    assert pairs(adjacency).tolist() == np.argwhere(np.triu(flags)).tolist()

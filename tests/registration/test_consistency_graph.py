@@ -18,7 +18,10 @@ GATES = ["lengths", "invariant", "published"]
 
 
 def consistency_graph(correspondences: Correspondences, *, config: SegregatorConfig) -> tuple[np.ndarray, np.ndarray]:
-    return graph_of_length(correspondences, length_bound_m=LENGTH_BOUND_M, config=config)
+    """The adjacency, and its edges i < j in ascending order."""
+    adjacency = graph_of_length(correspondences, length_bound_m=LENGTH_BOUND_M, config=config)
+    flags = np.unpackbits(adjacency.view(np.uint8), axis=1, bitorder="little")
+    return adjacency, np.argwhere(np.triu(flags))
 
 
 def random_covariances(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -19,18 +19,12 @@ import numpy as np
 
 from segslam.core.config import SegregatorConfig
 from segslam.core.kernels import kernel
-from segslam.core.types import IndexPairs
-from segslam.registration.cliques import Bits, lowest_bit, pack_flags, pairs, part
+from segslam.registration.cliques import Bits, lowest_bit, members, pack_flags
 from segslam.registration.segregator.correspondences import Correspondences
 
 
-def consistency_graph(
-    correspondences: Correspondences, *, length_bound_m: float, config: SegregatorConfig
-) -> tuple[Bits, IndexPairs]:
-    """The graph from the length test (l-TRIM) and the gate `config.gate`, with a vertex for each correspondence.
-
-    Its adjacency, and its edges: joined pairs i < j, in ascending order.
-    """
+def consistency_graph(correspondences: Correspondences, *, length_bound_m: float, config: SegregatorConfig) -> Bits:
+    """The graph from the length test (l-TRIM) and the gate `config.gate`, with a vertex for each correspondence."""
     adjacency = _length_consistent(
         correspondences.source,
         correspondences.target,
@@ -38,13 +32,10 @@ def consistency_graph(
         correspondences.target_index,
         length_bound_m,
     )
-    joined = pairs(adjacency)
     if config.gate != "lengths":
         covariances = correspondences.source_covariances, correspondences.target_covariances
-        kept = _distances(joined, *covariances, config.gate == "invariant") <= config.shape_bound_m2
-        part(adjacency, joined[~kept])
-        joined = joined[kept]
-    return adjacency, joined
+        _part_shapes(adjacency, *covariances, config.gate == "invariant", config.shape_bound_m2)
+    return adjacency
 
 
 @kernel("uint64[:, ::1](float64[:, ::1], float64[:, ::1], int64[::1], int64[::1], float64)")
@@ -141,12 +132,16 @@ def _shape_distance(a, b):
     return a[0] + a[1] + a[2] + b[0] + b[1] + b[2] - 2.0 * (roots[0] + roots[1] + roots[2])
 
 
-@kernel("float64[::1](int64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], boolean)")
-def _distances(pairs, source_covariances, target_covariances, invariant):
-    """Distance of each pair's summed covariances in the two scans (m^2), invariant to rotation or as published."""
-    distances = np.empty(len(pairs))
-    for row in range(len(pairs)):
-        i, j = pairs[row]
-        a, b = _sum(source_covariances, i, j), _sum(target_covariances, i, j)
-        distances[row] = _spectral_distance(a, b) if invariant else _shape_distance(a, b)
-    return distances
+@kernel("void(uint64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], boolean, float64)")
+def _part_shapes(adjacency, source_covariances, target_covariances, invariant, bound):
+    """Removes the edges of pairs whose summed covariances in the two scans are not within the bound (m^2)."""
+    neighbours = np.empty(len(adjacency), np.int64)
+    for i in range(len(adjacency)):
+        for k in range(members(adjacency[i], neighbours)):
+            j = neighbours[k]
+            if j > i:
+                a, b = _sum(source_covariances, i, j), _sum(target_covariances, i, j)
+                distance = _spectral_distance(a, b) if invariant else _shape_distance(a, b)
+                if not distance <= bound:
+                    adjacency[i, j >> 6] &= ~(np.uint64(1) << np.uint64(j & 63))
+                    adjacency[j, i >> 6] &= ~(np.uint64(1) << np.uint64(i & 63))

@@ -88,13 +88,13 @@ def _attempts(
             yield Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
             continue
         for bound_m in config.noise_bounds_m:
-            adjacency, edges = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
-            search = maximum_cliques(adjacency, max_cliques=config.max_cliques, max_nodes=CLIQUE_MAX_NODES)
-            size = len(search.cliques[0])
+            adjacency = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
+            cliques = maximum_cliques(adjacency, max_cliques=config.max_cliques, max_nodes=CLIQUE_MAX_NODES)
+            size = len(cliques[0])
             if size < config.min_clique:
                 yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} consistent correspondences")
                 continue
-            for clique in search.cliques:
+            for clique in cliques:
                 fit = _solve(source, target, correspondences, clique, bound_m, config)
                 if isinstance(fit, Rejected):
                     yield fit
@@ -105,7 +105,7 @@ def _attempts(
                     num_inliers=int(fit.inliers.sum()),
                     rms_m=fit.rms_m,
                     information=fit.information,
-                    num_edges=len(edges),
+                    num_edges=int(np.bitwise_count(adjacency).sum()) // 2,
                 )
                 yield fit.score, registration
 

@@ -27,7 +27,6 @@ MODULES = (
     "registration.segregator.consistency_graph",
     "labels.ground_surface",
     "labels.range_image",
-    "registration.segregator.clusters",
     "registration.segregator.plan",
     "registration.segregator.correspondences",
     "graph.closure_pairs",

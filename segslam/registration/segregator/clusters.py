@@ -14,11 +14,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
-from segslam.core.kernels import kernel
-from segslam.core.points import EMPTY, canonical_order, find_key, group_means, hash_keys, within_range
+from segslam.core.points import canonical_order, group_means, within_range
 from segslam.core.types import Covariances, Indices, Label, Labels, Points, Vector
 
 DCVC_START_RADIUS_M = 0.35
@@ -85,8 +86,7 @@ def curved_voxel_clusters(points: Points, *, pitch_deg: float) -> Indices:
     azimuth = _nearest_bin(turn, math.tau / num_azimuth) % num_azimuth
     num_radial = int(radial.max()) + 2  # one more than occupied: neighbours of the outermost bin have keys of their own
     keys, voxel = np.unique((pitch * num_radial + radial) * num_azimuth + azimuth, return_inverse=True)
-    _, component = np.unique(_first_connected(keys, num_radial, num_azimuth), return_inverse=True)
-    return component[voxel]
+    return _components(keys, num_radial, num_azimuth)[voxel]
 
 
 def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, Covariances]:
@@ -113,33 +113,15 @@ def _nearest_bin(values: Vector, width: float) -> Indices:
     return np.floor(values / width + 0.5).astype(np.int64)
 
 
-@kernel("int64(int64[:], int64)")
-def _root(parent, node):
-    while parent[node] != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
-    return node
+def _components(keys: Indices, num_radial: int, num_azimuth: int) -> Indices:
+    """The connected component of each voxel, numbered from 0; azimuth wraps.
 
-
-@kernel("int64[:](int64[:], int64, int64)")
-def _first_connected(keys, num_radial, num_azimuth):
-    """The first voxel of the connected component of each voxel.
-
-    Keys are distinct: (pitch * num_radial + radial) * num_azimuth + azimuth. Azimuth wraps.
+    Keys are distinct and ascending: (pitch * num_radial + radial) * num_azimuth + azimuth.
     """
-    table, _ = hash_keys(keys)
-    parent = np.arange(len(keys))
-    for voxel in range(len(keys)):
-        row, azimuth = keys[voxel] // num_azimuth, keys[voxel] % num_azimuth
-        for pitch_step in range(0, 2):
-            for radial_step in range(-1, 2):
-                for azimuth_step in range(-1, 2):
-                    neighbour_row = row + pitch_step * num_radial + radial_step
-                    neighbour_azimuth = (azimuth + azimuth_step) % num_azimuth
-                    neighbour = find_key(table, keys, neighbour_row * num_azimuth + neighbour_azimuth)
-                    if neighbour != EMPTY:
-                        a, b = _root(parent, voxel), _root(parent, neighbour)
-                        parent[max(a, b)] = min(a, b)
-    for voxel in range(len(keys)):
-        parent[voxel] = _root(parent, voxel)
-    return parent
+    row, azimuth = np.divmod(keys, num_azimuth)
+    pitch, radial, turn = np.indices((2, 3, 3)).reshape(3, -1, 1)
+    beside = (row + pitch * num_radial + radial - 1) * num_azimuth + (azimuth + turn - 1) % num_azimuth
+    at = np.minimum(np.searchsorted(keys, beside), len(keys) - 1)
+    touching = keys[at] == beside
+    ends = np.nonzero(touching)[1], at[touching]
+    return connected_components(coo_array((np.ones(len(ends[0])), ends), (len(keys),) * 2), directed=False)[1]

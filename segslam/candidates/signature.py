@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from scipy.fft import rfft2
 from scipy.ndimage import map_coordinates
 
-from segslam.core.points import hash_keys, voxel_first
+from segslam.core.points import first_rows, voxel_first
 from segslam.core.types import Label, Labels, Points, Record, SegslamError
 from segslam.labels.geometric import MAX_RANGE_M
 from segslam.labels.ground_surface import GROUND_CELL_M, heights_above_ground, rotated, upright
@@ -113,7 +113,7 @@ def _image(points: Points) -> Float[np.ndarray, "size size"]:
     cells = cells[(np.abs(cells[:, :2]) <= HALF).all(axis=1)]
     width = 2 * HALF + 1
     voxels = ((cells[:, 0] + HALF) * width + cells[:, 1] + HALF) * 2**16 + cells[:, 2] + 2**15
-    occupied = voxels[hash_keys(voxels)[1] == np.arange(len(voxels))]
+    occupied = voxels[first_rows(voxels) == np.arange(len(voxels))]
     counts = np.bincount(occupied >> 16, minlength=width * width).reshape(width, width)
     return (np.sqrt(np.minimum(counts, MAX_LEVELS)) * _window()).astype(np.float32)
 

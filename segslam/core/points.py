@@ -8,8 +8,6 @@ import numpy as np
 from segslam.core.kernels import kernel
 from segslam.core.types import Covariances, Indices, Points
 
-EMPTY = -1
-"""Value of an empty slot of a hash table, and row of a key that is not in the table."""
 MAX_CELLS = 2**62
 """Largest number of voxels that int64 keys can number."""
 
@@ -55,7 +53,7 @@ def voxel_first(points: Points, voxel_m: float) -> Indices:
     """
     rows = np.flatnonzero(is_finite(points))
     keys, _ = cell_keys(points.take(rows, axis=0), voxel_m)
-    return rows[hash_keys(keys)[1] == np.arange(len(keys))]
+    return rows[first_rows(keys) == np.arange(len(keys))]
 
 
 def voxel_means(points: Points, voxel_m: float, *, beyond_m: float = -1.0, within_m: float = math.inf) -> Points:
@@ -152,7 +150,7 @@ def _voxel_means(points, beyond_squared, within_squared, voxel_m, lows, extent):
             keys[count] = (i * extent[1] + j) * extent[2] + int(np.floor(z / voxel_m)) - lows[2]
             rows[count] = k
             count += 1
-    _, first = hash_keys(keys[:count])
+    first = first_rows(keys[:count])
     sums = np.zeros((count, 4))
     for k in range(count):
         group, point = sums[first[k]], points[rows[k]]
@@ -165,39 +163,22 @@ def _voxel_means(points, beyond_squared, within_squared, voxel_m, lows, extent):
     return sums[order, :3] / sums[order, 3:]
 
 
-@kernel("int64(int64, int64)")
-def _home(key, size):
-    return (key * 0x9E3779B97F4A7C1 >> 20) & (size - 1)
-
-
-@kernel("Tuple((int64[:], int64[:]))(int64[:])")
-def hash_keys(keys):
-    """An open-addressing table for `find_key`, and for each row the first row with the same key.
-
-    A slot of the table contains the first row of its key, or EMPTY.
-    """
+@kernel("int64[:](int64[:])")
+def first_rows(keys):
+    """For each row the first row with the same key, by a hash table with open addressing."""
     size = 16
     while size < 2 * len(keys):
         size *= 2
-    table = np.full(size, EMPTY, np.int64)
+    table = np.full(size, -1, np.int64)
     first = np.empty(len(keys), np.int64)
     for row in range(len(keys)):
-        slot = _home(keys[row], size)
-        while table[slot] != EMPTY and keys[table[slot]] != keys[row]:
+        slot = (keys[row] * 0x9E3779B97F4A7C1 >> 20) & (size - 1)
+        while table[slot] >= 0 and keys[table[slot]] != keys[row]:
             slot = (slot + 1) & (size - 1)
-        if table[slot] == EMPTY:
+        if table[slot] < 0:
             table[slot] = row
         first[row] = table[slot]
-    return table, first
-
-
-@kernel("int64(int64[:], int64[:], int64)")
-def find_key(table, keys, key):
-    """The first row of `keys` that equals `key`, or EMPTY; `table` is that of `hash_keys(keys)`."""
-    slot = _home(key, len(table))
-    while table[slot] != EMPTY and keys[table[slot]] != key:
-        slot = (slot + 1) & (len(table) - 1)
-    return table[slot]
+    return first
 
 
 @kernel("int64[:, :](int64[:], int64, int64, int64)")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from segslam.core.config import MapConfig
-from segslam.core.points import hash_keys
+from segslam.core.points import first_rows
 from segslam.core.types import Indices, Labels, Points, Vector
 from segslam.labels.encodings import Colors
 
@@ -210,7 +210,7 @@ def _cell_keys(points: np.ndarray, voxel_m: float) -> Indices:
 
 def _numbered(keys: Indices) -> Indices:
     """0, 1, ... for each key, in the order of first occurrence."""
-    _, first = hash_keys(keys)
+    first = first_rows(keys)
     is_first = first == np.arange(len(keys))
     return (np.cumsum(is_first) - 1)[first]
 

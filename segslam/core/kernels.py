@@ -32,7 +32,6 @@ MODULES = (
     "graph.closure_pairs",
     "output.map.views",
     "scans.pcd",
-    "registration.free_space",
     "slam.adjustment.alignment",
     "odometry.nudge",
     "core.points",

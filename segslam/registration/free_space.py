@@ -13,7 +13,6 @@ from jaxtyping import Float, Int8
 from scipy.ndimage import minimum_filter
 
 from segslam.core import geometry
-from segslam.core.kernels import kernel
 from segslam.core.points import within_range
 from segslam.core.types import Indices, Points, Transform, Vector
 
@@ -67,17 +66,23 @@ class FreeSpace:
 def observe_free_space(points: Points) -> FreeSpace:
     """The spherical image of a scan; `points` (n, 3) in the sensor's frame."""
     rays = np.ascontiguousarray(points, np.float32)
-    rays = rays.compress(within_range(rays, 0.0, np.inf), axis=0)
-    _, elevation, azimuth = geometry.spherical(rays)
-    column = ((azimuth + np.pi) * (NUM_COLUMNS / math.tau)).astype(np.int64) % NUM_COLUMNS
-    lowest_rad = float(elevation.min(initial=np.inf)) if len(rays) else 0.0
-    row_rad = _row_height(elevation - lowest_rad, column)
-    num_rows = 1 + int((float(elevation.max(initial=lowest_rad)) - lowest_rad) / row_rad)
-    nearest = _nearest_returns(rays, lowest_rad, row_rad, num_rows)
+    range_m, elevation_rad, column = _spherical(rays.compress(within_range(rays, 0.0, np.inf), axis=0))
+    lowest_rad = float(elevation_rad.min()) if len(range_m) else 0.0
+    row_rad = _row_height(elevation_rad - lowest_rad, column)
+    row = ((elevation_rad - lowest_rad) / row_rad).astype(np.int64)
+    nearest = np.full((row.max(initial=0) + 1, NUM_COLUMNS), np.inf, np.float32)
+    np.minimum.at(nearest, (row, column), range_m)
     seen = np.isfinite(nearest)
     around = minimum_filter(nearest, 3, mode=("nearest", "wrap"))
     path_m = float(np.median(nearest[seen])) if seen.any() else 0.0
     return FreeSpace(np.where(seen, around, np.float32(np.inf)), lowest_rad, row_rad, path_m)
+
+
+def _spherical(points: Points) -> tuple[Vector, Vector, Indices]:
+    """Range (m), elevation (rad) and column of the image of float32 points."""
+    range_m, elevation_rad, azimuth_rad = geometry.spherical(points)
+    column = ((azimuth_rad.astype(np.float64) + math.pi) / math.tau * NUM_COLUMNS).astype(np.int64) % NUM_COLUMNS
+    return range_m, elevation_rad.astype(np.float64), column
 
 
 def _row_height(elevation_rad: Vector, column: Indices) -> float:
@@ -104,43 +109,10 @@ def violation(points: Points, seen: FreeSpace, T_view_points: Transform) -> floa
 
 def fates(points: Points, seen: FreeSpace) -> Fates:
     """Where points (n, 3) in the frame of the scan that sees are, compared with the returns in their direction."""
-    return _fates(points.astype(np.float32), seen.nearest_m, seen.lowest_rad, seen.row_rad, seen.margin_m)
-
-
-@kernel("UniTuple(int64, 2)(float32, float32, float32, float64, float64)")
-def _cell(x, y, z, lowest_rad, row_rad):
-    """Row and column of a direction; the row may be outside the image."""
-    elevation = math.atan2(z, math.sqrt(x * x + y * y))
-    row = math.floor((elevation - lowest_rad) / row_rad)
-    column = math.floor((math.atan2(y, x) + math.pi) / (2.0 * math.pi) * NUM_COLUMNS)
-    return int(row), int(column) % NUM_COLUMNS
-
-
-@kernel("float32[:, :](float32[:, ::1], float64, float64, int64)")
-def _nearest_returns(points, lowest_rad, row_rad, num_rows):
-    nearest = np.full((num_rows, NUM_COLUMNS), np.inf, np.float32)
-    for at in range(len(points)):
-        x, y, z = points[at, 0], points[at, 1], points[at, 2]
-        distance = math.sqrt(x * x + y * y + z * z)
-        row, column = _cell(x, y, z, lowest_rad, row_rad)
-        row = min(max(row, 0), num_rows - 1)  # rounding, at the edges
-        nearest[row, column] = min(nearest[row, column], distance)
-    return nearest
-
-
-@kernel("int8[:](float32[:, :], float32[:, :], float64, float64, float64)")
-def _fates(points, nearest, lowest_rad, row_rad, margin_m):
-    found = np.full(len(points), AT_RETURN, np.int8)
-    for at in range(len(points)):
-        x, y, z = points[at]
-        row, column = _cell(x, y, z, lowest_rad, row_rad)
-        return_m = nearest[row, column] if 0 <= row < len(nearest) else np.inf
-        distance = math.sqrt(x * x + y * y + z * z)
-        room_m = margin_m + FREE_SPACE_MARGIN_RATIO * distance
-        if return_m == np.inf:
-            found[at] = NO_RETURN
-        elif distance > return_m + room_m:
-            found[at] = BEHIND
-        elif distance + room_m < return_m:
-            found[at] = IN_FRONT
-    return found
+    range_m, elevation_rad, column = _spherical(points.astype(np.float32))
+    row = np.floor((elevation_rad - seen.lowest_rad) / seen.row_rad).astype(np.int64)
+    above = np.clip(row, 0, len(seen.nearest_m) - 1) != row  # or below
+    return_m = np.where(above, np.inf, seen.nearest_m[np.where(above, 0, row), column])
+    room_m = seen.margin_m + FREE_SPACE_MARGIN_RATIO * range_m
+    conditions = [np.isinf(return_m), range_m > return_m + room_m, range_m + room_m < return_m]
+    return np.select(conditions, [NO_RETURN, BEHIND, IN_FRONT], AT_RETURN).astype(np.int8)

@@ -23,6 +23,7 @@ from segslam.core.types import (
     Indices,
     Information,
     Points,
+    Registration,
     Rejected,
     RejectReason,
     Transform,
@@ -30,7 +31,7 @@ from segslam.core.types import (
 )
 from segslam.registration.segregator.correspondences import Correspondences
 from segslam.registration.segregator.descent import GATE, least_cost, squared_distances
-from segslam.registration.segregator.pose_solver import PoseFit
+from segslam.registration.segregator.pose_solver import Scored
 
 SHARED_NOISE_M = 0.045
 """Measured (simulated truth): noise common to all centroids, in the information matrix only (m)."""
@@ -49,12 +50,12 @@ def align_gaussians(
     T_target_source: Transform,
     *,
     config: SegregatorConfig,
-) -> PoseFit | Rejected:
-    """The pose of least cost near an initial guess; its inliers are rows of `correspondences`.
+) -> Scored | Rejected:
+    """The pose of least cost near an initial guess; and its score, which is 0 at the gate.
 
-    `score` sums the inliers, each between 1 (exact) and 0 (at the gate). `information` follows from the noise model,
-    including the noise common to all clusters. Returns `Rejected` with TOO_FEW_INLIERS below `min_clique`, and with
-    DEGENERATE if a standard deviation of the pose exceeds the limits of a correct registration.
+    `information` follows from the noise model, including the noise common to all clusters. Returns `Rejected` with
+    TOO_FEW_INLIERS below `min_clique`, and with DEGENERATE if a standard deviation of the pose exceeds the limits of a
+    correct registration.
     """
     rows: Indices = np.empty(0, np.int64)
     for _ in range(MAX_ROUNDS):
@@ -76,11 +77,12 @@ def align_gaussians(
         if _leaves_open(information):
             return Rejected(RejectReason.DEGENERATE, "clusters and ground leave the pose open")
     gaps = pairs.target - geometry.apply(T_target_source, pairs.source)
-    return PoseFit(
+    score = float(np.sum(1.0 - np.minimum(_squared(pairs, T_target_source) / GATE, 1.0)))
+    return score, Registration(
         T_target_source=T_target_source,
-        inliers=np.isin(np.arange(len(correspondences)), rows),
+        num_correspondences=len(correspondences),
+        num_inliers=len(rows),
         rms_m=float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))),
-        score=float(np.sum(1.0 - np.minimum(_squared(pairs, T_target_source) / GATE, 1.0))),
         information=geometry.with_noise(
             information,
             rotation_rad=math.radians(SHARED_NOISE_DEG),

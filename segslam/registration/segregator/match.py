@@ -8,6 +8,7 @@ then point features.
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from segslam.registration.cliques import maximum_cliques
 from segslam.registration.segregator.consistency_graph import consistency_graph
 from segslam.registration.segregator.correspondences import Correspondences, feature_pairs
 from segslam.registration.segregator.gaussians import align_gaussians
-from segslam.registration.segregator.pose_solver import PoseFit, solve_level, solve_pose
+from segslam.registration.segregator.pose_solver import Scored, solve_level, solve_pose
 
 CLIQUE_MAX_NODES = 200_000
 """Chosen: search nodes after which the search stops with the best clique found."""
@@ -79,9 +80,7 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
     ]
 
 
-def _attempts(
-    source: Description, target: Description, config: SegregatorConfig
-) -> Iterator[tuple[float, Registration] | Rejected]:
+def _attempts(source: Description, target: Description, config: SegregatorConfig) -> Iterator[Scored | Rejected]:
     """Scores and poses of the maximum cliques: of clusters, then of clusters and features, for increasing bounds."""
     for correspondences in putative(source, target, config=config):
         if len(correspondences) < config.min_clique:
@@ -90,7 +89,7 @@ def _attempts(
         for bound_m in config.noise_bounds_m:
             adjacency = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
             cliques = maximum_cliques(adjacency, max_cliques=config.max_cliques, max_nodes=CLIQUE_MAX_NODES)
-            size = len(cliques[0])
+            size, num_edges = len(cliques[0]), int(np.bitwise_count(adjacency).sum()) // 2
             if size < config.min_clique:
                 yield Rejected(RejectReason.SMALL_CLIQUE, f"{size} consistent correspondences")
                 continue
@@ -99,15 +98,8 @@ def _attempts(
                 if isinstance(fit, Rejected):
                     yield fit
                     continue
-                registration = Registration(
-                    T_target_source=fit.T_target_source,
-                    num_correspondences=len(correspondences),
-                    num_inliers=int(fit.inliers.sum()),
-                    rms_m=fit.rms_m,
-                    information=fit.information,
-                    num_edges=int(np.bitwise_count(adjacency).sum()) // 2,
-                )
-                yield fit.score, registration
+                score, registration = fit
+                yield score, replace(registration, num_correspondences=len(correspondences), num_edges=num_edges)
 
 
 def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Iterator[Correspondences]:
@@ -131,7 +123,7 @@ def _solve(
     clique: Indices,
     bound_m: float,
     config: SegregatorConfig,
-) -> PoseFit | Rejected:
+) -> Scored | Rejected:
     """The pose from the correspondences of one clique, by `config.solver`.
 
     The initial pose of `gaussians` has the verticals aligned, if both are known.
@@ -142,9 +134,9 @@ def _solve(
         fit = solve_pose(members.source, members.target, bound_m=bound_m, config=config)
         if config.solver != "gaussians" or isinstance(fit, Rejected):
             return fit
-        rough: Transform | Rejected = fit.T_target_source
+        rough: Transform | Rejected = fit[1].T_target_source
     else:
-        rough = solve_level(members.source, members.target, source_up, target_up, bound_m=bound_m, config=config)
+        rough = solve_level(members.source, members.target, source_up, target_up, bound_m=bound_m)
     if isinstance(rough, Rejected):
         return rough
     return align_gaussians(correspondences, source, target, rough, config=config)

@@ -12,7 +12,6 @@ The decoupled solver is that of TEASER (Yang, Shi, Carlone, T-RO 2021), which Se
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -23,8 +22,8 @@ from segslam.core.robust import CONTROL_FACTOR, first_control, tls_weights
 from segslam.core.types import (
     Direction,
     Information,
-    Mask,
     Points,
+    Registration,
     Rejected,
     RejectReason,
     Rotation,
@@ -40,23 +39,11 @@ GNC_COST_TOLERANCE = 1e-6
 Fitted = TypeVar("Fitted")
 AlignRotation = Callable[[Points, Points, Vector], Rotation]
 """The rotation R that minimises sum w |b - R a|^2 over rows a, b, w."""
+Scored = tuple[float, Registration]
+"""A pose and its score: the sum over its inliers, each between 1 (exact) and 0 (at the bound)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseFit:
-    """A pose with its inliers, score and information."""
-
-    T_target_source: Transform
-    inliers: Mask
-    """Rows with residuals within the bound."""
-    rms_m: float
-    """Root mean square distance of the inliers."""
-    score: float
-    """Sum over the inliers, each between 1 (exact) and 0 (at the bound)."""
-    information: Information
-
-
-def solve_pose(source: Points, target: Points, *, bound_m: float, config: SegregatorConfig) -> PoseFit | Rejected:
+def solve_pose(source: Points, target: Points, *, bound_m: float, config: SegregatorConfig) -> Scored | Rejected:
     """The pose with the smallest truncated least-squares cost of matched points, by `config.solver`.
 
     Row i of `source` matches row i of `target`. Returns `Rejected(DEGENERATE)` if the points or the inliers are fewer
@@ -71,12 +58,13 @@ def solve_pose(source: Points, target: Points, *, bound_m: float, config: Segreg
     inliers = squared <= bound_m**2
     if not _fixes_rotation(source[inliers], bound_m, config):
         return _degenerate(int(inliers.sum()))
-    return PoseFit(
+    squared = squared[inliers]
+    return float(np.sum(1.0 - squared / bound_m**2)), Registration(
         T_target_source=T_target_source,
-        inliers=inliers,
-        rms_m=math.sqrt(squared[inliers].mean()),
-        score=float(np.sum(1.0 - squared[inliers] / bound_m**2)),
-        information=point_information(source[inliers], sigma_m=_axis_sigma(squared[inliers], bound_m)),
+        num_correspondences=len(source),
+        num_inliers=len(squared),
+        rms_m=math.sqrt(squared.mean()),
+        information=point_information(source[inliers], sigma_m=_axis_sigma(squared, bound_m)),
     )
 
 
@@ -113,7 +101,6 @@ def solve_level(
     target_up: Direction,
     *,
     bound_m: float,
-    config: SegregatorConfig,
 ) -> Transform | Rejected:
     """The pose that aligns the two verticals and minimises the truncated cost of the points projected to the ground.
 

@@ -1,6 +1,5 @@
 """The consistency graph against plain NumPy, its invariances, and the authors' edges."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +41,7 @@ def random_correspondences(seed: int, count: int = 70) -> Correspondences:
 
 def turned(correspondences: Correspondences, T_new_source: Transform) -> Correspondences:
     R = T_new_source[:3, :3]
-    return replace(
-        correspondences,
+    return correspondences._replace(
         source=geometry.apply(T_new_source, correspondences.source),
         source_covariances=R @ correspondences.source_covariances @ R.T,
     )
@@ -60,8 +58,8 @@ def wasserstein_shape(a: np.ndarray, b: np.ndarray) -> float:
 
 def plain_edges(c: Correspondences, gate: str, config: SegregatorConfig) -> list[list[int]]:
     found = []
-    for i in range(len(c)):
-        for j in range(i + 1, len(c)):
+    for i in range(len(c.source)):
+        for j in range(i + 1, len(c.source)):
             lengths = np.linalg.norm(c.source[i] - c.source[j]), np.linalg.norm(c.target[i] - c.target[j])
             a = c.source_covariances[i] + c.source_covariances[j]
             b = c.target_covariances[i] + c.target_covariances[j]
@@ -146,7 +144,7 @@ def test_correspondences_that_share_an_end_are_never_joined() -> None:
 
 def test_shapes_that_are_no_numbers_join_nothing() -> None:
     correspondences = random_correspondences(0)
-    broken = replace(correspondences, source_covariances=np.full_like(correspondences.source_covariances, np.nan))
+    broken = correspondences._replace(source_covariances=np.full_like(correspondences.source_covariances, np.nan))
     assert consistency_graph(broken, config=SegregatorConfig(gate="invariant"))[1].shape == (0, 2)
 
 

@@ -4,7 +4,7 @@ Yin, Yuan, Cao, Ji, Zhang, Xie, "Segregator: Global Point Cloud Registration wit
 ICRA 2023, section III. The tuple test is that of Zhou, Park, Koltun, "Fast Global Registration", ECCV 2016, eq. (2).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,8 +22,7 @@ TUPLE_SEED = 0
 Descriptors = Float[np.ndarray, "_ 33"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Correspondences:
+class Correspondences(NamedTuple):
     """Putative correspondences: Gaussian `source_index[i]` of the source may be `target_index[i]` of the target.
 
     The indices number the clusters first and the features after them.
@@ -35,9 +34,6 @@ class Correspondences:
     target_covariances: Covariances
     source_index: Indices
     target_index: Indices
-
-    def __len__(self) -> int:
-        return len(self.source)
 
     @staticmethod
     def of(source: Description, target: Description, pairs: IndexPairs) -> "Correspondences":
@@ -53,7 +49,7 @@ class Correspondences:
 
     def take(self, rows: Indices) -> "Correspondences":
         """The correspondences in these rows."""
-        return Correspondences(*(getattr(self, name)[rows] for name in self.__slots__))
+        return Correspondences(*(column[rows] for column in self))
 
 
 def mutual_nearest(source: Descriptors, target: Descriptors) -> IndexPairs:

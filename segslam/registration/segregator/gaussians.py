@@ -27,7 +27,6 @@ from segslam.core.types import (
     Rejected,
     RejectReason,
     Transform,
-    Vector,
 )
 from segslam.registration.segregator.correspondences import Correspondences
 from segslam.registration.segregator.descent import GATE, least_cost, squared_distances
@@ -66,10 +65,7 @@ def align_gaussians(
             break
         pairs = correspondences.take(rows)
         T_target_source, information = least_cost(
-            pairs.source,
-            pairs.target,
-            pairs.source_covariances,
-            pairs.target_covariances,
+            *pairs[:4],
             *nearest_planes(source, target, T_target_source),
             *nearest_planes(target, source, geometry.inverse(T_target_source)),
             T_target_source,
@@ -77,10 +73,10 @@ def align_gaussians(
         if _leaves_open(information):
             return Rejected(RejectReason.DEGENERATE, "clusters and ground leave the pose open")
     gaps = pairs.target - geometry.apply(T_target_source, pairs.source)
-    score = float(np.sum(1.0 - np.minimum(_squared(pairs, T_target_source) / GATE, 1.0)))
+    score = float(np.sum(1.0 - np.minimum(squared_distances(*pairs[:4], T_target_source) / GATE, 1.0)))
     return score, Registration(
         T_target_source=T_target_source,
-        num_correspondences=len(correspondences),
+        num_correspondences=len(correspondences.source),
         num_inliers=len(rows),
         rms_m=float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))),
         information=geometry.with_noise(
@@ -93,7 +89,7 @@ def align_gaussians(
 
 def nearest_pairs(correspondences: Correspondences, T_target_source: Transform) -> Indices:
     """Rows, ascending, within the gate that have the smallest distance among all rows sharing one of their ends."""
-    squared = _squared(correspondences, T_target_source)
+    squared = squared_distances(*correspondences[:4], T_target_source)
     bound = np.full(len(squared), GATE)
     for ends in (correspondences.source_index, correspondences.target_index):
         best = np.full(ends.max(initial=0) + 1, GATE)
@@ -113,16 +109,6 @@ def nearest_planes(scan: Description, other: Description, T_other_scan: Transfor
     sides = scan.ground_points[met], other.ground_points[nearest[met]], other.ground_normals[nearest[met]]
     centres, planes, normals = (side.astype(np.float64) for side in sides)
     return centres, planes, normals
-
-
-def _squared(correspondences: Correspondences, T_target_source: Transform) -> Vector:
-    return squared_distances(
-        correspondences.source,
-        correspondences.target,
-        correspondences.source_covariances,
-        correspondences.target_covariances,
-        T_target_source,
-    )
 
 
 def _leaves_open(information: Information) -> bool:

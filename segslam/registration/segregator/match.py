@@ -83,8 +83,9 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
 def _attempts(source: Description, target: Description, config: SegregatorConfig) -> Iterator[Scored | Rejected]:
     """Scores and poses of the maximum cliques: of clusters, then of clusters and features, for increasing bounds."""
     for correspondences in putative(source, target, config=config):
-        if len(correspondences) < config.min_clique:
-            yield Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{len(correspondences)} correspondences")
+        number = len(correspondences.source)
+        if number < config.min_clique:
+            yield Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, f"{number} correspondences")
             continue
         for bound_m in config.noise_bounds_m:
             adjacency = consistency_graph(correspondences, length_bound_m=2.0 * bound_m, config=config)
@@ -99,7 +100,7 @@ def _attempts(source: Description, target: Description, config: SegregatorConfig
                     yield fit
                     continue
                 score, registration = fit
-                yield score, replace(registration, num_correspondences=len(correspondences), num_edges=num_edges)
+                yield score, replace(registration, num_correspondences=number, num_edges=num_edges)
 
 
 def putative(source: Description, target: Description, *, config: SegregatorConfig) -> Iterator[Correspondences]:

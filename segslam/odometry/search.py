@@ -13,6 +13,7 @@ from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan
 from segslam.odometry.nudge import SEARCH_VOXELS
 from segslam.registration.free_space import observe_free_space
+from segslam.registration.prepared import Observed
 from segslam.verification import chance_of_wrong
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
@@ -103,8 +104,9 @@ class PoseSearch:
 
     def chance_of_wrong(self, local: LocalMap, scan: SeenScan, best: Fit) -> float:
         """Probability that a pose is wrong, by the score of loops, if it may be far from all that were tried."""
-        seen = observe_free_space(scan.points), observe_free_space(local.newest.points)
-        return chance_of_wrong((scan.surface, seen[0]), (local.surface(), seen[1]), best.T_map_lidar)
+        own = Observed(scan.surface, observe_free_space(scan.points))
+        earlier = Observed(local.surface(), observe_free_space(local.newest.points))
+        return chance_of_wrong(own, earlier, best.T_map_lidar)
 
     def spread(self, scan: SeenScan, fits: Sequence[Fit]) -> Information:
         """Covariance (6, 6) of the choice between poses near the most likely one, tangent in the scan's frame."""

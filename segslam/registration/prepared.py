@@ -9,22 +9,21 @@ from segslam.registration import refinement, segregator
 from segslam.registration.free_space import FreeSpace, observe_free_space
 
 Labeller = Callable[[Points], Labels]
-Observed = tuple[refinement.Surface, FreeSpace]
-"""What a scan saw: sufficient to judge a pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PreparedScan:
-    """A scan prepared for registration; computed once per scan."""
+class Observed:
+    """What a scan saw: sufficient to refine and verify a pose that is nearly known."""
 
-    description: Description
     surface: refinement.Surface
     free_space: FreeSpace
 
-    @property
-    def observed(self) -> Observed:
-        """Surface and free space: what verification compares."""
-        return self.surface, self.free_space
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedScan(Observed):
+    """A scan prepared for registration; computed once per scan."""
+
+    description: Description
 
 
 def prepare_scan(
@@ -35,14 +34,14 @@ def prepare_scan(
     If `points` are gathered from several scans, `seen_from_here` are the points measured from this pose: free space is
     computed from these only. Points of moving classes are used for neither surface nor free space.
     """
-    surface, seen = prepare_observed(points, labels, config=config, seen_from_here=seen_from_here)
-    return PreparedScan(segregator.describe(points, labels, config=config.segregator), surface, seen)
+    seen = prepare_observed(points, labels, config=config, seen_from_here=seen_from_here)
+    return PreparedScan(seen.surface, seen.free_space, segregator.describe(points, labels, config=config.segregator))
 
 
 def prepare_observed(
     points: Points, labels: Labels, *, config: Config, seen_from_here: Points | None = None
 ) -> Observed:
-    """Surface and free space as in `prepare_scan`: sufficient to refine and verify a pose that is nearly known."""
+    """Surface and free space as in `prepare_scan`."""
     still = points.compress(labels < Label.MOVING_CAR, axis=0)
     surface = refinement.make_surface(refinement.downsample(still, config=config.refine), config=config.refine)
-    return surface, observe_free_space(still if seen_from_here is None else seen_from_here)
+    return Observed(surface, observe_free_space(still if seen_from_here is None else seen_from_here))

@@ -86,7 +86,7 @@ def patches_of(surface: Surface) -> Patches:
 def agreement(source: Observed, target: Observed, T_target_source: Transform) -> Agreement:
     """Agreement of two scans at this pose of the source in the target."""
     ways = [
-        (*_seen_from(b, a, T_b_a), violation(a[0].points, b[1], T_b_a))
+        (*_seen_from(b, a, T_b_a), violation(a.surface.points, b.free_space, T_b_a))
         for a, b, T_b_a in ((source, target, T_target_source), (target, source, geometry.inverse(T_target_source)))
     ]
     overlaps, residuals_m, shown, violations = zip(*ways, strict=True)
@@ -105,22 +105,22 @@ def counted(shown: Shown) -> Counts:
 
 def _seen_from(b: Observed, a: Observed, T_b_a: Transform) -> tuple[float, float, Shown]:
     """Overlap, residual (m) and patches of a's standing points in the view of b."""
-    standing = patches_of(a[0])
+    standing = patches_of(a.surface)
     moved = geometry.apply(T_b_a, standing.points)
     within = within_range(moved, 0.0, MAX_RANGE_M)
     points = moved[within]
     if not len(points):
         return 0.0, math.inf, np.full(len(standing.size), -1, np.int8)
-    apart_m, to_plane_m = b[0].distances_m(points)
+    apart_m, to_plane_m = b.surface.distances_m(points)
     is_near = apart_m < INLIER_M
     rms_m = float(np.sqrt(np.mean(to_plane_m[is_near] ** 2))) if is_near.any() else math.inf
-    fate = fates(points, b[1])
+    fate = fates(points, b.free_space)
     known, near, squared, violating, hidden, unseen, range_m = (
         np.bincount(standing.patch[within], weights, minlength=len(standing.size))
         for weights in (
             is_near | (fate == IN_FRONT) | (fate == AT_RETURN),
             is_near,
-            is_near * (to_plane_m / max(a[0].roughness_m, b[0].roughness_m)) ** 2,
+            is_near * (to_plane_m / max(a.surface.roughness_m, b.surface.roughness_m)) ** 2,
             fate == IN_FRONT,
             ~is_near & (fate == BEHIND),
             ~is_near & (fate == NO_RETURN),

@@ -101,9 +101,8 @@ class Trial(Pair):
 
     def first_look(self, T_target_source: Transform) -> patches.Shown:
         """What the patches of the source show at this pose; takes 2 ms."""
-        scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            return patches.first_look(*scans, T_target_source)
+            return patches.first_look(self.source, self.target, T_target_source)
 
     def refined(self, coarse: Registration, T_begun: Transform, *, must_converge: bool = True) -> Found | Rejected:
         """A hypothesis refined with all points from `T_begun`, and what the scans show there."""
@@ -114,9 +113,8 @@ class Trial(Pair):
 
     def found(self, coarse: Registration, fine: Registration) -> Found:
         """A refined pose, and what the scans show there."""
-        scans = self.source.observed, self.target.observed
         with self.watch("verify"):
-            return Found(coarse, fine, patches.agreement(*scans, fine.T_target_source))
+            return Found(coarse, fine, patches.agreement(self.source, self.target, fine.T_target_source))
 
     def fits(self, pose: Found) -> bool:
         """True for a pose that the prior allows and that is probable enough if no other pose fits as well."""

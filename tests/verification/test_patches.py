@@ -65,18 +65,18 @@ def test_what_is_out_of_sight_or_out_of_range_counts_for_nothing() -> None:
 
 def test_what_the_other_scan_did_not_look_at_counts_for_nothing() -> None:
     """Of one scan of the room only the front half is left: the patches behind are not hidden, but out of its view."""
-    surface, _ = _room(2)
+    surface = _room(2).surface
     front = surface.points[surface.points[:, 0] > 0.0].astype(np.float32)
     half = prepare_observed(front, np.zeros(len(front), np.uint8), config=CONFIG)
     seen = first_look(_room(1), half, np.eye(4))
-    patches = patches_of(_room(1)[0])
+    patches = patches_of(_room(1).surface)
     x = np.bincount(patches.patch, patches.points[:, 0]) / patches.size
     assert (seen[x < -1.5] == -1).mean() > 0.95
     assert (seen[x > 1.5] >= 0).mean() > 0.95
 
 
 def test_near_and_far_patches_have_bins_of_their_own() -> None:
-    patches = patches_of(_room(1)[0])
+    patches = patches_of(_room(1).surface)
     range_m = np.bincount(patches.patch, np.linalg.norm(patches.points, axis=1)) / patches.size
     seen = first_look(_room(1), _room(2), np.eye(4))
     is_far = seen >= len(KINDS)
@@ -97,7 +97,7 @@ def test_the_patches_are_the_same_in_both_directions() -> None:
 
 
 def test_a_patch_counts_once_however_many_points_it_has() -> None:
-    patches = patches_of(_room(1)[0])
+    patches = patches_of(_room(1).surface)
     assert patches.size.sum() == len(patches.points)
     assert 50 < len(patches.size) < len(patches.points) / 5
     assert agreement(_room(1), _room(2), np.eye(4)).of_source.shape == patches.size.shape

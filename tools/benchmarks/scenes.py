@@ -122,7 +122,7 @@ def _true(place: Place, judge: Judge, count: int, rng: np.random.Generator, conf
         T_source, T_target = place.pose(source, visits[0]), place.pose(target, visits[1])
         one, other = place.prepared(source, visits[0]), place.prepared(target, visits[1])
         T_true = geometry.inverse(T_target) @ T_source
-        counts = agreement(one.observed, other.observed, T_true).overlap > 0.4
+        counts = agreement(one, other, T_true).overlap > 0.4
         found = judge(one, other, prior(T_true, rng))
         right = isinstance(found, Alignment) and common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
         wrong += isinstance(found, Alignment) and not right

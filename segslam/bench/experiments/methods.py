@@ -102,7 +102,7 @@ def _segregator(name: str, part: str = "description") -> Method:
 
 def _align(source: Values, target: Values, config: Config, watch: Stopwatch) -> Estimate | Rejected:
     scans = (
-        PreparedScan(values["description"], values["surface"].surface, values["surface"].free_space)
+        PreparedScan(values["surface"].surface, values["surface"].free_space, values["description"])
         for values in (source, target)
     )
     found = registration.register_prepared(*scans, config=config, watch=watch)

@@ -112,7 +112,7 @@ class Placer:
         T_target_predicted = geometry.inverse(T_world_target) @ T_world_predicted
         with watch("refine"):
             fine = refinement.refine(
-                own[0], target[0], T_target_predicted, config=self._config.refine, must_converge=False
+                own.surface, target.surface, T_target_predicted, config=self._config.refine, must_converge=False
             )
         if isinstance(fine, Rejected):
             return fine

@@ -54,8 +54,7 @@ def _timed_stages(source: Labelled, target: Labelled, config: Config) -> Iterabl
             "refine",
             timed(lambda: refinement.refine(one.surface, other.surface, T_target_source, config=config.refine)),
         )
-        sides = (one.surface, one.free_space), (other.surface, other.free_space)
-        yield "verify", timed(lambda: agreement(*sides, T_target_source))
+        yield "verify", timed(lambda: agreement(one, other, T_target_source))
     yield "cold pair", timed(lambda: _cold(source, target, config))
     yield BESIDE, timed(lambda: align_gicp(*(prepare_gicp(points) for points, _ in (source, target))))
 

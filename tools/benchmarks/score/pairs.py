@@ -83,8 +83,7 @@ def described(task: Task, config: Config) -> Pair:
     ]
     overlap = 0.0
     if task.is_true and task.T_target_source is not None:
-        scans = task.source.observed, task.target.observed
-        overlap = agreement(*scans, task.T_target_source).overlap
+        overlap = agreement(task.source, task.target, task.T_target_source).overlap
     is_searched = bool(tried) and trial.fits(tried[0])
     return Pair(task.part, task.sensor, task.is_true, overlap, poses, verdict, seconds, is_searched)
 

@@ -19,7 +19,7 @@ from segslam.core.types import Indices, Information, LoopCandidate, Rejected, Re
 from segslam.graph import noise
 from segslam.graph.closure_pairs import Matrices, adjoints, carried
 from segslam.graph.edges import Edge, Transforms
-from segslam.registration.hypotheses import Gate
+from segslam.verification.trial import Gate
 
 Link = tuple[float, Information]
 """Length of a link, and its covariance in the world frame."""

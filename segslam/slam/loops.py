@@ -14,12 +14,12 @@ from segslam.graph import Graph
 from segslam.graph.chains import far_from_prior, prior_gate
 from segslam.graph.confirmation import Confirmation
 from segslam.keyframes import Clouds, Submaps
-from segslam.registration.hypotheses import anywhere
 from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops
 from segslam.slam.loop_edits import LoopEdits
 from segslam.verification import register_near, register_prepared
 from segslam.verification.score import MISLED
+from segslam.verification.trial import anywhere
 
 NUM_PREPARED = 64
 """Number of prepared keyframes in memory, about 2 MB each; preparing another takes about 40 ms."""

@@ -15,10 +15,9 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import Alignment, Record, Rejected, RejectReason, Transform
-from segslam.registration.hypotheses import Gate, anywhere
 from segslam.registration.prepared import PreparedScan
 from segslam.verification.pair import tried_poses
-from segslam.verification.trial import Found, Trial, judged
+from segslam.verification.trial import Found, Gate, Trial, anywhere, judged
 
 MAX_PLACES = 6
 """Chosen: number of places tried until one is found; each takes about 100 ms."""

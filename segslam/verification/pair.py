@@ -12,11 +12,10 @@ from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import Alignment, Labels, Registration, Rejected, RejectReason, Transform, as_points
 from segslam.labels import geometric_labels
 from segslam.registration import refinement
-from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Gate, anywhere, coarse_poses
 from segslam.registration.prepared import Observed, PreparedScan, prepare_scan
 from segslam.verification import patches, score
 from segslam.verification.rivals import is_same, rivals_of
-from segslam.verification.trial import EQUAL_M, EQUAL_RAD, Found, Trial, judged
+from segslam.verification.trial import EQUAL_M, EQUAL_RAD, MAX_COARSE_FINE_M, Found, Gate, Trial, anywhere, judged
 
 KNOWN_M, KNOWN_RAD = 1.0, math.radians(3.0)
 """Chosen: largest error of a known pose. A rival this near is mostly the same pose (`rivals.SAME_POSE_M`)."""
@@ -78,7 +77,7 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
     """
     rejections: list[Rejected] = []
     found: list[Found] = []
-    for coarse in coarse_poses(trial):
+    for coarse in trial.coarse_poses():
         outcome = coarse if isinstance(coarse, Rejected) else _outcome(trial, coarse, found)
         if isinstance(outcome, Found):
             found.append(outcome)

@@ -10,9 +10,8 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.types import Direction, Registration, Rejected, Transform
 from segslam.registration import refinement
-from segslam.registration.hypotheses import anywhere, plans_near
 from segslam.verification import score
-from segslam.verification.trial import FEW_PRECISION_M, Found, Trial, few_points
+from segslam.verification.trial import Found, Trial, anywhere, few_points
 
 MAX_RIVALS = 6
 """Chosen: number of floor-plan poses tried as rivals, besides shifts along the weak direction."""
@@ -68,7 +67,7 @@ def _starts(found: Found, trial: Trial) -> list[_Start]:
     """Poses to which few points lead from shifts along the weak direction, and from floor plans."""
     weakest = refinement.weakest_level(found.fine.information)
     shifted = [start for sign in (-1.0, 1.0) for start in _shifted(found, sign * weakest, trial)]
-    plans = [_led(coarse, found, trial) for coarse in plans_near(trial, num_poses=MAX_RIVALS)]
+    plans = [_led(coarse, found, trial) for coarse in trial.plans_near(MAX_RIVALS)]
     return [
         start for start in (*shifted, *plans) if start is not None and not is_same(start.coarse.T_target_source, found)
     ]
@@ -86,10 +85,7 @@ def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
     most = score.shipped().most_lead(found.agreement.counts, trial.least_odds)
     if _lead(found, T_begun, trial) > most + APPROACH_LEAD:
         return None
-    with trial.watch("refine"):
-        fine = refinement.refine(
-            *surfaces, T_begun, config=trial.config.refine, must_converge=False, precision_m=FEW_PRECISION_M
-        )
+    fine = trial.led(T_begun)
     if isinstance(fine, Rejected):
         return None
     lead = _lead(found, fine.T_target_source, trial)

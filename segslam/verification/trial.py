@@ -1,17 +1,35 @@
-"""One pose between two scans: refined with few points, then with all, what the scans show there, and its verdict."""
+"""The poses that two scans suggest, from clusters and features, then from floor plans; and a pose that is tried.
+
+It is refined with few points, then with all; then it is judged by what the scans show there.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from copy import copy
 from functools import lru_cache
-from typing import NamedTuple
+from itertools import islice, tee
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig
+from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Registration, Rejected, RejectReason, Transform, probability_text
-from segslam.registration import refinement
-from segslam.registration.hypotheses import MAX_COARSE_FINE_M, Pair
+from segslam.registration import refinement, segregator
 from segslam.registration.prepared import PreparedScan
 from segslam.verification import patches, score
+
+MAX_HYPOTHESES = 3
+"""Chosen: number of coarse poses tried, the best first."""
+MAX_PLAN_HYPOTHESES = 6
+"""Chosen: number of poses tried after these, from aligning the two floor plans."""
+MAX_COARSE_FINE_M = 2.0
+"""Chosen: largest correction of a coarse pose by refinement (m)."""
+
+MOST_PLANS = 24
+"""Chosen: floor-plan poses looked through for those near the prior, 1 ms each."""
+
+NUM_FLOOR_PLANS = 4
+"""Number of floor plans in memory: a scan is compared with several others in turn. A source has 12 MB of spectra."""
 
 MIN_INLIERS = 3
 """Chosen: smallest number of clique members consistent with a coarse pose."""
@@ -30,6 +48,32 @@ and without other poses, are more than this below the least odds of an accepted 
 00, courtyard) none was more than 0.6 below; with 2 instead one hypothesis of 60 pairs of KITTI 00 is lost."""
 EQUAL_M, EQUAL_RAD = 0.1, math.radians(0.5)
 """Chosen: a hypothesis is not refined with all points if few points lead it this close to where another was refined."""
+
+
+@runtime_checkable
+class Gate(Protocol):
+    """Prior knowledge about the pose: a rejection for an impossible pose, None for all others."""
+
+    def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+        """`slack_m`: distance by which refinement may still move the pose."""
+        ...
+
+
+def anywhere(T_target_source: Transform, *, slack_m: float) -> Rejected | None:
+    """The gate of scans without prior knowledge."""
+    return None
+
+
+@lru_cache(1)
+def _ranked_plans(source: PreparedScan, target: PreparedScan) -> Iterator[Registration]:
+    """Poses by the floor plans, the best first; copies start again, so that rivals need no other search."""
+    (plans,) = tee(segregator.plan_hypotheses(_floor_plan(source), _floor_plan(target), num_poses=MOST_PLANS), 1)
+    return plans
+
+
+@lru_cache(NUM_FLOOR_PLANS)
+def _floor_plan(scan: PreparedScan) -> segregator.FloorPlan:
+    return segregator.FloorPlan(scan.surface.standing()[0], segregator.vertical(scan.description))
 
 
 @lru_cache(NUM_FEW)
@@ -56,13 +100,44 @@ class Found(NamedTuple):
         return score.shipped().mean_ratio(self.agreement.counts)
 
 
-class Trial(Pair):
-    """Two scans, and what is known about the pose between them; its methods try poses."""
+class Trial(NamedTuple):
+    """Two scans, and what is known about the pose of the source in the target; its methods try poses."""
+
+    source: PreparedScan
+    target: PreparedScan
+    config: Config
+    gate: Gate
+    watch: Stopwatch
 
     @property
     def least_odds(self) -> float:
         """Log odds that an accepted pose has at least."""
         return score.shipped().least_odds(self.config.verify)
+
+    def coarse_poses(self) -> Iterator[Registration | Rejected]:
+        """Hypotheses from clusters and features, then from floor plans.
+
+        Poses that the prior excludes are skipped and not counted: in symmetric places, such as a corridor, most poses
+        that fit are turned by 180 degrees or far along it.
+        """
+        described = self.source.description, self.target.description
+        with self.watch("match"):
+            ranked = segregator.hypotheses(*described, config=self.config.segregator)
+        if isinstance(ranked, Rejected):
+            yield ranked
+        else:
+            possible = [coarse for coarse in ranked if self._excluded(coarse) is None]
+            yield from (possible or ranked[:1])[:MAX_HYPOTHESES]
+        yield from self.plans_near(MAX_PLAN_HYPOTHESES)
+
+    def plans_near(self, num_poses: int) -> list[Registration]:
+        """Poses near the prior that align the two floor plans."""
+        with self.watch("match"):
+            ranked = copy(_ranked_plans(self.source, self.target))
+            return list(islice((coarse for coarse in ranked if self._excluded(coarse) is None), num_poses))
+
+    def _excluded(self, coarse: Registration) -> Rejected | None:
+        return self.gate(coarse.T_target_source, slack_m=MAX_COARSE_FINE_M)
 
     def begin(self, coarse: Registration) -> Transform | Rejected:
         """The pose to which few points of the source lead from a hypothesis; `Rejected` if it is hopeless with all.
@@ -70,21 +145,12 @@ class Trial(Pair):
         It is if a first look at its patches gives odds far below those of an accepted pose. Takes a third of the
         time of a refinement with all points, which most wrong hypotheses do not need.
         """
-        config = self.config
         if coarse.num_inliers < MIN_INLIERS:
             return Rejected(RejectReason.TOO_FEW_INLIERS, f"{coarse.num_inliers} < {MIN_INLIERS}")
-        rejected = self.gate(coarse.T_target_source, slack_m=MAX_COARSE_FINE_M)
+        rejected = self._excluded(coarse)
         if rejected is not None:
             return rejected
-        with self.watch("refine"):
-            led = refinement.refine(
-                few_points(self.source, config.refine),
-                self.target.surface,
-                coarse.T_target_source,
-                config=config.refine,
-                must_converge=False,
-                precision_m=FEW_PRECISION_M,
-            )
+        led = self.led(coarse.T_target_source)
         if isinstance(led, Rejected):
             return led
         moved_m = geometry.distance(geometry.inverse(coarse.T_target_source) @ led.T_target_source)
@@ -98,6 +164,19 @@ class Trial(Pair):
             detail = f"{judgement.log_odds:.1f} < {self.least_odds - FEW_NATS:.1f} nats with few points"
             return Rejected(RejectReason.IMPROBABLE, detail, judgement.probability, judgement.evidence)
         return led.T_target_source
+
+    def led(self, T_start: Transform) -> Registration | Rejected:
+        """The pose to which few points of the source lead; a pose that slides need not converge."""
+        config = self.config.refine
+        with self.watch("refine"):
+            return refinement.refine(
+                few_points(self.source, config),
+                self.target.surface,
+                T_start,
+                config=config,
+                must_converge=False,
+                precision_m=FEW_PRECISION_M,
+            )
 
     def first_look(self, T_target_source: Transform) -> patches.Shown:
         """What the patches of the source show at this pose; takes 2 ms."""

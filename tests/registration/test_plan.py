@@ -8,7 +8,6 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.types import Alignment, Label, Points, Registration, Transform
-from segslam.registration import hypotheses
 from segslam.registration.segregator.plan import CELL_M, NUM_YAWS, FloorPlan, plan_hypotheses
 from segslam.verification import register
 
@@ -96,7 +95,7 @@ def test_nothing_upright_gives_no_pose() -> None:
 def test_scans_that_share_nothing_but_walls_are_aligned_by_these(
     num_plans: int, aligned: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hypotheses, "MAX_PLAN_HYPOTHESES", num_plans)
+    monkeypatch.setattr("segslam.verification.trial.MAX_PLAN_HYPOTHESES", num_plans)
     config = load_config(overrides=["segregator.features=never"])
     ground = np.column_stack([column.ravel() for column in np.mgrid[-4:14:0.3, -6:20:0.3, -1.7:-1.6:1]])
     walls = _court(points_per_metre=60)

@@ -32,7 +32,7 @@ def _corridor_scan(x: float) -> PreparedScan:
 def _from(T_target_source: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> Alignment | Rejected:
     """What becomes of one coarse pose, the only one that is tried."""
     coarse = Registration(T_target_source, 9, 9, 0.1, np.eye(6))
-    monkeypatch.setattr(pair, "coarse_poses", lambda _: iter([coarse]))
+    monkeypatch.setattr(pair.Trial, "coarse_poses", lambda _: iter([coarse]))
     return register_prepared(_corridor_scan(SOURCE_X), _corridor_scan(TARGET_X), config=CONFIG)
 
 
@@ -69,7 +69,7 @@ def test_two_places_of_which_a_part_has_the_same_shape_are_not_taken_for_one(
 ) -> None:
     """Scans by seed of the scene, row of its path and visit. The walls match anywhere, and here one niche does too."""
     coarse = Registration(geometry.transform(geometry.yaw(math.radians(turn_deg)), shift_m), 9, 9, 0.1, np.eye(6))
-    monkeypatch.setattr(pair, "coarse_poses", lambda _: iter([coarse]))
+    monkeypatch.setattr(pair.Trial, "coarse_poses", lambda _: iter([coarse]))
     one, other = (
         scenes.Place(SCENES[scene](seed), sensor, 0.03, seed, CONFIG).prepared(row, visit)
         for seed, row, visit in (source, target)

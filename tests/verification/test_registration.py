@@ -10,14 +10,13 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Label, Registration, Rejected, RejectReason
-from segslam.registration import hypotheses, refinement, segregator
+from segslam.registration import refinement, segregator
 from segslam.registration.free_space import observe_free_space
-from segslam.registration.hypotheses import MAX_COARSE_FINE_M, MAX_HYPOTHESES, anywhere, coarse_poses
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import open_dataset
 from segslam.verification import register, register_near, register_prepared, rivals
 from segslam.verification.pair import tried_poses
-from segslam.verification.trial import Found, Trial
+from segslam.verification.trial import MAX_COARSE_FINE_M, MAX_HYPOTHESES, Found, Trial, anywhere
 from tools.benchmarks.altered import ALTERATIONS
 
 CONFIG = Config()
@@ -91,7 +90,7 @@ def test_poses_that_the_prior_excludes_do_not_use_up_the_attempts(monkeypatch: p
     turned = replace(right, T_target_source=right.T_target_source @ geometry.transform(geometry.yaw(np.pi), 0.0))
     ranked = [turned] * MAX_HYPOTHESES + [right]
     monkeypatch.setattr(segregator, "hypotheses", lambda *_, **__: ranked)
-    monkeypatch.setattr(hypotheses, "MAX_PLAN_HYPOTHESES", 0)
+    monkeypatch.setattr("segslam.verification.trial.MAX_PLAN_HYPOTHESES", 0)
 
     def gate(pose: np.ndarray, *, slack_m: float) -> Rejected | None:
         turn_deg = _error(T_target_source, pose)[1]
@@ -168,7 +167,7 @@ def test_the_first_iterations_decide_whether_a_rival_is_refined(
 def _found_pose() -> tuple[Trial, Found]:
     source, target, _ = _round_pair()
     trial = Trial(source, target, CONFIG, anywhere, Stopwatch())
-    (coarse, *_) = (one for one in coarse_poses(trial) if isinstance(one, Registration))
+    (coarse, *_) = (one for one in trial.coarse_poses() if isinstance(one, Registration))
     found = trial.refined(coarse, coarse.T_target_source)
     assert isinstance(found, Found)
     return trial, found

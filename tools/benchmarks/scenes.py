@@ -23,10 +23,10 @@ from segslam.core.types import Alignment, LoopCandidate, Rejected, Transform
 from segslam.graph.chains import prior_gate
 from segslam.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
-from segslam.registration.hypotheses import Gate
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register_prepared
 from segslam.verification.patches import agreement
+from segslam.verification.trial import Gate
 from tools.benchmarks import common
 from tools.benchmarks.scene_models import SCENES, SENSORS, Scene, pose, scan_points
 

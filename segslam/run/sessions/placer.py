@@ -21,11 +21,10 @@ from segslam.graph import AnchoredGraph
 from segslam.graph.chains import far_from_prior
 from segslam.keyframes import Submaps
 from segslam.registration import refinement
-from segslam.registration.hypotheses import MAX_COARSE_FINE_M
 from segslam.registration.prepared import Observed, prepare_observed
 from segslam.run.locator import Locator
 from segslam.verification.patches import agreement
-from segslam.verification.trial import Found, judged
+from segslam.verification.trial import MAX_COARSE_FINE_M, Found, judged
 
 REACH_M = 12.0
 """Chosen: the map's keyframes within this distance of a prediction are used for registration."""

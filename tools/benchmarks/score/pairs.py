@@ -15,13 +15,12 @@ from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Points, Rejected, Transform
 from segslam.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
-from segslam.registration.hypotheses import Gate, anywhere
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import Dataset, open_dataset
 from segslam.verification import register_prepared
 from segslam.verification.pair import tried_poses
 from segslam.verification.patches import agreement
-from segslam.verification.trial import Trial
+from segslam.verification.trial import Gate, Trial, anywhere
 from tools.benchmarks import common, scenes
 from tools.benchmarks.registration.scans import courtyard_points
 from tools.benchmarks.scene_models import SCENES

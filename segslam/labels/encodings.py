@@ -20,34 +20,40 @@ Encoding = Literal["raw", "learning", "learning-0"]
 ENCODINGS: tuple[Encoding, ...] = get_args(Encoding)
 
 UNKNOWN = 255  # entry of the tables below for ids that do not exist
-RAW: dict[Label, tuple[int, ...]] = {  # the `learning_map` of the benchmark, inverted: class -> raw ids
-    Label.UNLABELLED: (0, 1, 52, 99),
-    Label.CAR: (10,),
-    Label.BICYCLE: (11,),
-    Label.MOTORCYCLE: (15,),
-    Label.TRUCK: (18,),
-    Label.OTHER_VEHICLE: (13, 16, 20),
-    Label.PERSON: (30,),
-    Label.BICYCLIST: (31,),
-    Label.MOTORCYCLIST: (32,),
-    Label.ROAD: (40, 60),
-    Label.PARKING: (44,),
-    Label.SIDEWALK: (48,),
-    Label.OTHER_GROUND: (49,),
-    Label.BUILDING: (50,),
-    Label.FENCE: (51,),
-    Label.VEGETATION: (70,),
-    Label.TRUNK: (71,),
-    Label.TERRAIN: (72,),
-    Label.POLE: (80,),
-    Label.TRAFFIC_SIGN: (81,),
-    Label.MOVING_CAR: (252,),
-    Label.MOVING_BICYCLIST: (253,),
-    Label.MOVING_PERSON: (254,),
-    Label.MOVING_MOTORCYCLIST: (255,),
-    Label.MOVING_OTHER_VEHICLE: (256, 257, 259),
-    Label.MOVING_TRUCK: (258,),
+CLASSES: dict[Label, tuple[tuple[int, ...], str]] = {
+    Label.UNLABELLED: ((0, 1, 52, 99), "#9a9a9a"),
+    Label.CAR: ((10,), "#3f7fd6"),
+    Label.BICYCLE: ((11,), "#43c6c9"),
+    Label.MOTORCYCLE: ((15,), "#2b8f9c"),
+    Label.TRUCK: ((18,), "#5a4fcf"),
+    Label.OTHER_VEHICLE: ((13, 16, 20), "#7d6be0"),
+    Label.PERSON: ((30,), "#e0332e"),
+    Label.BICYCLIST: ((31,), "#e85a9b"),
+    Label.MOTORCYCLIST: ((32,), "#b03a7c"),
+    Label.ROAD: ((40, 60), "#6f5b73"),
+    Label.PARKING: ((44,), "#a488a8"),
+    Label.SIDEWALK: ((48,), "#8a6f8e"),
+    Label.OTHER_GROUND: ((49,), "#7c5a4a"),
+    Label.BUILDING: ((50,), "#e8b93c"),
+    Label.FENCE: ((51,), "#d9823b"),
+    Label.VEGETATION: ((70,), "#3f9b45"),
+    Label.TRUNK: ((71,), "#8b5a2b"),
+    Label.TERRAIN: ((72,), "#9bcf6a"),
+    Label.POLE: ((80,), "#f4e58c"),
+    Label.TRAFFIC_SIGN: ((81,), "#ff4f3f"),
+    Label.MOVING_CAR: ((252,), ""),
+    Label.MOVING_BICYCLIST: ((253,), ""),
+    Label.MOVING_PERSON: ((254,), ""),
+    Label.MOVING_MOTORCYCLIST: ((255,), ""),
+    Label.MOVING_OTHER_VEHICLE: ((256, 257, 259), ""),
+    Label.MOVING_TRUCK: ((258,), ""),
 }
+"""Raw ids of each class, the `learning_map` of the benchmark inverted, and its colour if maps contain it.
+
+Colours are chosen: ground in violet and green, vehicles in blue.
+"""
+RAW = {label: ids for label, (ids, _) in CLASSES.items()}
+COLORS = {label: color for label, (_, color) in CLASSES.items() if color}
 RAW_OF_LABEL = np.array([RAW[label][0] for label in Label], dtype=np.uint32)
 """The raw id that is written for each label; merged classes such as buses are written as the class they merge into."""
 
@@ -55,29 +61,6 @@ RARE = (Label.BICYCLE, Label.MOTORCYCLE, Label.BICYCLIST, Label.MOTORCYCLIST)
 RARE_MAX_SHARE = 0.02
 """Chosen: together they have 0.1 % of the data set's points, and under 0.1 % of each real scan tried."""
 ROAD_MIN_SHARE = 0.02  # chosen: the real scans of KITTI 00 contain 20 to 28 %
-COLORS = {
-    Label.UNLABELLED: "#9a9a9a",
-    Label.CAR: "#3f7fd6",
-    Label.BICYCLE: "#43c6c9",
-    Label.MOTORCYCLE: "#2b8f9c",
-    Label.TRUCK: "#5a4fcf",
-    Label.OTHER_VEHICLE: "#7d6be0",
-    Label.PERSON: "#e0332e",
-    Label.BICYCLIST: "#e85a9b",
-    Label.MOTORCYCLIST: "#b03a7c",
-    Label.ROAD: "#6f5b73",
-    Label.PARKING: "#a488a8",
-    Label.SIDEWALK: "#8a6f8e",
-    Label.OTHER_GROUND: "#7c5a4a",
-    Label.BUILDING: "#e8b93c",
-    Label.FENCE: "#d9823b",
-    Label.VEGETATION: "#3f9b45",
-    Label.TRUNK: "#8b5a2b",
-    Label.TERRAIN: "#9bcf6a",
-    Label.POLE: "#f4e58c",
-    Label.TRAFFIC_SIGN: "#ff4f3f",
-}
-"""Chosen, for the classes that maps contain: ground in violet and green, vehicles in blue."""
 
 Colors = UInt8[np.ndarray, "_ 3"]
 """Red, green and blue, one row per point."""

@@ -3,31 +3,36 @@
 Loop closing needs labels that are the same in every scan of a place; whether the class is correct matters less.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from segslam.core.points import within_range
 from segslam.core.types import Label, Labels, Mask, Points, Vector
 from segslam.labels.ground_surface import heights_above_ground, rotated, upright
-from segslam.labels.shapes import NUM_SLICES, Pieces, grid_cells, on_thin_uprights, on_walls, pieces
+from segslam.labels.shapes import (
+    BAND_M,
+    COLUMN_M,
+    RING,
+    SLICE_M,
+    Pieces,
+    grid_cells,
+    on_thin_uprights,
+    on_walls,
+    pieces,
+)
+
+Found = Iterator[tuple[Label, Mask]]
+"""The points of a cloud that have a class."""
 
 MAX_RANGE_M = 70.0
 """Chosen: points farther away remain unlabelled (m)."""
 GROUND_HEIGHT_M = 0.15
 """Chosen: points lower than this are ground (m)."""
-BAND_M = (0.4, 2.6)
-"""Chosen: lowest and highest height in which poles and small solids are searched (m)."""
 MIN_POINTS = 4
 """Chosen: smallest number of points of a pole, small solid or car within the band."""
 MAX_THINGS = 30
 """Chosen: largest number of objects per class; those with most points are kept."""
-POLE_CORE_M = 0.4
-"""Chosen: largest radius of a pole (m)."""
-POLE_CLEAR_M = 0.8
-"""Chosen: radius around a pole without other points (m)."""
-POLE_MIN_M = 1.0
-"""Chosen: smallest height of a pole within the band (m)."""
-POLE_MIN_SHARE = 0.7
-"""Chosen: smallest share of the heights of a pole without other points nearby."""
 TRUNK_MAX_M = 1.6
 """Chosen: largest length of a small solid: young trees, bushes, signs (m)."""
 TRUNK_MIN_M = 1.6
@@ -38,13 +43,6 @@ CAR_LENGTH_M = (1.0, 6.0)
 """Chosen: shortest and longest visible side of a car (m)."""
 CAR_MAX_WIDTH_M = 2.4
 """Chosen: largest width of a car (m)."""
-WALL_THICKNESS_M = 0.16
-"""Chosen: standard deviation of a wall's points across it (m)."""
-WALL_MIN_TOP_M = 1.8
-"""Chosen: smallest height of the top of a wall; hedges are lower (m)."""
-
-COLUMN_M = 0.1
-"""Chosen: a post is some cells wide, and points on it are rarely farther apart at ranges below 40 m."""
 
 
 def geometric_labels(points: Points) -> Labels:
@@ -65,52 +63,35 @@ def geometric_labels(points: Points) -> Labels:
     of_level = np.where(heights < GROUND_HEIGHT_M, np.uint8(Label.ROAD), np.uint8(Label.VEGETATION))
     for rule in (_poles, _solids, _walls):
         rest = np.flatnonzero(of_level == Label.VEGETATION)
-        of_level[rest] = rule(level[rest], heights[rest])
+        for label, found in rule(level[rest], heights[rest]):
+            of_level[rest[found]] = label
     labels[usable] = of_level
     return labels
 
 
-def _poles(points: Points, heights: Vector) -> Labels:
-    """POLE for the points of thin vertical objects, VEGETATION for the others."""
-    low, high = BAND_M
-    slice_m = (high - low) / NUM_SLICES
-    ring = round(POLE_CLEAR_M / COLUMN_M)
-    cells, _, shape = grid_cells(points, COLUMN_M, border=ring)
-    thin = on_thin_uprights(
-        cells,
-        np.floor((heights - low) / slice_m).astype(np.int64),
-        shape,
-        round(POLE_CORE_M / COLUMN_M),
-        ring,
-        round(POLE_MIN_M / slice_m),
-        POLE_MIN_SHARE,
-    )
-    rows = np.flatnonzero(thin)
-    found = pieces(points[rows], heights[rows], np.full(len(rows), True))
-    kept = _most_seen(found, np.full(len(found.top_m), True))
-    labels = np.full(len(points), Label.VEGETATION, np.uint8)
-    labels[rows[kept[found.of_point]]] = Label.POLE
-    return labels
+def _poles(points: Points, heights: Vector) -> Found:
+    """Thin vertical objects."""
+    cells, _, shape = grid_cells(points, COLUMN_M, border=RING)
+    thin = on_thin_uprights(cells, np.floor((heights - BAND_M[0]) / SLICE_M).astype(np.int64), shape)
+    found = pieces(points[thin], heights[thin], np.full(thin.sum(), True))
+    thin[thin] = _most_seen(found, np.full(len(found.top_m), True))[found.of_point]
+    yield Label.POLE, thin
 
 
-def _solids(points: Points, heights: Vector) -> Labels:
-    """TRUNK and CAR for the points of segments of these sizes, VEGETATION for the others."""
+def _solids(points: Points, heights: Vector) -> Found:
+    """Segments of the sizes of trunks and cars."""
     in_band = _within(heights, BAND_M)
     found = pieces(points, heights, in_band)
     is_trunk = (found.top_m >= TRUNK_MIN_M) & (found.length_m <= TRUNK_MAX_M)
     is_car = _within(found.top_m, CAR_TOP_M) & _within(found.length_m, CAR_LENGTH_M)
     is_car &= (found.width_m <= CAR_MAX_WIDTH_M) & ~is_trunk
-    labels = np.full(len(points), Label.VEGETATION, np.uint8)
     for label, suitable, eligible in ((Label.TRUNK, is_trunk, in_band), (Label.CAR, is_car, heights < BAND_M[1])):
         in_chosen = np.append(_most_seen(found, suitable), False)[found.of_point]  # NO_PIECE is the last one
-        labels[in_chosen & eligible] = label
-    return labels
+        yield label, in_chosen & eligible
 
 
-def _walls(points: Points, heights: Vector) -> Labels:
-    """BUILDING for points on vertical surfaces, VEGETATION for the others."""
-    walls = on_walls(points, heights, thickness_m=WALL_THICKNESS_M, min_top_m=WALL_MIN_TOP_M)
-    return np.where(walls, np.uint8(Label.BUILDING), np.uint8(Label.VEGETATION))
+def _walls(points: Points, heights: Vector) -> Found:
+    yield Label.BUILDING, on_walls(points, heights)
 
 
 def _most_seen(found: Pieces, suitable: Mask) -> Mask:

@@ -13,9 +13,24 @@ from scipy.ndimage import label, maximum_filter
 
 from segslam.core.types import IndexPairs, Indices, Mask, Points, Vector
 
+COLUMN_M = 0.1
+"""Chosen: a post is some cells wide, and points on it are rarely farther apart at ranges below 40 m."""
+BAND_M = (0.4, 2.6)
+"""Chosen: lowest and highest height in which poles and small solids are searched (m)."""
 NUM_SLICES = 16
+SLICE_M = (BAND_M[1] - BAND_M[0]) / NUM_SLICES
+CORE, RING = 4, 8
+"""Chosen, in columns: largest radius of a pole, and radius around it without other points."""
+MIN_SLICES = round(1.0 / SLICE_M)
+"""Chosen: smallest height of a pole within the band, 1 m."""
+MIN_SHARE = 0.7
+"""Chosen: smallest share of the heights of a pole without other points nearby."""
 WALL_CELL_M = 0.6
 """Chosen, like the next constants, by the IoU of buildings on the real KITTI scans 0-2 (`tools/benchmarks/labels`)."""
+WALL_THICKNESS_M = 0.16
+"""Standard deviation of a wall's points across it."""
+WALL_MIN_TOP_M = 1.8
+"""Smallest height of the top of a wall; hedges are lower."""
 LAYER_M = 2.0
 NUM_LAYERS = 5
 MIN_LENGTH_M = 0.3
@@ -30,39 +45,31 @@ _ANGLES = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
 COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 
 
-def on_thin_uprights(
-    cells: IndexPairs,
-    slices: Indices,
-    shape: tuple[int, int],
-    core: int,
-    ring: int,
-    min_slices: int,
-    min_share: float,
-) -> Mask:
+def on_thin_uprights(cells: IndexPairs, slices: Indices, shape: tuple[int, int]) -> Mask:
     """(n,) bool: whether each point belongs to a thin, tall, free-standing object.
 
     Point k is in column `cells[k]` of a grid of the given shape, in height slice `slices[k]`. For each occupied
-    column: combine the slices occupied within `core` cells, and remove those occupied between `core` and `ring` cells
-    away. The remaining slices must span `min_slices` and be a share `min_share` of the slices before removal. Points
-    outside the grid or the slices 0 to NUM_SLICES - 1 are ignored, as are columns within `ring` cells of the border.
+    column: combine the slices occupied within `CORE` cells, and remove those occupied between `CORE` and `RING` cells
+    away. The remaining slices must span `MIN_SLICES` and be a share `MIN_SHARE` of the slices before removal. Points
+    outside the grid or the slices 0 to NUM_SLICES - 1 are ignored, as are columns within `RING` cells of the border.
     """
     row, column = cells.T
     chosen = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1]) & (slices >= 0) & (slices < NUM_SLICES)
     column, bits = (row * shape[1] + column)[chosen], (1 << slices[chosen]).astype(np.uint16)
     masks, thin = np.zeros(shape[0] * shape[1], np.uint16), np.zeros(shape[0] * shape[1], np.uint16)
     np.bitwise_or.at(masks, column, bits)
-    a, b = np.mgrid[-ring : ring + 1, -ring : ring + 1].reshape(2, -1)
+    a, b = np.mgrid[-RING : RING + 1, -RING : RING + 1].reshape(2, -1)
     steps, squared = a * shape[1] + b, a * a + b * b
-    inner, outer = steps[squared <= core**2], steps[(squared > core**2) & (squared <= ring**2)]
+    inner, outer = steps[squared <= CORE**2], steps[(squared > CORE**2) & (squared <= RING**2)]
     inside = np.zeros(shape, bool)
-    inside[ring : shape[0] - ring, ring : shape[1] - ring] = True
+    inside[RING : shape[0] - RING, RING : shape[1] - RING] = True
     places = np.flatnonzero(inside.ravel() & (masks > 0))
     held = np.bitwise_or.reduce([masks[places + step] for step in inner])
-    tall = _span(held) >= min_slices
+    tall = _span(held) >= MIN_SLICES
     places, held = places[tall], held[tall]
     clear = held & ~np.bitwise_or.reduce([masks[places + step] for step in outer])
-    clear[np.bitwise_count(clear) < min_share * np.bitwise_count(held)] = 0
-    clear[_span(clear) < min_slices] = 0
+    clear[np.bitwise_count(clear) < MIN_SHARE * np.bitwise_count(held)] = 0
+    clear[_span(clear) < MIN_SLICES] = 0
     for step in inner:
         thin[places + step] |= clear
     chosen[chosen] = thin[column] & bits != 0
@@ -75,11 +82,11 @@ def _span(masks: np.ndarray) -> np.ndarray:
     return np.where(masks > 0, highest - lowest + 1, 0)
 
 
-def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: float) -> Mask:
+def on_walls(points: Points, heights: Vector) -> Mask:
     """(n,) bool: whether each point is on a vertical surface, for points in a level frame.
 
     Each voxel is tested with its 8 neighbours: the standard deviation of the points perpendicular to their line must be
-    below `thickness_m`, and one of the points must be higher than `min_top_m` above the ground.
+    below `WALL_THICKNESS_M`, and one of the points must be higher than `WALL_MIN_TOP_M` above the ground.
     """
     cells, corner, shape = grid_cells(points, WALL_CELL_M, border=1)
     layers = np.clip(heights / LAYER_M, 0, NUM_LAYERS - 1).astype(np.int64)
@@ -98,8 +105,8 @@ def on_walls(points: Points, heights: Vector, *, thickness_m: float, min_top_m: 
     middle, spread = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
     top = np.full(shape, -np.inf)
     np.maximum.at(top.ravel(), column, heights)
-    walls = (n >= MIN_POINTS) & (maximum_filter(top, 3).ravel()[places % top.size] >= min_top_m)
-    walls &= (middle - spread < (thickness_m * 1000) ** 2) & (middle + spread > (MIN_LENGTH_M * 1000) ** 2)
+    walls = (n >= MIN_POINTS) & (maximum_filter(top, 3).ravel()[places % top.size] >= WALL_MIN_TOP_M)
+    walls &= (middle - spread < (WALL_THICKNESS_M * 1000) ** 2) & (middle + spread > (MIN_LENGTH_M * 1000) ** 2)
     return walls[rows[voxel]]
 
 

@@ -3,45 +3,35 @@
 import numpy as np
 import pytest
 
-from segslam.labels.shapes import NUM_SLICES, on_thin_uprights
+from segslam.labels.shapes import CORE, MIN_SHARE, MIN_SLICES, NUM_SLICES, RING, on_thin_uprights
 
 SIDE = 60
-RULE = {"core": 3, "ring": 6, "min_slices": 6, "min_share": 0.7}
 
 
-def _found(cells, slices, **changes):
-    rule = RULE | changes
-    return on_thin_uprights(
-        np.asarray(cells),
-        np.asarray(slices),
-        (SIDE, SIDE),
-        rule["core"],
-        rule["ring"],
-        rule["min_slices"],
-        rule["min_share"],
-    )
+def _found(cells, slices):
+    return on_thin_uprights(np.asarray(cells), np.asarray(slices), (SIDE, SIDE))
 
 
 def _post(i, j, slices):
     return [(i, j)] * len(slices), list(slices)
 
 
-def _by_sets(cells, slices, core, ring, min_slices, min_share):
-    """The same rule by sets: which slices each column, its core and its ring hold."""
+def _by_sets(cells, slices):
+    """The same rule by sets: which slices each column, its core and its RING hold."""
     held = {}
     for cell, s in zip(map(tuple, cells), slices, strict=True):
         held.setdefault(cell, set()).add(s)
     marked = {}
     for i, j in held:
-        if not (ring <= i < SIDE - ring and ring <= j < SIDE - ring):
+        if not (RING <= i < SIDE - RING and RING <= j < SIDE - RING):
             continue
         squared = {cell: (cell[0] - i) ** 2 + (cell[1] - j) ** 2 for cell in held}
-        inside = set().union(*(held[c] for c in held if squared[c] <= core**2))
-        around = set().union(*(held[c] for c in held if core**2 < squared[c] <= ring**2))
+        inside = set().union(*(held[c] for c in held if squared[c] <= CORE**2))
+        around = set().union(*(held[c] for c in held if CORE**2 < squared[c] <= RING**2))
         clear = inside - around
-        if clear and max(clear) - min(clear) + 1 >= min_slices and len(clear) >= min_share * len(inside):
+        if clear and max(clear) - min(clear) + 1 >= MIN_SLICES and len(clear) >= MIN_SHARE * len(inside):
             for cell in held:
-                if squared[cell] <= core**2:
+                if squared[cell] <= CORE**2:
                     marked.setdefault(cell, set()).update(clear)
     return np.array([s in marked.get(tuple(c), ()) for c, s in zip(cells, slices, strict=True)])
 
@@ -51,7 +41,7 @@ def test_a_free_standing_post_is_found():
 
 
 def test_a_post_beside_a_wall_is_not():
-    wall = [(i, 34) for i in range(20, 40) for _ in range(10)]
+    wall = [(i, 30 + RING - 2) for i in range(20, 40) for _ in range(10)]
     cells, slices = _post(30, 30, range(10))
     assert not _found(cells + wall, slices + list(range(10)) * 20).any()
 
@@ -64,7 +54,7 @@ def test_only_the_trunk_of_a_tree_is_found():
     trunk_cells, trunk_slices = _post(30, 30, range(12))
     crown = [(30 + a, 30 + b) for a in range(-6, 7) for b in range(-6, 7)]
     cells, slices = trunk_cells + crown * 3, trunk_slices + [9] * len(crown) + [10] * len(crown) + [11] * len(crown)
-    found = _found(cells, slices, min_share=0.6)
+    found = _found(cells, slices)
     np.testing.assert_array_equal(found, np.r_[np.arange(12) < 9, np.zeros(3 * len(crown), bool)])
 
 
@@ -73,7 +63,7 @@ def test_the_kernel_agrees_with_sets_of_cells(seed):
     rng = np.random.default_rng(seed)
     cells = rng.integers(0, SIDE, (40, 2)).repeat(8, axis=0)
     slices = rng.integers(0, NUM_SLICES, len(cells))
-    expected = _by_sets(cells, slices, **RULE)
+    expected = _by_sets(cells, slices)
     assert expected.any()
     np.testing.assert_array_equal(_found(cells, slices), expected)
 

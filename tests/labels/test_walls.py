@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 
 from segslam.core.geometry import yaw
-from segslam.labels.shapes import LAYER_M, MIN_LENGTH_M, MIN_POINTS, NUM_LAYERS, WALL_CELL_M, on_walls
-
-RULE = {"thickness_m": 0.15, "min_top_m": 1.8}
+from segslam.labels.shapes import (
+    LAYER_M,
+    MIN_LENGTH_M,
+    MIN_POINTS,
+    NUM_LAYERS,
+    WALL_CELL_M,
+    WALL_MIN_TOP_M,
+    WALL_THICKNESS_M,
+    on_walls,
+)
 
 
 def _face(rng, *, length_m, height_m, thickness_m=0.02, turn_deg=0.0, num_points=3000):
@@ -23,9 +30,9 @@ def _by_components(points, heights):
     for k in range(len(points)):
         around = (np.abs(cells - cells[k]) <= 1).all(axis=1)
         near = points[around & (layers == layers[k]), :2]
-        if len(near) >= MIN_POINTS and heights[around].max() >= RULE["min_top_m"]:
+        if len(near) >= MIN_POINTS and heights[around].max() >= WALL_MIN_TOP_M:
             across, along = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(near.T, bias=True)), 0.0))
-            walls[k] = across < RULE["thickness_m"] and along > MIN_LENGTH_M
+            walls[k] = across < WALL_THICKNESS_M and along > MIN_LENGTH_M
     return walls
 
 
@@ -37,12 +44,12 @@ def rng():
 @pytest.mark.parametrize("turn_deg", [0.0, 30.0, 45.0, 100.0])
 def test_a_face_is_a_wall_however_it_is_turned(rng, turn_deg):
     points = _face(rng, length_m=8, height_m=4, turn_deg=turn_deg)
-    assert on_walls(points, points[:, 2], **RULE).mean() > 0.9  # too little is seen around its two ends
+    assert on_walls(points, points[:, 2]).mean() > 0.9  # too little is seen around its two ends
 
 
 def test_a_low_face_and_a_thick_bush_are_none(rng):
     for points in (_face(rng, length_m=8, height_m=1.5), _face(rng, length_m=8, height_m=4, thickness_m=0.5)):
-        assert on_walls(points, points[:, 2], **RULE).mean() < 0.05
+        assert on_walls(points, points[:, 2]).mean() < 0.05
 
 
 def test_each_point_agrees_with_a_component_analysis(rng):
@@ -51,15 +58,15 @@ def test_each_point_agrees_with_a_component_analysis(rng):
     expected = _by_components(points, points[:, 2])
     assert 0.2 < expected.mean() < 0.8
     # coordinates count in whole millimetres: a point or two may fall on the other side of a bound
-    assert (on_walls(points, points[:, 2], **RULE) != expected).mean() < 0.02
+    assert (on_walls(points, points[:, 2]) != expected).mean() < 0.02
 
 
 def test_permuting_the_points_permutes_the_walls(rng):
     points = _face(rng, length_m=6, height_m=5, thickness_m=0.14)
     order = rng.permutation(len(points))
-    expected = on_walls(points, points[:, 2], **RULE)[order]
-    np.testing.assert_array_equal(on_walls(points[order], points[order, 2], **RULE), expected)
+    expected = on_walls(points, points[:, 2])[order]
+    np.testing.assert_array_equal(on_walls(points[order], points[order, 2]), expected)
 
 
 def test_no_points_lie_on_no_wall():
-    assert on_walls(np.empty((0, 3)), np.empty(0), **RULE).shape == (0,)
+    assert on_walls(np.empty((0, 3)), np.empty(0)).shape == (0,)

@@ -8,8 +8,8 @@ from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Label
 from segslam.registration.segregator import describe
-from segslam.registration.segregator.clusters import Clusters
-from segslam.registration.segregator.ground import ground_cells, ground_heights, stand_on_ground
+from segslam.registration.segregator.clusters import MAX_RANGE_M, Clusters
+from segslam.registration.segregator.ground import ground_cells, stand_on_ground
 
 UPRIGHT = SegregatorConfig().foot_classes
 
@@ -20,7 +20,7 @@ def slope(rng: np.random.Generator, num_points: int = 20_000) -> np.ndarray:
 
 
 def cells(points: np.ndarray) -> np.ndarray:
-    return ground_cells(points, np.full(len(points), Label.ROAD, np.uint8), reach_m=100.0)
+    return ground_cells(points, np.full(len(points), Label.ROAD, np.uint8))
 
 
 def clusters_at(means: np.ndarray) -> Clusters:
@@ -32,7 +32,7 @@ def test_upright_clusters_stand_on_the_ground_beneath_and_others_stay() -> None:
     rng = np.random.default_rng(0)
     clusters = clusters_at(rng.uniform([-25, -25, 0], [25, 25, 3], (12, 3)))
     upright = np.arange(12) % 3 > 0
-    standing = stand_on_ground(clusters, upright, cells(slope(rng)), max_distance_m=5.0)
+    standing = stand_on_ground(clusters, upright, cells(slope(rng)))
     np.testing.assert_array_equal(standing.means[:, :2], clusters.means[:, :2])
     np.testing.assert_array_equal(standing.means[~upright], clusters.means[~upright])
     expected = 0.05 * clusters.means[:, 0] - 1.7
@@ -43,35 +43,34 @@ def test_upright_clusters_stand_on_the_ground_beneath_and_others_stay() -> None:
 def test_one_wrong_cell_does_not_lift_a_foot() -> None:
     rng = np.random.default_rng(1)
     ground = np.concatenate([slope(rng), [[10.2, 5.1, 4.0], [10.3, 5.2, 4.1]]])
-    standing = stand_on_ground(
-        clusters_at(np.array([[10.0, 5.0, 2.0]])), np.ones(1, bool), cells(ground), max_distance_m=5.0
-    )
+    standing = stand_on_ground(clusters_at(np.array([[10.0, 5.0, 2.0]])), np.ones(1, bool), cells(ground))
     assert standing.means[0, 2] == pytest.approx(-1.2, abs=0.06)
 
 
 @pytest.mark.parametrize("ground", [np.empty((0, 3)), np.array([[40.0, 0, -1.7]])], ids=["no ground", "far ground"])
 def test_clusters_without_ground_near_them_stay(ground: np.ndarray) -> None:
     clusters = clusters_at(np.array([[10.0, 5.0, 2.0]]))
-    standing = stand_on_ground(clusters, np.ones(1, bool), ground, max_distance_m=5.0)
+    standing = stand_on_ground(clusters, np.ones(1, bool), ground)
     np.testing.assert_array_equal(standing.means, clusters.means)
-    assert np.isnan(ground_heights(clusters.means, ground, max_distance_m=5.0)).all()
 
 
 def test_a_single_cell_of_ground_is_enough() -> None:
-    heights = ground_heights(np.array([[1.0, 0, 2], [0, 1, 3]]), np.array([[0.0, 0, -1.5]]), max_distance_m=5.0)
-    assert heights.tolist() == [-1.5, -1.5]
+    clusters = clusters_at(np.array([[1.0, 0, 2], [0, 1, 3]]))
+    standing = stand_on_ground(clusters, np.ones(2, bool), np.array([[0.0, 0, -1.5]]))
+    assert standing.means[:, 2].tolist() == [-1.5, -1.5]
 
 
 def test_ground_cells_are_the_means_of_a_dictionary() -> None:
     rng = np.random.default_rng(4)
     points = rng.uniform([-20, -20, -3], [20, 20, 0], (3000, 3)).astype(np.float32)
+    points[:100] *= 8.0
     labels = rng.choice([Label.ROAD, Label.TERRAIN, Label.CAR, Label.UNLABELLED], 3000).astype(np.uint8)
     members: dict[tuple[float, float], list[np.ndarray]] = {}
     for point, label in zip(points.astype(float), labels, strict=True):
-        if label in (Label.ROAD, Label.TERRAIN) and np.abs(point).max() < 15:
+        if label in (Label.ROAD, Label.TERRAIN) and np.abs(point).max() < MAX_RANGE_M:
             members.setdefault(tuple(np.floor(point[:2])), []).append(point)
     expected = [np.mean(members[cell], axis=0) for cell in sorted(members)]
-    np.testing.assert_allclose(ground_cells(points, labels, reach_m=15.0), expected, atol=1e-9)
+    np.testing.assert_allclose(ground_cells(points, labels), expected, atol=1e-9)
 
 
 @pytest.mark.data

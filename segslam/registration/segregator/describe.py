@@ -21,8 +21,6 @@ from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, s
 from segslam.registration.segregator.fpfh import fpfh
 from segslam.registration.segregator.ground import ground_cells, ground_patches, stand_on_ground
 
-FOOT_MAX_DISTANCE_M = 10.0
-"""Chosen: largest distance to the ground patch below such a cluster (m)."""
 FEW_CLUSTERS = 24
 """Chosen on simulated 00 and 08: number of clusters below which a scan has few clusters."""
 FEATURE_CLASSES = (Label.BUILDING, Label.VEGETATION)
@@ -65,8 +63,7 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
     clusters = semantic_clusters(points, labels, config=config)
     upright = np.isin(clusters.classes, [int(label) for label in config.foot_classes])
     if upright.any():
-        ground = ground_cells(points, labels, reach_m=MAX_RANGE_M)
-        clusters = stand_on_ground(clusters, upright, ground, max_distance_m=FOOT_MAX_DISTANCE_M)
+        clusters = stand_on_ground(clusters, upright, ground_cells(points, labels))
     wanted = config.features == "always" or (
         config.features == "when_few_clusters" and len(clusters.sizes) < FEW_CLUSTERS
     )

@@ -13,9 +13,11 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from segslam.core.types import GROUND_LABELS, Indices, Labels, Points, Vector
-from segslam.registration.segregator.clusters import Clusters
+from segslam.core.types import GROUND_LABELS, Indices, Labels, Mask, Points
+from segslam.registration.segregator.clusters import MAX_RANGE_M, Clusters
 
+FOOT_MAX_DISTANCE_M = 10.0
+"""Chosen: largest distance of a cluster to the ground below it."""
 FOOT_CELL_M = 1.0
 """Chosen: cell size in which the ground is averaged (m)."""
 NUM_FOOT_CELLS = 5
@@ -33,37 +35,30 @@ RESOLUTION_M = 1e-4
 """Unit of the integer sums of coordinates (m)."""
 
 
-def stand_on_ground(clusters: Clusters, upright: np.ndarray, ground: Points, *, max_distance_m: float) -> Clusters:
-    """The clusters, with the `upright` ones (k, bool) moved along z to the ground around them.
+def stand_on_ground(clusters: Clusters, upright: Mask, ground: Points) -> Clusters:
+    """The clusters, with the `upright` ones moved along z to the ground around them: the median of the nearest cells.
 
-    `ground` comes from `ground_cells`, in the clusters' frame. A cluster without ground within `max_distance_m`
+    `ground` comes from `ground_cells`, in the clusters' frame. A cluster without ground within `FOOT_MAX_DISTANCE_M`
     (horizontally) is not moved. Covariances do not change.
     """
-    heights = ground_heights(clusters.means, ground, max_distance_m=max_distance_m)
+    if not len(ground):
+        return clusters
+    columns = range(1, min(NUM_FOOT_CELLS, len(ground)) + 1)
+    distances, nearest = map(np.asarray, cKDTree(ground[:, :2]).query(clusters.means[:, :2], k=columns))
+    moved = upright & (distances[:, 0] <= FOOT_MAX_DISTANCE_M)
     means = clusters.means.copy()
-    moved = upright & np.isfinite(heights)
-    means[moved, 2] = heights[moved]
+    means[moved, 2] = np.median(ground[nearest[moved], 2], axis=1)
     return clusters._replace(means=means)
 
 
-def ground_heights(places: Points, ground: Points, *, max_distance_m: float) -> Vector:
-    """Height (m) of the ground at each place: the median of the nearest points of `ground`; NaN where none is near."""
-    if not len(ground):
-        return np.full(len(places), np.nan)
-    columns = range(1, min(NUM_FOOT_CELLS, len(ground)) + 1)
-    distances, nearest = map(np.asarray, cKDTree(ground[:, :2]).query(places[:, :2], k=columns))
-    heights = np.median(ground[nearest, 2], axis=1)
-    return np.where(distances[:, 0] <= max_distance_m, heights, np.nan)
-
-
-def ground_cells(points: Points, labels: Labels, *, reach_m: float) -> Points:
-    """The mean ground point of each occupied square cell, within `reach_m` in x, y and z.
+def ground_cells(points: Points, labels: Labels) -> Points:
+    """The mean ground point of each occupied square cell, within `MAX_RANGE_M` in x, y and z.
 
     Sums in float64 of float32 values above 1e-5 m are exact, so they do not depend on the order of points.
     """
     with np.errstate(over="ignore"):  # what float32 cannot hold is out of reach
-        ground = _ground(points.astype(np.float32), labels, reach_m)
-    return _cell_means(ground, ground, reach_m, FOOT_CELL_M)[0]
+        ground = _ground(points.astype(np.float32), labels, MAX_RANGE_M)
+    return _cell_means(ground, ground, MAX_RANGE_M, FOOT_CELL_M)[0]
 
 
 def ground_patches(points: Points, labels: Labels) -> tuple[Points, Points]:

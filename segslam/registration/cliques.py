@@ -41,15 +41,6 @@ def lowest_bit(word):
     return np.int64(count_bits((word & (~word + np.uint64(1))) - np.uint64(1)))
 
 
-@kernel("uint64(uint64[::1])")
-def pack_flags(eights):
-    """One word from 64 bytes of 0 or 1, eight at a time: a product collects the lowest bits in its highest byte."""
-    word = np.uint64(0)
-    for k in range(8):
-        word |= ((eights[k] * np.uint64(0x0102040810204080)) >> np.uint64(56)) << np.uint64(8 * k)
-    return word
-
-
 @kernel("int64(uint64[::1], int64[::1])")
 def members(row, out):
     """Writes the positions of the set bits of `row`, ascending, to `out`, and returns their number."""

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from segslam.registration.cliques import count_bits, lowest_bit, members, pack_flags, pack_rows
+from segslam.registration.cliques import count_bits, lowest_bit, members, pack_rows
 
 WORDS = st.integers(0, 2**64 - 1)
 
@@ -18,12 +18,6 @@ def test_bits_are_counted_as_python_counts_them(word: int) -> None:
 @given(word=WORDS.filter(bool))
 def test_lowest_bit_is_the_number_of_zeros_below_it(word: int) -> None:
     assert lowest_bit(np.uint64(word)) == (word & -word).bit_length() - 1
-
-
-@given(word=WORDS)
-def test_flags_are_packed_first_in_the_lowest_bit(word: int) -> None:
-    flags = np.array([word >> k & 1 for k in range(64)], np.uint8)
-    assert int(pack_flags(flags.view(np.uint64))) == word
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 200])

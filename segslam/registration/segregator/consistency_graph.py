@@ -19,7 +19,7 @@ import numpy as np
 
 from segslam.core.config import SegregatorConfig
 from segslam.core.kernels import kernel
-from segslam.registration.cliques import Bits, lowest_bit, members, pack_flags
+from segslam.registration.cliques import Bits, lowest_bit, members
 from segslam.registration.segregator.correspondences import Correspondences
 
 
@@ -65,7 +65,10 @@ def _length_consistent(source, target, source_index, target_index, bound):
             excess = a + b - bound * bound
             row[j] = ((excess <= 0.0) | (excess * excess <= 4.0 * a * b)) & (p[j] != own_p) & (q[j] != own_q)
         for word in range(i >> 6, words):
-            bits = pack_flags(eights[8 * word : 8 * word + 8])
+            bits = np.uint64(0)
+            for k in range(8):  # from 64 bytes of 0 or 1: a product collects eight lowest bits in its highest byte
+                eight = eights[8 * word + k] * np.uint64(0x0102040810204080)
+                bits |= (eight >> np.uint64(56)) << np.uint64(8 * k)
             adjacency[i, word] |= bits
             while bits and word > i >> 6:  # the word that contains bit i was tested for both orders
                 adjacency[64 * word + lowest_bit(bits), i >> 6] |= np.uint64(1) << np.uint64(i & 63)

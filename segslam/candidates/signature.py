@@ -8,7 +8,6 @@ opposite rays, so the signature determines the yaw up to 180 degrees.
 
 import math
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -25,6 +24,8 @@ HALF = 75
 """Cells from the sensor to the edge of the image: 30 m."""
 WINDOW_CELLS = 35.0
 """Standard deviation of the Gaussian weight around the sensor: 14 m."""
+_ALONG = np.exp(-0.5 * (np.arange(-HALF, HALF + 1) / WINDOW_CELLS) ** 2)
+WINDOW = np.outer(_ALONG, _ALONG)
 MAX_LEVELS = 10
 """Largest number of occupied voxels counted per column."""
 SIZE = 256
@@ -33,6 +34,10 @@ NUM_RADII, MAX_RADIUS = 24, 100
 """Number of circles in the spectrum, evenly spaced; the largest has a wavelength of 1.02 m."""
 NUM_ANGLES = 60
 """Number of rays over 180 degrees, 3 degrees apart."""
+_ANGLES = np.pi * np.arange(NUM_ANGLES) / NUM_ANGLES - np.pi / 2
+_RADII = (np.arange(NUM_RADII) + 1)[:, None] * MAX_RADIUS / NUM_RADII
+SAMPLES = np.stack([_RADII * np.sin(_ANGLES), _RADII * np.cos(_ANGLES)])
+"""Rows and columns of the transform on the half of each circle where columns are not negative."""
 GROUND_M = 0.4
 """Smallest height above the ground of the points used."""
 CIRCLES = ((8.0, 6), (16.0, 10))
@@ -103,7 +108,7 @@ def _standing(points: Points, labels: Labels, *, reach_m: float) -> Points:
 def signature_of_standing(points: Points) -> PlaceSignature:
     """The signature of points that stand above the ground, in a level frame with the sensor at the origin."""
     magnitudes = np.abs(rfft2(_image(points), (SIZE, SIZE)))
-    roots = np.sqrt(map_coordinates(np.pad(magnitudes, ((0, 0), (0, 1))), _samples(), order=1, mode="grid-wrap"))
+    roots = np.sqrt(map_coordinates(np.pad(magnitudes, ((0, 0), (0, 1))), SAMPLES, order=1, mode="grid-wrap"))
     return PlaceSignature(np.rint(255.0 * roots / max(float(roots.max()), 1e-9)).astype(np.uint8))
 
 
@@ -115,18 +120,4 @@ def _image(points: Points) -> Float[np.ndarray, "size size"]:
     voxels = ((cells[:, 0] + HALF) * width + cells[:, 1] + HALF) * 2**16 + cells[:, 2] + 2**15
     occupied = voxels[first_rows(voxels) == np.arange(len(voxels))]
     counts = np.bincount(occupied >> 16, minlength=width * width).reshape(width, width)
-    return (np.sqrt(np.minimum(counts, MAX_LEVELS)) * _window()).astype(np.float32)
-
-
-@cache
-def _window() -> Float[np.ndarray, "size size"]:
-    along = np.exp(-0.5 * (np.arange(-HALF, HALF + 1) / WINDOW_CELLS) ** 2)
-    return np.outer(along, along)
-
-
-@cache
-def _samples() -> Float[np.ndarray, "2 radii angles"]:
-    """Rows and columns of the transform on the half of each circle where columns are not negative."""
-    angles = np.pi * np.arange(NUM_ANGLES) / NUM_ANGLES - np.pi / 2
-    radii = (np.arange(NUM_RADII) + 1)[:, None] * MAX_RADIUS / NUM_RADII
-    return np.stack([radii * np.sin(angles), radii * np.cos(angles)])
+    return (np.sqrt(np.minimum(counts, MAX_LEVELS)) * WINDOW).astype(np.float32)

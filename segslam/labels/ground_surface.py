@@ -37,7 +37,10 @@ def upright(points: Points) -> Rotation:
     lowest = _lowest_of_cells(points, LEVEL_RADIUS_M)
     if len(lowest) < MIN_LEVEL_CELLS:
         return np.eye(3)
-    normal, height = _most_voted_plane(lowest)
+    normals = _upward_normals()
+    votes = _votes(lowest, normals, int(LEVEL_RADIUS_M / LEVEL_BIN_M))
+    best, depth = np.unravel_index(int(np.argmax(votes)), votes.shape)
+    normal, height = normals[best], -(float(depth) + 0.5) * LEVEL_BIN_M
     for bound_m in (0.4, 0.2, 0.15):
         near = lowest[np.abs(_along(lowest, normal) - height) < bound_m]
         if len(near) < MIN_LEVEL_CELLS:
@@ -88,14 +91,6 @@ def _lowest_of_cells(points, radius_m):
         if z < best[2] or (z == best[2] and (x < best[0] or (x == best[0] and y < best[1]))):
             best[0], best[1], best[2] = x, y, z
     return lowest[np.isfinite(lowest[:, 2])]
-
-
-def _most_voted_plane(points: Points) -> tuple[np.ndarray, float]:
-    """Unit normal of the plane below the sensor with the most points, and its height along the normal."""
-    normals = _upward_normals()
-    votes = _votes(points, normals, int(LEVEL_RADIUS_M / LEVEL_BIN_M))
-    best, depth = np.unravel_index(int(np.argmax(votes)), votes.shape)
-    return normals[best], -(depth + 0.5) * LEVEL_BIN_M
 
 
 @kernel("int64[:, ::1](float64[:, :], float64[:, ::1], int64)")

@@ -68,12 +68,13 @@ def plan_hypotheses(source: FloorPlan, target: FloorPlan, *, num_poses: int) -> 
     volume, steps = _correlation(source, target)
     filled = np.zeros((SIZE, SIZE, NUM_SLICES), bool)
     filled[*_slots(target.points)] = True
+    rises = np.arange(-MAX_RISE_SLICES, MAX_RISE_SLICES + 1)
     for yaw_index, i, j in _peaks(volume, num_poses):
         R_yaw = geometry.yaw(math.tau * yaw_index / NUM_YAWS)
         T_flat = geometry.transform(R_yaw, CELL_M * np.array([steps[i], steps[j], 0.0]))
         rows, columns, slices = _slots(geometry.apply(T_flat, source.points))
-        num_filled = _count_filled(rows, columns, slices, filled)
-        shift = T_flat[:3, 3] + [0.0, 0.0, SLICE_M * float(num_filled.argmax() - MAX_RISE_SLICES)]
+        num_filled = filled[rows, columns, np.clip(slices + rises[:, None], 0, NUM_SLICES - 1)].sum(axis=1)
+        shift = T_flat[:3, 3] + [0.0, 0.0, SLICE_M * float(rises[num_filled.argmax()])]
         R_scan_level = target.R_level_scan.T
         yield Registration(
             T_target_source=geometry.transform(R_scan_level @ R_yaw @ source.R_level_scan, R_scan_level @ shift),
@@ -122,17 +123,6 @@ def _peaks(volume: Float[np.ndarray, "yaws shifts shifts"], num_peaks: int) -> I
         volume[around, max(i - SAME_CELLS, 0) : i + SAME_CELLS + 1, max(j - SAME_CELLS, 0) : j + SAME_CELLS + 1] = -1.0
         places[around] = flat[around].argmax(axis=1)
         largest[around] = flat[around, places[around]]
-
-
-@kernel("int64[:](int64[:], int64[:], int64[:], boolean[:, :, ::1])")
-def _count_filled(rows, columns, slices, filled):
-    """Number of slots that are filled, for each rise from -MAX_RISE_SLICES to MAX_RISE_SLICES slices."""
-    num_filled = np.zeros(2 * MAX_RISE_SLICES + 1, np.int64)
-    for at in range(len(rows)):
-        for k in range(2 * MAX_RISE_SLICES + 1):
-            height = min(max(slices[at] + k - MAX_RISE_SLICES, 0), filled.shape[2] - 1)
-            num_filled[k] += filled[rows[at], columns[at], height]
-    return num_filled
 
 
 def _slots(points: Points) -> tuple[np.ndarray, ...]:

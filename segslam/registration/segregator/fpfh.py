@@ -30,33 +30,10 @@ TINY = 1e-300
 """Prevents division by zero for empty sums."""
 
 
-def _diamond(angle: float) -> float:
-    """Position, from -2 to 2, where the ray at this angle (-pi to pi) crosses the diamond |x| + |y| = 1."""
-    x, y = math.cos(angle), math.sin(angle)
-    side = y / (abs(x) + abs(y))
-    return side if x >= 0.0 else math.copysign(2.0, y) - side
-
-
-ANGLE_BOUNDS = (-math.inf, *(_diamond(math.pi * (2.0 * k / BINS - 1.0)) for k in range(1, BINS)), math.inf)
-"""Upper edges of the angle bins, as positions on the diamond."""
-
-
 @kernel("int64(float64)")
 def _bin(fraction):
     """The bin of a value at `fraction` of its range."""
     return min(max(int(BINS * fraction), 0), BINS - 1)
-
-
-@kernel("int64(float64, float64)")
-def _angle_bin(y, x):
-    """The bin of atan2(y, x), from the position on the diamond, which is off by one bin at most."""
-    diamond = y / (abs(x) + abs(y)) if x != 0.0 or y != 0.0 else 0.0
-    if x < 0.0:
-        diamond = (2.0 if y >= 0.0 else -2.0) - diamond
-    place = _bin(0.25 * diamond + 0.5)
-    if diamond < ANGLE_BOUNDS[place]:
-        return place - 1
-    return place + (diamond >= ANGLE_BOUNDS[place + 1])
 
 
 @kernel("UniTuple(int64, 3)(float64[:, :], float64[:, :], int64, int64)")
@@ -80,8 +57,8 @@ def _pair_columns(points, normals, source, target):
         return CENTRE, BINS + CENTRE, 2 * BINS + CENTRE
     wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx  # scaled by sine, like v
     alpha = (vx * tx + vy * ty + vz * tz) / sine
-    theta = _angle_bin(wx * tx + wy * ty + wz * tz, (ux * tx + uy * ty + uz * tz) * sine)
-    return theta, BINS + _bin(0.5 * alpha + 0.5), 2 * BINS + _bin(0.5 * phi + 0.5)
+    theta = math.atan2(wx * tx + wy * ty + wz * tz, (ux * tx + uy * ty + uz * tz) * sine)
+    return _bin(theta / math.tau + 0.5), BINS + _bin(0.5 * alpha + 0.5), 2 * BINS + _bin(0.5 * phi + 0.5)
 
 
 @kernel("float32[:, :](float64[:, :], float64[:, :], int64[:], int64[:], int32[:], boolean[:])")

@@ -23,6 +23,7 @@ from segslam.core.types import (
     Registration,
     Rejected,
     RejectReason,
+    Rotation,
     Transform,
 )
 
@@ -255,11 +256,8 @@ def observability(information: Information) -> tuple[float, Direction]:
     The ratio is 0 to 1, without the noise common to all points; 0 if the information is singular. The direction has
     unit length, in the source's frame: there the points constrain the pose least.
     """
-    try:
-        covariance = np.linalg.inv(information)
-    except np.linalg.LinAlgError:
-        return 0.0, np.array([1.0, 0.0, 0.0])
-    variances, directions = np.linalg.eigh(covariance[3:, 3:] - SHARED_NOISE_M**2 * np.eye(3))
+    covariance = _covariance_of_translation(information)
+    variances, directions = np.linalg.eigh(covariance - SHARED_NOISE_M**2 * np.eye(3))
     return float(max(variances[0], 0.0) / variances[2]), directions[:, 2]
 
 
@@ -268,11 +266,15 @@ def weakest_level(information: Information) -> Direction:
 
     Heights are left out: places repeat along the ground, as the doors of a corridor do.
     """
+    return np.array([*np.linalg.eigh(_covariance_of_translation(information)[:2, :2])[1][:, 1], 0.0])
+
+
+def _covariance_of_translation(information: Information) -> Rotation:
+    """(3, 3); of an unknown translation, all of it is along x."""
     try:
-        covariance = np.linalg.inv(information)[3:5, 3:5]
+        return np.linalg.inv(information)[3:, 3:]
     except np.linalg.LinAlgError:
-        return np.array([1.0, 0.0, 0.0])
-    return np.array([*np.linalg.eigh(covariance)[1][:, 1], 0.0])
+        return np.diag([1.0, 0.0, 0.0])
 
 
 def limited_information(hessian: Information, *, config: RefineConfig) -> Information:

@@ -30,7 +30,8 @@ MIN_DETAIL = 1.6
 """Chosen: smallest ratio of filled cells when the cell height is halved: 2 if all cells are filled, 1 if the beams
 are so far apart that half of the rows stay empty."""
 SHARE_OF_PATH = 0.125
-"""Chosen: the margin as a share of the free path. 1 m where the sensor sees 8 m far, as in KITTI's streets (7 to 9)."""
+"""Chosen: the margin as a share of the free path, the median range over the directions with a return. 1 m where the
+sensor sees 8 m far, as in KITTI's streets (7 to 9)."""
 MIN_MARGIN_M = 0.3
 """Chosen: three times the range noise of a poor sensor."""
 
@@ -54,13 +55,8 @@ class FreeSpace:
     """Lower edge of the first row."""
     row_rad: float
     """Height of a row."""
-    free_path_m: float
-    """Median range over the directions with a return: the scale of the place (m); 0 without returns."""
-
-    @property
-    def margin_m(self) -> float:
-        """Distance before a return at which a point violates free space, besides the growth with its range."""
-        return min(max(SHARE_OF_PATH * self.free_path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
+    margin_m: float
+    """Distance before a return at which a point violates free space, besides the growth with its range."""
 
 
 def observe_free_space(points: Points) -> FreeSpace:
@@ -75,7 +71,8 @@ def observe_free_space(points: Points) -> FreeSpace:
     seen = np.isfinite(nearest)
     around = minimum_filter(nearest, 3, mode=("nearest", "wrap"))
     path_m = float(np.median(nearest[seen])) if seen.any() else 0.0
-    return FreeSpace(np.where(seen, around, np.float32(np.inf)), lowest_rad, row_rad, path_m)
+    margin_m = min(max(SHARE_OF_PATH * path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
+    return FreeSpace(np.where(seen, around, np.float32(np.inf)), lowest_rad, row_rad, margin_m)
 
 
 def _spherical(points: Points) -> tuple[Vector, Vector, Indices]:

@@ -85,9 +85,9 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
                 break
         elif outcome is not None:
             rejections.append(outcome)
-    allowed = [pose for pose in found if trial.gate(pose.T_target_source, slack_m=0.0) is None]
+    excluded = [trial.gate(pose.T_target_source, slack_m=0.0) for pose in found]
+    allowed = [pose for pose, rejected in zip(found, excluded, strict=True) if rejected is None]
     if not allowed:
-        excluded = [trial.gate(pose.T_target_source, slack_m=0.0) for pose in found]
         return [*(rejected for rejected in excluded if rejected is not None), *rejections][0]
     best = max(allowed, key=lambda pose: pose.mean_ratio)
     if trial.fits(best):

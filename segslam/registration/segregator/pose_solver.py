@@ -3,11 +3,7 @@
 Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", RA-L 2020, Algorithm 1 with
 the TLS surrogate, eq. (11)-(14). The inner fit is Horn's closed form (JOSA A 1987) in its SVD shape.
 The decoupled solver is that of TEASER (Yang, Shi, Carlone, T-RO 2021), which Segregator's authors use.
-
-| here | paper |
-|---|---|
- control | mu |
-| bound_m | c bar |
+`control` is mu of the paper, and `bound_m` its c bar.
 """
 
 import math

@@ -14,16 +14,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
-from segslam.core.types import (
-    Description,
-    Direction,
-    Indices,
-    Points,
-    Registration,
-    Rejected,
-    RejectReason,
-    Transform,
-)
+from segslam.core.types import Description, Direction, Indices, Points, Registration, Rejected, RejectReason, Transform
 from segslam.registration.cliques import maximum_cliques
 from segslam.registration.segregator.consistency_graph import consistency_graph
 from segslam.registration.segregator.correspondences import Correspondences, feature_pairs

@@ -10,17 +10,7 @@ import numpy as np
 from segslam.core.points import within_range
 from segslam.core.types import Label, Labels, Mask, Points, Vector
 from segslam.labels.ground_surface import heights_above_ground, rotated, upright
-from segslam.labels.shapes import (
-    BAND_M,
-    COLUMN_M,
-    RING,
-    SLICE_M,
-    Pieces,
-    grid_cells,
-    on_thin_uprights,
-    on_walls,
-    pieces,
-)
+from segslam.labels.shapes import BAND_M, Pieces, on_thin_uprights, on_walls, pieces
 
 Found = Iterator[tuple[Label, Mask]]
 """The points of a cloud that have a class."""
@@ -71,8 +61,7 @@ def geometric_labels(points: Points) -> Labels:
 
 def _poles(points: Points, heights: Vector) -> Found:
     """Thin vertical objects."""
-    cells, _, shape = grid_cells(points, COLUMN_M, border=RING)
-    thin = on_thin_uprights(cells, np.floor((heights - BAND_M[0]) / SLICE_M).astype(np.int64), shape)
+    thin = on_thin_uprights(points, heights)
     found = pieces(points[thin], heights[thin], np.full(thin.sum(), True))
     thin[thin] = _most_seen(found, np.full(len(found.top_m), True))[found.of_point]
     yield Label.POLE, thin

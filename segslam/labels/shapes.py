@@ -45,25 +45,23 @@ _ANGLES = np.radians(np.arange(0.0, 90.0, RECTANGLE_STEP_DEG))
 COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 
 
-def on_thin_uprights(cells: IndexPairs, slices: Indices, shape: tuple[int, int]) -> Mask:
-    """(n,) bool: whether each point belongs to a thin, tall, free-standing object.
+def on_thin_uprights(points: Points, heights: Vector) -> Mask:
+    """(n,) bool: whether each point belongs to a thin, tall, free-standing object, for points in a level frame.
 
-    Point k is in column `cells[k]` of a grid of the given shape, in height slice `slices[k]`. For each occupied
-    column: combine the slices occupied within `CORE` cells, and remove those occupied between `CORE` and `RING` cells
-    away. The remaining slices must span `MIN_SLICES` and be a share `MIN_SHARE` of the slices before removal. Points
-    outside the grid or the slices 0 to NUM_SLICES - 1 are ignored, as are columns within `RING` cells of the border.
+    For each occupied column: combine the slices occupied within `CORE` cells, and remove those occupied between `CORE`
+    and `RING` cells away. The remaining slices must span `MIN_SLICES` and be a share `MIN_SHARE` of the slices before
+    removal. Points outside the band of heights are ignored.
     """
-    row, column = cells.T
-    chosen = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1]) & (slices >= 0) & (slices < NUM_SLICES)
-    column, bits = (row * shape[1] + column)[chosen], (1 << slices[chosen]).astype(np.uint16)
-    masks, thin = np.zeros(shape[0] * shape[1], np.uint16), np.zeros(shape[0] * shape[1], np.uint16)
+    cells, _, shape = grid_cells(points, COLUMN_M, border=RING)
+    slices = np.floor((heights - BAND_M[0]) / SLICE_M).astype(np.int64)
+    chosen = (slices >= 0) & (slices < NUM_SLICES)
+    column, bits = (cells[:, 0] * shape[1] + cells[:, 1])[chosen], (1 << slices[chosen]).astype(np.uint16)
+    masks, thin = np.zeros((2, shape[0] * shape[1]), np.uint16)
     np.bitwise_or.at(masks, column, bits)
     a, b = np.mgrid[-RING : RING + 1, -RING : RING + 1].reshape(2, -1)
     steps, squared = a * shape[1] + b, a * a + b * b
     inner, outer = steps[squared <= CORE**2], steps[(squared > CORE**2) & (squared <= RING**2)]
-    inside = np.zeros(shape, bool)
-    inside[RING : shape[0] - RING, RING : shape[1] - RING] = True
-    places = np.flatnonzero(inside.ravel() & (masks > 0))
+    places = np.flatnonzero(masks)
     held = np.bitwise_or.reduce([masks[places + step] for step in inner])
     tall = _span(held) >= MIN_SLICES
     places, held = places[tall], held[tall]

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from segslam.core.geometry import yaw
-from segslam.labels.shapes import CELL_M, NO_PIECE, pieces
+from segslam.labels.geometric import CELL_M, NO_PIECE, pieces
 
 
 def _rectangle(length_m, width_m, *, turn_deg, centre=(0.0, 0.0)):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from segslam.labels.shapes import (
+from segslam.labels.geometric import (
     BAND_M,
     COLUMN_M,
     CORE,

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from segslam.core.geometry import yaw
-from segslam.labels.shapes import (
+from segslam.labels.geometric import (
     LAYER_M,
     MIN_LENGTH_M,
-    MIN_POINTS,
     NUM_LAYERS,
     WALL_CELL_M,
+    WALL_MIN_POINTS,
     WALL_MIN_TOP_M,
     WALL_THICKNESS_M,
     on_walls,
@@ -30,7 +30,7 @@ def _by_components(points, heights):
     for k in range(len(points)):
         around = (np.abs(cells - cells[k]) <= 1).all(axis=1)
         near = points[around & (layers == layers[k]), :2]
-        if len(near) >= MIN_POINTS and heights[around].max() >= WALL_MIN_TOP_M:
+        if len(near) >= WALL_MIN_POINTS and heights[around].max() >= WALL_MIN_TOP_M:
             across, along = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(near.T, bias=True)), 0.0))
             walls[k] = across < WALL_THICKNESS_M and along > MIN_LENGTH_M
     return walls

@@ -75,13 +75,11 @@ class Places:
         self, signatures: Iterable[PlaceSignature], *, most: int = 20, below_id: int | None = None
     ) -> tuple[PlaceCandidate, ...]:
         """The same for several signatures of one scan (`signatures_around`): the best candidate of each place."""
+        found = [one for signature in signatures for one in self.shortlist(signature, most=most, below_id=below_id)]
         best: dict[int, PlaceCandidate] = {}
-        for signature in signatures:
-            for candidate in self.shortlist(signature, most=most, below_id=below_id):
-                known = best.get(candidate.place_id)
-                if known is None or candidate.score > known.score:
-                    best[candidate.place_id] = candidate
-        return tuple(sorted(best.values(), key=lambda candidate: -candidate.score)[:most])
+        for candidate in sorted(found, key=lambda candidate: -candidate.score):
+            best.setdefault(candidate.place_id, candidate)
+        return tuple(best.values())[:most]
 
     def _turned(self, signature: PlaceSignature, rows: Indices) -> tuple[Vector, Vector]:
         """Largest correlation of the spectra of some places with the scan's, over all yaws, and the yaws."""

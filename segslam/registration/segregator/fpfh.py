@@ -26,8 +26,6 @@ from segslam.core.types import Indices, Points
 BINS = 11
 CENTRE = BINS // 2
 COLUMNS = 3 * BINS
-TINY = 1e-300
-"""Prevents division by zero for empty sums."""
 
 
 @kernel("int64(float64)")
@@ -101,7 +99,7 @@ def neighbour_histograms(points, histograms, starts, ends, rows, chosen):
             for column in range(BINS * angle, BINS * (angle + 1)):
                 total += sums[index, column]
             for column in range(BINS * angle, BINS * (angle + 1)):
-                sums[index, column] *= 100.0 / max(total, TINY)
+                sums[index, column] *= 100.0 / max(total, 1e-300)
     return sums
 
 

@@ -9,7 +9,7 @@ from segslam.core.config import SegregatorConfig
 from segslam.core.types import Label
 from segslam.registration.segregator import describe
 from segslam.registration.segregator.clusters import MAX_RANGE_M, Clusters
-from segslam.registration.segregator.ground import ground_cells, stand_on_ground
+from segslam.registration.segregator.describe import ground_cells, stand_on_ground
 
 UPRIGHT = SegregatorConfig().foot_classes
 

@@ -6,7 +6,7 @@ from helpers.real_scans import raw_scan
 
 from segslam.core import geometry
 from segslam.core.types import Label
-from segslam.registration.segregator.ground import CELL_M, REACH_M, ground_patches
+from segslam.registration.segregator.describe import CELL_M, REACH_M, ground_patches
 
 SLOPE = geometry.exp(geometry.tangent(rotation_rad=[0.1, -0.05, 0.0], translation_m=[0.0, 0.0, -1.7]))
 

@@ -7,19 +7,27 @@ Differs from the paper: only the points with the most neighbours are key points,
 around it. A descriptor is the square root of its FPFH, scaled to unit length, so that Euclidean distances are Hellinger
 distances of histograms (Arandjelovic, Zisserman, "Three things everyone should know to improve object retrieval", CVPR
 2012).
+
+The ground is not in the paper. The visible part of a trunk or pole, and so the height of its centre, changes with the
+viewpoint; its foot on the ground does not. In 6 pairs of real scans 9 to 35 m apart, with 34 trunks, poles and signs
+per scan, 7 centres are within 0.2 m of a centre in the other scan, and 16 feet of a foot.
+
+Objects on a plane constrain tilt and height badly; the ground constrains both. With its patches, the mean rotation
+error of real pairs 9 to 35 m apart is 0.1 instead of 0.2 degrees.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from segslam.core.config import SegregatorConfig
 from segslam.core.points import normals, patch_covariances, radius_neighbours, voxel_means, within_range
-from segslam.core.types import Covariances, Description, Label, Labels, Points
-from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, semantic_clusters
+from segslam.core.types import GROUND_LABELS, Covariances, Description, Indices, Label, Labels, Mask, Points
+from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, Clusters, semantic_clusters
 from segslam.registration.segregator.fpfh import fpfh
-from segslam.registration.segregator.ground import ground_cells, ground_patches, stand_on_ground
 
 FEW_CLUSTERS = 24
 """Chosen on simulated 00 and 08: number of clusters below which a scan has few clusters."""
@@ -31,6 +39,24 @@ MIN_PATCH_POINTS = 4
 MAX_CLOUD_POINTS = 20_000
 """Chosen: largest number of points of a class after voxelising, about four times that of real scans; the nearest
 points are used if there are more."""
+
+FOOT_MAX_DISTANCE_M = 10.0
+"""Chosen: largest distance of a cluster to the ground below it."""
+FOOT_CELL_M = 1.0
+"""Chosen: cell size in which the ground is averaged (m)."""
+NUM_FOOT_CELLS = 5
+"""Chosen: number of nearest cells; their median height is that of the foot."""
+CELL_M = 4.0
+"""Chosen: edge of a patch (m)."""
+REACH_M = 40.0
+"""Chosen: farther ground, in x or y, is seen at a grazing angle and its height is inaccurate (m)."""
+MIN_GROUND_POINTS = 8
+MAX_THICKNESS_M = 0.15
+"""Chosen: largest root mean square distance of points from the patch's plane; excludes walls and bushes, not kerbs."""
+MIN_BREADTH_M = 0.3
+"""Chosen: smallest root mean square extent along the shorter side; a single ring has no defined tilt (m)."""
+RESOLUTION_M = 1e-4
+"""Unit of the integer sums of coordinates (m)."""
 
 
 class Features(NamedTuple):
@@ -101,3 +127,62 @@ def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Feat
         classes=np.full(len(chosen), label, np.uint8),
         descriptors=np.sqrt(histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1.0)).astype(np.float16),
     )
+
+
+def stand_on_ground(clusters: Clusters, upright: Mask, ground: Points) -> Clusters:
+    """The clusters, with the `upright` ones moved along z to the ground around them: the median of the nearest cells.
+
+    `ground` comes from `ground_cells`, in the clusters' frame. A cluster without ground within `FOOT_MAX_DISTANCE_M`
+    (horizontally) is not moved. Covariances do not change.
+    """
+    if not len(ground):
+        return clusters
+    columns = range(1, min(NUM_FOOT_CELLS, len(ground)) + 1)
+    distances, nearest = map(np.asarray, cKDTree(ground[:, :2]).query(clusters.means[:, :2], k=columns))
+    moved = upright & (distances[:, 0] <= FOOT_MAX_DISTANCE_M)
+    means = clusters.means.copy()
+    means[moved, 2] = np.median(ground[nearest[moved], 2], axis=1)
+    return clusters._replace(means=means)
+
+
+def ground_cells(points: Points, labels: Labels) -> Points:
+    """The mean ground point of each occupied square cell, within `MAX_RANGE_M` in x, y and z.
+
+    Sums in float64 of float32 values above 1e-5 m are exact, so they do not depend on the order of points.
+    """
+    with np.errstate(over="ignore"):  # what float32 cannot hold is out of reach
+        ground = _ground(points.astype(np.float32), labels, MAX_RANGE_M)
+    return _cell_means(ground, ground, MAX_RANGE_M, FOOT_CELL_M)[0]
+
+
+def ground_patches(points: Points, labels: Labels) -> tuple[Points, Points]:
+    """Centres (m) and unit normals of the ground patches of a scan, a row each, float32, in the frame of `points`.
+
+    Its origin is the sensor, towards which the normals point. NaN points are ignored.
+    """
+    ground = _ground(points, labels, REACH_M)
+    x, y, z = np.rint(ground / RESOLUTION_M).T  # sums of integers do not depend on the order of points
+    moments = np.column_stack([x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])
+    means, counts = _cell_means(ground, moments, REACH_M, CELL_M)
+    means = means[counts >= MIN_GROUND_POINTS]
+    centres = means[:, :3] * RESOLUTION_M
+    squares = means[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3) * RESOLUTION_M**2
+    variances, axes = np.linalg.eigh(squares - centres[:, :, None] * centres[:, None, :])
+    flat = (variances[:, 0] <= MAX_THICKNESS_M**2) & (variances[:, 1] >= MIN_BREADTH_M**2)
+    centres, normals = centres[flat], axes[flat, :, 0]
+    away = np.sum(normals * centres, axis=1, keepdims=True) > 0.0
+    return centres.astype(np.float32), np.where(away, -normals, normals).astype(np.float32)
+
+
+def _ground(points: Points, labels: Labels, reach_m: float) -> Points:
+    ground = points.compress(np.isin(labels, GROUND_LABELS), axis=0).astype(np.float64)
+    return ground.compress((np.abs(ground) < reach_m).all(axis=1), axis=0)  # false for NaN
+
+
+def _cell_means(ground: Points, rows: np.ndarray, reach_m: float, cell_m: float) -> tuple[np.ndarray, Indices]:
+    """Mean of the rows, one for each point, in each occupied cell of a square grid, and the number of its points."""
+    i, j = ((ground[:, :2] + reach_m) / cell_m).astype(np.int64).T
+    cell = i * math.ceil(2.0 * reach_m / cell_m) + j
+    counts = np.bincount(cell)
+    sums = np.column_stack([np.bincount(cell, column) for column in rows.T])
+    return sums[counts > 0] / counts[counts > 0, None], counts[counts > 0]

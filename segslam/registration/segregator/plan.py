@@ -65,7 +65,10 @@ def plan_hypotheses(source: FloorPlan, target: FloorPlan, *, num_poses: int) -> 
     """
     if min(len(source.points), len(target.points)) == 0:
         return
-    volume, steps = _correlation(source, target)
+    blurred = gaussian_filter(_plans(target.points, np.zeros(1))[0], BLUR_CELLS)
+    steps = np.arange(-int(MAX_SHIFT_M / CELL_M), int(MAX_SHIFT_M / CELL_M) + 1)
+    agreement = ifft(rfft2(blurred) * source.turned, axis=1, overwrite_x=True)[:, steps]
+    volume = np.ascontiguousarray(irfft(agreement, SIZE, axis=2)[:, :, steps])  # for each yaw and shift in x and y
     filled = np.zeros((SIZE, SIZE, NUM_SLICES), bool)
     filled[*_slots(target.points)] = True
     rises = np.arange(-MAX_RISE_SLICES, MAX_RISE_SLICES + 1)
@@ -83,14 +86,6 @@ def plan_hypotheses(source: FloorPlan, target: FloorPlan, *, num_poses: int) -> 
             rms_m=CELL_M,
             information=INFORMATION,
         )
-
-
-def _correlation(source: FloorPlan, target: FloorPlan) -> tuple[Float[np.ndarray, "yaws shifts shifts"], np.ndarray]:
-    """Correlation of the plans for each yaw of the source and each shift in x and y, and the shifts in cells."""
-    blurred = gaussian_filter(_plans(target.points, np.zeros(1))[0], BLUR_CELLS)
-    steps = np.arange(-int(MAX_SHIFT_M / CELL_M), int(MAX_SHIFT_M / CELL_M) + 1)
-    agreement = ifft(rfft2(blurred) * source.turned, axis=1, overwrite_x=True)[:, steps]
-    return np.ascontiguousarray(irfft(agreement, SIZE, axis=2)[:, :, steps]), steps
 
 
 def _plans(points: Points, yaws_rad: Vector) -> Float[np.ndarray, "plans size size"]:

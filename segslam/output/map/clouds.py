@@ -2,13 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from segslam.core.types import Label, Points
 from segslam.output.map.projected import utm
-from segslam.output.map.tiles import Extent, Part
+from segslam.output.map.tiles import Part
+
+if TYPE_CHECKING:
+    from segslam.output.map.store import MapStore
 
 HEADER_BYTES = 512
 """Bytes reserved for the header, which is written last because it contains the number of points."""
@@ -34,10 +37,10 @@ class BinaryCloud:
     filler: ClassVar[str]
     last_line: ClassVar[str]
 
-    def __init__(self, file: Path, extent: Extent) -> None:
+    def __init__(self, file: Path, store: "MapStore") -> None:
         self._stream = file.open("wb")
         self._stream.write(bytes(HEADER_BYTES))
-        self._intensity = [] if extent.brightest is None else ["intensity"]
+        self._intensity = ["intensity"] if store.has_intensities else []
         self._row = np.dtype([*self.row, *((name, "<f4") for name in self._intensity)])
         self._num_points = 0
 
@@ -110,18 +113,18 @@ class LasCloud:
     the label (SemanticKITTI learning id). Intensities are scaled to 16 bits, as LAS requires.
     """
 
-    def __init__(self, file: Path, extent: Extent) -> None:
+    def __init__(self, file: Path, store: "MapStore") -> None:
         import laspy  # type: ignore[import-untyped]  # an optional package
 
         self._laspy = laspy
         header = laspy.LasHeader(version="1.4", point_format=7)
         header.scales = np.full(3, 0.001)
-        self._intensity_step = None if extent.brightest is None else (extent.brightest or 1.0) / 65535
+        self._intensity_step = (store.tiles.brightest or 1.0) / 65535 if store.has_intensities else None
         self._projected: Callable[[Points], Points] = np.asarray
-        if extent.origin is not None:
+        if store.origin is not None:
             from pyproj import CRS
 
-            epsg, self._projected = utm(extent.origin)
+            epsg, self._projected = utm(store.origin)
             header.offsets = np.floor(self._projected(np.zeros((1, 3)))[0])
             header.add_crs(CRS.from_epsg(epsg))
         self._writer = laspy.open(file, mode="w", header=header)

@@ -6,14 +6,17 @@ which there are no points. All other cells are unknown. Memory holds one row of 
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
-from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 
 from segslam.core.types import GROUND_LABELS, Label, Labels, Mask, Points, Vector
-from segslam.output.map.tiles import TILE_M, Extent, Part, Tile, corner, distance_m
+from segslam.output.map.tiles import TILE_M, Part, corner, distance_m
+
+if TYPE_CHECKING:
+    from segslam.output.map.store import MapStore
 
 CELL_M = 0.2
 """Chosen: cell size of the occupancy grid (m)."""
@@ -35,30 +38,30 @@ REACH_M = 40.0
 class Grid:
     """Writes the grid; `file` is the .yaml file."""
 
-    def __init__(self, file: Path, extent: Extent) -> None:
+    def __init__(self, file: Path, store: "MapStore") -> None:
         self._file = file
-        self._extent = extent
+        self._store = store
         self._cells = round(TILE_M / CELL_M)  # along the edge of a tile
-        columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
+        self._west, east, self._south, self._row = store.tiles.bounds()
+        columns, rows = east - self._west + 1, self._row - self._south + 1
         self._band = np.full((self._cells, columns * self._cells), UNKNOWN, np.uint8)
-        self._row = extent.north
         self._pgm = file.with_suffix(".pgm").open("wb")
         self._pgm.write(f"P5\n{columns * self._cells} {rows * self._cells}\n255\n".encode("ascii"))
 
     def add(self, part: Part) -> None:
         """Set the cells of a part."""
         self._write_bands_above(part.tile[1])
-        left = (part.tile[0] - self._extent.west) * self._cells
+        left = (part.tile[0] - self._west) * self._cells
         self._band[:, left : left + self._cells] = self._occupancy(part)[::-1]
 
     def close(self) -> None:
         """Complete both files."""
-        self._write_bands_above(self._extent.south - 1)
+        self._write_bands_above(self._south - 1)
         self._pgm.close()
         about = {
             "image": self._file.with_suffix(".pgm").name,
             "resolution": TILE_M / self._cells,
-            "origin": [*corner((self._extent.west, self._extent.south)).tolist()],
+            "origin": corner((self._west, self._south)).tolist(),
             "negate": 0,
             "occupied_thresh": OCCUPIED_THRESHOLD,
             "free_thresh": FREE_THRESHOLD,
@@ -84,31 +87,12 @@ class Grid:
         cells = np.select([occupied, ground > 0], [OCCUPIED, FREE], UNKNOWN).astype(np.uint8)
         rows, columns = np.nonzero(cells == UNKNOWN)
         centres = corner(part.tile)[:2] + (np.column_stack([columns, rows]) + 0.5) * (TILE_M / self._cells)
-        free = self._extent.free_ranges.is_free(part.tile, centres)
-        cells[rows[free], columns[free]] = FREE
+        for place, free_m in zip(self._store.places, self._store.free_m, strict=True):
+            if distance_m(part.tile, place) < REACH_M:
+                x, y = (centres - place[:2]).T
+                free = np.hypot(x, y) < free_m[_direction(x, y)]
+                cells[rows[free], columns[free]] = FREE
         return cells
-
-
-class FreeRanges:
-    """The free range of each keyframe, by direction in the world."""
-
-    def __init__(self) -> None:
-        self._places: list[Vector] = []
-        self._free_m: list[Vector] = []
-
-    def add(self, points: Points, labels: Labels, place: Vector) -> None:
-        """Add a keyframe: its points (n, 3) in the world, and its position."""
-        self._places.append(place[:2])
-        self._free_m.append(free_range_m(points - place, labels))
-
-    def is_free(self, tile: Tile, places: Float[np.ndarray, "_ 2"]) -> Mask:
-        """Whether each of the places (n, 2) of a tile is within the free range of a keyframe."""
-        free = np.zeros(len(places), bool)
-        for place, free_m in zip(self._places, self._free_m, strict=True):
-            if distance_m(tile, place) < REACH_M:
-                x, y = (places - place).T
-                free |= np.hypot(x, y) < free_m[_direction(x, y)]
-        return free
 
 
 def free_range_m(points: Points, labels: Labels) -> Vector:

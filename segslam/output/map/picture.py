@@ -2,14 +2,18 @@
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from segslam.core.types import SegslamError, Vector
 from segslam.labels.encodings import COLORS, Colors
-from segslam.output.map.from_above import Window, visible
-from segslam.output.map.tiles import TILE_M, Extent, Part, corner
+from segslam.output.map.from_above import Window, drawn_map, visible
+from segslam.output.map.tiles import TILE_M, Part, corner
+
+if TYPE_CHECKING:
+    from segslam.output.map.store import MapStore
 
 MAX_SIDE = 4000
 """Largest number of pixels along the longer side; limits the memory."""
@@ -27,11 +31,12 @@ RELIEF_M, CONTRAST = 1.5, 0.35
 class Picture:
     """Top view with north (y) up; the highest point of a pixel is visible, below ceilings: see `cut_heights`."""
 
-    def __init__(self, file: Path, extent: Extent) -> None:
+    def __init__(self, file: Path, store: "MapStore") -> None:
         self._file = file
-        self._extent = extent
-        columns, rows = extent.east - extent.west + 1, extent.north - extent.south + 1
-        self._pixels = max(min(round(TILE_M / extent.config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
+        self._store = store
+        self._west, east, self._south, self._north = store.tiles.bounds()
+        columns, rows = east - self._west + 1, self._north - self._south + 1
+        self._pixels = max(min(round(TILE_M / store.config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
         size = rows * self._pixels, columns * self._pixels
         self._image = np.full((*size, 3), 255, np.uint8)  # white
         self._height_m = np.full(size, np.nan, np.float32)
@@ -39,15 +44,12 @@ class Picture:
 
     def add(self, part: Part) -> None:
         """Draw a part into its area of the image."""
-        cut_m = self._extent.cut_m
-        seen = np.arange(len(part.points))
-        if cut_m is not None:
-            seen = seen[visible(part.points, self._extent.path_m, cut_m)]
+        seen = np.flatnonzero(visible(part.points, self._store.path_m, self._store.cut_m))
         order = seen[np.argsort(part.points[seen, 2], kind="stable")]  # the last assignment to a pixel remains
         inside = (part.points[order] - corner(part.tile))[:, :2] / TILE_M * self._pixels
         column, row = np.clip(inside.astype(np.int64), 0, self._pixels - 1).T
-        top = (self._extent.north - part.tile[1]) * self._pixels
-        left = (part.tile[0] - self._extent.west) * self._pixels
+        top = (self._north - part.tile[1]) * self._pixels
+        left = (part.tile[0] - self._west) * self._pixels
         square = np.s_[top : top + self._pixels, left : left + self._pixels]
         self._image[square][self._pixels - 1 - row, column] = part.colors[order]
         self._height_m[square][self._pixels - 1 - row, column] = part.points[order, 2]
@@ -57,13 +59,9 @@ class Picture:
         """Write the image."""
         image, window, _ = self._finished()
         del self._image, self._height_m  # drawing needs as much memory again
-        from segslam.output.map.from_above import drawn_map  # importing matplotlib takes long
-
         titles = {"class": "class", "height": "height (m)", "intensity": "intensity"}
-        path_m = self._extent.path_m
-        self._file.write_bytes(
-            drawn_map(image, window, path_m=path_m, title=titles[self._extent.config.color], marks=self._marks())
-        )
+        title, path_m = titles[self._store.config.color], self._store.path_m
+        self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=title, marks=self._marks()))
 
     def _finished(self) -> tuple[np.ndarray, Window, float]:
         """The shaded image (rows, columns, 3) of what has points, its window, and the median height of its pixels."""
@@ -78,7 +76,7 @@ class Picture:
         area = np.s_[top:bottom, left:right]
         shading_px = max(round(SHADED_M * self._pixels / TILE_M), 3)
         image, height_m = closed_and_shaded(self._image[area], self._height_m[area], shading_px)
-        west, south, _ = corner((self._extent.west, self._extent.south)).tolist()
+        west, south, _ = corner((self._west, self._south)).tolist()
         pixel_m, height = TILE_M / self._pixels, len(known)
         east_west = west + left * pixel_m, west + right * pixel_m
         window = (*east_west, south + (height - bottom) * pixel_m, south + (height - top) * pixel_m)
@@ -86,10 +84,11 @@ class Picture:
 
     def _marks(self) -> list[tuple[str, str]]:
         """Text and colour of each class in the map, or of values along the colour scale."""
-        if self._extent.config.color == "class":
+        if self._store.config.color == "class":
             return [(label.name.lower().replace("_", " "), COLORS[label]) for label in COLORS if label in self._labels]
-        values = np.linspace(*self._extent.span[::-1], 6)
-        colors = of_numbers(values, span=self._extent.span)
+        low, high = span = self._store.span()
+        values = np.linspace(high, low, 6)
+        colors = of_numbers(values, span=span)
         return [(f"{value:.3g}", f"#{bytes(color).hex()}") for value, color in zip(values, colors, strict=True)]
 
 

@@ -39,7 +39,7 @@ class GeoTiff(Picture):
         import rasterio
         from rasterio.transform import Affine
 
-        origin = self._extent.origin
+        origin = self._store.origin
         assert origin is not None, "checked before the map is made"
         epsg, projected = utm(origin)
         image, window, height_m = self._finished()

@@ -2,25 +2,19 @@
 
 Points of several keyframes are collected, merged to voxels and appended to the file of their tile. Tiles are read in
 pieces. The files grow with the length of the drive; memory depends only on the surface within one tile. The writers of
-maps get an `Extent` and, for each tile, a `Part`.
+maps get a `Part` for each tile.
 """
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from segslam.core.config import MapConfig
 from segslam.core.points import first_rows
 from segslam.core.types import Indices, Labels, Points, Vector
 from segslam.labels.encodings import Colors
-
-if TYPE_CHECKING:
-    from segslam.gnss.geodesy import Origin
-    from segslam.output.map.grid import FreeRanges
 
 VOXEL = np.dtype([("point", "<f4", 3), ("count", "<u4"), ("label", "u1"), ("intensity", "<f4")])
 """`point` (m): x and y from the corner of the tile, z in the world."""
@@ -38,29 +32,6 @@ INTENSITIES = np.append(0.0, 2.0 ** np.arange(-10.0, 16.1, 0.125))
 """Steps of 9 % from 0.001 to the largest value of 16 bits, for intensities in any unit."""
 Tile = tuple[int, int]
 """Column (along x) and row (along y)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Extent:
-    """Range of tiles of a map: columns `west` to `east`, rows `south` to `north`, all included."""
-
-    west: int
-    east: int
-    south: int
-    north: int
-    brightest: float | None
-    """Upper bound of the intensities; None if intensities are unknown."""
-    path_m: Points
-    """Positions of the keyframes in the world, in order (m)."""
-    config: MapConfig
-    span: tuple[float, float]
-    """Both ends of the colour scale, for heights or intensities."""
-    free_ranges: "FreeRanges"
-    """Free space observed by the keyframes."""
-    cut_m: Vector | None
-    """Heights (n,) of `from_above.cut_heights` for each position of the path; None if no picture is drawn."""
-    origin: "Origin | None"
-    """Place of the world frame (east, north, up) on the globe, if it is known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +119,11 @@ class Tiles:
         """Tiles that have voxels, by rows from north to south, each row from west to east."""
         self.flush()
         return iter(sorted(self._known, key=lambda tile: (-tile[1], tile[0])))
+
+    def bounds(self) -> tuple[int, int, int, int]:
+        """First and last column, first and last row of the tiles that have voxels; there is one at least."""
+        (west, south), (east, north) = np.min(list(self), axis=0).tolist(), np.max(list(self), axis=0).tolist()
+        return west, east, south, north
 
     def voxels(self, tile: Tile) -> np.ndarray:
         """The VOXEL rows of a tile, one per cell."""

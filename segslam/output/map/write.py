@@ -6,30 +6,24 @@ and one tile, whatever the length of the drive.
 """
 
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from segslam.core import geometry
 from segslam.core.config import MapConfig
 from segslam.core.extras import how_to_install
 from segslam.core.interrupts import removed_when_stopped
-from segslam.core.points import within_range
-from segslam.core.types import Keyframe, Label, SegslamError, Transform
+from segslam.core.types import Keyframe, SegslamError, Transform
 from segslam.core.whole_files import check_target, whole_file
-from segslam.labels.encodings import of_classes
 from segslam.output.map.clouds import BinaryCloud, LasCloud, PcdCloud, PlyCloud
-from segslam.output.map.from_above import BESIDE_M, cut_heights
-from segslam.output.map.grid import FreeRanges, Grid
-from segslam.output.map.picture import Picture, of_numbers
+from segslam.output.map.grid import Grid
+from segslam.output.map.picture import Picture
 from segslam.output.map.projected import GeoTiff
-from segslam.output.map.tiles import Extent, Part, Tile, Tiles, corner, distance_m
-from segslam.output.map.views import Views, moved
+from segslam.output.map.store import MapStore
+from segslam.output.map.tiles import Part
 from segslam.slam.adjustment import Progress, no_progress
 
 if TYPE_CHECKING:
@@ -37,7 +31,7 @@ if TYPE_CHECKING:
 
 
 MapFile = BinaryCloud | LasCloud | Picture | Grid
-"""Made from a path and the extent; `add` takes the parts in their order, and `close` completes the file."""
+"""Made from a path and the `MapStore`; `add` takes the parts in their order, and `close` completes the file."""
 KINDS: dict[str, type[MapFile]] = {
     ".ply": PlyCloud,
     ".pcd": PcdCloud,
@@ -49,8 +43,6 @@ KINDS: dict[str, type[MapFile]] = {
     ".tiff": GeoTiff,
 }
 """Writers by file extension."""
-SHARES = 0.01, 0.99
-"""Share of the voxels, at both ends, that the colour scale ignores as outliers."""
 
 
 def check_names(files: Sequence[Path], *, origin: "Origin | None" = None) -> None:
@@ -103,15 +95,13 @@ def write_map(
     check_files(files, origin=origin)
     with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name, removed_when_stopped(Path(name)):
         scratch = Path(name)
-        store = MapStore(scratch, config)
+        store = MapStore(scratch, config, origin)
         for keyframe, T_world_keyframe in placed:
             store.add(keyframe, T_world_keyframe)
-        has_picture = any(issubclass(KINDS[file.suffix.lower()], Picture) for file in files)
-        extent = store.extent(origin, for_picture=has_picture)
-        if extent is None:
+        if not len(store.tiles):
             raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
         parts = show(store.parts(), len(store.tiles), "clean")
-        num_points = _write(parts, extent, files, scratch=scratch / "files")
+        num_points = _write(parts, store, files, scratch=scratch / "files")
     return {
         "num_map_points": num_points,
         "num_map_moving_points": store.num_moving_points,
@@ -119,13 +109,13 @@ def write_map(
     }
 
 
-def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scratch: Path) -> int:
+def _write(parts: Iterable[Part], store: MapStore, files: Sequence[Path], *, scratch: Path) -> int:
     """Write the parts to all files, in a scratch folder until they are complete; returns the number of points."""
     writers = []
     for number, file in enumerate(files):
         folder = scratch / str(number)
         folder.mkdir(parents=True)
-        writers.append(KINDS[file.suffix.lower()](folder / file.name, extent))
+        writers.append(KINDS[file.suffix.lower()](folder / file.name, store))
     num_points = 0
     for part in parts:
         num_points += len(part.points)
@@ -138,91 +128,3 @@ def _write(parts: Iterable[Part], extent: Extent, files: Sequence[Path], *, scra
             for made in (scratch / str(number)).iterdir():  # a grid is two files
                 shutil.move(made, complete.enter_context(whole_file(file.parent / made.name)))
     return num_points
-
-
-class MapStore:
-    """Voxels by tile, and a range image of each keyframe."""
-
-    def __init__(self, scratch: Path, config: MapConfig) -> None:
-        """`scratch`: an empty folder, which the caller removes."""
-        self._config = config
-        self.tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
-        self._views = Views(scratch / "views", spread_m=config.voxel_m)
-        self._free_ranges = FreeRanges()
-        self._T_keyframe_world: list[Transform] = []
-        self._places: list[np.ndarray] = []
-        self._has_intensities = True
-        self.num_moving_points = 0
-        self.num_voxels_seen_through = 0
-
-    def add(self, keyframe: Keyframe, T_world_keyframe: Transform) -> None:
-        """Add a keyframe: the near points of static classes as voxels, and all points as a range image.
-
-        Raises SegslamError if the map is coloured by intensity and the keyframe has none.
-        """
-        if keyframe.intensities is None and self._config.color == "intensity":
-            raise SegslamError(
-                f"map.color=intensity: keyframe {keyframe.id} has no intensities; runs contain them only if mapped "
-                "with `--set map.color=intensity`; or use map.color=class or height"
-            )
-        self._has_intensities &= keyframe.intensities is not None
-        moves = keyframe.labels >= Label.MOVING_CAR
-        kept = within_range(keyframe.points, 0.0, self._config.max_range_m) & ~moves
-        self.num_moving_points += int(moves.sum())
-        intensities = np.zeros(len(kept), np.float32) if keyframe.intensities is None else keyframe.intensities
-        points = geometry.apply(T_world_keyframe, keyframe.points[kept].astype(np.float64))
-        self.tiles.add(points, keyframe.labels[kept], intensities[kept])
-        self._free_ranges.add(points, keyframe.labels[kept], T_world_keyframe[:3, 3])
-        self._views.add(keyframe.points)
-        self._T_keyframe_world.append(geometry.inverse(T_world_keyframe))
-        self._places.append(T_world_keyframe[:3, 3])
-
-    def extent(self, origin: "Origin | None", *, for_picture: bool) -> Extent | None:
-        """Extent of the tiles that have voxels; None if there are none. Heights to cut are found for pictures only."""
-        tiles = list(self.tiles)
-        if not tiles:
-            return None
-        (west, south), (east, north) = np.min(tiles, axis=0).tolist(), np.max(tiles, axis=0).tolist()
-        path_m = np.array(self._places)
-        near_path = (
-            self.tiles.voxels(tile)["point"] + corner(tile)
-            for tile in tiles
-            if any(distance_m(tile, place) < BESIDE_M for place in self._places)
-        )
-        return Extent(
-            west,
-            east,
-            south,
-            north,
-            brightest=self.tiles.brightest if self._has_intensities else None,
-            path_m=path_m,
-            config=self._config,
-            span=self._span(),
-            free_ranges=self._free_ranges,
-            cut_m=cut_heights(path_m, near_path) if for_picture else None,
-            origin=origin,
-        )
-
-    def parts(self) -> Iterator[Part]:
-        """The clean voxels of each tile, in the order that `Part` names."""
-        color = self._config.color
-        for tile in self.tiles:
-            voxels = self.tiles.voxels(tile)
-            gone = moved(voxels["point"], voxels["label"], self._views_of(tile), config=self._config)
-            self.num_voxels_seen_through += int(gone.sum())
-            kept = voxels[~gone]
-            world = kept["point"] + corner(tile)
-            values = kept["intensity"] if color == "intensity" else world[:, 2]
-            paint = of_classes(kept["label"]) if color == "class" else of_numbers(values, span=self._span())
-            yield Part(tile, world, kept["label"], kept["intensity"], paint)
-
-    def _span(self) -> tuple[float, float]:
-        """Values at both ends of the colour scale."""
-        return (self.tiles.intensities if self._config.color == "intensity" else self.tiles.heights).span(*SHARES)
-
-    def _views_of(self, tile: Tile) -> Iterator[tuple[np.ndarray, Transform]]:
-        """The range image of each keyframe near a tile, and T_keyframe_tile."""
-        T_world_tile = geometry.transform(np.eye(3), corner(tile))
-        for number, place in enumerate(self._places):
-            if distance_m(tile, place) < self._config.view_range_m:
-                yield self._views[number], self._T_keyframe_world[number] @ T_world_tile

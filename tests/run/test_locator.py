@@ -1,7 +1,9 @@
 """Single scans in a finished run, with no guess."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +13,9 @@ from helpers.drives import drifting, round_drive, round_sweeps, write_kitti_sequ
 import segslam
 from segslam.core import geometry
 from segslam.core.config import load_config
-from segslam.core.types import Rejected, SegslamError
+from segslam.core.types import Rejected, SegslamError, Step
 from segslam.odometry.sweep import GivenOdometry
-from segslam.output.log import read_log
+from segslam.output.log import read_log, reader
 from segslam.run.locator import Locator, submaps_of
 
 NUM_MAPPED = 50
@@ -60,7 +62,13 @@ def test_signatures_are_in_the_log_and_computed_if_it_has_none(run: Path, monkey
     recorded = read_log(run / "log.mcap").keyframes()
     stored = [recorded[number].place for number in range(len(recorded))]
     assert all(place is not None and len(place) == 1440 for place in stored)
-    monkeypatch.setattr("segslam.output.log.reader.place_of", lambda message: {"place": None})  # as in an older log
+    step_of = reader._step
+
+    def older_step(*given: Any) -> Step:
+        step = step_of(*given)
+        return step if step.keyframe is None else replace(step, keyframe=replace(step.keyframe, place=None))
+
+    monkeypatch.setattr(reader, "_step", older_step)
     older = Locator.from_run(run)
     newer_spectra = [np.frombuffer(place or b"", np.uint8) for place in stored]
     for number, spectrum in enumerate(newer_spectra):

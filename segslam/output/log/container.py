@@ -44,13 +44,6 @@ class CutError(Exception):
         self.offset = offset
 
 
-class Span(NamedTuple):
-    """A range of bytes in a file."""
-
-    offset: int
-    size: int
-
-
 class Stored(NamedTuple):
     """A message."""
 
@@ -58,8 +51,8 @@ class Stored(NamedTuple):
     schema: Schema
     data: bytes
     channel_id: int
-    chunk: Span
-    """Position of the chunk that contains the message."""
+    chunk: tuple[int, int]
+    """Position in the file, and size, of the chunk that contains the message."""
 
 
 def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
@@ -86,15 +79,16 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
                     channel = channels.get(record.channel_id)
                     if channel is None or channel.schema_id not in schemas:
                         raise CutError(offset)
-                    yield Stored(channel.topic, schemas[channel.schema_id], record.data, channel.id, Span(offset, size))
+                    yield Stored(channel.topic, schemas[channel.schema_id], record.data, channel.id, (offset, size))
 
 
-def messages_within(records: bytes) -> Iterator[tuple[int, bytes]]:
-    """Channel and data of each message in a sequence of complete records. Raises CutError if they are damaged."""
+def message_within(records: bytes, channel_id: int) -> bytes | None:
+    """Data of the first message of a channel in a sequence of complete records. Raises CutError if they are damaged."""
     for offset, _, outer in _records(BytesIO(records), within=True):
         for record in _records_of_chunk(offset, outer) if isinstance(outer, Chunk) else ():
-            if isinstance(record, Message):
-                yield record.channel_id, record.data
+            if isinstance(record, Message) and record.channel_id == channel_id:
+                return record.data
+    return None
 
 
 def metadata(path: Path) -> tuple[dict[str, dict[str, str]], CutError | None]:

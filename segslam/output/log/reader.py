@@ -29,14 +29,13 @@ from segslam.core.types import (
 )
 from segslam.output.folder import log_of
 from segslam.output.log import container, schema
-from segslam.output.log.container import CutError, Span, messages_within
+from segslam.output.log.container import CutError, message_within
 from segslam.output.log.foxglove import transforms
-from segslam.output.log.records import Bulk, KeyframePoints, codec, intensities, place_of, points_and_labels
+from segslam.output.log.records import Bulk, KeyframePoints, codec, intensities, points_and_labels
 from segslam.output.log.schema import restored
 from segslam.slam.adjustment import Adjustment
 
 logger = logging.getLogger(__name__)
-NO_POINTS, NO_LABELS = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
 NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, RecursionError, DecodeError)
 """Exceptions on content of another program, or damaged in spite of a correct checksum."""
 Parts = dict[str, container.Stored]
@@ -47,8 +46,8 @@ Decoded = TypeVar("Decoded")
 class RecordedKeyframes:
     """Keyframes by id; the `segslam.keyframes.Clouds` of a finished run."""
 
-    def __init__(self, path: Path, kept: Sequence[tuple[Keyframe, Span, int]]) -> None:
-        """`kept`: each keyframe without its points; the chunk of the file that has them, and their channel."""
+    def __init__(self, path: Path, kept: Sequence[tuple[Keyframe, tuple[int, int], int]]) -> None:
+        """`kept`: each keyframe without its points; offset and size of the chunk that has them, and their channel."""
         self._path = path
         self._kept = kept
 
@@ -65,14 +64,13 @@ class RecordedKeyframes:
 
     def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
         """Points and labels of a keyframe. Raises SegslamError if the file has changed since it was opened."""
-        _, chunk, channel_id = self._kept[keyframe_id]
+        _, (offset, size), channel_id = self._kept[keyframe_id]
         try:
             with self._path.open("rb") as stream:
-                stream.seek(chunk.offset)
-                records = stream.read(chunk.size)
-            for number, data in messages_within(records):
-                if number == channel_id:
-                    return points_and_labels(KeyframePoints.FromString(data))
+                stream.seek(offset)
+                data = message_within(stream.read(size), channel_id)
+            if data is not None:
+                return points_and_labels(KeyframePoints.FromString(data))
         except (OSError, CutError, ValueError, DecodeError) as error:
             raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
         raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
@@ -164,7 +162,7 @@ class RunLog:
 
     def keyframes(self) -> "RecordedKeyframes":
         """The keyframes of the complete steps, with access to their points. Raises SegslamError as `steps` does."""
-        kept: list[tuple[Keyframe, Span, int]] = []
+        kept: list[tuple[Keyframe, tuple[int, int], int]] = []
         with suppress(CutError):
             for parts in self._parts_until(schema.STEP):
                 if (cloud := parts.get(schema.KEYFRAME)) is None:
@@ -244,10 +242,9 @@ def _step(parts: Parts, clouds: bool) -> Step:
     keyframe: dict = {}
     if schema.KEYFRAME in parts:
         message = KeyframePoints.FromString(parts[schema.KEYFRAME].data)
-        keyframe = {"points": NO_POINTS, "labels": NO_LABELS, "intensities": None, **place_of(message)}
-        if clouds:
-            points, labels = points_and_labels(message)
-            keyframe |= {"points": points, "labels": labels, "intensities": intensities(message)}
+        points, labels = points_and_labels(message if clouds else KeyframePoints())
+        known = intensities(message) if clouds else None
+        keyframe = {"points": points, "labels": labels, "intensities": known, "place": message.place or None}
     estimate = _estimate(parts) if schema.ESTIMATE in parts else None
     return _record(Step, parts[schema.STEP], {Step: {"estimate": estimate}, Keyframe: keyframe})
 

@@ -19,7 +19,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from google.protobuf import descriptor_pool, message_factory
-from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 from google.protobuf.message import Message
 from jaxtyping import AbstractArray
 
@@ -159,17 +159,10 @@ def _message_class() -> type[Message]:
         "intensity_roots": FieldDescriptorProto.TYPE_BYTES,
         "place": FieldDescriptorProto.TYPE_BYTES,
     }
-    optional = FieldDescriptorProto.LABEL_OPTIONAL
-    fields = [
-        FieldDescriptorProto(name=name, number=number, type=kind, label=optional)
-        for number, (name, kind) in enumerate(kinds.items(), start=1)
-    ]
-    file = FileDescriptorProto(
-        name="segslam/keyframe_points.proto",
-        package="segslam",
-        syntax="proto3",
-        message_type=[DescriptorProto(name="KeyframePoints", field=fields)],
-    )
+    file = FileDescriptorProto(name="segslam/keyframe_points.proto", package="segslam", syntax="proto3")
+    message = file.message_type.add(name="KeyframePoints")
+    for number, (name, kind) in enumerate(kinds.items(), start=1):
+        message.field.add(name=name, number=number, type=kind, label=FieldDescriptorProto.LABEL_OPTIONAL)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("segslam.KeyframePoints"))
@@ -219,11 +212,6 @@ def intensities(message: Message) -> Vector | None:
         return None
     shares = (np.frombuffer(message.intensity_roots, np.uint8) / 255) ** 2
     return (message.intensity_greatest * shares).astype(np.float32)
-
-
-def place_of(message: Message) -> dict[str, bytes | None]:
-    """The field `place` of the keyframe; None in older logs."""
-    return {"place": message.place or None}
 
 
 def _roots(intensities: Vector) -> dict[str, object]:

@@ -30,7 +30,7 @@ from segslam.core.types import (
     WorkFailed,
 )
 from segslam.output.log import foxglove, schema
-from segslam.output.log.container import messages_within
+from segslam.output.log.container import message_within
 from segslam.output.log.drawing import Drawing, ground_truth, map_message, map_points, words
 from segslam.output.log.records import KeyframePoints, codec, keyframe_points, points_and_labels
 from segslam.output.log.schema import channels, metadata
@@ -148,14 +148,15 @@ class LogWriter:
         if newest is not None and newest.id == keyframe_id:
             return newest.points, newest.labels
         offset, size = self._steps_of_keyframes[keyframe_id]
+        name = f"{self._path}: keyframe {keyframe_id}"
         try:
             records = os.pread(self._output.raw.fileno(), size, offset)
         except (OSError, ValueError) as error:  # ValueError: closed, perhaps just now
-            raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read, the log is closed") from error
-        for channel_id, data in messages_within(records):
-            if channel_id == self._channels[schema.KEYFRAME]:
-                return points_and_labels(KeyframePoints.FromString(data))
-        raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
+            raise SegslamError(f"{name} cannot be read, the log is closed") from error
+        data = message_within(records, self._channels[schema.KEYFRAME])
+        if data is None:
+            raise SegslamError(f"{name} is missing; the log was changed while it was open")
+        return points_and_labels(KeyframePoints.FromString(data))
 
     def write_result(
         self,

@@ -1,5 +1,6 @@
 """The log gives back what was written, and other tools can read it."""
 
+import os
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -85,6 +86,18 @@ def test_a_cloud_asked_for_after_the_log_is_closed_is_an_error_of_our_own(steps:
             log.write(step)
     with pytest.raises(SegslamError, match="the log is closed"):
         log.cloud(0)
+
+
+def test_a_cloud_asked_for_after_another_program_changed_the_log_is_an_error_of_our_own(
+    steps: list[Step], tmp_path: Path
+) -> None:
+    with LogWriter(tmp_path / "log.mcap", config=CONFIG) as log:
+        for step in steps[:4]:
+            log.write(step)
+        os.truncate(tmp_path / "log.mcap", (tmp_path / "log.mcap").stat().st_size // 2)
+        for place in (lambda: log.cloud(0), lambda: log.cloud(1)):
+            with pytest.raises(SegslamError, match="the log was changed while it was open"):
+                place()
 
 
 def test_the_poses_of_all_estimates_stay_in_proportion_to_the_keyframes(

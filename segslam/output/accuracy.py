@@ -33,18 +33,17 @@ def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
     Those of the odometry after repairs start with `odometry_`, those of KISS-ICP alone, if known, with `kiss_icp_`. A
     drive localised in a map has no figures of loops, because loops within it are not searched.
     """
-    corrected = trajectory_accuracy(result.trajectory, reference)
-    others = {"odometry_": result.odometry} | ({} if result.alone is None else {f"{ALONE}_": result.alone})
-    compared = {
+    trajectories = {"": result.trajectory, "odometry_": result.odometry, f"{ALONE}_": result.alone}
+    figures = {
         prefix + name: value
-        for prefix, trajectory in others.items()
+        for prefix, trajectory in trajectories.items()
+        if trajectory is not None
         for name, value in trajectory_accuracy(trajectory, reference).items()
     }
     if result.from_map_m is not None:
-        return corrected | compared
-    closures, pairs, truth = judged_closures(result, reference)
-    measured = np.array([closure.T_target_source for closure in closures]).reshape(-1, 4, 4)
-    return corrected | compared | loop_metrics(measured, pairs, truth)
+        return figures
+    _, *measured = judged_closures(result, reference)
+    return figures | loop_metrics(*measured)
 
 
 def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[str, float]:
@@ -53,13 +52,14 @@ def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[s
     return trajectory_metrics(trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]])
 
 
-def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[LoopClosure], IndexPairs, Poses]:
-    """The closures whose two keyframes have a true pose, the rows of (source, target), and the true poses, by row."""
+def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[LoopClosure], Poses, IndexPairs, Poses]:
+    """The closures whose two keyframes have a true pose: they, their poses, the rows of both, and the true poses."""
     rows = rows_of_same_scan(result.trajectory.scan_index[result.keyframe_rows], reference.scan_index)
     place_of_id = {int(keyframe_id): place for place, keyframe_id in enumerate(rows[:, 0])}
     known = [c for c in result.closures() if c.source_id in place_of_id and c.target_id in place_of_id]
     pairs = np.array([(place_of_id[c.source_id], place_of_id[c.target_id]) for c in known], dtype=int).reshape(-1, 2)
-    return known, pairs, reference.T_world_lidar[rows[:, 1]]
+    measured = np.array([closure.T_target_source for closure in known]).reshape(-1, 4, 4)
+    return known, measured, pairs, reference.T_world_lidar[rows[:, 1]]
 
 
 def scores(

@@ -216,10 +216,8 @@ def _false_closures(run: FinishedRun) -> set[tuple[int, int]]:
     """(source, target) of the closures that are false by the ground truth."""
     if run.reference is None:
         return set()
-    closures, rows, truth = judged_closures(run.result, run.reference)
-    measured = np.array([closure.T_target_source for closure in closures]).reshape(-1, 4, 4)
-    false = false_loops(measured, rows, truth)
-    return {closure.pair for closure, is_false in zip(closures, false, strict=True) if is_false}
+    closures, *measured = judged_closures(run.result, run.reference)
+    return {closure.pair for closure, is_false in zip(closures, false_loops(*measured), strict=True) if is_false}
 
 
 class _PlainPowers(LogFormatter):

@@ -43,10 +43,11 @@ class BeforeAfter:
         places = np.array([T[:2, 3] for poses in self._maps for T in poses.values()])
         corners = np.array([places.min(axis=0) - REACH_M / 2, places.max(axis=0) + REACH_M / 2])
         (west, south), (east, north) = corners.tolist()
-        self._whole = [_Density((west, east, south, north)) for _ in self._maps]
+        self._panels = [[_Density((west, east, south, north)) for _ in self._maps]]
         self._loops = [pair for pair, weight in estimate.closure_weights.items() if weight >= REJECTED_WEIGHT]
         detail = most_changed(*self._maps, self._loops)
-        self._detail = [] if detail is None else [_Density(window) for window in _details(self._maps, detail)]
+        if detail is not None:
+            self._panels.append([_Density(window) for window in _details(self._maps, detail)])
 
     def add(self, keyframe: Keyframe) -> None:
         """Draw a keyframe into both maps."""
@@ -56,9 +57,8 @@ class BeforeAfter:
         points = keyframe.points[stands].astype(np.float64)
         for number, poses in enumerate(self._maps):
             placed = geometry.apply(poses[keyframe.id], points)
-            for panels in (self._whole, self._detail):
-                if panels:
-                    panels[number].add(placed)
+            for panels in self._panels:
+                panels[number].add(placed)
 
     def below_ceiling(self, keyframe: Keyframe) -> Keyframe:
         """A keyframe without the points that hide the others in top view; without intensities."""
@@ -73,15 +73,14 @@ class BeforeAfter:
 
     def draw(self) -> bytes:
         """The figure as a PNG: the whole maps above, the detail of the largest change below, if there are closures."""
-        rows = [panels for panels in (self._whole, self._detail) if panels]
-        heights = [panels[0].height_per_width for panels in rows]
+        heights = [panels[0].height_per_width for panels in self._panels]
         layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
         figure = Figure(figsize=(12.0, 6.0 * sum(heights) + 0.5), facecolor=BACKGROUND, layout=layout)
-        grid = figure.subplots(len(rows), 2, squeeze=False, height_ratios=heights)
+        grid = figure.subplots(len(heights), 2, squeeze=False, height_ratios=heights)
         num = len(self._loops)
         corrected = f"corrected by {num} loop{'s' * (num != 1)}" if num else "adjusted as a whole; no loop was found"
         titles = ("before: odometry only", f"after: {corrected}")
-        for row, panels in zip(grid, rows, strict=True):
+        for row, panels in zip(grid, self._panels, strict=True):
             brightest = max(panel.brightest() for panel in panels)
             for axes, panel, poses, color in zip(row, panels, self._maps, (BEFORE, AFTER), strict=True):
                 panel.draw(axes, brightest, np.array([T[:3, 3] for T in poses.values()]), color)

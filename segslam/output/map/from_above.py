@@ -74,8 +74,12 @@ def _png_over(image: np.ndarray, size: tuple[int, int], figure: Figure) -> bytes
     picture = Image.new("RGB", drawn.size, "white")
     picture.paste(Image.fromarray(image).resize(size, Image.Resampling.NEAREST))
     picture.paste(drawn, mask=drawn)
+    return _png_of(picture)
+
+
+def _png_of(image: Image.Image) -> bytes:
     content = io.BytesIO()
-    picture.save(content, format="png")
+    image.save(content, format="png")
     return content.getvalue()
 
 
@@ -111,15 +115,13 @@ def small_png(file: Path) -> bytes:
             return file.read_bytes()
         small = image.convert("RGB")
         small.thumbnail((SMALL_PX, SMALL_PX))
-        content = io.BytesIO()
-        small.save(content, format="png")
-        return content.getvalue()
+        return _png_of(small)
 
 
-def png(figure: Figure) -> bytes:
-    """The figure as a PNG at `DPI`; equal data give equal bytes."""
+def png(figure: Figure, *, dpi: int = DPI) -> bytes:
+    """The figure as a PNG; equal data give equal bytes."""
     image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=DPI, metadata={"Software": None})
+    figure.savefig(image, format="png", dpi=dpi, metadata={"Software": None})
     return image.getvalue()
 
 

@@ -6,7 +6,6 @@ for `interactive.js`, drawn by plotly.js, all embedded in the page.
 
 import base64
 import gzip
-import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
@@ -32,6 +31,7 @@ from segslam.core.types import (
     Transform,
 )
 from segslam.output.finished import FinishedRun
+from segslam.output.map.from_above import png
 from segslam.output.report.figures import paths_of, true_scans
 from segslam.slam.slam_result import outcome_text
 
@@ -208,6 +208,4 @@ def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform],
             near = points[np.abs(points[:, :2]).max(axis=1) < VIEW_M]
             axes.plot(near[:, 0], near[:, 1], ",", color=color, rasterized=True)
         axes.set(title=name, xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), aspect="equal", xlabel="x (m)")
-    image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=140)
-    return image.getvalue()
+    return png(figure, dpi=140)

@@ -163,9 +163,9 @@ def merged(voxels: np.ndarray, voxel_m: float) -> np.ndarray:
 
     Ties between classes are resolved to the smallest id. Cells are in the order of their first occurrence.
     """
-    keys = _cell_keys(voxels["point"], voxel_m)
-    cells = _numbered(keys)
-    num_cells = int(cells.max()) + 1 if len(cells) else 0
+    _, first = hash_keys(_cell_keys(voxels["point"], voxel_m))
+    is_first = first == np.arange(len(voxels))
+    cells, num_cells = (np.cumsum(is_first) - 1)[first], int(is_first.sum())
     result = np.zeros(num_cells, VOXEL)
     weights = voxels["count"].astype(np.float64)
     counts = np.bincount(cells, weights, minlength=num_cells)
@@ -184,21 +184,11 @@ def _cell_keys(points: np.ndarray, voxel_m: float) -> Indices:
     return (x << 42) | (y << 21) | z
 
 
-def _numbered(keys: Indices) -> Indices:
-    """0, 1, ... for each key, in the order of first occurrence."""
-    first = first_rows(keys)
-    is_first = first == np.arange(len(keys))
-    return (np.cumsum(is_first) - 1)[first]
-
-
 def _commonest_labels(cells: Indices, labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """(num_cells,) uint8 label with the largest weight in each cell."""
-    pairs = cells * NUM_LABELS + labels
-    numbers = _numbered(pairs)
+    pairs, numbers = np.unique(cells * NUM_LABELS + labels, return_inverse=True)
     counts = np.bincount(numbers, weights)
-    _, first = np.unique(numbers, return_index=True)
-    pair = pairs[first]
-    cell, label = pair // NUM_LABELS, pair % NUM_LABELS
+    cell, label = np.divmod(pairs, NUM_LABELS)
     order = np.lexsort((-label, counts, cell))
     last_of_cell = np.append(np.diff(cell[order]) > 0, True) if len(order) else np.zeros(0, bool)
     return label[order[last_of_cell]].astype(np.uint8)

@@ -83,11 +83,12 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
 
 
 def message_within(records: bytes, channel_id: int) -> bytes | None:
-    """Data of the first message of a channel in a sequence of complete records. Raises CutError if they are damaged."""
-    for offset, _, outer in _records(BytesIO(records), within=True):
-        for record in _records_of_chunk(offset, outer) if isinstance(outer, Chunk) else ():
-            if isinstance(record, Message) and record.channel_id == channel_id:
-                return record.data
+    """Data of the first message of a channel in records of a log; None without one before the end, or a damage."""
+    with suppress(CutError):
+        for offset, _, outer in _records(BytesIO(MCAP0_MAGIC + records)):
+            for record in _records_of_chunk(offset, outer) if isinstance(outer, Chunk) else ():
+                if isinstance(record, Message) and record.channel_id == channel_id:
+                    return record.data
     return None
 
 
@@ -123,7 +124,7 @@ def count(path: Path, topic: str) -> int:
 def summary_of(stream: IO[bytes]) -> Summary | None:
     """The index at the end of a file; None if it is missing or damaged."""
     with suppress(OSError, *_DAMAGE):
-        size = _size(stream)
+        size = stream.seek(0, os.SEEK_END)
         end = size - len(MCAP0_MAGIC)
         stream.seek(end - _FOOTER_BYTES)
         footer = Footer.read(ReadDataStream(BytesIO(stream.read(_FOOTER_BYTES)[_RECORD_HEAD.size :])))
@@ -135,25 +136,21 @@ def summary_of(stream: IO[bytes]) -> Summary | None:
     return None
 
 
-def _size(stream: IO[bytes] | BytesIO) -> int:
-    return stream.seek(0, os.SEEK_END)
-
-
-def _records(stream: IO[bytes] | BytesIO, start: int = 0, *, within: bool = False) -> Iterator[tuple[int, int, object]]:
+def _records(stream: IO[bytes] | BytesIO, start: int = 0) -> Iterator[tuple[int, int, object]]:
     """Offset, size and content of each record of a file from `start`, up to the end of the data section.
 
-    `within`: the stream has some complete records only. Raises CutError for an incomplete or damaged record, for a
-    record that a log does not have there, and for a file that is not MCAP.
+    Raises CutError for an incomplete or damaged record, for a record that a log does not have there, and for a file
+    that is not MCAP.
     """
-    size = _size(stream)
+    size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
-    if not within and stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+    if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise CutError(0)
     if start > size:
         raise CutError(size)
-    offset = 0 if within else max(start, len(MCAP0_MAGIC))
+    offset = max(start, len(MCAP0_MAGIC))
     stream.seek(offset)
-    while not within or offset < size:
+    while True:
         head = stream.read(_RECORD_HEAD.size)
         if len(head) < _RECORD_HEAD.size:
             raise CutError(offset)

@@ -71,7 +71,7 @@ class RecordedKeyframes:
                 data = message_within(stream.read(size), channel_id)
             if data is not None:
                 return points_and_labels(KeyframePoints.FromString(data))
-        except (OSError, CutError, ValueError, DecodeError) as error:
+        except (OSError, ValueError, DecodeError) as error:
             raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
         raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
 

@@ -4,7 +4,7 @@ import fcntl
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -30,7 +30,7 @@ from segslam.core.types import (
     WorkFailed,
 )
 from segslam.output.log import foxglove, schema
-from segslam.output.log.container import CutError, message_within
+from segslam.output.log.container import message_within
 from segslam.output.log.drawing import Drawing, ground_truth, map_message, map_points, words
 from segslam.output.log.records import KeyframePoints, codec, keyframe_points, points_and_labels
 from segslam.output.log.schema import channels, metadata
@@ -153,9 +153,7 @@ class LogWriter:
             records = os.pread(self._output.raw.fileno(), size, offset)
         except (OSError, ValueError) as error:  # ValueError: closed, perhaps just now
             raise SegslamError(f"{name} cannot be read, the log is closed") from error
-        data = None
-        with suppress(CutError):
-            data = message_within(records, self._channels[schema.KEYFRAME])
+        data = message_within(records, self._channels[schema.KEYFRAME])
         if data is None:
             raise SegslamError(f"{name} is missing; the log was changed while it was open")
         return points_and_labels(KeyframePoints.FromString(data))

@@ -10,6 +10,7 @@ Source: Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Naviga
 from ECEF to geodetic coordinates: Bowring, "The accuracy of geodetic latitude and height equations", 1985.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -104,3 +105,17 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
     elif latitude_deg >= 72.0 and 0.0 <= longitude < 42.0:
         zone = 31 + 2 * int((longitude + 3.0) // 12.0)
     return (32600 if latitude_deg >= 0.0 else 32700) + zone
+
+
+def utm(origin: Origin) -> tuple[int, Callable[[Points], Points]]:
+    """EPSG code of the UTM zone of an origin; its local frame (n, 3) to easting, northing, ellipsoidal height (m)."""
+    from pyproj import Transformer
+
+    epsg = utm_epsg(origin.latitude_deg, origin.longitude_deg)
+    transformer = Transformer.from_crs(WGS84_3D, epsg, always_xy=True)
+
+    def projected(enu_m: Points) -> Points:
+        latitude, longitude, height_m = geodetic_from_enu(enu_m, origin).T
+        return np.column_stack([*transformer.transform(longitude, latitude), height_m])
+
+    return epsg, projected

@@ -23,12 +23,13 @@ from pyproj import Transformer
 from segslam.core import geometry
 from segslam.core.types import Points, SegslamError
 from segslam.gnss import Origin, enu_from_geodetic, geodetic_from_enu
+from segslam.gnss.geodesy import utm
 from segslam.output.export import track
 from segslam.output.folder import write_localised
 from segslam.output.georeferenced import Globe, georeference, read_globe, take_over
 from segslam.output.log import read_log, schema
 from segslam.output.log.locations import write_locations
-from segslam.output.map.projected import _affine, utm
+from segslam.output.map.picture import _affine
 from segslam.output.report.figures import STYLE, draw_fixes
 from segslam.scans import open_dataset
 

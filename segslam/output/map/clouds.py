@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from segslam.core.types import Label, Points
-from segslam.output.map.projected import utm
 from segslam.output.map.tiles import Part
 
 if TYPE_CHECKING:
-    from segslam.output.map.store import MapStore
+    from segslam.output.map.write import MapStore
 
 HEADER_BYTES = 512
 """Bytes reserved for the header, which is written last because it contains the number of points."""
@@ -123,6 +122,8 @@ class LasCloud:
         self._projected: Callable[[Points], Points] = np.asarray
         if store.origin is not None:
             from pyproj import CRS
+
+            from segslam.gnss.geodesy import utm
 
             epsg, self._projected = utm(store.origin)
             header.offsets = np.floor(self._projected(np.zeros((1, 3)))[0])

@@ -16,7 +16,7 @@ from segslam.core.types import GROUND_LABELS, Label, Labels, Mask, Points, Vecto
 from segslam.output.map.tiles import TILE_M, Part, corner, distance_m
 
 if TYPE_CHECKING:
-    from segslam.output.map.store import MapStore
+    from segslam.output.map.write import MapStore
 
 CELL_M = 0.2
 """Chosen: cell size of the occupancy grid (m)."""

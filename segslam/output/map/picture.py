@@ -1,19 +1,20 @@
-"""Top view of a map as a PNG: shaded by height, with the trajectory, a scale bar and a legend."""
+"""Top view of a map, shaded by height: as a PNG with the trajectory, a scale bar and a legend, or as GeoTIFF."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from segslam.core.types import SegslamError, Vector
+from segslam.core.types import Points, SegslamError, Vector
 from segslam.labels.encodings import COLORS, Colors
 from segslam.output.map.from_above import Window, drawn_map, visible
 from segslam.output.map.tiles import TILE_M, Part, corner
 
 if TYPE_CHECKING:
-    from segslam.output.map.store import MapStore
+    from segslam.output.map.write import MapStore
 
 MAX_SIDE = 4000
 """Largest number of pixels along the longer side; limits the memory."""
@@ -26,6 +27,7 @@ BAND_PX = 256
 """Rows of the image that are shaded at once; the result does not depend on it."""
 RELIEF_M, CONTRAST = 1.5, 0.35
 """Chosen: height difference with strong shading, and strength of the shading."""
+CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
 
 class Picture:
@@ -132,3 +134,48 @@ def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:
     table = (255 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
     share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
     return table[(share * (len(table) - 1)).astype(np.int64)]
+
+
+class GeoTiff(Picture):
+    """The top view without legend as GeoTIFF in UTM; needs the origin of a georeferenced run."""
+
+    def close(self) -> None:
+        """Write the image."""
+        import rasterio
+        from rasterio.transform import Affine
+
+        from segslam.gnss.geodesy import utm
+
+        origin = self._store.origin
+        assert origin is not None, "checked before the map is made"
+        epsg, projected = utm(origin)
+        image, window, height_m = self._finished()
+        rows, columns = image.shape[:2]
+        with rasterio.open(
+            self._file,
+            "w",
+            driver="GTiff",
+            height=rows,
+            width=columns,
+            count=3,
+            dtype="uint8",
+            crs=f"EPSG:{epsg}",
+            transform=Affine(*_affine(projected, window, rows, columns, height_m).ravel()),
+            compress="deflate",
+            photometric="RGB",
+        ) as file:
+            file.write(image.transpose(2, 0, 1))
+
+
+def _affine(projected: Callable[[Points], Points], window: Window, rows: int, columns: int, height_m: float) -> Points:
+    """(2, 3) map from column and row to UTM: exact to a centimetre within a few kilometres.
+
+    UTM turns and scales the local frame; its curvature is 4 mm over a kilometre, far from the central meridian.
+    """
+    west, east, south, north = window
+    places = np.column_stack(
+        [west + CORNERS[:, 0] * (east - west), north - CORNERS[:, 1] * (north - south), np.full(4, height_m)]
+    )
+    pixels = np.column_stack([CORNERS * [columns, rows], np.ones(4)])
+    solution, *_ = np.linalg.lstsq(pixels, projected(places)[:, :2], rcond=None)
+    return solution.T

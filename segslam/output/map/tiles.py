@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.core.points import first_rows
 from segslam.core.types import Indices, Labels, Points, Vector
 from segslam.labels.encodings import Colors
 

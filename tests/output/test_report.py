@@ -23,7 +23,7 @@ from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.types import MotionState, SegslamError
 from segslam.output.accuracy import accuracy
-from segslam.output.finished import FIGURES, read_run
+from segslam.output.finished import FIGURES, FinishedRun, read_run
 from segslam.output.folder import ALONE, write_metrics, write_poses
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, loops, write_report
@@ -68,6 +68,10 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert run.reference is not None
     write_metrics(made.folder, run.metrics | accuracy(run.result, run.reference))
     return write_report(made.folder)
+
+
+def _page(run: FinishedRun, plots: dict[str, str]) -> str:
+    return page(run, plots, top="", gallery="", about={})
 
 
 def test_a_map_from_above_is_on_the_page(scored: Path, tmp_path: Path) -> None:
@@ -169,8 +173,8 @@ def test_every_figure_is_in_the_table_with_its_meaning(scored: Path) -> None:
 
 def test_changed_settings_are_marked_and_shown_open(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run").folder)
-    assert '<tr class="changed">' not in page(run, {})
-    changed = page(replace(run, config=load_config(None, ["keyframes.distance_m=1.25"])), {})
+    assert '<tr class="changed">' not in _page(run, {})
+    changed = _page(replace(run, config=load_config(None, ["keyframes.distance_m=1.25"])), {})
     assert re.search(
         r'<details open><summary>keyframes</summary>.*<tr class="changed"><td><code>distance_<wbr>m', changed
     )
@@ -181,7 +185,7 @@ def test_changed_settings_are_marked_and_shown_open(tmp_path: Path) -> None:
 
 def test_names_are_not_taken_for_markup(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run").folder)
-    assert "<script>" not in page(replace(run, dataset="<script>alert(1)</script>"), {"<script>": "<svg/>"})
+    assert "<script>" not in _page(replace(run, dataset="<script>alert(1)</script>"), {"<script>": "<svg/>"})
 
 
 def test_same_run_gives_the_same_page(scored: Path, tmp_path: Path) -> None:
@@ -192,7 +196,7 @@ def test_same_run_gives_the_same_page(scored: Path, tmp_path: Path) -> None:
 def test_run_without_loops_is_drawn(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run").folder)
     bare = replace(run, metrics={}, result=replace(run.result, attempts=()))
-    html = page(bare, {"Loops": draw_loops(bare)})
+    html = _page(bare, {"Loops": draw_loops(bare)})
     assert "No place was visited twice" in html
     assert "accepted" not in _plots(html)["Loops"]
 

@@ -82,6 +82,8 @@ def _record(record: Any) -> Codec:
     names = [field.name for field in kept]
     optional = {name for name in names if NoneType in get_args(hints[name])}
     has_default = {field.name for field in kept if not (field.default is field.default_factory is MISSING)}
+    absent = dict.fromkeys(optional - has_default)
+    required = [name for name in names if name not in optional | has_default]
     codecs = {name: codec(hints[name]) for name in names}
 
     def encode(value: Any) -> Json:
@@ -89,16 +91,14 @@ def _record(record: Any) -> Codec:
         return {name: codecs[name].encode(item) for name, item in present if item is not None}
 
     def decode(value: Json, bulk: Bulk) -> Any:
-        absent = dict.fromkeys(optional - has_default - set(value))
-        left_out = (optional | has_default) - set(value)
-        present = {name: codecs[name].decode(value[name], bulk) for name in names if name not in left_out}
-        return record(**absent, **present, **(bulk[record] if record in BULK else {}))
+        known = {name: codecs[name].decode(value[name], bulk) for name in names if name in value or name in required}
+        return record(**absent | known, **(bulk[record] if record in BULK else {}))
 
     schema = {
         "title": record.__name__,
         "type": "object",
         "properties": {name: codecs[name].schema for name in names},
-        "required": [name for name in names if name not in optional | has_default],
+        "required": required,
     }
     return Codec(encode, decode, schema)
 

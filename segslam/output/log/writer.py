@@ -34,7 +34,7 @@ from segslam.output.log.container import message_within
 from segslam.output.log.drawing import Drawing, ground_truth, map_message, map_points, words
 from segslam.output.log.records import KeyframePoints, codec, keyframe_points, points_and_labels
 from segslam.output.log.schema import channels, metadata
-from segslam.slam.adjustment import Adjusted, Adjustment
+from segslam.slam.adjustment import Adjusted
 
 POSES_PER_KEYFRAME = 50
 """Chosen: number of logged poses of estimates per keyframe, about 4 kB each, so that the log grows with the drive
@@ -125,7 +125,7 @@ class LogWriter:
             self._channels = _register_channels(self._mcap)
         if reference is not None and len(reference):
             first_ns = int(reference.stamp_ns[0])
-            given = schema.REFERENCE, _json(Trajectory, reference)
+            given = schema.REFERENCE, _json(reference)
             self._write([ground_truth(reference, stamp_ns=first_ns), given], stamp_ns=first_ns)
 
     def write(self, step: Step) -> None:
@@ -171,12 +171,11 @@ class LogWriter:
         messages: list[Unwritten] = [map_message(points, labels, stamp_ns=stamp_ns)] if len(points) else []
         messages += [*self._drawing.draw_estimate(estimate, stamp_ns=stamp_ns), _estimate_message(estimate)]
         if late_loops:
-            messages.append((schema.LATE_LOOPS, _json(LateLoops, LateLoops(late_loops))))
+            messages.append((schema.LATE_LOOPS, _json(LateLoops(late_loops))))
         if adjusted is not None:
             before = foxglove.path(adjusted.before.T_world_keyframe.values(), stamp_ns=stamp_ns)
-            record = _json(Adjustment, adjusted.record)
-            messages += [(schema.TRAJECTORY_BEFORE, before), (schema.ADJUSTMENT, record)]
-        self._write([*messages, (schema.RESULT, _json(Trajectory, trajectory))], stamp_ns=stamp_ns)
+            messages += [(schema.TRAJECTORY_BEFORE, before), (schema.ADJUSTMENT, _json(adjusted.record))]
+        self._write([*messages, (schema.RESULT, _json(trajectory))], stamp_ns=stamp_ns)
 
     def move(self, path: Path) -> None:
         """Replace the file `path`, after all data written here is safely on the disk."""
@@ -210,7 +209,7 @@ class LogWriter:
             yield schema.KEYFRAME, keyframe_points(step.keyframe, resolution_m=self._resolution_m)
         if step.estimate is not None and logs_estimate:
             yield _estimate_message(step.estimate)
-        yield schema.STEP, _json(Step, step)
+        yield schema.STEP, _json(step)
 
     def _affords(self, num_poses: int) -> bool:
         """True if the logged estimates may contain this many more poses; counts them if so."""
@@ -276,8 +275,8 @@ def _register_channels(mcap: Writer) -> dict[str, int]:
 
 
 def _estimate_message(estimate: GraphEstimate) -> Unwritten:
-    return schema.ESTIMATE, _json(GraphEstimate, estimate, keyframe_ids=list(estimate.T_world_keyframe))
+    return schema.ESTIMATE, _json(estimate, keyframe_ids=list(estimate.T_world_keyframe))
 
 
-def _json(record: type, value: Any, **more: Any) -> bytes:
-    return json.dumps(codec(record).encode(value) | more, allow_nan=False).encode()
+def _json(record: Any, **more: Any) -> bytes:
+    return json.dumps(codec(record.__class__).encode(record) | more, allow_nan=False).encode()

@@ -4,7 +4,6 @@ import base64
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from html import escape
-from types import MappingProxyType
 from typing import Any
 
 from segslam.core.config import Config, changed_settings
@@ -71,14 +70,7 @@ details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child
 """
 
 
-def page(
-    run: FinishedRun,
-    plots: Mapping[str, str],
-    *,
-    top: str = "",
-    gallery: str = "",
-    about: Mapping[str, str] = MappingProxyType({}),
-) -> str:
+def page(run: FinishedRun, plots: Mapping[str, str], *, top: str, gallery: str, about: Mapping[str, str]) -> str:
     """The page; `plots`: caption -> SVG, between the HTML `top` and `gallery`; `about`: metadata of its log."""
     name = run.folder.resolve().name
     title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"

@@ -46,7 +46,11 @@ class FoxgloveServer(ServerListener):
                 context=context,
                 message_backlog_size=MOST_MESSAGES,
             )
-            self._check = OriginCheck(host, port, (inner, self._server.port))
+            try:
+                self._check = OriginCheck(host, port, (inner, self._server.port))
+            except OSError:
+                self._server.stop()
+                raise
         except (OSError, RuntimeError) as error:
             raise SegslamError(f"--foxglove {address}: cannot listen there ({error}); give another port") from error
         shown = f"[{host}]" if ":" in host else host

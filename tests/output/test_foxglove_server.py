@@ -1,6 +1,7 @@
 """The channels of the log, as a viewer receives them over a WebSocket."""
 
 import json
+import socket
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
 pytest.importorskip("websockets", reason="websockets is not installed")
 
+import foxglove
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from helpers.commands import run
@@ -172,6 +174,17 @@ def test_an_invalid_port_is_rejected(address: str) -> None:
 def test_a_port_in_use_is_reported() -> None:
     with FoxgloveServer("0") as server, pytest.raises(SegslamError, match="cannot listen there"):
         FoxgloveServer(server.url.rpartition("/")[2])
+
+
+def test_a_port_in_use_leaves_no_server_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[Any] = []
+    start = foxglove.start_server
+    monkeypatch.setattr(foxglove, "start_server", lambda **options: started.append(start(**options)) or started[-1])
+    monkeypatch.setattr("segslam.output.foxglove_server.hidden_address", lambda: "127.0.0.1")
+    with FoxgloveServer("0") as server, pytest.raises(SegslamError, match="cannot listen there"):
+        FoxgloveServer(server.url.rpartition("/")[2])
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", started[1].port), timeout=5.0).close()
 
 
 def test_without_the_package_one_line_has_the_install_command(

@@ -79,14 +79,14 @@ def read_globe(folder: Path) -> Globe | None:
     file = folder / FILE
     if not file.exists():
         return None
-    with _not_damaged(file):
+    with not_damaged(file):
         values = json.loads(file.read_text(encoding="utf-8"))
         origin = Origin(*(float(values[name]) for name in DEGREES_AND_HEIGHT))
     return Globe(origin, read_poses(folder / ENU, format="tum").T_a_b)
 
 
 @contextmanager
-def _not_damaged(file: Path) -> Iterator[None]:
+def not_damaged(file: Path) -> Iterator[None]:
     """Context manager that raises SegslamError if the file cannot be read within it, or has other content."""
     try:
         yield
@@ -145,7 +145,7 @@ def take_over(run: str | Path, map_run: str | Path) -> bool:
 def use_of(folder: Path) -> str:
     """How the fixes of a run were used; empty without fixes. Raises SegslamError for a damaged file."""
     file = folder / FILE
-    with _not_damaged(file):
+    with not_damaged(file):
         return str(json.loads(file.read_text(encoding="utf-8")).get("use", "")) if file.exists() else ""
 
 
@@ -154,7 +154,7 @@ def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
     file = folder / FIXES
     if not file.exists():
         return []
-    with _not_damaged(file):
+    with not_damaged(file):
         values = json.loads((folder / FILE).read_text(encoding="utf-8"))
         offset_ns = round(1e9 * (values["given_offset_s"] + values["clock_offset_s"])) + stamp_shift_ns
         with file.open(newline="", encoding="utf-8") as stream:

@@ -248,6 +248,14 @@ def test_the_report_shows_the_fixes(made: MadeRun, tmp_path: Path) -> None:
     assert draw_fixes(tmp_path) is None
 
 
+@pytest.mark.parametrize("content", ["stamp_ns,kept\n1,1\n", "stamp_ns,residual_east_m\n1,far\n", b"\xff\xfe\x00"])
+def test_a_damaged_file_of_fixes_is_named_by_the_report(made: MadeRun, tmp_path: Path, content: str | bytes) -> None:
+    folder = shutil.copytree(made.folder, tmp_path / "run")
+    (folder / "gnss.csv").write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(SegslamError, match=r"gnss\.csv: damaged .*; run `segslam georeference` again"):
+        draw_fixes(folder)
+
+
 @pytest.mark.usefixtures("short_runs")
 def test_map_places_a_run_before_its_maps_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, out = write_day(tmp_path / "monday", day=0, first=0, num_scans=22), tmp_path / "run"

@@ -248,20 +248,23 @@ def svg(figure: Figure, name: str) -> str:
 
 
 def draw_fixes(folder: Path) -> str | None:
-    """SVG text: fixes over the path in top view, and residuals over time; None for a run without fixes."""
+    """SVG text: fixes over the path in top view, and residuals over time; None for a run without fixes.
+
+    Raises SegslamError for damaged files.
+    """
     file = folder / "gnss.csv"
-    from segslam.output.georeferenced import read_globe
+    from segslam.output.georeferenced import not_damaged, read_globe
 
     globe = read_globe(folder) if file.is_file() else None
     if globe is None:
         return None
-    with file.open(newline="", encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["residual_east_m"]]
     names = ("east_m", "north_m", "residual_east_m", "residual_north_m")
-    values = np.array([[float(row[name]) for name in names] for row in rows]).reshape(-1, len(names))
+    with not_damaged(file), file.open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["residual_east_m"]]
+        values = np.array([[float(row[name]) for name in names] for row in rows]).reshape(-1, len(names))
+        minutes = np.array([int(row["stamp_ns"]) for row in rows], float) / 60e9
+        kept = np.array([row["kept"] == "1" for row in rows], bool)
     enu_m, residual_m = values[:, :2], values[:, 2:]
-    minutes = np.array([int(row["stamp_ns"]) for row in rows], float) / 60e9
-    kept = np.array([row["kept"] == "1" for row in rows], bool)
     figure = Figure(figsize=(WIDTH_IN, 1.5 * WIDTH_IN), layout="constrained")
     above, over_time = figure.subplots(2, 1, height_ratios=(2, 1))
     above.plot(*globe.T_enu_lidar[:, :2, 3].T, color=CORRECTED, linewidth=1.2, label="trajectory", zorder=3)

@@ -9,7 +9,6 @@ Revert" (IROS 2020).
 
 import math
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -39,26 +38,6 @@ MAX_SPREAD_CELLS = 12
 """Largest number of pixels that a near point covers to each side."""
 
 
-class Views:
-    """The range images of all keyframes, on disk."""
-
-    def __init__(self, file: Path, *, spread_m: float) -> None:
-        """A point covers all directions within `spread_m` of it, because keyframes are downsampled."""
-        self._file = file
-        self._spread_m = spread_m
-        file.touch()
-
-    def add(self, points: Points) -> None:
-        """Add the points (n, 3) of the next keyframe, in its own frame."""
-        with self._file.open("ab") as stream:
-            nearest_returns(points.astype(np.float32), self._spread_m).tofile(stream)
-
-    def __getitem__(self, number: int) -> np.ndarray:
-        """(NUM_ROWS, NUM_COLUMNS) uint16, the range image of the keyframe added as number 0, 1, ..."""
-        cells = NUM_ROWS * NUM_COLUMNS
-        return np.fromfile(self._file, np.uint16, cells, offset=2 * cells * number).reshape(NUM_ROWS, NUM_COLUMNS)
-
-
 @kernel("UniTuple(float64, 3)(float64, float64, float64)")
 def _direction(x, y, z):
     """Row and column, as fractions, and range."""
@@ -70,7 +49,10 @@ def _direction(x, y, z):
 
 @kernel("uint16[:, :](float32[:, :], float64)")
 def nearest_returns(points, spread_m):
-    """Range image in units of STEP_M; each point covers all pixels within `spread_m` of it."""
+    """(NUM_ROWS, NUM_COLUMNS) range image in units of STEP_M of the points of a keyframe, in its own frame.
+
+    Each point covers all pixels within `spread_m` of it, because keyframes are downsampled.
+    """
     nearest = np.full((NUM_ROWS, NUM_COLUMNS), NOTHING, np.uint16)
     for x, y, z in points:
         row, column, distance = _direction(x, y, z)

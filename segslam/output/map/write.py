@@ -29,7 +29,7 @@ from segslam.output.map.from_above import BESIDE_M, cut_heights
 from segslam.output.map.grid import Grid, free_range_m
 from segslam.output.map.picture import GeoTiff, Picture, of_numbers
 from segslam.output.map.tiles import Part, Tile, Tiles, corner, distance_m
-from segslam.output.map.views import Views, moved
+from segslam.output.map.views import moved, nearest_returns
 from segslam.slam.adjustment import Progress, no_progress
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ class MapStore:
         self.config = config
         self.origin = origin
         self.tiles = Tiles(scratch / "tiles", voxel_m=config.voxel_m)
-        self._views = Views(scratch / "views", spread_m=config.voxel_m)
+        self._scratch = scratch
         self._T_keyframe_world: list[Transform] = []
         self.places: list[Vector] = []
         """Position of each keyframe in the world (m)."""
@@ -175,7 +175,8 @@ class MapStore:
         self.tiles.add(points, keyframe.labels[kept], intensities[kept])
         place = T_world_keyframe[:3, 3]
         self.free_m.append(free_range_m(points - place, keyframe.labels[kept]))
-        self._views.add(keyframe.points)
+        view = nearest_returns(keyframe.points.astype(np.float32), self.config.voxel_m)
+        np.save(self._scratch / f"{len(self.places)}.npy", view)
         self._T_keyframe_world.append(geometry.inverse(T_world_keyframe))
         self.places.append(place)
 
@@ -216,4 +217,4 @@ class MapStore:
         T_world_tile = geometry.transform(np.eye(3), corner(tile))
         for number, place in enumerate(self.places):
             if distance_m(tile, place) < self.config.view_range_m:
-                yield self._views[number], self._T_keyframe_world[number] @ T_world_tile
+                yield np.load(self._scratch / f"{number}.npy"), self._T_keyframe_world[number] @ T_world_tile

@@ -1,7 +1,6 @@
 """The channels of the log, as a viewer receives them over a WebSocket."""
 
 import json
-import socket
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,10 +27,9 @@ from websockets.typing import Origin, Subprotocol
 from segslam.cli.console import Terminal
 from segslam.cli.viewers import serve_foxglove
 from segslam.core.types import SegslamError
-from segslam.output.foxglove_server import MOST_MESSAGES, FoxgloveServer, parse_address
+from segslam.output.foxglove_server import MOST_MESSAGES, FoxgloveServer, is_allowed, parse_address
 from segslam.output.log import read_log, schema
 from segslam.output.log.schema import channels
-from segslam.output.origin_check import is_allowed
 
 
 def _wait(condition: Callable[[], object], seconds: float = 20.0) -> None:
@@ -180,11 +178,9 @@ def test_a_port_in_use_leaves_no_server_behind(monkeypatch: pytest.MonkeyPatch) 
     started: list[Any] = []
     start = foxglove.start_server
     monkeypatch.setattr(foxglove, "start_server", lambda **options: started.append(start(**options)) or started[-1])
-    monkeypatch.setattr("segslam.output.foxglove_server.hidden_address", lambda: "127.0.0.1")
     with FoxgloveServer("0") as server, pytest.raises(SegslamError, match="cannot listen there"):
         FoxgloveServer(server.url.rpartition("/")[2])
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", started[1].port), timeout=5.0).close()
+    assert len(started) == 1
 
 
 def test_without_the_package_one_line_has_the_install_command(

@@ -121,7 +121,7 @@ def refine(
     folder = new_folder(out)
     when_stopped(f"the log in {folder} is kept, without results")
     with refined.begun(folder, Slam(refined.config), options={}) as made:
-        steps = made.take((step, 0, False) for step in recorded.whole_steps(len(recorded.keyframes())))
+        steps = made.take((step, 0, False) for step in recorded.whole_steps(len(recorded.keyframes()[0])))
         if is_interrupted(terminal.progress(steps, recorded.num_steps(), "read")):
             raise typer.Exit(EXIT_STATUS)
         copy_alone(recorded.path.parent, folder)
@@ -225,7 +225,7 @@ def _check_keyframes(run: Path, edits: LoopEdits, terminal: Terminal) -> None:
     recorded = read_log(run)
     if recorded.options.get("in_map"):
         raise SegslamError(f"{run}: localised in the map of another run, without loops of its own; edit that run")
-    num = len(recorded.keyframes())
+    num = len(recorded.keyframes()[0])
     for newer, older in sorted(edits.forbidden | edits.added):
         if newer >= num:
             raise SegslamError(f"{newer}:{older}: {run} has keyframes 0 to {num - 1}; the report shows their ids")

@@ -23,6 +23,8 @@ Points = Float[np.ndarray, "_ 3"]
 """Points, a row each, in metres."""
 Labels = UInt8[np.ndarray, "_"]
 """SemanticKITTI learning ids, one per point."""
+CloudOf = Callable[[int], tuple[Points, Labels]]
+"""Function from the id of a keyframe to its points, in its frame, and their labels."""
 ScanLabels = Labels | Callable[[], Labels]
 """The labels of a scan, or a function that computes them, as for a network."""
 Transform = Float[np.ndarray, "4 4"]

@@ -10,7 +10,7 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import Config, KeyframeConfig
 from segslam.core.points import voxel_first
-from segslam.core.types import Indices, Keyframe, Label, Labels, Points, Transform, Vector
+from segslam.core.types import CloudOf, Indices, Keyframe, Label, Labels, Points, Transform, Vector
 from segslam.registration import refinement
 from segslam.registration.prepared import Labeller, PreparedScan, prepare_scan
 
@@ -120,7 +120,7 @@ class Submaps:
     """Submaps of the keyframes of a drive, computed on use."""
 
     def __init__(
-        self, config: Config, clouds: Callable[[], Clouds], labeller: Labeller, motion_variance: Callable[[], Vector]
+        self, config: Config, clouds: CloudOf, labeller: Labeller, motion_variance: Callable[[], Vector]
     ) -> None:
         """`clouds` provides the points of keyframes by id, `labeller` geometric labels.
 
@@ -147,13 +147,13 @@ class Submaps:
 
     def gathered(self, keyframe_id: int, *, newest_id: int | None = None) -> Submap:
         """The submap with the labels stored in the keyframes, without keyframes after `newest_id`."""
-        points, labels = self._clouds().cloud(keyframe_id)
+        points, labels = self._clouds(keyframe_id)
         clouds, all_labels = [points], [labels]
         for neighbour in self._neighbours(keyframe_id, len(self.T_odom) - 1 if newest_id is None else newest_id):
             if len(refinement.downsample(np.vstack(clouds), config=self._config.refine)) >= DENSE_VOXELS:
                 break
             T_keyframe_neighbour = geometry.inverse(self.T_odom[keyframe_id]) @ self.T_odom[neighbour]
-            more, more_labels = self._clouds().cloud(neighbour)
+            more, more_labels = self._clouds(neighbour)
             clouds.append(geometry.apply(T_keyframe_neighbour, more.astype(np.float64)).astype(np.float32))
             all_labels.append(more_labels)
         if len(clouds) == 1:

@@ -14,6 +14,7 @@ from segslam.core.points import within_range
 from segslam.core.threads import at_once
 from segslam.core.types import (
     Alignment,
+    CloudOf,
     Found,
     Information,
     Keyframe,
@@ -26,7 +27,7 @@ from segslam.core.types import (
     as_points,
 )
 from segslam.graph import PoseGraph
-from segslam.keyframes import Clouds, Submaps, downsample_keyframe
+from segslam.keyframes import Submaps, downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.output.finished import read_run
 from segslam.output.log import read_log
@@ -68,7 +69,7 @@ class Locator:
     def __init__(
         self,
         keyframes: list[Keyframe],
-        clouds: Clouds,
+        clouds: CloudOf,
         informations: Sequence[Information | None],
         T_world_keyframe: dict[int, Transform],
         *,
@@ -92,10 +93,9 @@ class Locator:
     def from_run(cls, folder: str | Path) -> "Locator":
         """The locator of a run folder. Raises SegslamError, naming the file, if it is damaged or did not finish."""
         run = read_run(folder)
-        recorded = read_log(run.folder).keyframes()
-        keyframes = [recorded[number] for number in range(len(recorded))]
+        keyframes, clouds = read_log(run.folder).keyframes()
         informations = run.result.keyframe_informations()
-        return cls(keyframes, recorded, informations, run.result.estimate.T_world_keyframe, config=run.config)
+        return cls(keyframes, clouds, informations, run.result.estimate.T_world_keyframe, config=run.config)
 
     def locate(
         self, points: ArrayLike, labels: Labels | None = None, *, max_places: int = MAX_PLACES
@@ -147,11 +147,11 @@ class Locator:
 
 
 def submaps_of(
-    keyframes: list[Keyframe], clouds: Clouds, informations: Sequence[Information | None], config: Config
+    keyframes: list[Keyframe], clouds: CloudOf, informations: Sequence[Information | None], config: Config
 ) -> Submaps:
     """The submaps of a drive; sparse keyframes are merged with their neighbours. Arguments as for `Locator`."""
     graph = PoseGraph(config.graph)
-    submaps = Submaps(config, lambda: clouds, geometric_labels, lambda: graph.motion_variance)
+    submaps = Submaps(config, clouds, geometric_labels, lambda: graph.motion_variance)
     for keyframe, information in zip(keyframes, informations, strict=True):
         graph.add_keyframe(keyframe.id, keyframe.T_odom_keyframe, keyframe.travel_m, information=information)
         submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))

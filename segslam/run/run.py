@@ -19,7 +19,7 @@ from segslam.core.config import config_to_yaml
 from segslam.core.memory import give_back, peak_mb
 from segslam.core.threads import in_other_thread
 from segslam.core.trajectory import travelled_m
-from segslam.core.types import BadScan, MotionState, Scan, SegslamError, Step, Trajectory, Transform
+from segslam.core.types import BadScan, CloudOf, MotionState, Scan, SegslamError, Step, Trajectory, Transform
 from segslam.core.whole_files import write_whole
 from segslam.graph import PoseGraph
 from segslam.output.accuracy import accuracy
@@ -38,7 +38,6 @@ from segslam.output.folder import (
     write_poses,
 )
 from segslam.output.log import LogWriter, Mirror, RunLog, read_log
-from segslam.output.log.drawing import CloudOf
 from segslam.scans import Dataset
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.vertical_angle import measure_vertical_angle

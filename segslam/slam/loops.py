@@ -9,11 +9,11 @@ from segslam.candidates import PlaceSignature, signature_of
 from segslam.candidates.proximity import LEAST_PROBABILITY, ProximityDetector
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch, at_once
-from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
+from segslam.core.types import Alignment, CloudOf, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import Graph
 from segslam.graph.chains import far_from_prior, prior_gate
 from segslam.graph.confirmation import Confirmation
-from segslam.keyframes import Clouds, Submaps
+from segslam.keyframes import Submaps
 from segslam.registration.prepared import Labeller, PreparedScan
 from segslam.slam.far_loops import FarLoops
 from segslam.slam.loop_edits import LoopEdits
@@ -37,7 +37,7 @@ class LoopCloser:
         self,
         config: Config,
         graph: Graph,
-        clouds: Callable[[], Clouds],
+        clouds: CloudOf,
         labeller: Labeller,
         edits: LoopEdits,
         *,

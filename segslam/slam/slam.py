@@ -69,7 +69,12 @@ class Slam:
         self.graph = self._new_graph()
         self._clouds: Clouds = CloudStore(self.config.keyframes.resolution_m)
         self._loops = LoopCloser(
-            self.config, self.graph, lambda: self._clouds, geometric_labels, edits, is_known=known is not None
+            self.config,
+            self.graph,
+            lambda number: self._clouds.cloud(number),
+            geometric_labels,
+            edits,
+            is_known=known is not None,
         )
         self._steps: list[tuple[int, int, Transform]] = []
         self._motions: list[Motion] = []

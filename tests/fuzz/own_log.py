@@ -47,9 +47,8 @@ class Read:
         self.reference: Trajectory | None = log.reference()
         self.result = log.result()
         self.late: tuple[LoopAttempt, ...] = log.late_loops()
-        recorded = log.keyframes()
-        self.keyframes = [recorded[number] for number in range(len(recorded))]
-        self.clouds = [recorded.cloud(number) for number in range(len(recorded))]
+        self.keyframes, cloud = log.keyframes()
+        self.clouds = [cloud(number) for number in range(len(self.keyframes))]
 
     def check_part_of(self, whole: "Read") -> None:
         """Raises AssertionError unless each part is that of the whole log, or missing."""

@@ -60,7 +60,7 @@ def test_a_submap_has_the_neighbours_whose_pose_is_known_to_a_voxel() -> None:
     ring = np.column_stack([np.cos(np.arange(400)), np.sin(np.arange(400)), np.zeros(400)]).astype(np.float32) * 10.0
     store = CloudStore(CONFIG.resolution_m)
     variance = np.array([0.0, 0.01, 0.01, 0.36, 0.01])
-    submaps = Submaps(Config(), lambda: store, lambda points: np.zeros(len(points), np.uint8), lambda: variance)
+    submaps = Submaps(Config(), store.cloud, lambda points: np.zeros(len(points), np.uint8), lambda: variance)
     for row in range(5):
         store.keep(Keyframe(row, row, 0, _at(float(row)), float(row), ring, np.zeros(400, np.uint8)))
         submaps.add(_at(float(row)), labelled_by_shape=False)

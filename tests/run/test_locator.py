@@ -59,8 +59,7 @@ def test_a_scan_of_another_town_is_not_found(run: Path) -> None:
 
 
 def test_signatures_are_in_the_log_and_computed_if_it_has_none(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded = read_log(run / "log.mcap").keyframes()
-    stored = [recorded[number].place for number in range(len(recorded))]
+    stored = [keyframe.place for keyframe in read_log(run / "log.mcap").keyframes()[0]]
     assert all(place is not None and len(place) == 1440 for place in stored)
     step_of = reader._step
 
@@ -72,7 +71,7 @@ def test_signatures_are_in_the_log_and_computed_if_it_has_none(run: Path, monkey
     older = Locator.from_run(run)
     newer_spectra = [np.frombuffer(place or b"", np.uint8) for place in stored]
     for number, spectrum in enumerate(newer_spectra):
-        signature = older._signature(read_log(run / "log.mcap").keyframes()[number])
+        signature = older._signature(read_log(run / "log.mcap").keyframes()[0][number])
         assert (signature.spectrum.ravel() == spectrum).all()
 
 
@@ -168,9 +167,8 @@ def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path, capsys: pyte
 
 def test_neighbours_whose_motion_is_unsure_are_not_merged(run: Path) -> None:
     """As while the run was mapped: the information of each motion is in its log."""
-    recorded = read_log(run).keyframes()
-    keyframes = [recorded[number] for number in range(6)]
+    keyframes, clouds = read_log(run).keyframes()
     informations = [None, None, 1e-2 * np.eye(6), None, None, None]
-    submaps = submaps_of(keyframes, recorded, informations, load_config(None, []))
+    submaps = submaps_of(keyframes[:6], clouds, informations, load_config(None, []))
     assert set(submaps._neighbours(1, 5)) == {0}
     assert 1 not in set(submaps._neighbours(2, 5))

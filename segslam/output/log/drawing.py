@@ -1,6 +1,6 @@
 """Visualisation of a run, step by step, as Foxglove messages: drawings, and what happens in words."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from google.protobuf.message import Message
 from segslam.core import geometry
 from segslam.core.points import voxel_first, within_range
 from segslam.core.types import (
+    CloudOf,
     GraphEstimate,
     Keyframe,
     Label,
@@ -65,8 +66,6 @@ MAP_BATCH = 50
 MAP_RANGE_M, MAP_VOXEL_M = 40.0, 0.2
 
 Topical = tuple[str, Message]
-CloudOf = Callable[[int], tuple[Points, Labels]]
-"""Function from the id of a keyframe to its points, in its frame, and their labels."""
 INFO, WARNING = Log.Level.Value("INFO"), Log.Level.Value("WARNING")
 
 

@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -16,6 +17,7 @@ from google.protobuf.message import DecodeError
 from segslam.core.config import Config, config_from_yaml
 from segslam.core.errors import brief, unreadable
 from segslam.core.types import (
+    CloudOf,
     GraphEstimate,
     Keyframe,
     Labels,
@@ -41,39 +43,6 @@ NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, R
 Parts = dict[str, container.Stored]
 """The latest message of each topic."""
 Decoded = TypeVar("Decoded")
-
-
-class RecordedKeyframes:
-    """Keyframes by id; the `segslam.keyframes.Clouds` of a finished run."""
-
-    def __init__(self, path: Path, kept: Sequence[tuple[Keyframe, tuple[int, int], int]]) -> None:
-        """`kept`: each keyframe without its points; offset and size of the chunk that has them, and their channel."""
-        self._path = path
-        self._kept = kept
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def __getitem__(self, keyframe_id: int) -> Keyframe:
-        """A keyframe, without points."""
-        return self._kept[keyframe_id][0]
-
-    def keep(self, keyframe: Keyframe) -> None:
-        """Raises TypeError: keyframes cannot be added to a recorded drive."""
-        raise TypeError(f"keyframe {keyframe.id}: the log {self._path} is read only")
-
-    def cloud(self, keyframe_id: int) -> tuple[Points, Labels]:
-        """Points and labels of a keyframe. Raises SegslamError if the file has changed since it was opened."""
-        _, (offset, size), channel_id = self._kept[keyframe_id]
-        try:
-            with self._path.open("rb") as stream:
-                stream.seek(offset)
-                data = message_within(stream.read(size), channel_id)
-            if data is not None:
-                return points_and_labels(KeyframePoints.FromString(data))
-        except (OSError, ValueError, DecodeError) as error:
-            raise SegslamError(f"{self._path}: keyframe {keyframe_id} cannot be read ({error})") from error
-        raise SegslamError(f"{self._path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,19 +129,37 @@ class RunLog:
                 return parts
         return {}
 
-    def keyframes(self) -> "RecordedKeyframes":
-        """The keyframes of the complete steps, with access to their points. Raises SegslamError as `steps` does."""
-        kept: list[tuple[Keyframe, tuple[int, int], int]] = []
+    def keyframes(self) -> tuple[list[Keyframe], CloudOf]:
+        """The keyframes of the complete steps, without points, and a function that reads the points of each.
+
+        Raises SegslamError as `steps` does; the function, if the file has changed since.
+        """
+        keyframes: list[Keyframe] = []
+        places: list[tuple[tuple[int, int], int]] = []
         with suppress(CutError):
             for parts in self._parts_until(schema.STEP):
-                if (cloud := parts.get(schema.KEYFRAME)) is None:
+                if (stored := parts.get(schema.KEYFRAME)) is None:
                     continue
                 parts.pop(schema.ESTIMATE, None)
                 keyframe = self._decoded(_step, parts, False).keyframe
-                if keyframe is None or keyframe.id != len(kept):
-                    raise SegslamError(f"{self.path}: keyframe {len(kept)} is missing; map the data again")
-                kept.append((keyframe, cloud.chunk, cloud.channel_id))
-        return RecordedKeyframes(self.path, kept)
+                if keyframe is None or keyframe.id != len(keyframes):
+                    raise SegslamError(f"{self.path}: keyframe {len(keyframes)} is missing; map the data again")
+                keyframes.append(keyframe)
+                places.append((stored.chunk, stored.channel_id))
+        return keyframes, partial(self._cloud, places)
+
+    def _cloud(self, places: Sequence[tuple[tuple[int, int], int]], keyframe_id: int) -> tuple[Points, Labels]:
+        """The points of a keyframe; `places`: offset and size of the chunk with those of each, and their channel."""
+        (offset, size), channel_id = places[keyframe_id]
+        try:
+            with self.path.open("rb") as stream:
+                stream.seek(offset)
+                data = message_within(stream.read(size), channel_id)
+            if data is not None:
+                return points_and_labels(KeyframePoints.FromString(data))
+        except (OSError, ValueError, DecodeError) as error:
+            raise SegslamError(f"{self.path}: keyframe {keyframe_id} cannot be read ({error})") from error
+        raise SegslamError(f"{self.path}: keyframe {keyframe_id} is missing; the log was changed while it was open")
 
     def _parts_until(self, last: str, *, since_last: str | None = None) -> Iterator[Parts]:
         """The messages of each step, or of other groups that end with the topic `last`. Raises CutError at a cut."""

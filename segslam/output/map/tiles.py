@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from segslam.core.points import first_rows
 from segslam.core.types import Indices, Labels, Points, Vector
 from segslam.labels.encodings import Colors
 
@@ -162,7 +163,7 @@ def merged(voxels: np.ndarray, voxel_m: float) -> np.ndarray:
 
     Ties between classes are resolved to the smallest id. Cells are in the order of their first occurrence.
     """
-    _, first = hash_keys(_cell_keys(voxels["point"], voxel_m))
+    first = first_rows(_cell_keys(voxels["point"], voxel_m))
     is_first = first == np.arange(len(voxels))
     cells, num_cells = (np.cumsum(is_first) - 1)[first], int(is_first.sum())
     result = np.zeros(num_cells, VOXEL)

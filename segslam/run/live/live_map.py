@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from segslam.core.config import MapConfig
-from segslam.core.types import Keyframe, Labels, Points, SegslamError, Transform
-from segslam.output.log.drawing import CloudOf, map_points
+from segslam.core.types import CloudOf, Keyframe, Labels, Points, SegslamError, Transform
+from segslam.output.log.drawing import map_points
 from segslam.output.map.write import write_map
 
 logger = logging.getLogger(__name__)

@@ -72,9 +72,7 @@ def find_session(
     in this order, and those before and after each that is found, until the first `MOST_FAILED` were not. They look like
     a place of the earlier session, and no other place is tried.
     """
-    recorded = session.log.keyframes()
-    keyframes = [recorded[number] for number in range(len(recorded))]
-    submaps = submaps_of(keyframes, recorded, session.informations, config)
+    submaps = submaps_of(*session.log.keyframes(), session.informations, config)
     found: list[LoopClosure] = []
     count = len(session.travel_m)
     queries = (

@@ -25,6 +25,7 @@ from segslam.output.log import LogWriter, read_log
 from segslam.run.live.folder import FolderSource, stamp_of_name
 from segslam.run.live.front import Front
 from segslam.run.live.waiting import Rhythm, Waiting
+from segslam.scans import open_dataset
 from segslam.scans.presets import SETTINGS as PRESETS
 
 INTERVAL_NS = 100_000_000
@@ -140,6 +141,22 @@ def test_a_file_is_read_once_when_it_is_closed_or_renamed(tmp_path: Path) -> Non
     ]
     scan = written.read(written.index, written.stamp_ns)
     assert (scan.index, len(scan.points)) == (0, 10)
+
+
+def test_the_times_of_the_points_of_a_file_are_used_as_when_it_is_mapped_later(tmp_path: Path) -> None:
+    source, waiting, stopped = FolderSource(tmp_path), Waiting(), threading.Event()
+    source.open(print)
+    threading.Thread(target=source.feed, args=(waiting, stopped)).start()
+    head = "VERSION 0.7\nFIELDS x y z time\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 5\nHEIGHT 1\nDATA ascii\n"
+    try:
+        (tmp_path / "1700000000.5.pcd").write_text(head + "".join(f"{k + 1} 2 3 {0.025 * k}\n" for k in range(5)))
+        arrival = waiting.take(5.0)
+    finally:
+        stopped.set()
+    assert arrival is not None
+    times = arrival.read(0, arrival.stamp_ns).times
+    np.testing.assert_allclose(times, [0.0, 0.25, 0.5, 0.75, 1.0], atol=1e-6)
+    np.testing.assert_array_equal(times, open_dataset(tmp_path)[0].times)
 
 
 def test_a_file_that_is_no_scan_is_a_bad_scan(tmp_path: Path) -> None:

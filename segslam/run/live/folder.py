@@ -20,6 +20,7 @@ from segslam.core.types import BadScan, Scan, SegslamError, Transform
 from segslam.run.live.waiting import Arrival, Waiting
 from segslam.scans.clouds import SUFFIXES, read_file
 from segslam.scans.dataset import make_scan
+from segslam.scans.scan_files import sweep_times
 
 IN_CLOSE_WRITE, IN_MOVED_TO = 0x8, 0x80
 IN_DELETE_SELF, IN_MOVE_SELF, IN_UNMOUNT, IN_Q_OVERFLOW = 0x400, 0x800, 0x2000, 0x4000
@@ -145,6 +146,7 @@ class FolderSource:
             stamp_ns,
             cloud.points,
             np.zeros(len(cloud.points), np.uint8),
+            sweep_times(cloud.times, len(cloud.points), 1e-9 * stamp_ns),
             intensities=cloud.intensities if self._has_intensities else None,
             vertical_angle_deg=self._vertical_angle_deg,
         )

@@ -1,27 +1,20 @@
 """A source of live scans that ignores the request to end."""
 
-from collections.abc import Callable
 from threading import Event
 
-from segslam.core.types import Transform
-from segslam.run.live.waiting import Arrival, Waiting
+from segslam.run.live.waiting import Source, Waiting
 
 
-class HangingSource:
+class HangingSource(Source):
     """Gives no scan, ignores `stopped`, and must not be closed while it hangs."""
 
-    name = "hanging"
-
-    def open(self, tell: Callable[[str], None]) -> None:
-        """Nothing to open."""
+    def __init__(self) -> None:
+        super().__init__("hanging")
 
     def feed(self, waiting: Waiting, stopped: Event) -> str:
         """Hangs, like a middleware that waits for a peer."""
         Event().wait()
         return ""
-
-    def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
-        """There is no subscriber."""
 
     def close(self) -> None:
         """Would hang, too."""

@@ -1,12 +1,11 @@
 """A source of live scans in a room."""
 
-from collections.abc import Callable
 from threading import Event
 
 import numpy as np
 
-from segslam.core.types import BadScan, Scan, Transform
-from segslam.run.live.waiting import Arrival, Waiting
+from segslam.core.types import BadScan, Scan
+from segslam.run.live.waiting import Source, Waiting
 
 
 def ring(radius_m: float) -> np.ndarray:
@@ -14,13 +13,11 @@ def ring(radius_m: float) -> np.ndarray:
     return np.column_stack([radius_m * np.cos(angles), radius_m * np.sin(angles), np.zeros(500)])
 
 
-class NearSource:
+class NearSource(Source):
     """An unusable scan, then two with surfaces at 6 m; then it ends."""
 
-    name = "live/near"
-
-    def open(self, tell: Callable[[str], None]) -> None:
-        """Nothing to open."""
+    def __init__(self) -> None:
+        super().__init__("live/near")
 
     def feed(self, waiting: Waiting, stopped: Event) -> str:
         """Three scans."""
@@ -32,9 +29,3 @@ class NearSource:
         for stamp_ns in (2, 3):
             waiting.put(stamp_ns, lambda index, stamp_ns: Scan(ring(6.0), stamp_ns, index))
         return "no more scans"
-
-    def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
-        """There is no subscriber."""
-
-    def close(self) -> None:
-        """Nothing to close."""

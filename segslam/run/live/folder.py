@@ -12,15 +12,12 @@ from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from threading import Event
 from time import time_ns
-
-import numpy as np
+from typing import Any
 
 from segslam.core.errors import unreadable
-from segslam.core.types import BadScan, Scan, SegslamError, Transform
-from segslam.run.live.waiting import Arrival, Waiting
+from segslam.core.types import BadScan, Scan, SegslamError
+from segslam.run.live.waiting import Source, Waiting
 from segslam.scans.clouds import SUFFIXES, read_file
-from segslam.scans.dataset import make_scan
-from segslam.scans.scan_files import sweep_times
 
 IN_CLOSE_WRITE, IN_MOVED_TO = 0x8, 0x80
 IN_DELETE_SELF, IN_MOVE_SELF, IN_UNMOUNT, IN_Q_OVERFLOW = 0x400, 0x800, 0x2000, 0x4000
@@ -35,14 +32,13 @@ WAKE_S = 0.2
 """Longest time until a stop takes effect."""
 
 
-class FolderSource:
+class FolderSource(Source):
     """Scans as their files appear; existing files are ignored. A name that is written again is another scan."""
 
-    def __init__(self, folder: Path, *, intensities: bool = False, vertical_angle_deg: float = 0.0) -> None:
+    def __init__(self, folder: Path, **options: Any) -> None:
+        """`options` as for `Source`."""
         self._folder = folder.expanduser().resolve()
-        self._has_intensities = intensities
-        self._vertical_angle_deg = vertical_angle_deg
-        self.name = f"live/{self._folder.name}"
+        super().__init__(f"live/{self._folder.name}", **options)
         self._fd = -1
         self._has_missed = False
         self._noted_ns = RawValue("q", 0)
@@ -84,9 +80,6 @@ class FolderSource:
                 elif self._is_scan(self._folder / name):
                     self._put(self._folder / name, waiting)
         return ""
-
-    def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
-        """No effect: a folder has no subscribers."""
 
     def close(self) -> None:
         """Stop watching."""
@@ -140,16 +133,7 @@ class FolderSource:
             cloud = read_file(file)
         except SegslamError as error:
             raise BadScan(str(error)) from error
-        scan = make_scan(
-            file,
-            index,
-            stamp_ns,
-            cloud.points,
-            np.zeros(len(cloud.points), np.uint8),
-            sweep_times(cloud.times, len(cloud.points), 1e-9 * stamp_ns),
-            intensities=cloud.intensities if self._has_intensities else None,
-            vertical_angle_deg=self._vertical_angle_deg,
-        )
+        scan = self._scan(file, index, stamp_ns, cloud)
         found = file.stat()
         if found.st_size != content[1] or found.st_mtime_ns > content[0]:
             raise BadScan(f"{file}: written again before it was read; give each scan a file of its own")

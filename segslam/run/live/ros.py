@@ -31,11 +31,9 @@ from segslam.core.types import BadScan, GraphEstimate, Labels, Points, Scan, Seg
 from segslam.gnss.fixes import Row
 from segslam.gnss.reading import row_of
 from segslam.run.live.live_map import DrawnMap
-from segslam.run.live.waiting import Arrival, Waiting
-from segslam.scans.dataset import make_scan
+from segslam.run.live.waiting import Arrival, Source, Waiting
 from segslam.scans.messages import CLOUD
 from segslam.scans.point_cloud2 import read_message, stamp_ns_of
-from segslam.scans.scan_files import sweep_times
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -60,7 +58,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Late subscribers receive the last message."""
 
 
-class TopicSource:
+class TopicSource(Source):
     """The clouds of a topic; each pose is published as nav_msgs/Odometry, with the stamp of its cloud.
 
     The reliability of the publisher is copied: a reliable subscription does not receive from a best-effort publisher,
@@ -68,13 +66,11 @@ class TopicSource:
     clouds are ignored.
     """
 
-    def __init__(self, topic: str, *, intensities: bool = False, vertical_angle_deg: float = 0.0) -> None:
-        """Raises SegslamError for an invalid topic name. A missing slash at its start is added."""
+    def __init__(self, topic: str, **options: Any) -> None:
+        """`options` as for `Source`. Raises SegslamError for an invalid topic name. A missing first slash is added."""
         self._topic = topic if topic.startswith("/") else f"/{topic}"
-        self.name = f"live{self._topic}"
+        super().__init__(f"live{self._topic}", **options)
         _check_topic(self._topic, f"--topic {topic}", "`ros2 topic list` shows the topics")
-        self._has_intensities = intensities
-        self._vertical_angle_deg = vertical_angle_deg
         self._is_paused = False
         self._lidar_frame = "lidar"
         self._reliability: ReliabilityPolicy | None = None
@@ -164,16 +160,7 @@ class TopicSource:
             cloud = read_message(message)
         except (KeyError, TypeError, ValueError) as error:
             raise BadScan(f"{self._topic}: cloud {index} cannot be read ({error!r})") from error
-        return make_scan(
-            FilePath(self._topic),
-            index,
-            stamp_ns,
-            cloud.points,
-            np.zeros(len(cloud.points), np.uint8),
-            sweep_times(cloud.times, len(cloud.points), 1e-9 * (cloud.stamp_ns or 0)),
-            intensities=cloud.intensities if self._has_intensities else None,
-            vertical_angle_deg=self._vertical_angle_deg,
-        )
+        return self._scan(FilePath(self._topic), index, stamp_ns, cloud)
 
     def _set_parameters(self, parameters: list[Any]) -> SetParametersResult:
         for parameter in parameters:

@@ -4,12 +4,17 @@ import ctypes
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from threading import Condition, Event
 from time import monotonic
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
+
+import numpy as np
 
 from segslam.core.types import BadScan, Scan, Transform
+from segslam.scans.dataset import Cloud, make_scan
+from segslam.scans.scan_files import sweep_times
 
 MOST_WAITING = 4
 """Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
@@ -156,33 +161,37 @@ class Rhythm:
         return int(median(self._intervals_ns)) if self._intervals_ns else 0
 
 
-@runtime_checkable
-class Source(Protocol):
+class Source:
     """A stream of scans; it is sent to the front process before it is opened."""
 
-    @property
-    def name(self) -> str:
-        """Name for messages and logs, such as `live/scans`."""
-        ...
+    def __init__(self, name: str, *, intensities: bool = False, vertical_angle_deg: float = 0.0) -> None:
+        """`name` is for messages and logs, such as `live/scans`; the others as for `open_dataset`."""
+        self.name = name
+        self._has_intensities = intensities
+        self._vertical_angle_deg = vertical_angle_deg
 
     def open(self, tell: Callable[[str], None]) -> None:
-        """Start to listen; `tell` prints messages, now and later.
-
-        Raises SegslamError if the source is not available.
-        """
-        ...
+        """Start to listen; `tell` prints messages, now and later. Raises SegslamError if that is not possible."""
 
     def feed(self, waiting: Waiting, stopped: Event) -> str:
-        """Put scans as they arrive until `stopped`; returns the reason if it ended otherwise.
-
-        Runs in its own thread.
-        """
-        ...
+        """Put scans as they arrive until `stopped`; returns the reason if it ended otherwise. Has its own thread."""
+        raise NotImplementedError
 
     def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
-        """Publish the pose of a scan to subscribers; must be fast, because the next scan waits."""
-        ...
+        """Publish the pose of a scan to subscribers, if any; must be fast, because the next scan waits."""
 
     def close(self) -> None:
         """Release the resources of `open`."""
-        ...
+
+    def _scan(self, file: Path, index: int, stamp_ns: int, cloud: Cloud) -> Scan:
+        """The scan of a cloud. Raises BadScan, naming `file`, if no point can be used."""
+        return make_scan(
+            file,
+            index,
+            stamp_ns,
+            cloud.points,
+            np.zeros(len(cloud.points), np.uint8),
+            sweep_times(cloud.times, len(cloud.points), 1e-9 * (cloud.stamp_ns or stamp_ns)),
+            intensities=cloud.intensities if self._has_intensities else None,
+            vertical_angle_deg=self._vertical_angle_deg,
+        )

@@ -23,7 +23,6 @@ from geometry_msgs.msg import TransformStamped
 from helpers.ros_robot import FIXES, TOPIC
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from rclpy.qos import ReliabilityPolicy
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -33,7 +32,7 @@ from segslam.core.types import SegslamError
 from segslam.gnss import enu_from_geodetic, geodetic_from_enu
 from segslam.output.log import read_log
 from segslam.run.live.live_map import DrawnMap
-from segslam.run.live.ros import LATCHED, MappingPublisher, TopicSource, _common_reliability, point_cloud2
+from segslam.run.live.ros import LATCHED, MappingPublisher, TopicSource, point_cloud2
 from segslam.scans.point_cloud2 import read_message
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -216,12 +215,6 @@ def test_a_topic_is_named_from_the_root_and_checked() -> None:
     assert TopicSource("points").name == TopicSource("/points").name == "live/points"
     with pytest.raises(SegslamError, match="--topic bad topic!: not a topic name"):
         TopicSource("bad topic!")
-
-
-def test_reliability_is_compatible_with_all_publishers() -> None:
-    reliable, best_effort = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
-    assert _common_reliability([reliable, reliable]) == reliable
-    assert _common_reliability([reliable, best_effort]) == best_effort
 
 
 def test_a_source_that_is_paused_takes_no_cloud() -> None:

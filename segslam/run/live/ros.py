@@ -1,7 +1,7 @@
 """ROS 2 node: point clouds in; odometry, path and map out. No other module imports rclpy."""
 
 from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path as FilePath
 from threading import Event, Thread
@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, TransformStamped, Vector3
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.context import Context
@@ -21,9 +20,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.time import Time
 from rclpy.validate_full_topic_name import validate_full_topic_name
 from scipy.spatial.transform import Rotation as ScipyRotation
 from sensor_msgs.msg import NavSatFix, PointCloud2, PointField
+from std_msgs.msg import Header
 
 from segslam.core import geometry
 from segslam.core.errors import brief
@@ -108,10 +109,8 @@ class TopicSource(Source):
 
     def publish(self, arrival: Arrival, T_odom_lidar: Transform) -> None:
         """Publish the pose of a cloud."""
-        message = Odometry(child_frame_id=self._lidar_frame)
-        message.header.frame_id = ODOM
-        message.header.stamp = _time(arrival.sent_ns)
-        _set_pose(message.pose.pose, T_odom_lidar)
+        message = Odometry(header=_header(ODOM, arrival.sent_ns), child_frame_id=self._lidar_frame)
+        message.pose.pose = _pose(T_odom_lidar)
         self._odometry.publish(message)
         if self._transforms:
             transform = _transform(T_odom_lidar, parent=ODOM, child=self._lidar_frame, stamp_ns=arrival.sent_ns)
@@ -124,11 +123,13 @@ class TopicSource(Source):
             self._context.try_shutdown()
 
     def _follow_publishers(self, waiting: Waiting) -> None:
-        """Subscribe with the reliability of the publishers; subscribe again if it has changed."""
+        """Subscribe with the reliability of the publishers, best effort if any is; again if it has changed."""
         publishers = [info for info in self._node.get_publishers_info_by_topic(self._topic) if info.topic_type == CLOUD]
         if not publishers:
             return
-        wanted = _common_reliability(info.qos_profile.reliability for info in publishers)
+        offered = {info.qos_profile.reliability for info in publishers}
+        best_effort = ReliabilityPolicy.BEST_EFFORT
+        wanted = best_effort if best_effort in offered else ReliabilityPolicy.RELIABLE
         if wanted == self._reliability:
             return
         if self._subscription is not None:
@@ -138,7 +139,7 @@ class TopicSource(Source):
         self._subscription = self._node.create_subscription(
             PointCloud2, self._topic, lambda message: self._put(message, waiting), profile
         )
-        kind = "best effort, so clouds can be lost" if wanted == ReliabilityPolicy.BEST_EFFORT else "reliable"
+        kind = "best effort, so clouds can be lost" if wanted == best_effort else "reliable"
         self._tell(f"{self._topic}: subscribed ({kind})")
 
     def _other_topics(self) -> str:
@@ -228,14 +229,9 @@ class MappingPublisher(_Spun):
 
     def show_map(self, drawn: DrawnMap) -> None:
         """Publish a map and the path of its keyframes."""
-        path = Path()
-        path.header.frame_id = MAP
-        path.header.stamp = _time(drawn.stamp_ns)
-        for T_map_keyframe in drawn.T_world_keyframe.values():
-            pose = PoseStamped(header=path.header)
-            _set_pose(pose.pose, T_map_keyframe)
-            path.poses.append(pose)
-        self._path.publish(path)
+        header = _header(MAP, drawn.stamp_ns)
+        poses = [PoseStamped(header=header, pose=_pose(T)) for T in drawn.T_world_keyframe.values()]
+        self._path.publish(Path(header=header, poses=poses))
         self._map.publish(point_cloud2(drawn.points, drawn.labels, frame=MAP, stamp_ns=drawn.stamp_ns))
 
     def _save_map(self, _: Any, response: Any) -> Any:
@@ -276,9 +272,8 @@ def point_cloud2(points: Points, labels: Labels, *, frame: str, stamp_ns: int) -
     """A cloud with the fields x, y, z (float32) and label (uint8)."""
     rows = np.empty(len(points), np.dtype([("xyz", "<f4", 3), ("label", "u1")]))
     rows["xyz"], rows["label"] = points, labels
-    message = PointCloud2(height=1, width=len(rows), point_step=rows.itemsize, row_step=rows.nbytes, is_dense=True)
-    message.header.frame_id = frame
-    message.header.stamp = _time(stamp_ns)
+    message = PointCloud2(header=_header(frame, stamp_ns), height=1, width=len(rows), is_dense=True)
+    message.point_step, message.row_step = rows.itemsize, rows.nbytes
     message.fields = [
         PointField(name=axis, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, axis in enumerate("xyz")
     ]
@@ -287,32 +282,24 @@ def point_cloud2(points: Points, labels: Labels, *, frame: str, stamp_ns: int) -
     return message
 
 
-def _common_reliability(offered: Iterable[ReliabilityPolicy]) -> ReliabilityPolicy:
-    """The reliability compatible with all publishers: reliable only if all of them are."""
-    best_effort = ReliabilityPolicy.BEST_EFFORT
-    return best_effort if best_effort in list(offered) else ReliabilityPolicy.RELIABLE
-
-
 def _transform(T_parent_child: Transform, *, parent: str, child: str, stamp_ns: int) -> TransformStamped:
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id = parent
-    message.header.stamp = _time(stamp_ns)
-    x, y, z = T_parent_child[:3, 3].tolist()
-    message.transform.translation.x, message.transform.translation.y, message.transform.translation.z = x, y, z
-    _set_quaternion(message.transform.rotation, T_parent_child)
+    message = TransformStamped(header=_header(parent, stamp_ns), child_frame_id=child)
+    message.transform.translation = Vector3(**_xyz(T_parent_child))
+    message.transform.rotation = _quaternion(T_parent_child)
     return message
 
 
-def _set_pose(pose: Any, T_a_b: Transform) -> None:
-    pose.position.x, pose.position.y, pose.position.z = T_a_b[:3, 3].tolist()
-    _set_quaternion(pose.orientation, T_a_b)
+def _pose(T_a_b: Transform) -> Pose:
+    return Pose(position=Point(**_xyz(T_a_b)), orientation=_quaternion(T_a_b))
 
 
-def _set_quaternion(quaternion: Any, T_a_b: Transform) -> None:
-    x, y, z, w = ScipyRotation.from_matrix(T_a_b[:3, :3]).as_quat().tolist()
-    quaternion.x, quaternion.y, quaternion.z, quaternion.w = x, y, z, w
+def _xyz(T_a_b: Transform) -> dict[str, float]:
+    return dict(zip("xyz", T_a_b[:3, 3].tolist(), strict=True))
 
 
-def _time(stamp_ns: int) -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    return Time(sec=seconds, nanosec=nanoseconds)
+def _quaternion(T_a_b: Transform) -> Quaternion:
+    return Quaternion(**dict(zip("xyzw", ScipyRotation.from_matrix(T_a_b[:3, :3]).as_quat().tolist(), strict=True)))
+
+
+def _header(frame: str, stamp_ns: int) -> Header:
+    return Header(frame_id=frame, stamp=Time(nanoseconds=stamp_ns).to_msg())

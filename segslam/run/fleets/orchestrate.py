@@ -16,7 +16,8 @@ from segslam.run.fleets.drives import Drive, drives_of, key_of, read_drives, wit
 from segslam.run.fleets.relations import Components
 from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
-from segslam.run.sessions.session_pose import MIN_FOUND, Relation, SessionPose
+from segslam.run.sessions.recorded import SessionPose
+from segslam.run.sessions.session_pose import MIN_FOUND, Relation
 from segslam.slam.adjustment import Progress, no_progress
 
 FILE = "fleet.json"

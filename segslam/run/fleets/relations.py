@@ -12,7 +12,8 @@ from segslam.core import geometry
 from segslam.core.types import LoopClosure, Registration, SegslamError
 from segslam.graph.closure_pairs import adjoints
 from segslam.output.log.records import codec
-from segslam.run.sessions.session_pose import MOST_FAILED, Relation, SessionPose
+from segslam.run.sessions.recorded import SessionPose
+from segslam.run.sessions.session_pose import MOST_FAILED, Relation
 
 
 def write_relation(file: Path, relation: Relation) -> None:

@@ -23,15 +23,15 @@ from segslam.gnss.reading import read_fixes
 from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
-from segslam.output.log import read_log
+from segslam.output.log import RunLog, read_log
 from segslam.run.fleets.alignments import Alignments, part_of, write_alignments
 from segslam.run.fleets.drives import Drive
 from segslam.run.fleets.relations import read_relation, write_relation
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_folder, open_scans
-from segslam.run.sessions.merge import Before, arranged, write_merged
-from segslam.run.sessions.recorded import Session, read_session
-from segslam.run.sessions.session_pose import Relation, SessionPose, find_session
+from segslam.run.sessions.merge import arranged, write_merged
+from segslam.run.sessions.recorded import Session, SessionPose, read_session
+from segslam.run.sessions.session_pose import Relation, find_session
 from segslam.scans import DataSource
 from segslam.scans.presets import SETTINGS, Preset, extent_m, preset, preset_for
 
@@ -194,11 +194,10 @@ def join(
     return read_metrics(folder)
 
 
-def _before(folder: Path, key: str) -> Before | None:
+def _before(folder: Path, key: str) -> RunLog | None:
     """The component that is replaced, if it has two or more drives, the first of the new one."""
     made = _made_with(folder)
-    num_drives = len(made.splitlines())
-    return Before(read_log(folder), num_drives) if num_drives > 1 and key.startswith(made) else None
+    return read_log(folder) if len(made.splitlines()) > 1 and key.startswith(made) else None
 
 
 def _write_drives(folder: Path, drives: Sequence[Mapped], sessions: Sequence[Session], together: Trajectory) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
-    Information,
+    CloudOf,
+    Keyframe,
     LoopAttempt,
     LoopClosure,
     Motion,
@@ -32,17 +33,49 @@ FIRST_MOTION = Motion(MotionState.BEGUN, information=1e-12 * np.eye(6))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SessionPose:
+    """Pose of a session in an earlier one."""
+
+    earlier: int
+    """Number of the earlier session."""
+    T_earlier_world: Transform
+    """Pose of the session's world frame in that of the earlier session."""
+    found: tuple[LoopClosure, ...]
+    """Consistent locations of keyframes of the session (sources) at keyframes of the earlier one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shift:
+    """Offsets of the numbers of a session, so that its steps follow those of the previous sessions."""
+
+    keyframe_id: int = 0
+    scan_index: int = 0
+    stamp_ns: int = 0
+    travel_m: float = 0.0
+    T_new_old: Transform | None = None
+    """Transform of its odometry frame; None for identity."""
+
+    def pose(self, T_odom_lidar: Transform) -> Transform:
+        """A pose of the session's odometry in that of the merged run."""
+        return T_odom_lidar if self.T_new_old is None else self.T_new_old @ T_odom_lidar
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Session:
     """A finished run with the poses of its keyframes."""
 
     run: FinishedRun
     log: RunLog
+    keyframes: list[Keyframe]
+    """Without points."""
+    cloud_of: CloudOf
     T_world_keyframe: Poses
     """Poses by the run's own estimate."""
-    T_odom_keyframe: Poses
     travel_m: Vector
-    informations: tuple[Information | None, ...]
-    """Information of the motion from the previous keyframe to each keyframe; None for the noise model of odometry."""
+    shift: Shift = Shift()
+    """Its place in a merged run."""
+    found: SessionPose | None = None
+    """Its pose in a session before it in a merged run; None for the first one."""
 
     @property
     def name(self) -> str:
@@ -71,19 +104,13 @@ def _angle(sessions: Sequence[Session]) -> VerticalAngle | None:
 
 def read_session(folder: Path) -> Session:
     """The session of a run folder, or of its log. Raises SegslamError as `read_run`, or if keyframes are missing."""
-    run = read_run(folder)
-    log = read_log(folder)
-    estimate = run.result.estimate.T_world_keyframe
-    T_odom, travel_m = [], []
-    for step in log.steps(clouds=False):
-        if step.keyframe is not None:
-            T_odom.append(step.keyframe.T_odom_keyframe)
-            travel_m.append(step.keyframe.travel_m)
-    if list(estimate) != list(range(len(T_odom))):
-        raise SegslamError(f"{log.path}: damaged, poses of {len(estimate)} keyframes for {len(T_odom)}; replay it")
-    poses = np.array([estimate[number] for number in range(len(T_odom))])
-    informations = tuple(run.result.keyframe_informations())
-    return Session(run, log, poses, np.array(T_odom), np.array(travel_m), informations)
+    run, log = read_run(folder), read_log(folder)
+    (keyframes, cloud_of), estimate = log.keyframes(), run.result.estimate.T_world_keyframe
+    ids = range(len(keyframes))
+    if list(estimate) != list(ids):
+        raise SegslamError(f"{log.path}: damaged, poses of {len(estimate)} keyframes for {len(ids)}; replay it")
+    travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
+    return Session(run, log, keyframes, cloud_of, np.array([estimate[number] for number in ids]), travel_m)
 
 
 def read_sessions(folders: list[Path]) -> list[Session]:
@@ -97,38 +124,18 @@ def read_sessions(folders: list[Path]) -> list[Session]:
     return [read_session(folder) for folder in folders]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Shift:
-    """Offsets of the numbers of a session, so that its steps follow those of the previous sessions."""
-
-    keyframe_id: int = 0
-    scan_index: int = 0
-    stamp_ns: int = 0
-    travel_m: float = 0.0
-    T_new_old: Transform | None = None
-    """Transform of its odometry frame; None for identity."""
-
-    def pose(self, T_odom_lidar: Transform) -> Transform:
-        """A pose of the session's odometry in that of the merged run."""
-        return T_odom_lidar if self.T_new_old is None else self.T_new_old @ T_odom_lidar
-
-    def attempt(self, attempt: LoopAttempt) -> LoopAttempt:
-        """A loop of the session with the new ids of its keyframes."""
-        ids = {name: getattr(attempt.candidate, name) + self.keyframe_id for name in ("source_id", "target_id")}
-        outcome = attempt.outcome
-        return replace(
-            attempt,
-            candidate=replace(attempt.candidate, **ids),
-            outcome=replace(outcome, **ids) if isinstance(outcome, LoopClosure) else outcome,
-        )
+def shifted(closure: LoopClosure, source_shift: int, target_shift: int) -> LoopClosure:
+    """The loop in a graph in which the ids of the two sessions are larger by these numbers."""
+    return replace(closure, source_id=closure.source_id + source_shift, target_id=closure.target_id + target_shift)
 
 
-def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopAttempt, ...]]) -> Iterator[Step]:
-    """The steps of a session (`RunLog.whole_steps`); `more`: further loops of its keyframes, by original id."""
+def shifted_steps(session: Session, more: Mapping[int, LoopAttempt]) -> Iterator[Step]:
+    """The steps of a session (`RunLog.whole_steps`) by its shift; `more`: a loop of its keyframes, by original id."""
+    shift = session.shift
     for number, step in enumerate(session.log.whole_steps(len(session.travel_m))):
-        attempts, keyframe, motion = [shift.attempt(attempt) for attempt in step.attempts], step.keyframe, step.motion
+        attempts, keyframe = [_shifted(attempt, shift.keyframe_id) for attempt in step.attempts], step.keyframe
         if keyframe is not None:
-            attempts += more.get(keyframe.id, ())
+            attempts += [more[keyframe.id]] if keyframe.id in more else []
             keyframe = replace(
                 keyframe,
                 id=keyframe.id + shift.keyframe_id,
@@ -137,15 +144,22 @@ def shifted_steps(session: Session, shift: Shift, more: Mapping[int, tuple[LoopA
                 T_odom_keyframe=shift.pose(keyframe.T_odom_keyframe),
                 travel_m=keyframe.travel_m + shift.travel_m,
             )
-        if number == 0 and shift.keyframe_id:
-            motion = FIRST_MOTION
-        yield Step(
-            step.scan_index + shift.scan_index,
-            step.stamp_ns + shift.stamp_ns,
-            shift.pose(step.T_odom_lidar),
-            keyframe,
-            tuple(attempts),
-            None,
-            step.stage_seconds,
-            motion,
+        yield replace(
+            step,
+            scan_index=step.scan_index + shift.scan_index,
+            stamp_ns=step.stamp_ns + shift.stamp_ns,
+            T_odom_lidar=shift.pose(step.T_odom_lidar),
+            keyframe=keyframe,
+            attempts=tuple(attempts),
+            motion=FIRST_MOTION if number == 0 and shift.keyframe_id else step.motion,
         )
+
+
+def _shifted(attempt: LoopAttempt, shift: int) -> LoopAttempt:
+    """A loop within a session with the new ids of its keyframes."""
+    candidate, outcome = attempt.candidate, attempt.outcome
+    return replace(
+        attempt,
+        candidate=replace(candidate, source_id=candidate.source_id + shift, target_id=candidate.target_id + shift),
+        outcome=shifted(outcome, shift, shift) if isinstance(outcome, LoopClosure) else outcome,
+    )

@@ -5,8 +5,8 @@ noise (`segslam.graph.closure_pairs`). A wrong location is consistent with few o
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected
 from segslam.graph import PoseGraph
 from segslam.graph.closure_pairs import largest_consistent
 from segslam.run.locator import Locator, submaps_of
-from segslam.run.sessions.recorded import FIRST_MOTION, Session
+from segslam.run.sessions.recorded import FIRST_MOTION, Session, shifted
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.recognition import MAX_PLACES
 
@@ -40,20 +40,8 @@ class Relation:
 
     T_earlier_later: Transform | None
     found: tuple[LoopClosure, ...]
-    """Consistent locations of keyframes of the later session (sources) at keyframes of the earlier one."""
+    """As those of `SessionPose`."""
     reason: str = ""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SessionPose:
-    """Pose of a session in an earlier one."""
-
-    earlier: int
-    """Number of the earlier session."""
-    T_earlier_world: Transform
-    """Pose of the session's world frame in that of the earlier session."""
-    found: tuple[LoopClosure, ...]
-    """As those of `Relation`."""
 
 
 def find_session(
@@ -72,23 +60,22 @@ def find_session(
     in this order, and those before and after each that is found, until the first `MOST_FAILED` were not. They look like
     a place of the earlier session, and no other place is tried.
     """
-    submaps = submaps_of(*session.log.keyframes(), session.informations, config)
-    found: list[LoopClosure] = []
     count = len(session.travel_m)
-    queries = (
-        _spread(count)
-        if likely is None
-        else _with_neighbours(likely, count, lambda: found[-1].source_id if found else None)
-    )
+    informations = session.run.result.keyframe_informations()
+    submaps = submaps_of(session.keyframes, session.cloud_of, informations, config)
     graph, first_id = _both(earlier, session, config)
+    queue = deque(_spread(count) if likely is None else likely)
+    found: list[LoopClosure] = []
     kept: list[LoopClosure] = []
     num_tried = 0
-    for keyframe_id in progress(queries, min(count, NUM_QUERIES if likely is None else len(likely)), "locate"):
+    for keyframe_id in progress(each_once(queue, count), min(count, len(queue)), "locate"):
         num_tried += 1
         submap = submaps.submap(keyframe_id)
         place = locator.locate(submap.points, submap.labels, max_places=MAX_PLACES if likely is None else 1)
         if not isinstance(place, Rejected):
             found.append(LoopClosure.of(keyframe_id, place.keyframe_id, place.alignment))
+            if likely is not None:  # a place that is shared is so for some metres, perhaps for a few keyframes only
+                queue.extendleft((keyframe_id - 1, keyframe_id + 1))
             consistent = largest_consistent(graph.consistent_pairs([shifted(one, first_id, 0) for one in found]))
             kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
         if _is_enough(kept, session) or (likely is not None and not found and num_tried == MOST_FAILED):
@@ -117,26 +104,14 @@ def _spread(count: int) -> list[int]:
     return keyframe_ids
 
 
-def _with_neighbours(likely: Sequence[int], count: int, last_found: Callable[[], int | None]) -> Iterator[int]:
-    """Likely keyframes of a session of so many, each once; after one that was found, first the next and the one before.
-
-    Where sessions share a place, they do so for some metres; at the end of one and the beginning of the other that may
-    be a few keyframes only.
-    """
-    queue, searched = deque(likely), set[int]()
+def each_once(queue: deque[int], count: int) -> Iterator[int]:
+    """Keyframes of a session of so many from a queue, to which others may be added meanwhile; each once."""
+    searched = set[int]()
     while queue:
         keyframe_id = queue.popleft()
-        if keyframe_id in searched or not 0 <= keyframe_id < count:
-            continue
-        searched.add(keyframe_id)
-        yield keyframe_id
-        if last_found() == keyframe_id:
-            queue.extendleft((keyframe_id - 1, keyframe_id + 1))
-
-
-def shifted(closure: LoopClosure, source_shift: int, target_shift: int) -> LoopClosure:
-    """The loop in a graph in which the ids of the two sessions are larger by these numbers."""
-    return replace(closure, source_id=closure.source_id + source_shift, target_id=closure.target_id + target_shift)
+        if keyframe_id not in searched and 0 <= keyframe_id < count:
+            searched.add(keyframe_id)
+            yield keyframe_id
 
 
 def attempt(closure: LoopClosure) -> LoopAttempt:
@@ -152,7 +127,9 @@ def _both(earlier: Session, session: Session, config: Config) -> tuple[PoseGraph
     first_id = len(earlier.travel_m)
     for number, one in enumerate((earlier, session)):
         shift_m = number * (float(earlier.travel_m[-1]) + BREAK_STEP_M)
-        for row, (T_world, travel_m) in enumerate(zip(one.T_world_keyframe, one.travel_m, strict=True)):
-            information = FIRST_MOTION.information if number and row == 0 else one.informations[row]
+        informations = one.run.result.keyframe_informations()
+        if number:
+            informations[0] = FIRST_MOTION.information
+        for T_world, travel_m, information in zip(one.T_world_keyframe, one.travel_m, informations, strict=True):
             graph.add_keyframe(graph.num_keyframes, T_world, float(travel_m) + shift_m, information=information)
     return graph, first_id

@@ -107,7 +107,7 @@ def with_settings(drives: Iterable[Drive], settings: Sequence[str]) -> list[Driv
 def _drive(value: Any, where: str, folder: Path) -> Drive:
     """Raises SegslamError for an entry that is neither a path nor a mapping of known options."""
     given = {"data": value} if isinstance(value, str) else value
-    if not isinstance(given, dict) or "data" not in given:
+    if not isinstance(given, dict) or not given.get("data"):
         raise SegslamError(f"{where}: expected a path or options with data: PATH, found {short(value)}")
     unknown = [name for name in given if name not in OPTIONS]
     if unknown:

@@ -119,7 +119,7 @@ def test_drives_with_fixes_are_on_the_globe_alone_and_together(joined: FleetResu
 def test_fixes_that_cannot_be_read_end_a_drive_before_it_is_mapped(recordings: list[Path], tmp_path: Path) -> None:
     drive = Drive("monday", str(recordings[0]), gnss=str(tmp_path / "none.csv"))
     with pytest.raises(SegslamError, match=r"none\.csv"):
-        map_drive(tmp_path, drive, "key")
+        map_drive(tmp_path, drive)
     assert list(tmp_path.iterdir()) == []
 
 

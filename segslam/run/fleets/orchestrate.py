@@ -4,7 +4,6 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -88,7 +87,7 @@ class _Fleet:
         self._reasons: dict[str, str] = {}
 
     def run(self, drives: Sequence[Drive], same_reference: bool) -> FleetResult:
-        mapped = self._mapped(drives)
+        mapped = self._done("index", steps.index_drive, self._done("map", steps.map_drive, drives))
         if not mapped:
             first, why = next(iter(self._reasons.items()))
             raise SegslamError(f"no drive could be mapped; {first}: {why}")
@@ -115,30 +114,14 @@ class _Fleet:
         self._seconds[name] = self._seconds.get(name, 0.0) + perf_counter() - started
         return [outcomes[number] for number in range(len(tasks))]
 
-    def _failed(self, name: str, reason: str) -> None:
-        self._reasons[name] = reason
-        self._say(f"{name}: {reason}")
-
-    def _mapped(self, drives: Sequence[Drive]) -> list[Mapped]:
-        tasks: list[tuple[Path, Drive, str]] = []
-        for drive in drives:
-            try:
-                tasks.append((self._folder, drive, drive.key(version("segslam"))))
-            except SegslamError as error:
-                self._failed(drive.name, str(error))
-        mapped = [Mapped(drive.name, key) for _, drive, key in tasks]
-        mapped = self._done("map", steps.map_drive, tasks, mapped)
-        return self._done("index", steps.index_drive, [(self._folder, drive) for drive in mapped], mapped)
-
-    def _done(
-        self, step: str, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], drives: Sequence[Mapped]
-    ) -> list[Mapped]:
-        """The drives whose tasks did not fail."""
-        failures = [outcome.failure for outcome in self._all(step, function, tasks)]
-        for drive, failure in zip(drives, failures, strict=True):
-            if failure is not None:
-                self._failed(drive.name, failure)
-        return [drive for drive, failure in zip(drives, failures, strict=True) if failure is None]
+    def _done(self, step: str, function: Callable[..., Mapped], drives: Sequence[Drive | Mapped]) -> list[Mapped]:
+        """The drives for which the step did not fail."""
+        outcomes = self._all(step, function, [(self._folder, drive) for drive in drives])
+        for drive, outcome in zip(drives, outcomes, strict=True):
+            if outcome.failure is not None:
+                self._reasons[drive.name] = outcome.failure
+                self._say(f"{drive.name}: {outcome.failure}")
+        return [outcome.value for outcome in outcomes if outcome.failure is None]
 
     def _proposed(self, mapped: Sequence[Mapped]) -> dict[tuple[int, int], list[tuple[int, float]]]:
         """Keyframes of a drive that look most like places of an earlier one, by the numbers of both."""

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 from uuid import uuid4
@@ -76,11 +77,12 @@ def is_made(folder: Path, key: str) -> bool:
     return _made_with(folder) == key
 
 
-def map_drive(fleet: Path, drive: Drive, key: str) -> None:
+def map_drive(fleet: Path, drive: Drive) -> Mapped:
     """Map a drive into its run folder, as `segslam map` does. Raises SegslamError, as that does."""
-    folder = Mapped(drive.name, key).folder(fleet)
-    if is_made(folder, key):
-        return
+    mapped = Mapped(drive.name, drive.key(version("segslam")))
+    folder = mapped.folder(fleet)
+    if is_made(folder, mapped.key):
+        return mapped
     part = _beside(folder)
     names = ("sequence", "dataset", "labels", "encoding", "frames", "topic")
     options = {name: given for name in names if (given := getattr(drive, name))}
@@ -92,7 +94,8 @@ def map_drive(fleet: Path, drive: Drive, key: str) -> None:
         odometry = given_odometry(Path(drive.odometry), open_scans(source, config), config.odometry)
     place = None if fixes is None else partial(_georeference, drive.name, fixes)
     map_folder(source.data, part, config=config, odometry=odometry, place=place, **options)
-    _made(part, folder, key)
+    _made(part, folder, mapped.key)
+    return mapped
 
 
 def _georeference(name: str, fixes: Fixes, part: Path) -> str:
@@ -117,12 +120,13 @@ def _config(drive: Drive, source: DataSource) -> Config:
     return load_config(file, drive.set, base=load_config(None, [ONE_THREAD], base=preset(name)))
 
 
-def index_drive(fleet: Path, drive: Mapped) -> None:
-    """Write the signatures of all keyframes of a run."""
+def index_drive(fleet: Path, drive: Mapped) -> Mapped:
+    """Write the signatures of all keyframes of a run; returns the drive."""
     file = drive.signatures(fleet)
     if not file.exists():
         spectra = np.array([one.spectrum for one in _locator(fleet, drive).signatures])
         _replace(file, lambda part: np.save(part, spectra))
+    return drive
 
 
 def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped], key: str) -> Likely:

@@ -9,7 +9,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.types import SegslamError
-from segslam.run.fleets.alignments import Alignments, Part, part_of, read_alignments, write_alignments
+from segslam.run.fleets.kept import Alignments, KeptAlignment, Part, part_of, read_kept, write_kept
 from segslam.slam.adjustment import Adjustment
 from segslam.slam.adjustment.alignment import Alignment
 from segslam.slam.adjustment.known import Guess
@@ -47,7 +47,7 @@ def _kept(folder: Path) -> Alignment:
     alignments = Alignments(folder, [MONDAY, FRIDAY])
     assert alignments(2, 10 + 3, GUESS, lambda: found) is found
     ((file, kept),) = alignments.changed()
-    write_alignments(file, kept)
+    write_kept(file, tuple[KeptAlignment, ...], kept)
     return found
 
 
@@ -99,23 +99,21 @@ def test_the_key_of_a_drive_contains_recording_settings_poses_and_correction() -
 
 
 def test_alignments_are_read_as_they_were_written(tmp_path: Path) -> None:
-    kept = {(3, 5, *GUESS): _alignment(), (3, 4, *GUESS): None, (0, 9, *GUESS): _alignment()}
-    file = tmp_path / "kept.npy"
-    write_alignments(file, kept)
-    again = read_alignments(file)
-    assert list(again) == sorted(kept)
-    assert all(_equal(again[key], found) for key, found in kept.items())
-    written = file.read_bytes()
-    write_alignments(file, dict(reversed(again.items())))
-    assert file.read_bytes() == written, "the order in which they were computed does not matter"
+    computed = {(3, 5): _alignment(), (3, 4): None, (0, 9): _alignment()}
+    alignments = Alignments(tmp_path, [MONDAY])
+    for (target_id, source_id), found in computed.items():
+        alignments(target_id, source_id, GUESS, lambda found=found: found)
+    ((file, kept),) = alignments.changed()
+    assert [one.key for one in kept] == [(*pair, *GUESS) for pair in sorted(computed)], "not as they were computed"
+    write_kept(file, tuple[KeptAlignment, ...], kept)
+    again = read_kept(file, tuple[KeptAlignment, ...])
+    assert [one.key for one in again] == [one.key for one in kept]
+    assert all(_equal(one.found, computed[one.key[:2]]) for one in again)
 
 
-@pytest.mark.parametrize("content", [b"", b"no array", None])
-def test_a_damaged_file_is_named(tmp_path: Path, content: bytes | None) -> None:
-    file = tmp_path / "kept.npy"
-    if content is None:
-        np.save(file, np.zeros(3))
-    else:
-        file.write_bytes(content)
-    with pytest.raises(SegslamError, match=r"kept\.npy: damaged"):
-        read_alignments(file)
+@pytest.mark.parametrize("content", [b"", b"no JSON", b"[3]", b'{"key": 3}'])
+def test_a_damaged_file_is_named(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "kept.json"
+    file.write_bytes(content)
+    with pytest.raises(SegslamError, match=r"kept\.json: damaged"):
+        read_kept(file, tuple[KeptAlignment, ...])

@@ -7,13 +7,8 @@ import pytest
 
 from segslam.core import geometry
 from segslam.core.types import Alignment, LoopClosure, Registration, SegslamError
-from segslam.run.fleets.relations import (
-    MOST_FAILED,
-    Components,
-    inverted,
-    read_relation,
-    write_relation,
-)
+from segslam.run.fleets.kept import read_kept, write_kept
+from segslam.run.fleets.relations import MOST_FAILED, Components, inverted
 from segslam.run.sessions.session_pose import Relation
 
 RNG = np.random.default_rng(3)
@@ -36,8 +31,8 @@ def _found(own: int, target: int) -> LoopClosure:
 def test_a_relation_is_read_as_it_was_written(tmp_path: Path) -> None:
     file = tmp_path / "relation.json"
     relation = Relation(_pose(), (_found(3, 5), _found(7, 9)))
-    write_relation(file, relation)
-    again = read_relation(file)
+    write_kept(file, Relation, relation)
+    again = read_kept(file, Relation)
     np.testing.assert_array_equal(again.T_earlier_later, relation.T_earlier_later)
     for found, found_again in zip(relation.found, again.found, strict=True):
         assert found.pair == found_again.pair
@@ -46,11 +41,11 @@ def test_a_relation_is_read_as_it_was_written(tmp_path: Path) -> None:
             np.testing.assert_array_equal(one.T_target_source, other.T_target_source)
             np.testing.assert_array_equal(one.information, other.information)
         assert own.observability == read.observability
-    write_relation(file, Relation(None, (), "0 of 9"))
-    assert read_relation(file).reason == "0 of 9"
+    write_kept(file, Relation, Relation(None, (), "0 of 9"))
+    assert read_kept(file, Relation).reason == "0 of 9"
     file.write_text('{"found": 3}')
     with pytest.raises(SegslamError, match="damaged"):
-        read_relation(file)
+        read_kept(file, Relation)
 
 
 def test_the_inverse_has_the_same_cost_for_the_same_motion() -> None:

@@ -1,33 +1,16 @@
-"""Relative poses of drives: written to files, inverted, and chained to the poses of a component."""
+"""Relative poses of drives: inverted, and chained to the poses of a component."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from heapq import heappop, heappush
-from pathlib import Path
 
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.types import LoopClosure, Registration, SegslamError
+from segslam.core.types import LoopClosure, Registration
 from segslam.graph.closure_pairs import adjoints
-from segslam.output.log.records import codec
 from segslam.run.sessions.recorded import SessionPose
 from segslam.run.sessions.session_pose import MOST_FAILED, Relation
-
-
-def write_relation(file: Path, relation: Relation) -> None:
-    """As JSON, without loss."""
-    file.write_text(json.dumps(codec(Relation).encode(relation)) + "\n", encoding="utf-8")
-
-
-def read_relation(file: Path) -> Relation:
-    """Raises SegslamError, naming the file, if it is damaged."""
-    try:
-        relation: Relation = codec(Relation).decode(json.loads(file.read_text(encoding="utf-8")), {})
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SegslamError(f"{file}: damaged ({error!r}); remove it, and call `segslam fleet` again") from error
-    return relation
 
 
 def inverted(found: LoopClosure) -> LoopClosure:

@@ -25,9 +25,8 @@ from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
 from segslam.output.log import RunLog, read_log
-from segslam.run.fleets.alignments import Alignments, part_of, write_alignments
 from segslam.run.fleets.drives import Drive
-from segslam.run.fleets.relations import read_relation, write_relation
+from segslam.run.fleets.kept import Alignments, KeptAlignment, part_of, read_kept, write_kept
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_folder, open_scans
 from segslam.run.sessions.merge import arranged, write_merged
@@ -161,8 +160,8 @@ def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], 
         session, known = (read_session(one.folder(fleet)) for one in (later, earlier))
         locator = _locator(fleet, earlier)
         relation = find_session(session, known, locator, config=known.run.config, likely=queries)
-        _replace(file, lambda part: write_relation(part, relation))
-    return read_relation(file)
+        _replace(file, partial(write_kept, kind=Relation, value=relation))
+    return read_kept(file, Relation)
 
 
 def join(
@@ -192,7 +191,7 @@ def join(
             before = _before(folder, key)
             together = write_merged(merged, part, config, kept=kept, before=before).result.trajectory
             for file, alignments in kept.changed():
-                _replace(file, partial(write_alignments, kept=alignments))
+                _replace(file, partial(write_kept, kind=tuple[KeptAlignment, ...], value=alignments))
         _write_drives(part / "drives", drives, sessions, together)
         _made(part, folder, key)
     return read_metrics(folder)

@@ -1,15 +1,21 @@
-"""Alignments of submaps kept in files, one for each pair of drives, so that a component is adjusted again quickly."""
+"""What a fleet keeps in a file for each pair of drives: their relation, and alignments of submaps.
+
+With the alignments, a component is adjusted again quickly.
+"""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import SegslamError
+from segslam.output.log.records import codec
 from segslam.run.fleets.drives import key_of
 from segslam.slam.adjustment import Adjustment
 from segslam.slam.adjustment.alignment import Alignment
@@ -17,16 +23,15 @@ from segslam.slam.adjustment.known import Compute, Guess
 
 Key = tuple[int, ...]
 """Keyframes of the target and of the source by their own drives, and the rounded initial guess."""
-Kept = Mapping[Key, Alignment | None]
-ROW = np.dtype(
-    [
-        ("key", np.int64, 8),
-        ("converged", bool),
-        ("T_target_source", np.float64, (4, 4)),
-        ("information", np.float64, (6, 6)),
-        ("overlap", np.float64),
-    ]
-)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeptAlignment:
+    """An alignment, as a file has it."""
+
+    key: Key
+    found: Alignment | None
+    """None if it did not converge."""
 
 
 class Part(NamedTuple):
@@ -63,41 +68,30 @@ class Alignments:
         ends = np.array([target_id, source_id])
         drives = np.searchsorted(self._first_ids, ends, side="right") - 1
         target, source = (self._parts[number] for number in drives)
-        file = self._folder / f"{source.name} in {target.name}-{key_of(target.key, source.key)}.npy"
+        file = self._folder / f"{source.name} in {target.name}-{key_of(target.key, source.key)}.json"
         if file not in self._files:
-            self._files[file] = read_alignments(file) if file.exists() else {}
+            rows = read_kept(file, tuple[KeptAlignment, ...]) if file.exists() else ()
+            self._files[file] = {one.key: one.found for one in rows}
         kept, key = self._files[file], (*(ends - self._first_ids[drives]).tolist(), *guess)
         if key not in kept:
             kept[key] = compute()
             self._changed.add(file)
         return kept[key]
 
-    def changed(self) -> Iterator[tuple[Path, Kept]]:
-        """The files with new alignments, and their whole content."""
+    def changed(self) -> Iterator[tuple[Path, tuple[KeptAlignment, ...]]]:
+        """The files with new alignments, and their whole content, in the order of the keys."""
         for file in sorted(self._changed):
-            yield file, self._files[file]
+            yield file, tuple(KeptAlignment(key, found) for key, found in sorted(self._files[file].items()))
 
 
-def write_alignments(file: Path, kept: Kept) -> None:
-    """Write alignments, in the order of their keys, without loss."""
-    rows = np.zeros(len(kept), ROW)
-    for row, (key, found) in zip(rows, sorted(kept.items()), strict=True):
-        row["key"], row["converged"] = key, found is not None
-        if found is not None:
-            row["T_target_source"], row["information"] = found.T_target_source, found.information
-            row["overlap"] = found.overlap
-    np.save(file, rows)
+def write_kept(file: Path, kind: Any, value: Any) -> None:
+    """A value of this type, a record or a tuple of them, as JSON without loss."""
+    file.write_text(json.dumps(codec(kind).encode(value)) + "\n", encoding="utf-8")
 
 
-def read_alignments(file: Path) -> dict[Key, Alignment | None]:
+def read_kept(file: Path, kind: Any) -> Any:
     """Raises SegslamError, naming the file, if it is damaged."""
     try:
-        rows = np.load(file)
-        if rows.dtype != ROW or rows.ndim != 1:
-            raise ValueError(f"rows of {rows.dtype}")
-    except (OSError, ValueError, EOFError) as error:
+        return codec(kind).decode(json.loads(file.read_text(encoding="utf-8")), {})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise SegslamError(f"{file}: damaged ({error!r}); remove it, and call `segslam fleet` again") from error
-    return {
-        tuple(key.tolist()): Alignment(T, information, float(overlap)) if converged else None
-        for key, converged, T, information, overlap in rows
-    }

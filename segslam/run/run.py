@@ -183,18 +183,11 @@ class Run:
 
     def repeat(self, steps: Iterator[Step]) -> Iterator[Step]:
         """Repeat the steps of a log, starting from the keyframes; this thread reads the log, another works."""
-        return in_other_thread(
-            steps, lambda recorded: self._logged(self._slam.repeat(recorded)), max_waiting=MOST_WAITING
-        )
+        return in_other_thread(steps, lambda step: self._logged(self._slam.repeat(step)), max_waiting=MOST_WAITING)
 
     def take(self, steps: Iterator[tuple[Step, int, bool]]) -> Iterator[Step]:
         """Take over recorded steps with their loops: each item is a Step, and `below` and `optimize` of `Slam.take`."""
-
-        def taken(item: tuple[Step, int, bool]) -> Step:
-            step, below, optimize = item
-            return self._logged(self._slam.take(step, below=below, optimize=optimize))
-
-        return in_other_thread(steps, taken, max_waiting=MOST_WAITING)
+        return in_other_thread(steps, lambda item: self._logged(self._slam.take(*item)), max_waiting=MOST_WAITING)
 
     def _finish(self, search_s: float, progress: Progress) -> tuple[SlamResult, dict[str, Any]]:
         """Final optimisation; writes all results. Returns the result and the figures that need no reference."""

@@ -120,7 +120,7 @@ class Slam:
         keyframe = None if recorded.keyframe is None else replace(recorded.keyframe, place=None)
         return self._advance(replace(recorded, keyframe=keyframe), Stopwatch(), self._loops.attempt)
 
-    def take(self, recorded: Step, *, below: int = 0, optimize: bool = False) -> Step:
+    def take(self, recorded: Step, below: int = 0, optimize: bool = False) -> Step:
         """As `repeat`, but with the recorded loops and places.
 
         Further loops are searched among keyframes with ids below `below`. The graph is optimised only with `optimize`.

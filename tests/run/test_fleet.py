@@ -172,7 +172,7 @@ def test_an_added_drive_needs_its_own_loops_and_alignments_only_and_the_componen
         aligned.append(1)
         return align(*arguments)
 
-    def taken(self: Slam, step: Step, *, below: int = 0, optimize: bool = False) -> Step:
+    def taken(self: Slam, step: Step, below: int, optimize: bool) -> Step:
         searched.extend([1] if below else [])
         return take(self, step, below=below, optimize=optimize)
 

@@ -262,14 +262,14 @@ class LiveFigures:
 
     def metrics(self) -> dict[str, Any]:
         """The figures of `metrics.json` that only live runs have."""
-        tally, gaps = self._front.tally, self._front.gaps
+        tally = self._front.tally
         return {
             "num_scans_arrived": tally.num_arrived,
             "num_scans_dropped": tally.num_dropped,
-            "num_scans_missing": gaps.num_missing,
-            "num_gaps": gaps.num_gaps,
-            "longest_gap_s": gaps.longest_gap_s,
-            "num_clock_set": gaps.num_clock_set,
+            "num_scans_missing": tally.num_missing,
+            "num_gaps": tally.num_gaps,
+            "longest_gap_s": tally.longest_gap_s,
+            "num_clock_set": tally.num_clock_set,
             "num_restarts": self._front.num_restarts,
             "num_keyframes_unsearched": self._num_unsearched,
             "latency_ms": _spread(self._latency_ms),
@@ -287,7 +287,7 @@ class LiveFigures:
                 text += f", loops {self._lag_s[-1]:.1f} s behind"
         if num_dropped := self._front.tally.num_dropped:
             text += f", {num_dropped} dropped"
-        if num_missing := self._front.gaps.num_missing:
+        if num_missing := self._front.tally.num_missing:
             text += f", {num_missing} missing"
         return text
 

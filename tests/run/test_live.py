@@ -24,7 +24,7 @@ from segslam.output.finished import read_run
 from segslam.output.log import LogWriter, read_log
 from segslam.run.live.folder import FolderSource, stamp_of_name
 from segslam.run.live.front import Front
-from segslam.run.live.waiting import Rhythm, Waiting
+from segslam.run.live.waiting import Rhythm, Tally, Waiting
 from segslam.scans import open_dataset
 from segslam.scans.presets import SETTINGS as PRESETS
 
@@ -58,40 +58,40 @@ def test_a_closed_queue_gives_what_waits_and_takes_nothing_more() -> None:
 
 
 def test_gaps_are_counted_by_stamp_with_the_scans_that_they_lack() -> None:
-    rhythm = Rhythm()
+    rhythm = Rhythm(Tally())
     for number in (0, 1, 2, 3, 6, 7, 8, 18):
         rhythm.note(number * INTERVAL_NS)
-    assert (rhythm.gaps.num_gaps, rhythm.gaps.num_missing) == (2, 2 + 9)
-    assert rhythm.gaps.longest_gap_s == pytest.approx(1.0)
+    assert (rhythm.tally.num_gaps, rhythm.tally.num_missing) == (2, 2 + 9)
+    assert rhythm.tally.longest_gap_s == pytest.approx(1.0)
     assert rhythm.intervals(0, 3 * INTERVAL_NS) == pytest.approx(3.0)
     assert rhythm.intervals(0, int(1.2 * INTERVAL_NS)) == 1.0
     assert rhythm.intervals(0, 1000 * INTERVAL_NS) == 10.0
 
 
 def test_stamps_continue_when_the_clock_of_the_sender_is_set_back() -> None:
-    rhythm = Rhythm()
+    rhythm = Rhythm(Tally())
     stamps = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
     again = [rhythm.note(1_000_000_000_000 + number * INTERVAL_NS) for number in range(20)]
     assert np.all(np.diff([*stamps, *again]) == INTERVAL_NS)
-    assert (rhythm.gaps.num_clock_set, rhythm.gaps.num_gaps) == (1, 0)
+    assert (rhythm.tally.num_clock_set, rhythm.tally.num_gaps) == (1, 0)
 
 
 @pytest.mark.parametrize("ahead_ns", [25 * 3600 * 10**9, 2_000_000_000 * 10**9])
 def test_stamps_of_a_clock_that_is_set_forward_continue_and_count_no_missing_scans(ahead_ns: int) -> None:
     """Also if it is set for one scan only, as by a damaged packet."""
-    first_ns, rhythm = 1_700_000_000 * 10**9, Rhythm()
+    first_ns, rhythm = 1_700_000_000 * 10**9, Rhythm(Tally())
     sent = [first_ns + INTERVAL_NS * number for number in range(12)]
     sent[4] += ahead_ns
     sent[8:] = [stamp_ns + ahead_ns for stamp_ns in sent[8:]]
     assert np.all(np.diff([rhythm.note(stamp_ns) for stamp_ns in sent]) == INTERVAL_NS)
-    assert (rhythm.gaps.num_clock_set, rhythm.gaps.num_gaps, rhythm.gaps.num_missing) == (3, 0, 0)
+    assert (rhythm.tally.num_clock_set, rhythm.tally.num_gaps, rhythm.tally.num_missing) == (3, 0, 0)
 
 
 def test_a_pause_of_an_hour_is_a_gap() -> None:
-    rhythm = Rhythm()
+    rhythm = Rhythm(Tally())
     for stamp_s in (0, 1, 2, 3, 3603):
         rhythm.note(stamp_s * 10**9)
-    assert (rhythm.gaps.num_clock_set, rhythm.gaps.num_gaps, rhythm.gaps.longest_gap_s) == (0, 1, 3600.0)
+    assert (rhythm.tally.num_clock_set, rhythm.tally.num_gaps, rhythm.tally.longest_gap_s) == (0, 1, 3600.0)
 
 
 @pytest.mark.parametrize(

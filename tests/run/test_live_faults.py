@@ -73,7 +73,7 @@ def test_a_file_removed_before_it_is_read_is_counted_and_changes_no_stamp(
         arrivals[1].read(1, 0)
     stamps = [arrivals[number].stamp_ns for number in (0, 2, 3)]
     assert 0 < stamps[2] - stamps[0] < 5_000_000_000
-    assert (waiting.tally.num_arrived, waiting.rhythm.gaps.num_clock_set, waiting.rhythm.gaps.num_missing) == (4, 0, 0)
+    assert (waiting.tally.num_arrived, waiting.tally.num_clock_set, waiting.tally.num_missing) == (4, 0, 0)
 
 
 @pytest.mark.parametrize("stem", ["9999999999999900001", "9999999999999999"])
@@ -169,7 +169,7 @@ def test_whatever_a_scan_raises_is_counted_and_the_run_continues_until_the_odome
         waiting.put(INTERVAL_NS * number, read)
     sent: SimpleQueue[object] = SimpleQueue()
     with pytest.raises(OdometryEnded, match="has ended"):
-        _place_all(_Breaks(Config()), _Published(), waiting, sent, None, Past([], deque()))
+        _place_all(_Breaks(Config()).track, _Published(), waiting, sent, None, Past([], deque()))
     items = [sent.get() for _ in range(sent.qsize())]
     placed = [item.tracked for item in items if isinstance(item, Placed)]
     bad = {number: str(one) for number, one in enumerate(placed) if isinstance(one, BadScan)}

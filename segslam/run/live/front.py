@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from multiprocessing.sharedctypes import RawValue
 from queue import SimpleQueue
 from threading import Thread
@@ -21,7 +22,7 @@ from segslam.core.memory import note_peak_of
 from segslam.core.types import SegslamError, Step
 from segslam.odometry.tracker import Tracked
 from segslam.run.live.serve import END_S, READY, Chosen, Ended, Past, Placed, serve
-from segslam.run.live.waiting import Gaps, Source, Tally
+from segslam.run.live.waiting import Source, Tally
 from segslam.scans.presets import Preset
 
 CLOUDS_KEPT = 20
@@ -53,7 +54,7 @@ class Front:
         self._past = Past([], deque(maxlen=CLOUDS_KEPT))
         self._num_placed = 0
         self._received: SimpleQueue[Any] = SimpleQueue()
-        self._before_chosen: deque[Any] = deque()
+        self._before_chosen: list[Any] = []
         """Unusable scans before the first scan with a pose, and the end if there is none."""
         self.num_keyframes_waiting = 0
         self.num_restarts = 0
@@ -61,11 +62,6 @@ class Front:
         self._start()
         self._receiver = Thread(target=self._receive, name="receive", daemon=True)
         self._receiver.start()
-
-    @property
-    def gaps(self) -> Gaps:
-        """Gaps in the stamps up to the last scan with a pose."""
-        return self._past.gaps
 
     def wait_until_ready(self) -> None:
         """Wait until arriving scans are processed. Raises SegslamError if the source cannot be opened."""
@@ -82,14 +78,12 @@ class Front:
         return item
 
     def __iter__(self) -> Iterator[Placed]:
-        while not isinstance(item := self._next(), Ended):
-            if isinstance(item, Placed) and item.is_keyframe:
-                self.num_keyframes_waiting -= 1
+        for item in chain(self._before_chosen, iter(self._received.get, None)):
+            if isinstance(item, Ended):
+                self.ended = item
+                return
+            self.num_keyframes_waiting -= item.is_keyframe
             yield item
-        self.ended = item
-
-    def _next(self) -> Any:
-        return self._before_chosen.popleft() if self._before_chosen else self._received.get()
 
     def stop(self) -> None:
         """Accept no more scans; waiting scans are still processed."""
@@ -120,10 +114,7 @@ class Front:
 
     def _receive(self) -> None:
         """Pass on what the front process sends, and start another one if it dies."""
-        while True:
-            died = self._receive_until_dead()
-            if died is None:
-                return
+        while (died := self._receive_until_dead()) is not None:
             self._process.join(timeout=1.0)
             num_lost = self.tally.num_arrived - self.tally.num_dropped - self._num_placed
             self.tally.num_dropped += num_lost
@@ -166,15 +157,12 @@ class Front:
             self._past.preset = item.preset
         if isinstance(item, Placed):
             self._num_placed += 1
-            self._note(item)
+            if isinstance(item.tracked, Tracked):
+                self._note(item.tracked)
         self._received.put(item)
 
-    def _note(self, placed: Placed) -> None:
+    def _note(self, tracked: Tracked) -> None:
         """Note what another front process needs to continue after this scan."""
-        tracked = placed.tracked
-        self._past.gaps = placed.gaps
-        if not isinstance(tracked, Tracked):
-            return
         if tracked.registered is not None:
             self.num_keyframes_waiting += 1
             self._past.clouds.append((len(self._past.steps), tracked.registered.points))

@@ -4,7 +4,7 @@ import signal
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from threading import Event, Thread
@@ -20,7 +20,7 @@ from segslam.core.types import BadScan, Points, Scan, SegslamError, Step
 from segslam.odometry.apart import OdometryApart
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.tracker import Tracked, Tracker
-from segslam.run.live.waiting import Arrival, Gaps, Source, Tally, Waiting
+from segslam.run.live.waiting import Arrival, Source, Tally, Waiting
 from segslam.scans.presets import Preset, extent_of, preset_for
 
 READY = b"ready"
@@ -35,14 +35,13 @@ MOST_SHOWN = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A scan with its odometry pose, or an unusable scan, and the gaps so far."""
+    """A scan with its odometry pose, or an unusable scan."""
 
     tracked: Tracked | BadScan
     latency_s: float
     """Time from the arrival of the scan to the publication of its pose."""
     placed_s: float
     """Time of the publication, by time.monotonic."""
-    gaps: Gaps
 
     @property
     def is_keyframe(self) -> bool:
@@ -78,9 +77,12 @@ class Past:
     """Poses and motions only."""
     clouds: deque[tuple[int, Points]]
     """Row and points of the last keyframes."""
-    gaps: Gaps = field(default_factory=Gaps)
     preset: Preset | None = None
     """None before the first scan with a pose."""
+
+
+Track = Callable[..., Tracked]
+"""As `Tracker.track`."""
 
 
 class OdometryEnded(Exception):
@@ -113,15 +115,15 @@ def serve(
     try:
         with OdometryApart(config.odometry) as odometry:
             _warm_up(config, odometry)
-            tracker: Tracker | _Choosing = _Choosing(configs, odometry, to_send.put)
+            track = _choosing(configs, odometry, to_send.put)
             if past.preset:
-                tracker = _continued(Tracker(config, odometry=odometry), past, waiting)
+                track = _continued(Tracker(config, odometry=odometry), past, waiting).track
             source.open(to_send.put)
             to_send.put(READY)
             feeder.start()
             Thread(target=_listen, args=(pipe, waiting, stopped), daemon=True).start()
             try:
-                is_idle = _place_all(tracker, source, waiting, to_send, idle_s, past)
+                is_idle = _place_all(track, source, waiting, to_send, idle_s, past)
             finally:
                 stopped.set()
                 feeder.join(timeout=END_S)
@@ -148,28 +150,25 @@ def _warm_up(config: Config, odometry: OdometryApart) -> None:
         throwaway.track(Scan(points, stamp_ns))
 
 
-class _Choosing:
-    """A tracker with the settings that fit its first scan with a pose, which is passed to `tell`."""
+def _choosing(configs: Mapping[Preset, Config], odometry: OdometryApart, tell: Callable[[Chosen], None]) -> Track:
+    """Tracks with the settings that fit the first scan with a pose, which are passed to `tell`."""
+    chosen_tracker: Tracker | None = None
 
-    def __init__(
-        self, configs: Mapping[Preset, Config], odometry: OdometryApart, tell: Callable[[Chosen], None]
-    ) -> None:
-        self._configs, self._odometry, self._tell = configs, odometry, tell
-        self._tracker: Tracker | None = None
-
-    def track(self, scan: Scan, *, gap: float) -> Tracked:
-        """As `Tracker.track`; a BadScan chooses nothing."""
-        if self._tracker:
-            return self._tracker.track(scan, gap=gap)
+    def track(scan: Scan, *, gap: float) -> Tracked:
+        nonlocal chosen_tracker
+        if chosen_tracker:
+            return chosen_tracker.track(scan, gap=gap)
         extent_m = extent_of(scan.points)
         chosen = Chosen(preset_for(extent_m), extent_m)
-        config = self._configs[chosen.preset]
-        self._odometry.begin(config.odometry)
-        tracker = Tracker(config, odometry=self._odometry)
+        config = configs[chosen.preset]
+        odometry.begin(config.odometry)
+        tracker = Tracker(config, odometry=odometry)
         tracked = tracker.track(scan, gap=gap)
-        self._tracker = tracker
-        self._tell(chosen)
+        chosen_tracker = tracker
+        tell(chosen)
         return tracked
+
+    return track
 
 
 def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
@@ -178,9 +177,10 @@ def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
         return tracker
     for step in past.steps:
         tracker.note(step)
+    waiting.rhythm.tally = Tally()  # the gaps between these scans are counted
     for step in past.steps[-ROWS_CONTINUED:]:
         waiting.rhythm.note(step.stamp_ns)
-    waiting.rhythm.gaps = past.gaps
+    waiting.rhythm.tally = waiting.tally
     keyframes = [row for row, _ in past.clouds]
     last = range(max(len(past.steps) - ROWS_CONTINUED, keyframes[0]), len(past.steps))
     rows = sorted({*keyframes, *last})
@@ -199,7 +199,7 @@ def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
 
 
 def _place_all(
-    tracker: Tracker | _Choosing,
+    track: Track,
     source: Source,
     waiting: Waiting,
     to_send: "SimpleQueue[Any]",
@@ -210,7 +210,7 @@ def _place_all(
     last_ns = past.steps[-1].stamp_ns if past.steps else None
     while (arrival := waiting.take(idle_s)) is not None:
         gap = 1.0 if last_ns is None else waiting.rhythm.intervals(last_ns, arrival.stamp_ns)
-        tracked = _tracked(tracker, arrival, gap)
+        tracked = _tracked(track, arrival, gap)
         if isinstance(tracked, Tracked):
             last_ns = arrival.stamp_ns
             try:
@@ -219,34 +219,24 @@ def _place_all(
                 why = f"{source.name}: the pose of scan {arrival.index} was not published ({error!r})"
                 to_send.put(why[:MOST_SHOWN])
         now = monotonic()
-        to_send.put(Placed(tracked, now - arrival.arrived_s, now, waiting.rhythm.gaps))
+        to_send.put(Placed(tracked, now - arrival.arrived_s, now))
     return not waiting.is_closed
 
 
-def _tracked(tracker: Tracker | _Choosing, arrival: Arrival, gap: float) -> Tracked | BadScan:
+def _tracked(track: Track, arrival: Arrival, gap: float) -> Tracked | BadScan:
     """The pose of a scan; BadScan for any exception of a single scan, because the run continues.
 
     Raises OdometryEnded if no further scan can be placed.
     """
     try:
-        scan = arrival.read(arrival.index, arrival.stamp_ns)
-    except BadScan as error:
-        return error
-    except Exception as error:
-        return _unusable(arrival, error)
-    try:
-        return tracker.track(scan, gap=gap)
+        return track(arrival.read(arrival.index, arrival.stamp_ns), gap=gap)
     except BadScan as error:
         return error
     except SegslamError as error:
         raise OdometryEnded(str(error).partition("; continue")[0]) from error
     except Exception as error:
-        return _unusable(arrival, error)
-
-
-def _unusable(arrival: Arrival, error: Exception) -> BadScan:
-    shown = f"{type(error).__name__}: {error}".splitlines()[0][:MOST_SHOWN]
-    return BadScan(f"scan {arrival.index}: cannot be used ({shown})")
+        shown = f"{type(error).__name__}: {error}".splitlines()[0][:MOST_SHOWN]
+        return BadScan(f"scan {arrival.index}: cannot be used ({shown})")
 
 
 def _feed(source: Source, waiting: Waiting, stopped: Event, ended: list[Ended]) -> None:

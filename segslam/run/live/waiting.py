@@ -8,7 +8,6 @@ from pathlib import Path
 from statistics import median
 from threading import Condition, Event
 from time import monotonic
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,14 +30,26 @@ SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
 
 
 class Tally(ctypes.Structure):
-    """Scans that arrived, and those dropped because the queue was full.
+    """Scans that arrived, those dropped because the queue was full, and gaps in the stamps.
 
     It can lie in memory shared by two processes: the counts survive the process that counts.
     """
 
-    _fields_ = (("num_arrived", ctypes.c_int64), ("num_dropped", ctypes.c_int64))
+    _fields_ = (
+        ("num_arrived", ctypes.c_int64),
+        ("num_dropped", ctypes.c_int64),
+        ("num_gaps", ctypes.c_int64),
+        ("num_missing", ctypes.c_int64),
+        ("num_clock_set", ctypes.c_int64),
+        ("longest_gap_s", ctypes.c_double),
+    )
     num_arrived: int
     num_dropped: int
+    num_gaps: int
+    num_missing: int
+    """Number of missing scans, estimated from the length of the gaps."""
+    num_clock_set: int
+    longest_gap_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +77,7 @@ class Waiting:
         self._changed = Condition()
         self.tally = tally or Tally()
         self.is_closed = False
-        self.rhythm = Rhythm()
+        self.rhythm = Rhythm(self.tally)
 
     def put(self, sent_ns: int, read: Callable[[int, int], Scan]) -> None:
         """Add a scan; drop the oldest if the queue is full. Does not wait. Without a usable stamp it is unusable."""
@@ -109,24 +120,14 @@ class Waiting:
             self._changed.notify()
 
 
-class Gaps(NamedTuple):
-    """Gaps in the stamps so far."""
-
-    num_gaps: int = 0
-    num_missing: int = 0
-    """Number of missing scans, estimated from the length of the gaps."""
-    longest_gap_s: float = 0.0
-    num_clock_set: int = 0
-
-
 class Rhythm:
-    """Tracks the stamps of arriving scans."""
+    """Tracks the stamps of arriving scans, and counts gaps."""
 
-    def __init__(self) -> None:
+    def __init__(self, tally: Tally) -> None:
         self._intervals_ns: deque[int] = deque(maxlen=21)
         self._last_ns: int | None = None
         self._shift_ns = 0
-        self.gaps = Gaps()
+        self.tally = tally
 
     def note(self, sent_ns: int) -> int:
         """The stamp of the next scan: as sent, or shifted to follow the last one if the clock was set."""
@@ -135,9 +136,14 @@ class Rhythm:
         if last_ns is not None and not last_ns - SET_BACK_NS <= stamp_ns <= last_ns + SET_FORWARD_NS:
             self._shift_ns += last_ns + self._usual_ns() - stamp_ns
             stamp_ns = sent_ns + self._shift_ns
-            self.gaps = self.gaps._replace(num_clock_set=self.gaps.num_clock_set + 1)
+            self.tally.num_clock_set += 1
         if last_ns is not None and stamp_ns > last_ns:
-            self._note_interval(stamp_ns - last_ns)
+            interval_ns, usual_ns = stamp_ns - last_ns, self._usual_ns()
+            if usual_ns and interval_ns > LONG_GAP * usual_ns:
+                self.tally.num_gaps += 1
+                self.tally.num_missing += round(interval_ns / usual_ns) - 1
+                self.tally.longest_gap_s = max(self.tally.longest_gap_s, interval_ns * 1e-9)
+            self._intervals_ns.append(interval_ns)
         self._last_ns = max(stamp_ns, last_ns or 0)
         return stamp_ns
 
@@ -148,14 +154,6 @@ class Rhythm:
             return 1.0
         gap = (to_ns - from_ns) / usual_ns
         return 1.0 if gap < LONG_GAP else min(gap, LONGEST_PREDICTED)
-
-    def _note_interval(self, interval_ns: int) -> None:
-        usual_ns = self._usual_ns()
-        if usual_ns and interval_ns > LONG_GAP * usual_ns:
-            num_gaps, num_missing, longest_s, num_clock_set = self.gaps
-            num_missing += round(interval_ns / usual_ns) - 1
-            self.gaps = Gaps(num_gaps + 1, num_missing, max(longest_s, interval_ns * 1e-9), num_clock_set)
-        self._intervals_ns.append(interval_ns)
 
     def _usual_ns(self) -> int:
         return int(median(self._intervals_ns)) if self._intervals_ns else 0

@@ -120,7 +120,7 @@ def refine(
     make_room(out, overwrite=overwrite, inputs=[run])
     folder = new_folder(out)
     when_stopped(f"the log in {folder} is kept, without results")
-    with refined.begun(folder, Slam(refined.config), options={}) as made:
+    with refined.begun(folder, Slam(refined.config)) as made:
         steps = made.take((step, 0, False) for step in recorded.whole_steps(len(recorded.keyframes()[0])))
         if is_interrupted(terminal.progress(steps, recorded.num_steps(), "read")):
             raise typer.Exit(EXIT_STATUS)

@@ -1,6 +1,6 @@
 """Loop closing and optimisation again, from the log of a run; also with loops that its position fixes propose."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,22 +68,14 @@ class Replay:
         name = self.recorded.options.get("in_map")
         return Path(name) if name else None
 
-    def begun(
-        self,
-        folder: Path,
-        slam: Slam | None = None,
-        *,
-        options: Mapping[str, str] | None = None,
-        mirror: Mirror | None = None,
-    ) -> Run:
-        """The new run in its folder, before its first step.
+    def begun(self, folder: Path, slam: Slam | None = None, *, mirror: Mirror | None = None) -> Run:
+        """The new run in its folder, before its first step. By default, `slam` closes loops with the edits.
 
-        By default, `slam` closes loops with the edits, and the log has the `options` that further replays need.
+        The log has the options that further replays need.
         """
-        if options is None and self.in_map:
-            options = {"in_map": str(self.in_map)}
-        elif options is None:
-            options = {} if self.edits == NO_EDITS else {"edits": self.edits.to_json()}
+        options = {"in_map": str(self.in_map)} if self.in_map else {}
+        if self.edits != NO_EDITS:
+            options["edits"] = self.edits.to_json()
         return Run(
             folder,
             slam or Slam(self.config, edits=self.edits),

@@ -32,6 +32,15 @@ def test_a_forbidden_loop_is_not_closed_by_this_replay_and_later_ones(log: Path,
     assert (newer, older) in _closures(tmp_path / "back" / "log.mcap")
 
 
+def test_a_refined_run_keeps_the_edits_for_later_replays(log: Path, tmp_path: Path) -> None:
+    newer, older = max(_closures(log))
+    assert run("edit", log, "--forbid", f"{newer}:{older}", "--out", tmp_path / "edited", *QUICK) == 0
+    minutes = ("--refine-minutes", 5, "--quiet")
+    assert run("refine", tmp_path / "edited", "--out", tmp_path / "refined", *minutes) == 0
+    assert run("replay", tmp_path / "refined", "--out", tmp_path / "again", *QUICK) == 0
+    assert (newer, older) not in _closures(tmp_path / "again" / "log.mcap")
+
+
 def test_an_added_loop_is_registered_though_no_search_proposes_it(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

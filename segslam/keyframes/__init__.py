@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from segslam.candidates import PlaceSignature, signature_of
 from segslam.core import geometry
 from segslam.core.config import Config, KeyframeConfig
 from segslam.core.points import voxel_first
@@ -159,6 +160,13 @@ class Submaps:
         if len(clouds) == 1:
             return Submap(points, labels, points)
         return Submap(np.vstack(clouds), np.concatenate(all_labels), points)
+
+    def signature(self, keyframe_id: int, recorded: bytes | None) -> PlaceSignature:
+        """The signature of a keyframe's place: as recorded, or else of its submap without later keyframes."""
+        if recorded is not None:
+            return PlaceSignature.from_bytes(recorded)
+        made = self.gathered(keyframe_id, newest_id=keyframe_id)
+        return signature_of(made.points, made.labels)
 
     def prepared(self, keyframe_id: int) -> PreparedScan:
         """The submap of a keyframe, prepared for alignment."""

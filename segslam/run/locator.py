@@ -84,7 +84,7 @@ class Locator:
         self.submaps = submaps_of(keyframes, clouds, informations, config)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         """A keyframe by its id, prepared for alignment."""
-        self.signatures = [self._signature(keyframe) for keyframe in keyframes]
+        self.signatures = [self.submaps.signature(keyframe.id, keyframe.place) for keyframe in keyframes]
         self.places = Places()
         for keyframe, signature in zip(keyframes, self.signatures, strict=True):
             self.places.add(keyframe.id, signature)
@@ -138,12 +138,6 @@ class Locator:
         if candidates:
             self.prepared(candidates[0].place_id)
         return own, candidates
-
-    def _signature(self, keyframe: Keyframe) -> PlaceSignature:
-        if keyframe.place is not None:
-            return PlaceSignature.from_bytes(keyframe.place)
-        made = self.submaps.gathered(keyframe.id, newest_id=keyframe.id)
-        return signature_of(made.points, made.labels)
 
 
 def submaps_of(

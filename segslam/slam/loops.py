@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from functools import lru_cache
 from time import monotonic
 
-from segslam.candidates import PlaceSignature, signature_of
+from segslam.candidates import PlaceSignature
 from segslam.candidates.proximity import LEAST_PROBABILITY, ProximityDetector
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch, at_once
@@ -73,11 +73,7 @@ class LoopCloser:
         self.submaps.add(T_odom_keyframe, labelled_by_shape=labelled_by_shape)
         if not self._config.retrieval.enabled:
             return None
-        if recorded is None:
-            made = self.submaps.gathered(newest_id)
-            signature = signature_of(made.points, made.labels)
-        else:
-            signature = PlaceSignature.from_bytes(recorded)
+        signature = self.submaps.signature(newest_id, recorded)
         self._far.add(newest_id, signature)
         return signature
 

@@ -68,11 +68,8 @@ def test_signatures_are_in_the_log_and_computed_if_it_has_none(run: Path, monkey
         return step if step.keyframe is None else replace(step, keyframe=replace(step.keyframe, place=None))
 
     monkeypatch.setattr(reader, "_step", older_step)
-    older = Locator.from_run(run)
-    newer_spectra = [np.frombuffer(place or b"", np.uint8) for place in stored]
-    for number, spectrum in enumerate(newer_spectra):
-        signature = older._signature(read_log(run / "log.mcap").keyframes()[0][number])
-        assert (signature.spectrum.ravel() == spectrum).all()
+    for signature, place in zip(Locator.from_run(run).signatures, stored, strict=True):
+        assert (signature.spectrum.ravel() == np.frombuffer(place or b"", np.uint8)).all()
 
 
 def test_the_run_is_not_changed(run: Path) -> None:

@@ -81,7 +81,8 @@ def recognise(
         return [one._replace(agreement=one.agreement._replace(of_target=NO_PATCHES)) for one in best]
 
     rejections = []
-    for place_id in islice(_spread(candidates, T_world_place, SPREAD_M), max_places):
+    place_ids = [candidate.place_id for candidate in candidates]
+    for place_id in islice(spread(place_ids, T_world_place, SPREAD_M), max_places):
         found = tried(place_id)
         if isinstance(found, Rejected):
             rejections.append(found)
@@ -91,26 +92,26 @@ def recognise(
             rejections.append(outcome)
             continue
         T_world_lidar = T_world_place(place_id) @ found[0].T_target_source
-        others = list(islice(_spread(candidates, T_world_place, ELSEWHERE_M, [T_world_lidar]), MAX_RIVALS))
+        others = list(islice(spread(place_ids, T_world_place, ELSEWHERE_M, [T_world_lidar]), MAX_RIVALS))
         halves = at_once(*(partial(found_elsewhere, T_world_lidar, half) for half in (others[0::2], others[1::2])))
         outcome = judged(found[0], [*found[1:], *halves[0], *halves[1]], config=config)
         return outcome if isinstance(outcome, Rejected) else Recognised(place_id, T_world_lidar, outcome)
     return rejections[0] if rejections else Rejected(RejectReason.TOO_FEW_CORRESPONDENCES, "no place to compare with")
 
 
-def _spread(
-    candidates: Sequence[PlaceCandidate],
+def spread(
+    place_ids: Sequence[int],
     T_world_place: Callable[[int], Transform],
     apart_m: float,
     taken: Sequence[Transform] = (),
 ) -> Iterator[int]:
-    """The candidates that are at least so far from all before, and from places that are taken already."""
+    """The places that are at least so far from all before, and from those that are taken already."""
     taken = list(taken)
-    for candidate in candidates:
-        T_world = T_world_place(candidate.place_id)
+    for place_id in place_ids:
+        T_world = T_world_place(place_id)
         if all(_apart_m(T_world, other) >= apart_m for other in taken):
             taken.append(T_world)
-            yield candidate.place_id
+            yield place_id
 
 
 def _apart_m(T_world_a: Transform, T_world_b: Transform) -> float:

@@ -9,6 +9,7 @@ again without initial guess.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import islice
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from segslam.keyframes import Submaps
 from segslam.registration import refinement
 from segslam.registration.prepared import Observed, prepare_observed
 from segslam.run.locator import Locator
+from segslam.slam.recognition import spread
 from segslam.verification.patches import agreement
 from segslam.verification.trial import MAX_COARSE_FINE_M, Found, judged
 
@@ -80,21 +82,15 @@ class Placer:
         """The keyframe registered with the nearest ones of the map, starting at the odometry's prediction."""
         assert self._last is not None
         T_world_predicted = self._last.T_world_keyframe @ self._motion(self._last.keyframe_id, keyframe_id)
-        apart_m = np.hypot(*(self._T_world_map[:, :2, 3] - T_world_predicted[:2, 3]).T)
-        apart_m = np.hypot(apart_m, self._T_world_map[:, 2, 3] - T_world_predicted[2, 3])
+        apart_m = np.linalg.norm(self._T_world_map[:, :3, 3] - T_world_predicted[:3, 3], axis=1)
         outcome: Placement | Rejected = Rejected(RejectReason.NO_PLACE, f"{apart_m.min():.0f} m from the map")
         with watch("prepare"):
             own = self._seen(self._submaps, keyframe_id)
-        tried: list[int] = []
-        for target_id in np.argsort(apart_m)[: 10 * NUM_TRIED].tolist():
-            near = [np.linalg.norm(self._T_world_map[target_id, :3, 3] - self._T_world_map[t, :3, 3]) for t in tried]
-            if apart_m[target_id] > REACH_M or len(tried) == NUM_TRIED:
+        near = [number for number in np.argsort(apart_m)[: 10 * NUM_TRIED].tolist() if apart_m[number] <= REACH_M]
+        for target_id in islice(spread(near, self._T_world_map.__getitem__, APART_M), NUM_TRIED):
+            outcome = self._registered(keyframe_id, own, target_id, T_world_predicted, watch)
+            if isinstance(outcome, Placement):
                 break
-            if all(distance_m >= APART_M for distance_m in near):
-                tried.append(target_id)
-                outcome = self._registered(keyframe_id, own, target_id, T_world_predicted, watch)
-                if isinstance(outcome, Placement):
-                    break
         return outcome
 
     def _registered(

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.sweep import GivenOdometry, Odometry
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import new_folder
-from segslam.output.log import Mirror
 from segslam.run.run import Run
 from segslam.scans import Dataset, DataSource
 from segslam.scans.presets import extent_m, preset, preset_for
@@ -70,17 +70,9 @@ def map_folder(
 
 
 def begun(
-    scans: Dataset,
-    folder: Path,
-    config: Config,
-    *,
-    odometry: Odometry,
-    slam_of: SlamOf = Slam,
-    options: Mapping[str, str] = MappingProxyType({}),
-    resumes: bool = False,
-    mirror: Mirror | None = None,
+    scans: Dataset, folder: Path, config: Config, *, odometry: Odometry, slam_of: SlamOf = Slam, **more: Any
 ) -> Run:
-    """A run that maps a data set, before its first scan. `options`, `resumes` and `mirror` as for `Run`."""
+    """A run that maps a data set, before its first scan. `more`: the other arguments of `Run`."""
     labeller = None if scans.labels.geometric else lambda points: unlabelled(len(points))
     return Run(
         folder,
@@ -88,9 +80,7 @@ def begun(
         dataset=scans.name,
         T_camera_lidar=scans.T_camera_lidar,
         reference=scans.reference,
-        options=options,
-        resumes=resumes,
-        mirror=mirror,
+        **more,
     )
 
 

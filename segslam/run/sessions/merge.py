@@ -231,7 +231,7 @@ def _placed(sessions: Sequence[Session], session_poses: Sequence[SessionPose | N
         T_last_first = geometry.inverse(T_before_world @ before.T_world_keyframe[-1]) @ (
             T_first_world[-1] @ session.T_world_keyframe[0]
         )
-        T_new_first = shift.pose(before.keyframes[-1].T_odom_keyframe) @ T_last_first
+        T_new_first = shift.T_new_old @ before.keyframes[-1].T_odom_keyframe @ T_last_first
         drive, first_ns = before.run.result.trajectory, int(session.run.result.trajectory.stamp_ns[0])
         last_ns = int(drive.stamp_ns[-1]) + shift.stamp_ns
         shift = Shift(

@@ -1,7 +1,7 @@
 """A finished run as one session of a merged run: its keyframes, and its steps with new numbers."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,12 +52,8 @@ class Shift:
     scan_index: int = 0
     stamp_ns: int = 0
     travel_m: float = 0.0
-    T_new_old: Transform | None = None
-    """Transform of its odometry frame; None for identity."""
-
-    def pose(self, T_odom_lidar: Transform) -> Transform:
-        """A pose of the session's odometry in that of the merged run."""
-        return T_odom_lidar if self.T_new_old is None else self.T_new_old @ T_odom_lidar
+    T_new_old: Transform = field(default_factory=lambda: np.eye(4))
+    """Pose of its odometry frame in that of the merged run."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,14 +137,14 @@ def shifted_steps(session: Session, more: Mapping[int, LoopAttempt]) -> Iterator
                 id=keyframe.id + shift.keyframe_id,
                 scan_index=keyframe.scan_index + shift.scan_index,
                 stamp_ns=keyframe.stamp_ns + shift.stamp_ns,
-                T_odom_keyframe=shift.pose(keyframe.T_odom_keyframe),
+                T_odom_keyframe=shift.T_new_old @ keyframe.T_odom_keyframe,
                 travel_m=keyframe.travel_m + shift.travel_m,
             )
         yield replace(
             step,
             scan_index=step.scan_index + shift.scan_index,
             stamp_ns=step.stamp_ns + shift.stamp_ns,
-            T_odom_lidar=shift.pose(step.T_odom_lidar),
+            T_odom_lidar=shift.T_new_old @ step.T_odom_lidar,
             keyframe=keyframe,
             attempts=tuple(attempts),
             motion=FIRST_MOTION if number == 0 and shift.keyframe_id else step.motion,

@@ -34,9 +34,11 @@ def evaluate(
             raise SegslamError("evaluate: no ground truth; give `reference`")
     made, true = _known(estimate), _known(reference)
     rows = matching_rows(made, true)
-    figures = scores(
-        _poses(made)[rows[:, 0]], _poses(true)[rows[:, 1]], align=align, rpe_distance_m=rpe_distance_m, up=up
+    matched, truth = (
+        (known.T_world_lidar if isinstance(known, Trajectory) else known.T_a_b)[own]
+        for known, own in zip((made, true), rows.T, strict=True)
     )
+    figures = scores(matched, truth, align=align, rpe_distance_m=rpe_distance_m, up=up)
     if not figures:
         raise SegslamError(f"evaluate: only {len(rows)} poses match the reference; at least three are needed")
     return figures
@@ -53,10 +55,6 @@ def _known(given: Given) -> Trajectory | PoseFile:
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
         raise SegslamError(f"evaluate: poses of shape {poses.shape}; give finite matrices, (n, 4, 4)")
     return PoseFile(poses, None)
-
-
-def _poses(known: Trajectory | PoseFile) -> Poses:
-    return known.T_world_lidar if isinstance(known, Trajectory) else known.T_a_b
 
 
 def matching_rows(

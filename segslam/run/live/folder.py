@@ -105,12 +105,10 @@ class FolderSource(Source):
         if len(self._seen) > NAMES_KEPT:
             self._seen.popitem(last=False)
 
-        def read(index: int, stamp_ns: int) -> Scan:
-            return self._read(file, index, stamp_ns, content)
-
         named_ns = stamp_of_name(file.stem)
         self._noted_ns.value = max(self._noted_ns.value, found.st_ctime_ns)
-        waiting.put(found.st_mtime_ns if named_ns is None else named_ns, read)
+        sent_ns = found.st_mtime_ns if named_ns is None else named_ns
+        waiting.put(sent_ns, lambda index, stamp_ns: self._read(file, index, stamp_ns, content))
 
     def _put_missed(self, waiting: Waiting) -> None:
         """Put the scans whose files have changed since the newest one that was put, in order.

@@ -1,12 +1,13 @@
 """The list of drives of a fleet."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from segslam.core.types import SegslamError
-from segslam.run.fleets.drives import Drive, drives_of, read_drives, with_settings
+from segslam.run.fleets.drives import Drive, drives_of, read_drives
 
 LIST = """
 drives:
@@ -63,7 +64,7 @@ def test_the_key_changes_with_recording_options_and_version_but_not_with_the_nam
     key = drive.key("1")
     assert Drive("other", drive.data).key("1") == key
     assert drive.key("2") != key
-    assert with_settings([drive], ["odometry.max_range_m=60"])[0].key("1") != key
+    assert replace(drive, set=("odometry.max_range_m=60",)).key("1") != key
     scan.write_bytes(bytes(32))
     assert drive.key("1") != key
 

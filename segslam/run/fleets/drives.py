@@ -5,7 +5,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -97,11 +97,6 @@ def drives_of(data: Sequence["Drive | str | Path"], *, config: Path | None = Non
     return _named(
         [one if isinstance(one, Drive) else _drive({"data": str(one), **options}, str(one), Path.cwd()) for one in data]
     )
-
-
-def with_settings(drives: Iterable[Drive], settings: Sequence[str]) -> list[Drive]:
-    """The drives with further settings, before their own."""
-    return [replace(drive, set=(*settings, *drive.set)) for drive in drives]
 
 
 def _drive(value: Any, where: str, folder: Path) -> Drive:

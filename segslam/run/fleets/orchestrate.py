@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import write_whole
 from segslam.run.fleets import steps
-from segslam.run.fleets.drives import Drive, drives_of, key_of, read_drives, with_settings
+from segslam.run.fleets.drives import Drive, drives_of, key_of, read_drives
 from segslam.run.fleets.relations import Components
 from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
@@ -33,7 +33,7 @@ class FleetResult:
     """By name: `state` (mapped or failed), `component` (number, None if it failed), and `reason` of a failure."""
     components: tuple[dict[str, Any], ...]
     """`folder`, names of the `drives`, `num_loops_between`, `ate_m` if it is known, and `reason` if it failed."""
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float]
     """Wall time by step."""
 
     @property
@@ -75,7 +75,8 @@ def fleet(
     with workers(folder, number=number, scheduler=scheduler) as (run, dashboard):
         if dashboard:
             say(f"dashboard: {dashboard}")
-        return _Fleet(folder, run, shown, say).run(with_settings(listed, settings), same_reference)
+        listed = [replace(drive, set=(*settings, *drive.set)) for drive in listed]
+        return _Fleet(folder, run, shown, say).run(listed, same_reference)
 
 
 class _Fleet:
@@ -158,11 +159,10 @@ class _Fleet:
 
     def _joined(self, mapped: Sequence[Mapped], components: Components, same: bool) -> list[dict[str, Any]]:
         tasks, made = [], []
-        for number, members in enumerate(components.members()):
-            order, poses = components.arranged(members)
+        for number, (order, poses) in enumerate(components.arranged()):
             drives = [mapped[drive] for drive in order]
             folder = self._folder / f"component_{number}"
-            tasks.append((self._folder, folder, drives, poses, _key(drives, poses, same), same))
+            tasks.append((folder, drives, poses, _key(drives, poses, same), same))
             made.append({"folder": folder.name, "drives": [drive.name for drive in drives]})
         for one, outcome in zip(made, self._all("join", steps.join, tasks), strict=True):
             figures = outcome.value or {}

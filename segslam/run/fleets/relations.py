@@ -1,6 +1,7 @@
 """Relative poses of drives: inverted, and chained to the poses of a component."""
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from heapq import heappop, heappush
 
@@ -38,13 +39,6 @@ class Components:
         self._num_failed = [0] * num_drives
         """By component: pairs that could not be joined since its last drive was."""
 
-    def members(self) -> list[list[int]]:
-        """The drives of each component, by their first."""
-        return [
-            [drive for drive, own in enumerate(self._component) if own == first]
-            for first in sorted(set(self._component))
-        ]
-
     def add(self, later: int, earlier: int, relation: Relation) -> None:
         """Join two drives, unless they are joined already, or their relation is unknown."""
         self._tried.add((later, earlier))
@@ -57,26 +51,26 @@ class Components:
         self._component = [one if own == other else own for own in self._component]
         self._num_failed[one] = 0
 
-    def arranged(self, members: Sequence[int]) -> tuple[list[int], list[SessionPose | None]]:
-        """The drives of a component, each after one in which its pose is known, and these poses.
+    def arranged(self) -> Iterator[tuple[list[int], list[SessionPose | None]]]:
+        """The drives of each component, each after one in which its pose is known, and these poses.
 
         Of the drives that may be next the first is, so that one that is added to a fleet is the last if it can be.
         """
-        related: dict[int, list[int]] = {drive: [] for drive in members}
+        related = defaultdict[int, list[int]](list)
         for later, earlier in self._relations:
-            if later in related:
-                related[later].append(earlier)
-                related[earlier].append(later)
-        order, poses = list[int](), list[SessionPose | None]()
-        waiting = [(members[0], -1)]
-        while waiting:
-            drive, number = heappop(waiting)
-            if drive not in order:
-                for other in related[drive]:
-                    heappush(waiting, (other, len(order)))
-                poses.append(self._pose(drive, order[number], number) if order else None)
-                order.append(drive)
-        return order, poses
+            related[later].append(earlier)
+            related[earlier].append(later)
+        for first in sorted(set(self._component)):
+            order, poses = list[int](), list[SessionPose | None]()
+            waiting = [(first, -1)]
+            while waiting:
+                drive, number = heappop(waiting)
+                if drive not in order:
+                    for other in related[drive]:
+                        heappush(waiting, (other, len(order)))
+                    poses.append(self._pose(drive, order[number], number) if order else None)
+                    order.append(drive)
+            yield order, poses
 
     def _pose(self, drive: int, before: int, number: int) -> SessionPose:
         """The pose of a drive in one that it is related to, which has this number in the order."""

@@ -165,16 +165,11 @@ def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], 
 
 
 def join(
-    fleet: Path,
-    folder: Path,
-    drives: Sequence[Mapped],
-    poses: Sequence[SessionPose | None],
-    key: str,
-    same_reference: bool,
+    folder: Path, drives: Sequence[Mapped], poses: Sequence[SessionPose | None], key: str, same_reference: bool
 ) -> Mapping[str, Any]:
-    """The drives of a component as one run, each with its pose in one before it; returns the figures of the run."""
+    """The drives of a component as one run in a folder of the fleet, by the pose of each in one before; its figures."""
     if not is_made(folder, key):
-        part = _beside(folder)
+        part, fleet = _beside(folder), folder.parent
         sessions = [read_session(drive.folder(fleet)) for drive in drives]
         if len(drives) == 1:
             shutil.copytree(drives[0].folder(fleet), part)
@@ -222,7 +217,7 @@ def _locator(fleet: Path, drive: Mapped) -> Locator:
 
 def _beside(target: Path) -> Path:
     """A new name beside the target: two workers may do the same work, if the first seemed to be lost."""
-    return target.with_name(f".{target.name}.{uuid4().hex}{UNFINISHED}")
+    return target.with_name(f".{target.stem}.{uuid4().hex}{UNFINISHED}{target.suffix}")
 
 
 def _made(part: Path, folder: Path, key: str) -> None:
@@ -242,7 +237,6 @@ def _replace(file: Path, write: Any) -> None:
     """Write a file under another name, then rename it."""
     file.parent.mkdir(parents=True, exist_ok=True)
     part = _beside(file)
-    part = part.with_name(part.name + file.suffix)
     write(part)
     part.replace(file)
 

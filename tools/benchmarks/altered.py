@@ -20,7 +20,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses, read_poses
-from segslam.core.types import Alignment, Points, Rotation, Vector
+from segslam.core.types import Points, Rotation, Vector
 from segslam.output.finished import read_run
 from segslam.scans import open_dataset
 from segslam.verification import register
@@ -158,12 +158,9 @@ def registered(drive: Altered, steps: Sequence[int]) -> common.Row:
         for target in (source - step for step in steps):
             found = register(drive.points_of(source), drive.points_of(target))
             T_true = geometry.inverse(drive.T_world_lidar[target]) @ drive.T_world_lidar[source]
-            outcome = "rejected"
-            if isinstance(found, Alignment):
-                is_right = common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
-                outcome = "right" if is_right else "wrong"
-            counts[outcome] += 1
-    return {"pairs": counts.total(), **{name: counts[name] for name in ("right", "wrong", "rejected")}}
+            counts[common.verdict(found, T_true)] += 1
+    total, right, wrong = counts.total(), counts["right"], counts["wrong"]
+    return {"pairs": total, "right": right, "wrong": wrong, "rejected": total - right - wrong}
 
 
 def run_benchmark() -> None:

@@ -12,11 +12,12 @@ import numpy as np
 
 from segslam.bench.experiments.provenance import commit, machine
 from segslam.cli import main
+from segslam.core import geometry
 from segslam.core.evaluation import PoseError
-from segslam.core.types import Transform
+from segslam.core.types import Alignment, Rejected, Transform
 
-RIGHT_M, RIGHT_DEG = 0.5, 2.0
-"""Chosen: a refined pose with a larger error is in another minimum; correct ones have errors of centimetres."""
+RIGHT = 0.5, 2.0
+"""m, degrees. Chosen: a refined pose that errs more is in another minimum; correct ones have errors of centimetres."""
 
 Row = dict[str, Any]
 """A line of a table."""
@@ -60,9 +61,16 @@ def markdown(title: str, rows: Sequence[Row]) -> str:
     return f"## {title}\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def is_right(T_error: Transform) -> bool:
-    """True if the error of a refined pose is that of a correct one."""
-    return PoseError.of(T_error).within(RIGHT_M, RIGHT_DEG)
+def is_right(T_target_source: Transform, T_true: Transform | None, tolerance: tuple[float, float] = RIGHT) -> bool:
+    """Whether the error of a refined pose is that of a correct one; False without a true pose: two other places."""
+    return T_true is not None and PoseError.of(geometry.inverse(T_true) @ T_target_source).within(*tolerance)
+
+
+def verdict(found: Alignment | Rejected, T_true: Transform | None, tolerance: tuple[float, float] = RIGHT) -> str:
+    """`right`, `wrong`, or the reason of the rejection."""
+    if isinstance(found, Rejected):
+        return found.reason.value
+    return "right" if is_right(found.fine.T_target_source, T_true, tolerance) else "wrong"
 
 
 def draw_pairs(allowed: np.ndarray, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:

@@ -16,7 +16,7 @@ from segslam.core.types import Alignment, Registration, Rejected, Transform
 from segslam.registration import refinement, segregator
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register_prepared
-from tools.benchmarks.common import RIGHT_DEG, RIGHT_M
+from tools.benchmarks.common import RIGHT
 from tools.benchmarks.registration.scans import Labelled
 
 LOST = PoseError(math.inf, math.inf)
@@ -71,7 +71,7 @@ class Attempt:
     @property
     def lost(self) -> bool:
         """Rejected although refinement of the best hypothesis is correct."""
-        return not self.accepted and self.refined.within(RIGHT_M, RIGHT_DEG)
+        return not self.accepted and self.refined.within(*RIGHT)
 
 
 def attempt(trial: Trial, prepared: Callable[[int], PreparedScan], *, config: Config) -> Attempt:

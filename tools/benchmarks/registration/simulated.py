@@ -11,7 +11,7 @@ from segslam.core.config import Config
 from segslam.core.types import Alignment
 from segslam.registration.prepared import PreparedScan
 from segslam.verification import register_prepared
-from tools.benchmarks.common import RIGHT_DEG, RIGHT_M, Row
+from tools.benchmarks.common import RIGHT, Row
 from tools.benchmarks.registration.attempts import Attempt, attempt, percent, preparer
 from tools.benchmarks.registration.scans import BANDS_M, Labelled, SimulatedPlace, by_shape
 
@@ -92,7 +92,7 @@ def _gates(trials: list[Attempt], negatives: Counter[str]) -> dict[str, object]:
         "negatives": negatives.total(),
         "accepted": negatives["accepted"],
         "reasons": ", ".join(f"{reason} {count}" for reason, count in negatives.most_common()),
-        "true_pairs": sum(trial.refined.within(RIGHT_M, RIGHT_DEG) for trial in trials),
+        "true_pairs": sum(trial.refined.within(*RIGHT) for trial in trials),
         "lost": sum(trial.lost for trial in trials),
         "accepted_wrong": sum(trial.wrong for trial in trials),
     }
@@ -101,7 +101,7 @@ def _gates(trials: list[Attempt], negatives: Counter[str]) -> dict[str, object]:
 def _information(trials: list[Attempt]) -> dict[str, object]:
     """Whitened squared errors of correct poses: mean 6 and 95 % below the bound if the information is correct."""
     coarse = np.array([trial.coarse_squared for trial in trials if trial.coarse.success])
-    fine = np.array([trial.fine_squared for trial in trials if trial.fine.within(RIGHT_M, RIGHT_DEG)])
+    fine = np.array([trial.fine_squared for trial in trials if trial.fine.within(*RIGHT)])
     return {
         "coarse_poses": len(coarse),
         "coarse_mean": round(float(coarse.mean()), 2),

@@ -17,8 +17,9 @@ from segslam.verification.patches import BINS
 from segslam.verification.score import Table
 from tools.benchmarks import common, score
 from tools.benchmarks.scene_models import SCENES
+from tools.benchmarks.scenes import Task, tasks
 from tools.benchmarks.score import ratio
-from tools.benchmarks.score.pairs import Task, described, of_drive, of_scene, of_towns
+from tools.benchmarks.score.pairs import described, of_drive, of_towns
 from tools.benchmarks.score.ratio import Best, Pair
 
 DRIVES = ("kitti_whole", "nclt", "courtyard", "town")
@@ -61,7 +62,7 @@ def _describe(options: Namespace) -> None:
 def _tasks(options: Namespace, config: Config) -> Iterator[Task]:
     parts = options.parts.split(",")
     noises = [float(noise) for noise in options.noise.split(",")]
-    drawn = partial(of_scene, count=options.pairs, seed=options.seed, config=config)
+    drawn = partial(tasks, count=options.pairs, seed=options.seed, config=config)
     for turn, sensor in enumerate(options.sensors.split(",")):
         for number, name in enumerate(part for part in parts if part in SCENES):
             yield from drawn(name, sensor, noises[(turn + number) % len(noises)])

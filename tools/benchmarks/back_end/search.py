@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,23 +11,21 @@ from segslam.core import geometry
 from segslam.core.evaluation import FOUND_WITHIN_M, REVISIT_MIN_TRAVEL_M
 from segslam.core.types import LoopClosure
 from segslam.graph import PoseGraph
-from tools.benchmarks.back_end.drives import CONFIG, Drive
+from tools.benchmarks.back_end.drives import CONFIG, Drive, closure
 
 REACH_M = 8.0
 """Distance up to which two keyframes are always registered."""
 MAX_ROUNDS = 3
 
 
-@dataclass
 class Search:
     """Search for loops in a drive."""
 
-    drive: Drive
-    rng: np.random.Generator
-    graph: PoseGraph = field(default_factory=lambda: PoseGraph(CONFIG.graph))
-    detector: ProximityDetector = field(default_factory=lambda: ProximityDetector(CONFIG.proximity))
-    closures: list[LoopClosure] = field(default_factory=list)
-    tried: set[tuple[int, int]] = field(default_factory=set)
+    def __init__(self, drive: Drive, rng: np.random.Generator) -> None:
+        self._drive, self._rng = drive, rng
+        self.graph, self.detector = PoseGraph(CONFIG.graph), ProximityDetector(CONFIG.proximity)
+        self.closures: list[LoopClosure] = []
+        self._tried: set[tuple[int, int]] = set()
 
     def look(self, keyframe_id: int) -> int:
         """Try new candidates of one keyframe; returns the number of closures found."""
@@ -38,31 +35,31 @@ class Search:
             keyframe_id, graph.T_world_keyframes, graph.travel_m, graph.covariances
         ):
             pair = (keyframe_id, candidate.target_id)
-            if pair in self.tried:
+            if pair in self._tried:
                 continue
-            self.tried.add(pair)
-            T_target_source = geometry.inverse(self.drive.truth[candidate.target_id]) @ self.drive.truth[keyframe_id]
+            self._tried.add(pair)
+            T_target_source = self._drive.true(candidate.target_id, keyframe_id)
             if geometry.distance(T_target_source) <= REACH_M:
-                found.append(self.drive.closure(*pair, self.rng))
+                found.append(closure(*pair, T_target_source, self._rng))
         for loop in found:
-            self.graph.add_closure(loop)
+            graph.add_closure(loop)
             self.detector.note_closure(loop)
         self.closures += found
         return len(found)
 
     def figures(self) -> dict[str, Any]:
         return {
-            "tried": len(self.tried),
+            "tried": len(self._tried),
             "closures": len(self.closures),
             "recall_4m": self._recall(4.0),
             "recall_10m": self._recall(10.0),
-            **self.drive.errors(self.graph.T_world_keyframes),
+            **self._drive.errors(self.graph.T_world_keyframes),
         }
 
     def _recall(self, within_m: float) -> float | None:
         """Share of the keyframes this near to an old one that have a closure within 10 m of travel."""
-        wanted = self.drive.travel_m[list(_revisits(self.drive, within_m))]
-        closed = self.drive.travel_m[[loop.source_id for loop in self.closures]]
+        wanted = self._drive.travel_m[list(_revisits(self._drive, within_m))]
+        closed = self._drive.travel_m[[loop.source_id for loop in self.closures]]
         away_m = np.abs(wanted[:, None] - closed).min(axis=1, initial=np.inf)
         return float((away_m <= FOUND_WITHIN_M).mean()) if len(wanted) else None
 

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from segslam.bench.experiments.pairs import Trial
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import PoseError
-from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Registration, Rejected, Transform
 from segslam.registration import refinement, segregator
 from segslam.registration.prepared import PreparedScan, prepare_scan
@@ -23,13 +22,9 @@ LOST = PoseError(math.inf, math.inf)
 """Error of a rejected registration."""
 
 
-def error(T_estimate: Transform, T_true: Transform) -> PoseError:
+def error(found: Registration | Rejected, T_true: Transform) -> PoseError:
     """The paper's: of dT = T_estimate inverse(T_true)."""
-    return PoseError.of(T_estimate @ geometry.inverse(T_true))
-
-
-def error_of(outcome: Registration | Rejected, T_true: Transform) -> PoseError:
-    return LOST if isinstance(outcome, Rejected) else error(outcome.T_target_source, T_true)
+    return LOST if isinstance(found, Rejected) else PoseError.of(found.T_target_source @ geometry.inverse(T_true))
 
 
 def preparer(scan: Callable[[int], Labelled], config: Config) -> Callable[[int], PreparedScan]:
@@ -42,36 +37,29 @@ def preparer(scan: Callable[[int], Labelled], config: Config) -> Callable[[int],
     return prepared
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Attempt:
+class Attempt(NamedTuple):
     """A pair with known pose, processed by all stages."""
 
     coarse: PoseError
     """Error of the best hypothesis before verification."""
     refined: PoseError
     """Error of the best hypothesis after refinement."""
-    outcome: Alignment | Rejected
     fine: PoseError
     """Error of the accepted pose."""
     coarse_squared: float
     """Squared error of the best hypothesis, whitened by its information; NaN without one."""
     fine_squared: float
     """The same for the accepted pose."""
-    seconds: dict[str, float]
-
-    @property
-    def accepted(self) -> bool:
-        return isinstance(self.outcome, Alignment)
 
     @property
     def wrong(self) -> bool:
         """Accepted, but not a success by the criterion of the paper."""
-        return self.accepted and not self.fine.success
+        return self.fine != LOST and not self.fine.success
 
     @property
     def lost(self) -> bool:
         """Rejected although refinement of the best hypothesis is correct."""
-        return not self.accepted and self.refined.within(*RIGHT)
+        return self.fine == LOST and self.refined.within(*RIGHT)
 
 
 def attempt(trial: Trial, prepared: Callable[[int], PreparedScan], *, config: Config) -> Attempt:
@@ -80,18 +68,10 @@ def attempt(trial: Trial, prepared: Callable[[int], PreparedScan], *, config: Co
     refined: Registration | Rejected = coarse
     if isinstance(coarse, Registration):
         refined = refinement.refine(source.surface, target.surface, coarse.T_target_source, config=config.refine)
-    watch = Stopwatch()
-    outcome = register_prepared(source, target, config=config, watch=watch)
-    fine = outcome.fine if isinstance(outcome, Alignment) else outcome
-    return Attempt(
-        coarse=error_of(coarse, T_true),
-        refined=error_of(refined, T_true),
-        outcome=outcome,
-        fine=error_of(fine, T_true),
-        coarse_squared=_squared(coarse, T_true),
-        fine_squared=_squared(fine, T_true),
-        seconds=watch.seconds,
-    )
+    found = register_prepared(source, target, config=config)
+    fine = found.fine if isinstance(found, Alignment) else found
+    errors = error(coarse, T_true), error(refined, T_true), error(fine, T_true)
+    return Attempt(*errors, _squared(coarse, T_true), _squared(fine, T_true))
 
 
 def _squared(found: Registration | Rejected, T_true: Transform) -> float:

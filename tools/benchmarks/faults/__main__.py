@@ -20,7 +20,7 @@ import numpy as np
 
 from segslam.scans import open_dataset
 from tools.benchmarks import common
-from tools.benchmarks.faults.episodes import Outcome, disk_episode, live_episode, map_episode, topic_episode
+from tools.benchmarks.faults.episodes import EPISODES, Outcome
 
 MOST_POINTS = 8000
 """Chosen: points of a scan, so that a run with a fault takes seconds."""
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--every", type=float, default=0.5, help="seconds between two scans of a live run")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", choices=("live", "map", "disk", "topic"))
+    parser.add_argument("--only", choices=EPISODES)
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True)
     dataset = open_dataset(chosen.data, labels="none", vertical_angle_deg=0.0)
@@ -53,20 +53,12 @@ def run_all(
     """Episodes in turn, until the time is over."""
     rng, end = random.Random(seed), monotonic() + seconds
     outcomes: list[Outcome] = []
-    kinds = [only] if only else ["live", "map", "disk", *(["topic"] if find_spec("rclpy") else [])]
+    kinds = [only] if only else [kind for kind in EPISODES if kind != "topic" or find_spec("rclpy")]
     while not outcomes or monotonic() < end:
         kind = kinds[len(outcomes) % len(kinds)]
         folder = out / f"{len(outcomes):03d}-{kind}"
         folder.mkdir(parents=True)
-        match kind:
-            case "live":
-                outcome = live_episode(scans, folder, rng, every_s=every_s)
-            case "map":
-                outcome = map_episode(scans, folder, rng)
-            case "disk":
-                outcome = disk_episode(scans, folder, rng, every_s=every_s)
-            case _:
-                outcome = topic_episode(scans, folder, rng, every_s=every_s)
+        outcome = EPISODES[kind](scans, folder, rng, every_s)
         print(f"{folder.name}: {outcome}", file=sys.stderr, flush=True)
         outcomes.append(outcome)
     return outcomes

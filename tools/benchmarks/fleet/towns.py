@@ -1,6 +1,7 @@
 """Simulated drives through parts of KITTI's routes: four days in each town, both directions, another lane."""
 
 import json
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +40,12 @@ def drives_in(folder: Path, *, whole: bool = False) -> list[Path]:
     """The drives that were written, one town after the other; with `whole` those that map a town at once."""
     found = sorted(path for path in folder.iterdir() if (path / "sequences").is_dir())
     return [path for path in found if path.name.endswith("_whole") == whole]
+
+
+def fleet_command(listed: Path, out: Path, *options: str) -> list[str]:
+    """`segslam fleet` with the drives of a list, all in the frame of their true poses."""
+    words = ("fleet", str(listed), "--out", str(out), "--same-reference", "-q", *options)
+    return [sys.executable, "-m", "segslam", *words]
 
 
 def _write(folder: Path, road: Drive, driven: Drive, town: str, day: int) -> str:

@@ -53,6 +53,14 @@ def write_report(file: Path, figures: Mapping[str, Any]) -> None:
     file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
+def spread(values: Sequence[float] | np.ndarray) -> dict[str, float]:
+    """Median, 95th percentile and maximum; empty without values."""
+    if not len(values):
+        return {}
+    median, p95, most = np.percentile(values, [50, 95, 100])
+    return {"median": float(median), "p95": float(p95), "max": float(most)}
+
+
 def markdown(title: str, rows: Sequence[Row]) -> str:
     """A table of rows with the same keys."""
     if not rows:

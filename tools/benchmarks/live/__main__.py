@@ -14,43 +14,37 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from itertools import chain, cycle, islice
+from itertools import cycle, islice
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
 
-from segslam.core import geometry
+from segslam.core.evaluation import pose_errors
+from segslam.core.trajectory import rows_of_same_stamp
 from segslam.output.finished import read_run
 from segslam.output.log import read_log
 from segslam.scans import Dataset, open_dataset
 from tools.benchmarks import common
-from tools.benchmarks.live.sender import FolderSender, RosSender, Sender
+from tools.benchmarks.live.sender import FolderSender, RosSender
 
 TOPIC = "/segslam_bench/points"
 SAMPLE_S = 5.0
 OWN_DOMAIN = {"ROS_DOMAIN_ID": "87", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
 
 
-def rows_sent(num_scans: int, num_sent: int | None) -> Iterator[int]:
-    """Each scan once, or forwards and backwards until `num_sent` are sent."""
-    if num_sent is None:
-        return iter(range(num_scans))
-    return islice(cycle(chain(range(num_scans), range(num_scans - 2, 0, -1))), num_sent)
-
-
 def rss_mb(pid: int) -> float:
     """Memory of a process and of all that it has started."""
-    total = 0.0
     status = Path(f"/proc/{pid}/status").read_text()
-    total += next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")), 0) / 1024
+    own = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")), 0) / 1024
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return total + sum(rss_mb(int(child)) for child in children)
+    return own + sum(rss_mb(int(child)) for child in children)
 
 
-def run_live(dataset: Dataset, sender: Sender, words: list[str], every_s: float, seconds: float | None) -> Any:
+def run_live(
+    dataset: Dataset, sender: FolderSender | RosSender, words: list[str], every_s: float, seconds: float | None
+) -> Any:
     """Exit status, figures, (seconds, MB) of the memory, and how many scans were sent."""
     command = [sys.executable, "-m", "segslam", "live", *words, "--json"]
     live = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -61,7 +55,10 @@ def run_live(dataset: Dataset, sender: Sender, words: list[str], every_s: float,
     sender.wait_for_listener()
     num_sent, memory, started = 0, [], monotonic()
     next_s, next_sample = started, started
-    for row in rows_sent(len(dataset), None if seconds is None else int(seconds / every_s)):
+    rows = list(range(len(dataset)))
+    if seconds is not None:  # forwards and backwards
+        rows = list(islice(cycle(rows + rows[-2:0:-1]), int(seconds / every_s)))
+    for row in rows:
         scan = dataset[row]
         sleep(max(0.0, next_s - monotonic()))
         stamp_ns = scan.stamp_ns if seconds is None else int(num_sent * every_s * 1e9)
@@ -82,19 +79,14 @@ def compared(live: Path, offline: Path) -> dict[str, Any]:
     """The two runs: closures that only one has, and the largest distance between poses of the same stamp."""
     closures = [closures_by_stamp(folder) for folder in (live, offline)]
     here, there = (read_run(folder).result.trajectory for folder in (live, offline))
-    of_stamp = {int(stamp): T for stamp, T in zip(there.stamp_ns, there.T_world_lidar, strict=True)}
-    pairs = [
-        (T, of_stamp[int(stamp)])
-        for stamp, T in zip(here.stamp_ns, here.T_world_lidar, strict=True)
-        if int(stamp) in of_stamp
-    ]
-    apart = [geometry.distance(geometry.inverse(one) @ other) for one, other in pairs]
+    rows = rows_of_same_stamp(here.stamp_ns, there.stamp_ns, max_difference_ns=0)
+    apart_m = pose_errors(here.T_world_lidar[rows[:, 0]], there.T_world_lidar[rows[:, 1]]).translation_m
     return {
         "num_closures": [len(found) for found in closures],
         "num_only_live": len(closures[0] - closures[1]),
         "num_only_offline": len(closures[1] - closures[0]),
-        "num_poses_compared": len(apart),
-        "largest_apart_m": max(apart),
+        "num_poses_compared": len(rows),
+        "largest_apart_m": float(apart_m.max()),
     }
 
 
@@ -127,7 +119,7 @@ def main() -> None:
     chosen.out.mkdir(parents=True)
     settings = [word for setting in chosen.set for word in ("--set", setting)]
     dataset = open_dataset(chosen.data, frames=chosen.frames, labels="none", vertical_angle_deg=0.0)
-    sender: Sender
+    sender: FolderSender | RosSender
     if chosen.ros:
         sender, source = RosSender(TOPIC, chosen.ros), ["--topic", TOPIC]
     else:
@@ -142,11 +134,7 @@ def main() -> None:
         "every_s": chosen.every,
         "num_sent": num_sent,
         **{key: metrics[key] for key in metrics if key.startswith(("num_", "latency", "loop_lag", "longest"))},
-        "process_without_odometry_ms": {
-            "median": float(np.median(process_ms)),
-            "p95": float(np.percentile(process_ms, 95)),
-            "max": max(process_ms),
-        },
+        "process_without_odometry_ms": common.spread(process_ms),
         "odometry_ms": metrics["stage_ms"]["odometry"],
         "odometry_ms_by_fifths": by_fifths([1000 * step.stage_seconds["odometry"] for step in steps]),
         "rss_mb_by_fifths": by_fifths([mb for _, mb in memory]),

@@ -4,17 +4,10 @@ from array import array
 from collections import deque
 from pathlib import Path
 from time import sleep
-from typing import Protocol
 
 import numpy as np
 
-
-class Sender(Protocol):
-    """Sends scans."""
-
-    def wait_for_listener(self) -> None: ...
-
-    def send(self, points: np.ndarray, stamp_ns: int) -> None: ...
+from tools.benchmarks.faults.files import write_whole
 
 
 class FolderSender:
@@ -31,12 +24,9 @@ class FolderSender:
         """No receiver to wait for."""
 
     def send(self, points: np.ndarray, stamp_ns: int) -> None:
-        """Write a scan under a hidden name, and rename it when it is whole."""
-        name = f"{stamp_ns:019d}.bin"
-        part = self._folder / f".{name}"
-        np.column_stack([points, np.linalg.norm(points, axis=1)]).astype("<f4").tofile(part)
-        part.rename(self._folder / name)
-        self._files.append(self._folder / name)
+        """Write a scan."""
+        rows = np.column_stack([points, np.linalg.norm(points, axis=1)])
+        self._files.append(write_whole(self._folder, rows, f"{stamp_ns:019d}.bin"))
         if self._keeps is not None and len(self._files) > self._keeps:
             self._files.popleft().unlink()
         with (self._folder / "times.txt").open("a") as stream:

@@ -17,7 +17,7 @@ from typing import Any
 
 from segslam import keep_freed_memory
 from tools.benchmarks import common
-from tools.benchmarks.speed.growth import curves, drives, optimisation
+from tools.benchmarks.speed.growth import curves, optimisation
 from tools.benchmarks.speed.throughput import latency, start, throughput
 
 PACKAGES = ("segslam", "kiss-icp", "numpy", "numba", "gtsam", "small-gicp", "mcap")
@@ -38,7 +38,7 @@ def measures(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
         ),
         "latency": lambda: latency(*scans, labels=options.labels),
         "start": start,
-        "growth": lambda: curves(GRAPH_SIZES) | {"drive": drives(DRIVE_SIZES)},
+        "growth": lambda: curves(GRAPH_SIZES, DRIVE_SIZES),
         "large_graph": lambda: optimisation(*LARGE_GRAPH, false_share=FALSE_SHARE),
     }
 

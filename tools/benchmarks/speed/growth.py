@@ -42,14 +42,14 @@ ROUNDS = 4
 """Rounds of one block before the drive moves to the next."""
 AWAY = 100
 """Keyframes from a block to the next."""
-SIGMA_RAD, SIGMA_M = 0.002, 0.02
+SIGMAS = geometry.tangent(rotation_rad=0.002, translation_m=0.02)
 
 
-def graph(num_poses: int, num_closures: int, *, false_share: float, seed: int = 0) -> G2oGraph:
+def graph(num_poses: int, num_closures: int, *, false_share: float) -> G2oGraph:
     """Rounds of one circle, each a little higher, with drifting odometry; some closures are false."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     true = _rounds(num_poses)
-    information = np.diag(geometry.tangent(rotation_rad=SIGMA_RAD, translation_m=SIGMA_M) ** -2.0)
+    information = np.diag(SIGMAS**-2.0)
     edges = [_edge(rng, true, i, i + 1, information) for i in range(num_poses - 1)]
     poses = {0: true[0]}
     for edge in edges:
@@ -83,10 +83,11 @@ class Drive(Slam):
 
     def __init__(self, T_world_true: np.ndarray) -> None:
         config = Config()
-        super().__init__(config, odometry=GivenOdometry(_no_scans(), config.odometry))
+        no_scans = Trajectory(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4, 4)))
+        super().__init__(config, odometry=GivenOdometry(no_scans, config.odometry))
         self._true = T_world_true
         self._rng = np.random.default_rng(0)
-        self._information = np.diag(geometry.tangent(rotation_rad=SIGMA_RAD, translation_m=SIGMA_M) ** -2.0)
+        self._information = np.diag(SIGMAS**-2.0)
 
     def _attempt(self, candidate: LoopCandidate, watch: Stopwatch) -> LoopAttempt:
         edge = _edge(self._rng, self._true, candidate.target_id, candidate.source_id, self._information)
@@ -129,25 +130,20 @@ def drive(num_keyframes: int) -> dict[str, float]:
     }
 
 
-def drives(sizes: tuple[int, ...]) -> dict[str, Any]:
-    """`drive` by number of keyframes, and the exponent of its time."""
-    rows = [drive(size) for size in sizes]
-    return {"size": list(sizes), "exponent": exponent(sizes, [row["seconds"] for row in rows])} | {
-        name: [row[name] for row in rows] for name in rows[0]
-    }
-
-
-def curves(sizes: tuple[int, ...]) -> dict[str, Any]:
+def curves(sizes: tuple[int, ...], drive_sizes: tuple[int, ...]) -> dict[str, Any]:
     """Seconds by size, and the exponent of the power law through the larger half of them."""
-    measured = {
-        "optimise_graph": [optimisation(n, n // 5, false_share=0.2)["seconds"] for n in sizes],
-        "propose_loops": [_propose_seconds(n) for n in sizes],
-        "draw_path": [_draw_seconds(n) for n in sizes],
+    measured: dict[str, tuple[tuple[int, ...], Callable[[int], dict[str, Any]]]] = {
+        "optimise_graph": (sizes, lambda n: {"seconds": optimisation(n, n // 5, false_share=0.2)["seconds"]}),
+        "propose_loops": (sizes, lambda n: {"seconds": _propose_seconds(n)}),
+        "draw_path": (sizes, lambda n: {"seconds": _draw_seconds(n)}),
+        "drive": (drive_sizes, drive),
     }
-    return {
-        name: {"size": list(sizes), "seconds": seconds, "exponent": exponent(sizes, seconds)}
-        for name, seconds in measured.items()
-    }
+    found = {}
+    for name, (numbers, measure) in measured.items():
+        rows = [measure(number) for number in numbers]
+        found[name] = {"size": list(numbers), "exponent": exponent(numbers, [row["seconds"] for row in rows])}
+        found[name] |= {key: [row[key] for row in rows] for key in rows[0]}
+    return found
 
 
 def exponent(sizes: tuple[int, ...], seconds: list[float]) -> float:
@@ -160,7 +156,7 @@ def _propose_seconds(num_keyframes: int) -> float:
     detector, poses = ProximityDetector(Config().proximity), _rounds(num_keyframes)
     pairs = [(source, source - LAP) for source in range(LAP, num_keyframes, 5)]
     for pair in pairs:
-        detector.note_closure(_closure(*pair))
+        detector.note_closure(LoopClosure(*pair, np.eye(4), np.eye(6), alignment=None))  # type: ignore[arg-type]
     detector.note_estimate({})
     travel_m = STEP_M * np.arange(num_keyframes)
     motions = [
@@ -197,10 +193,6 @@ def _town(num_poses: int) -> np.ndarray:
     return np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
 
 
-def _no_scans() -> Trajectory:
-    return Trajectory(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4, 4)))
-
-
 def _rounds(num_poses: int) -> np.ndarray:
     turn = 2.0 * np.pi / LAP
     radius_m = STEP_M / turn
@@ -217,11 +209,7 @@ def _rounds(num_poses: int) -> np.ndarray:
 def _edge(
     rng: np.random.Generator, true: np.ndarray, a: int, b: int, information: np.ndarray, *, lie: bool = False
 ) -> Edge:
-    noise = rng.normal(size=6) * geometry.tangent(rotation_rad=SIGMA_RAD, translation_m=SIGMA_M)
+    noise = rng.normal(size=6) * SIGMAS
     if lie:
         noise = rng.normal(size=6) * geometry.tangent(rotation_rad=0.3, translation_m=5.0)
     return Edge(a, b, geometry.inverse(true[a]) @ true[b] @ geometry.exp(noise), information)
-
-
-def _closure(source_id: int, target_id: int) -> LoopClosure:
-    return LoopClosure(source_id, target_id, np.eye(4), np.eye(6), alignment=None)  # type: ignore[arg-type]

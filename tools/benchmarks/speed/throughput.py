@@ -22,9 +22,11 @@ from segslam import open_dataset
 from segslam.core.config import Config
 from segslam.output.log import schema
 from segslam.slam.slam import Slam
+from tools.benchmarks.common import spread
 
 RIVALS = Path(__file__).with_name("rivals.py")
 REPEATS = 7
+FIGURES = ("scans_per_second", "num_keyframes", "num_candidates", "num_loops_accepted", "peak_rss_mb", "stage_ms")
 
 
 def throughput(
@@ -58,15 +60,7 @@ def _mapped(data: Path, sequence: str, frames: tuple[int, int], labels: str) -> 
         before = _cpu_seconds()
         metrics = json.loads(_output([*command, *options]))
         cpu_ms = 1e3 * (_cpu_seconds() - before) / metrics["num_scans"]
-        chosen = (
-            "scans_per_second",
-            "num_keyframes",
-            "num_candidates",
-            "num_loops_accepted",
-            "peak_rss_mb",
-            "stage_ms",
-        )
-        return {name: metrics[name] for name in chosen} | {"cpu_ms_per_scan": cpu_ms} | memory(out / "log.mcap")
+        return {name: metrics[name] for name in FIGURES} | {"cpu_ms_per_scan": cpu_ms} | memory(out / "log.mcap")
 
 
 def memory(log: Path) -> dict[str, float]:
@@ -125,17 +119,10 @@ def latency(data: Path, sequence: str, frames: tuple[int, int], *, labels: str) 
     total = np.array([1e3 * sum(step.stage_seconds.values()) for step in steps])
     tried = np.array([bool(step.attempts) for step in steps])
     return {
-        "process_ms": _summary(total),
-        "odometry_ms": _summary(odometry),
-        "all_else_ms": _summary(total - odometry),
-        "with_loops_ms": _summary(total[tried]),
+        "process_ms": spread(total),
+        "odometry_ms": spread(odometry),
+        "all_else_ms": spread(total - odometry),
+        "with_loops_ms": spread(total[tried]),
         "share_with_loops": float(tried.mean()),
         "labels": labels,
     }
-
-
-def _summary(milliseconds: np.ndarray) -> dict[str, float]:
-    if not len(milliseconds):
-        return {}
-    median, p95 = np.percentile(milliseconds, [50, 95])
-    return {"median": float(median), "p95": float(p95), "max": float(milliseconds.max())}

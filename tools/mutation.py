@@ -85,8 +85,8 @@ class Outcome:
 def faults_of(source: str, file: str = "") -> list[Fault]:
     """All faults of the code within functions, in the order of their lines."""
     finder = _Finder(source, file)
-    finder.visit(ast.parse(source))
-    return sorted(set(finder.found), key=lambda fault: (fault.line, fault.column, fault.new))
+    found = {fault for node in _code(ast.parse(source)) for fault in finder.faults(node)}
+    return sorted(found, key=lambda fault: (fault.line, fault.column, fault.new))
 
 
 def chosen(faults: Sequence[Fault], *, num_lines: int, seed: int) -> list[Fault]:
@@ -137,15 +137,9 @@ class Copy:
             finally:
                 file.write_text(source, encoding="utf-8")
                 os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
-        row = fault.line - 1
-        return Outcome(
-            fault,
-            source.splitlines()[row].strip(),
-            broken.splitlines()[row].strip(),
-            status != 0,
-            "time limit" if status is None else _first_failure(text) if status else "",
-            round(time.monotonic() - start, 1),
-        )
+        before, after = (text.splitlines()[fault.line - 1].strip() for text in (source, broken))
+        by = "time limit" if status is None else _first_failure(text) if status else ""
+        return Outcome(fault, before, after, status != 0, by, round(time.monotonic() - start, 1))
 
     def _run(self, words: Sequence[str], environment: dict[str, str], limit_s: float) -> tuple[int | None, str]:
         """Exit status, None at the time limit, and what was printed."""
@@ -175,35 +169,31 @@ def _first_failure(text: str) -> str:
     return (named or lines or ["no output"])[-1].split(" - ")[0][:150]
 
 
-class _Finder(ast.NodeVisitor):
-    """Collects the faults of a source."""
+def _code(node: ast.AST, *, runs: bool = False) -> Iterator[ast.AST]:
+    """The nodes of the bodies of functions, without types and what has no effect while running."""
+    children = ast.iter_child_nodes(node)
+    if isinstance(node, UNTOUCHED):
+        return
+    if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        children, runs = iter(node.body), True
+    elif isinstance(node, ast.AnnAssign):
+        children = iter([node.value] if node.value else [])
+    elif runs:
+        yield node
+    for child in children:
+        yield from _code(child, runs=runs)
+
+
+class _Finder:
+    """Finds the faults of the nodes of a source."""
 
     def __init__(self, source: str, file: str) -> None:
-        self.found: list[Fault] = []
         self._file = file
         self._lines = source.splitlines()
-        self._depth = 0
         tokens = tokenize.generate_tokens(io.StringIO(source).readline)
         self._tokens = [token for token in tokens if token.type in (tokenize.OP, tokenize.NAME)]
 
-    def visit(self, node: ast.AST) -> None:
-        if isinstance(node, UNTOUCHED):
-            return
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            self._depth += 1
-            for statement in node.body:
-                self.visit(statement)
-            self._depth -= 1
-            return
-        if isinstance(node, ast.AnnAssign):
-            if node.value is not None:
-                self.visit(node.value)
-            return
-        if self._depth:
-            self.found += self._faults(node)
-        self.generic_visit(node)
-
-    def _faults(self, node: ast.AST) -> Iterator[Fault]:
+    def faults(self, node: ast.AST) -> Iterator[Fault]:
         match node:
             case ast.BinOp():
                 yield from self._swapped(node.left, node.op, node.right)
@@ -223,12 +213,9 @@ class _Finder(ast.NodeVisitor):
                 old = self._lines[node.lineno - 1][column : self._column(node.lineno, node.end_col_offset or 0)]
                 half = value // 2 if isinstance(value, int) else value / 2
                 yield self._fault(node.lineno, column, old, repr(half))
-            case ast.Call(func=ast.Name(id=name) as function) if name in SWAPPED_NAMES:
-                column = self._column(function.lineno, function.col_offset)
-                yield self._fault(function.lineno, column, name, SWAPPED_NAMES[name])
-            case ast.Call(func=ast.Attribute(attr=name, end_lineno=int(line), end_col_offset=int(end))):
-                if name in SWAPPED_NAMES:
-                    yield self._fault(line, self._column(line, end) - len(name), name, SWAPPED_NAMES[name])
+            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name) as function) if name in SWAPPED_NAMES:
+                line, end = function.end_lineno or 0, function.end_col_offset or 0
+                yield self._fault(line, self._column(line, end) - len(name), name, SWAPPED_NAMES[name])
             case _:
                 pass
 

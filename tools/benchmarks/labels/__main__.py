@@ -14,48 +14,42 @@ from segslam.bench.experiments.methods import find_method
 from segslam.core.config import load_config
 from segslam.scans import open_dataset
 from tools.benchmarks import common
-from tools.benchmarks.labels.courtyard import courtyard
-from tools.benchmarks.labels.kitti import class_agreement, pairs_by_labels, speed
+from tools.benchmarks.labels.measures import class_agreement, courtyard, pairs_by_labels, speed
 
 
 def tables(results: dict[str, Any]) -> str:
     """The figures as Markdown."""
     iou = results["class_iou"]
-    names = list(iou["all"])
-    lines = [f"| intersection over union | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
-    lines += [f"| {scans} | {' | '.join(f'{iou[scans][name]:.2f}' for name in names)} |" for scans in sorted(iou)]
-    lines += [
-        "",
-        f"| real pairs, {results['num_yaws']} yaws | success | false | coarse mean (worst) | refined mean (worst) |",
-        "|---|---|---|---|---|",
+    classes = [{"scans": scans} | {name: f"{iou[scans][name]:.2f}" for name in iou["all"]} for scans in sorted(iou)]
+    kitti = [{"pairs": name} | _success(found) | _errors(found) for name, found in results["kitti"].items()]
+    courtyard = [
+        {"apart": band, "method": name}
+        | _success(found)
+        | {"CPU ms, median": f"{found['median_cpu_ms']:.0f}", "wall ms": f"{found['median_ms']:.0f}"}
+        for band, methods in results["courtyard"].items()
+        for name, found in methods.items()
     ]
-    lines += [_pairs_line(name, found) for name, found in results["kitti"].items()]
-    lines += [
-        "",
-        "| courtyard | method | success | false | CPU ms, median | wall ms |",
-        "|---|---|---|---|---|---|",
-    ]
-    for band, methods in results["courtyard"].items():
-        lines += [
-            f"| {band} | {name} | {found['success_percent']:.1f} % of {found['num_pairs']} "
-            f"| {found['num_false_accepted']} | {found['median_cpu_ms']:.0f} | {found['median_ms']:.0f} |"
-            for name, found in methods.items()
-        ]
+    parts = {
+        "Intersection over union": classes,
+        f"Real pairs, {results['num_yaws']} yaws": kitti,
+        "Courtyard": courtyard,
+    }
     took = results["speed"]
-    lines += [
-        "",
-        f"Labels for {took['num_points']:,} points: {took['thread_ms_median']} ms (p95 {took['thread_ms_p95']})",
-    ]
-    return "\n".join(lines) + "\n"
+    speed = f"Labels for {took['num_points']:,} points: {took['thread_ms_median']} ms (p95 {took['thread_ms_p95']})\n"
+    return "\n".join([*(common.markdown(title, rows) for title, rows in parts.items()), speed])
 
 
-def _pairs_line(name: str, found: dict[str, Any]) -> str:
-    errors = []
+def _success(found: dict[str, Any]) -> common.Row:
+    success = f"{found['success_percent']:.1f} % of {found['num_pairs']}"
+    return {"success": success, "false": found["num_false_accepted"]}
+
+
+def _errors(found: dict[str, Any]) -> common.Row:
+    row: common.Row = {}
     for kind in ("coarse", "refined"):
         (mean_m, worst_m), (mean_deg, worst_deg) = found[f"{kind}_m"], found[f"{kind}_deg"]
-        errors.append(f"{mean_m:.3f} m {mean_deg:.2f} deg ({worst_m:.3f} m {worst_deg:.2f} deg)")
-    success = f"{found['success_percent']:.1f} % of {found['num_pairs']}"
-    return f"| {name} | {success} | {found['num_false_accepted']} | {' | '.join(errors)} |"
+        row[f"{kind} mean (worst)"] = f"{mean_m:.3f} m {mean_deg:.2f} deg ({worst_m:.3f} m {worst_deg:.2f} deg)"
+    return row
 
 
 def main() -> None:
@@ -82,14 +76,7 @@ def main() -> None:
         "config": config.model_dump(mode="json"),
         "class_iou": class_agreement(options.data),
         "speed": speed(first.points),
-        "courtyard": courtyard(
-            options.data,
-            config,
-            methods=methods,
-            num_pairs=options.pairs,
-            seed=options.seed,
-            pictures=options.pictures,
-        ),
+        "courtyard": courtyard(options, config, methods=methods),
         "kitti": pairs_by_labels(options.data, config, options.yaws),
     }
     common.write_report(options.out, results)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.evaluation import pose_errors
+from segslam.core.memory import status_mb
 from segslam.core.trajectory import rows_of_same_stamp
 from segslam.output.finished import read_run
 from segslam.output.log import read_log
@@ -36,10 +37,8 @@ OWN_DOMAIN = {"ROS_DOMAIN_ID": "87", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST
 
 def rss_mb(pid: int) -> float:
     """Memory of a process and of all that it has started."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    own = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")), 0) / 1024
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return own + sum(rss_mb(int(child)) for child in children)
+    return (status_mb("VmRSS", pid) or 0.0) + sum(rss_mb(int(child)) for child in children)
 
 
 def run_live(

@@ -22,6 +22,8 @@ from segslam.core.config import Config
 from segslam.core.trajectory import camera_from_lidar, write_kitti
 from tools.benchmarks import (
     label_maps,
+    labels,
+    live,
     locate,
     odometry,
     peers,
@@ -35,8 +37,6 @@ from tools.benchmarks import (
 from tools.benchmarks import map as map_benchmark
 from tools.benchmarks.back_end import __main__ as back_end
 from tools.benchmarks.faults import __main__ as faults
-from tools.benchmarks.labels import __main__ as labels
-from tools.benchmarks.live import __main__ as live
 from tools.benchmarks.registration import __main__ as registration
 from tools.benchmarks.speed import __main__ as speed
 from tools.benchmarks.speed import growth

@@ -134,8 +134,7 @@ def topic_episode(scans: list[np.ndarray], out: Path, rng: random.Random, every_
     """A topic that stops for some seconds; needs ROS 2."""
     import rclpy
 
-    from tools.benchmarks.live.__main__ import TOPIC
-    from tools.benchmarks.live.sender import RosSender
+    from tools.benchmarks.live import TOPIC, RosSender
 
     found, run = Outcome(), out / "run"
     command = Command("live", "--topic", TOPIC, "--out", run, "--idle", IDLE_S, "--json")

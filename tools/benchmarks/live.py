@@ -63,7 +63,7 @@ class FolderSender:
 class RosSender:
     """Publishes PointCloud2 messages of 16 bytes a point, stamped when they are sent."""
 
-    def __init__(self, topic: str, reliability: str) -> None:
+    def __init__(self, reliability: str) -> None:
         import rclpy
         from rclpy.qos import QoSProfile, ReliabilityPolicy
         from sensor_msgs.msg import PointCloud2, PointField
@@ -71,7 +71,7 @@ class RosSender:
         rclpy.init()
         self._node = rclpy.create_node("bench")
         profile = QoSProfile(depth=5, reliability=ReliabilityPolicy[reliability.upper()])
-        self._publisher = self._node.create_publisher(PointCloud2, topic, profile)
+        self._publisher = self._node.create_publisher(PointCloud2, TOPIC, profile)
         self._message = PointCloud2(height=1, point_step=16)
         self._message.header.frame_id = "lidar"
         self._message.fields = [
@@ -179,7 +179,7 @@ def main() -> None:
     dataset = open_dataset(chosen.data, frames=chosen.frames, labels="none", vertical_angle_deg=0.0)
     sender: FolderSender | RosSender
     if chosen.ros:
-        sender, source = RosSender(TOPIC, chosen.ros), ["--topic", TOPIC]
+        sender, source = RosSender(chosen.ros), ["--topic", TOPIC]
     else:
         scans = chosen.out / "scans"
         sender, source = FolderSender(scans, keeps=100 if chosen.seconds else None), [str(scans)]

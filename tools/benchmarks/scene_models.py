@@ -46,12 +46,12 @@ def _scene(parts: Sequence[Mesh], path: np.ndarray, max_shift_m: float) -> Scene
     return Scene(whole, path, max_shift_m, scene_of(whole))
 
 
-def corridor(seed: int, *, regular: bool = False, length_m: float = 60.0) -> Scene:
+def corridor(seed: int, *, regular: bool = False) -> Scene:
     """A corridor 2.4 m wide and 2.6 m high with recessed doors.
 
     The doors are 3 m apart if `regular`. Otherwise their distances are irregular, and cupboards stand along the walls.
     """
-    rng = np.random.default_rng(seed)
+    rng, length_m = np.random.default_rng(seed), 60.0
     parts = [_slab(0.0, length_m, -1.2, 1.2, 0.0, Label.OTHER_GROUND), _slab(0.0, length_m, -1.2, 1.2, 2.6)]
     parts += [_wall([(x, -1.6), (x, 1.6)], 2.6) for x in (0.0, length_m)]
     for side in (-1.0, 1.0):
@@ -75,12 +75,12 @@ def corridor(seed: int, *, regular: bool = False, length_m: float = 60.0) -> Sce
     return _scene(parts, _path(along, 0.1 * np.sin(along), 1.0, 0.0), 6.0)
 
 
-def garage(seed: int, *, levels: int = 3) -> Scene:
-    """Levels 3 m apart with the same pillars and walls, but different cars. The path runs through all levels."""
+def garage(seed: int) -> Scene:
+    """Three levels 3 m apart with the same pillars and walls, but different cars. The path runs through all levels."""
     rng = np.random.default_rng(seed)
     length, width = 64.0, 34.0
     parts, paths = [_slab(0.0, length, 0.0, width, 0.0, Label.OTHER_GROUND)], []
-    for level in range(levels):
+    for level in range(3):
         floor = 3.0 * level
         parts.append(_slab(0.0, length, 0.0, width, floor + 2.85))
         rim = [(0.0, 0.0), (length, 0.0), (length, width), (0.0, width), (0.0, 0.0)]
@@ -100,9 +100,9 @@ def garage(seed: int, *, levels: int = 3) -> Scene:
     return _scene(parts, np.concatenate(paths), 10.0)
 
 
-def tunnel(seed: int, *, length_m: float = 240.0) -> Scene:
+def tunnel(seed: int) -> Scene:
     """A tunnel 10 m wide and 6 m high with niches, signs, lamps and cabinets at irregular distances."""
-    rng = np.random.default_rng(seed)
+    rng, length_m = np.random.default_rng(seed), 240.0
     parts = [_slab(0.0, length_m, -5.0, 5.0, 0.0, Label.ROAD), _slab(0.0, length_m, -5.0, 5.0, 6.0)]
     for side in (-1.0, 1.0):
         line = [(0.0, side * 5.0)]

@@ -99,27 +99,20 @@ def tasks(name: str, sensor: str, noise_m: float, *, count: int, seed: int, conf
         scans = place.prepared(source, first), here.prepared(target, second)
         return Task(name, sensor, *scans, T_true if place is here else None, is_true, gate)
 
-    for source, target in _true_pairs(here.scene, count, rng):
+    for source, target in common.draw_pairs(_pairs(here.scene, are_true=True), count, rng):
         yield task(here, source, target, is_true=True)
-    for number, (source, target) in enumerate(_false_pairs(here.scene, count, rng)):
+    for number, (source, target) in enumerate(common.draw_pairs(_pairs(here.scene, are_true=False), count, rng)):
         place = here if number % 2 else elsewhere
         yield task(place, source % len(place.scene.path), target, is_true=False)
 
 
-def _true_pairs(scene: Scene, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Rows of the path within reach of each other and on one level."""
-    apart = np.linalg.norm(scene.path[:, None, :3] - scene.path[:, :3], axis=-1)
-    return common.draw_pairs((apart < scene.max_shift_m) & (_heights(scene) < 0.5), count, rng)
-
-
-def _false_pairs(scene: Scene, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Rows of the path at other levels, or as far apart as the scene allows."""
-    apart = np.linalg.norm(scene.path[:, None, :2] - scene.path[:, :2], axis=-1)
-    return common.draw_pairs((apart > 2.5 * scene.max_shift_m) | (_heights(scene) > 1.0), count, rng)
-
-
-def _heights(scene: Scene) -> np.ndarray:
-    return np.abs(scene.path[:, None, 2] - scene.path[:, 2])
+def _pairs(scene: Scene, *, are_true: bool) -> np.ndarray:
+    """Which rows of the path are within reach of each other on one level; or at other levels, or far apart."""
+    steps = scene.path[:, None, :3] - scene.path[:, :3]
+    climb = np.abs(steps[..., 2])
+    if are_true:
+        return (np.linalg.norm(steps, axis=-1) < scene.max_shift_m) & (climb < 0.5)
+    return (np.linalg.norm(steps[..., :2], axis=-1) > 2.5 * scene.max_shift_m) | (climb > 1.0)
 
 
 def _gate(T_prior: Transform, config: Config) -> Gate:

@@ -139,30 +139,23 @@ def row_of(run: Path) -> dict[str, Any]:
     return row
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows for a reader, ATE in metres of keyframes."""
-    lines = [
-        "| run | odometry | ATE | height | KITTI % | closures, false, off | recall | exact, same places | ratio "
-        "| exact, all within 6 m | chi2 of chains 1, 10, 100; closures |",
-        "|" + "---|" * 11,
-    ]
-    for row in rows:
-        found, loops, noise = row["found"], row["loops"], row["noise"]
-        cells = [
-            row["run"],
-            _number(row["odometry"]["ate_m"]),
-            _number(found["ate_m"]),
-            _number(found.get("height_m")),
-            _number(found.get("kitti_translation_percent")),
-            f"{loops['closures']}, {loops['num_loops_false']}, {found['switched_off']}",
-            _number(loops.get("loop_recall")),
-            _number(row["exact"]["ate_m"]),
-            _number(row["ate_by_exact"]),
-            f"{_number(row['exact_everywhere']['ate_m'])} ({row['exact_everywhere']['closures']})",
-            f"{', '.join(_number(noise[f'chain_{k}']) for k in (1, 10, 100))}; {_number(noise['closures'])}",
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def cells(row: dict[str, Any]) -> common.Row:
+    """A row for a reader, ATE in metres of keyframes."""
+    found, loops, noise = row["found"], row["loops"], row["noise"]
+    return {
+        "run": row["run"],
+        "odometry": _number(row["odometry"]["ate_m"]),
+        "ATE": _number(found["ate_m"]),
+        "height": _number(found.get("height_m")),
+        "KITTI %": _number(found.get("kitti_translation_percent")),
+        "closures, false, off": f"{loops['closures']}, {loops['num_loops_false']}, {found['switched_off']}",
+        "recall": _number(loops.get("loop_recall")),
+        "exact, same places": _number(row["exact"]["ate_m"]),
+        "ratio": _number(row["ate_by_exact"]),
+        "exact, all within 6 m": f"{_number(row['exact_everywhere']['ate_m'])} ({row['exact_everywhere']['closures']})",
+        "chi2 of chains": ", ".join(f"{k}: {_number(noise[f'chain_{k}'])}" for k in LENGTHS),
+        "chi2 of closures": _number(noise["closures"]),
+    }
 
 
 def _number(value: float | None) -> str:
@@ -176,7 +169,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = [row_of(run) for run in options.runs]
     common.write_report(options.out, {"config": CONFIG.model_dump(mode="json"), "rows": rows})
-    print(table(rows))
+    print(common.markdown("Back end", list(map(cells, rows))))
 
 
 if __name__ == "__main__":

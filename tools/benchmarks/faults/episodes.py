@@ -138,7 +138,7 @@ def topic_episode(scans: list[np.ndarray], out: Path, rng: random.Random, every_
 
     found, run = Outcome(), out / "run"
     command = Command("live", "--topic", TOPIC, "--out", run, "--idle", IDLE_S, "--json")
-    sender = RosSender(TOPIC, "reliable")
+    sender = RosSender("reliable")
     if not _starts(found, command):
         return found
     sender.wait_for_listener()

@@ -18,9 +18,9 @@ FIRST = 100
 SEED = 3501
 
 
-def write_towns(out: Path, poses: Path, *, num_frames: int = NUM_FRAMES, towns: Sequence[str] = TOWNS) -> Iterator[str]:
+def write_towns(out: Path, poses: Path, *, num_frames: int) -> Iterator[str]:
     """Write the drives of all towns, and the whole of each in one drive; yields the names of folders."""
-    for town in towns:
+    for town in TOWNS:
         road = read_drive(poses / f"{town}.txt", sequence=town)
         road = _part(road, slice(FIRST, FIRST + num_frames))
         scale = num_frames / NUM_FRAMES

@@ -10,7 +10,7 @@ from segslam.core.config import Config
 from segslam.core.types import Alignment
 from segslam.registration.prepared import PreparedScan
 from segslam.verification import register_prepared
-from tools.benchmarks.common import RIGHT, Row
+from tools.benchmarks.common import RIGHT, Row, draw_pairs
 from tools.benchmarks.registration.attempts import Attempt, attempt, percent, preparer
 from tools.benchmarks.registration.scans import BANDS_M, Labelled, SimulatedPlace, by_shape
 
@@ -34,14 +34,14 @@ def simulated(
         for labels in ("given", "shape"):
             name = {"place": place.name, "labels": labels}
             prepared = preparer(scan_of(place, labels), config)
-            by_band = {band_m: place.pairs(band_m, sample) for band_m in BANDS_M}
-            trials = {
-                band_m: [attempt(pair, prepared, config=config) for pair in pairs] for band_m, pairs in by_band.items()
-            }
+            seen: set[int] = set()
+            trials: dict[tuple[int, int], list[Attempt]] = {}
+            for band_m in BANDS_M:
+                pairs = place.pairs(band_m, sample)
+                trials[band_m] = [attempt(pair, prepared, config=config) for pair in pairs]
+                seen |= {scan.index for pair in pairs for scan in (pair.source, pair.target)}
             whole = [trial for some in trials.values() for trial in some]
-            scans = (scan for pairs in by_band.values() for pair in pairs for scan in (pair.source, pair.target))
-            seen = sorted({scan.index for scan in scans})
-            negatives = _negatives(place, seen, num_negatives, prepared, config, rng)
+            negatives = _negatives(place, sorted(seen), num_negatives, prepared, config, rng)
             successes += [name | _success(band_m, some) for band_m, some in trials.items()]
             gates.append(name | _gates(whole, negatives))
             informations.append(name | _information(whole))
@@ -62,11 +62,11 @@ def _negatives(
     rng: np.random.Generator,
 ) -> Counter[str]:
     """Outcomes of random pairs without overlap: reasons, and number of acceptances."""
-    apart = [(a, b) for a in indices for b in indices if a != b and place.distance_m(a, b) > NEGATIVE_M]
+    at = place.T_world_lidar[indices, :2, 3]
+    far = np.linalg.norm(at[:, None] - at, axis=-1) > NEGATIVE_M
     outcomes: Counter[str] = Counter()
-    for row in rng.choice(len(apart), min(count, len(apart)), replace=False):
-        source, target = apart[row]
-        outcome = register_prepared(prepared(source), prepared(target), config=config)
+    for source, target in draw_pairs(far, count, rng):
+        outcome = register_prepared(prepared(indices[source]), prepared(indices[target]), config=config)
         outcomes["accepted" if isinstance(outcome, Alignment) else outcome.reason.value] += 1
     return outcomes
 

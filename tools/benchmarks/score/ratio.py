@@ -132,7 +132,7 @@ def learnt(pairs: Sequence[Pair]) -> Table:
     the same.
     """
     blank = Table(log_ratios(pairs), Weights._make([0.0] * len(Weights._fields)))
-    found = [best for best, _ in bests(pairs, blank)]
+    found = [best for pair in pairs if (best := best_of(pair, blank)) is not None]
     is_right = np.array([best.pose.is_right for best in found])
     values = np.array([ingredients(best) for best in found])
     mean, scale = values.mean(axis=0), values.std(axis=0) + 1e-9

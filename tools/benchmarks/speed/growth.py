@@ -3,6 +3,7 @@
 import resource
 import tempfile
 import time
+import timeit
 from collections.abc import Callable
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -43,21 +44,21 @@ ROUNDS = 4
 AWAY = 100
 """Keyframes from a block to the next."""
 SIGMAS = geometry.tangent(rotation_rad=0.002, translation_m=0.02)
+INFORMATION = np.diag(SIGMAS**-2.0)
 
 
 def graph(num_poses: int, num_closures: int, *, false_share: float) -> G2oGraph:
     """Rounds of one circle, each a little higher, with drifting odometry; some closures are false."""
     rng = np.random.default_rng(0)
     true = _rounds(num_poses)
-    information = np.diag(SIGMAS**-2.0)
-    edges = [_edge(rng, true, i, i + 1, information) for i in range(num_poses - 1)]
+    edges = [_edge(rng, true, i, i + 1) for i in range(num_poses - 1)]
     poses = {0: true[0]}
     for edge in edges:
         poses[edge.b] = poses[edge.a] @ edge.T_a_b
     sources = np.sort(rng.choice(np.arange(LAP, num_poses), num_closures, replace=num_closures > num_poses - LAP))
     lies = rng.random(num_closures) < false_share
     for source, lie in zip(sources.tolist(), lies.tolist(), strict=True):
-        edges.append(_edge(rng, true, source - LAP, source, information, lie=lie))
+        edges.append(_edge(rng, true, source - LAP, source, lie=lie))
     return G2oGraph(poses, edges)
 
 
@@ -87,14 +88,13 @@ class Drive(Slam):
         super().__init__(config, odometry=GivenOdometry(no_scans, config.odometry))
         self._true = T_world_true
         self._rng = np.random.default_rng(0)
-        self._information = np.diag(SIGMAS**-2.0)
 
     def _attempt(self, candidate: LoopCandidate, watch: Stopwatch) -> LoopAttempt:
-        edge = _edge(self._rng, self._true, candidate.target_id, candidate.source_id, self._information)
-        found = Registration(edge.T_a_b, 30, 30, 0.05, self._information)
+        edge = _edge(self._rng, self._true, candidate.target_id, candidate.source_id)
+        found = Registration(edge.T_a_b, 30, 30, 0.05, INFORMATION)
         alignment = Alignment(found, found, 0.8, 0.05, 0.0)
         ids = candidate.source_id, candidate.target_id
-        return LoopAttempt(candidate, LoopClosure(*ids, edge.T_a_b, self._information, alignment), {})
+        return LoopAttempt(candidate, LoopClosure(*ids, edge.T_a_b, INFORMATION, alignment), {})
 
 
 def drive(num_keyframes: int) -> dict[str, float]:
@@ -165,7 +165,9 @@ def _propose_seconds(num_keyframes: int) -> float:
     ]
     closures = [Edge(a, b, np.eye(4), closure_information(np.eye(6))) for b, a in pairs]
     chains = Chains(poses, motions, closures)
-    return _timed(lambda: detector.candidates(num_keyframes - 1, poses, travel_m, chains.covariances))
+    return min(
+        timeit.repeat(lambda: detector.candidates(num_keyframes - 1, poses, travel_m, chains.covariances), number=1)
+    )
 
 
 def _draw_seconds(num_keyframes: int) -> float:
@@ -173,16 +175,7 @@ def _draw_seconds(num_keyframes: int) -> float:
     poses = dict(enumerate(_rounds(num_keyframes)))
     drawing._T_odom_keyframe = poses
     estimate = GraphEstimate(poses, 0.0, {})
-    return _timed(lambda: list(drawing.draw_estimate(estimate, stamp_ns=0)))
-
-
-def _timed(work: Callable[[], object]) -> float:
-    times = []
-    for _ in range(5):
-        started = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - started)
-    return min(times)
+    return min(timeit.repeat(lambda: list(drawing.draw_estimate(estimate, stamp_ns=0)), number=1))
 
 
 def _town(num_poses: int) -> np.ndarray:
@@ -194,22 +187,18 @@ def _town(num_poses: int) -> np.ndarray:
 
 
 def _rounds(num_poses: int) -> np.ndarray:
+    """Rounds of one circle, each a little higher."""
     turn = 2.0 * np.pi / LAP
     radius_m = STEP_M / turn
-    return np.stack(
-        [
-            geometry.transform(
-                geometry.yaw(turn * i), [radius_m * np.sin(turn * i), -radius_m * np.cos(turn * i), 1e-4 * i]
-            )
-            for i in range(num_poses)
-        ]
-    )
+    poses = np.tile(np.eye(4), (num_poses, 1, 1))
+    for i, pose in enumerate(poses):
+        pose[:3, :3] = geometry.yaw(turn * i)
+        pose[:3, 3] = radius_m * np.sin(turn * i), -radius_m * np.cos(turn * i), 1e-4 * i
+    return poses
 
 
-def _edge(
-    rng: np.random.Generator, true: np.ndarray, a: int, b: int, information: np.ndarray, *, lie: bool = False
-) -> Edge:
+def _edge(rng: np.random.Generator, true: np.ndarray, a: int, b: int, *, lie: bool = False) -> Edge:
     noise = rng.normal(size=6) * SIGMAS
     if lie:
         noise = rng.normal(size=6) * geometry.tangent(rotation_rad=0.3, translation_m=5.0)
-    return Edge(a, b, geometry.inverse(true[a]) @ true[b] @ geometry.exp(noise), information)
+    return Edge(a, b, geometry.inverse(true[a]) @ true[b] @ geometry.exp(noise), INFORMATION)

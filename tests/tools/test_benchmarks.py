@@ -21,6 +21,7 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.trajectory import camera_from_lidar, write_kitti
 from tools.benchmarks import (
+    common,
     label_maps,
     labels,
     live,
@@ -93,6 +94,21 @@ def one_pair(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     return json.loads(capsys.readouterr().out)
+
+
+def test_a_report_is_written_with_figures_that_are_no_numbers(tmp_path: Path) -> None:
+    """A rejected pose has an infinite error, and a mean over nothing is not a number."""
+    common.write_report(tmp_path / "figures.json", {"rows": [{"worst_m": np.inf, "mean_m": float("nan"), "pairs": 3}]})
+    written = json.loads((tmp_path / "figures.json").read_text())
+    assert written["rows"] == [{"worst_m": None, "mean_m": None, "pairs": 3}]
+
+
+def test_labels_without_a_correct_registration_have_tables() -> None:
+    none = {"success_percent": 0.0, "num_pairs": 2, "num_false_accepted": 0, "coarse_m": None, "coarse_deg": None}
+    none |= {"refined_m": None, "refined_deg": None}
+    results = {"class_iou": {"all": {"car": 0.5, "pole": 0.5}, "scan 0": {"car": 0.5}}, "kitti": {"all pairs": none}}
+    results |= {"num_yaws": 1, "courtyard": {}, "speed": {"num_points": 1} | _no_times()}
+    assert "0.0 % of 2" in labels.tables(results)
 
 
 def test_back_end_keeps_true_closures_and_lowers_the_error(call: Call, tmp_path: Path) -> None:
@@ -214,8 +230,8 @@ def test_registration_aligns_real_pairs(call: Call, data_dir: Path, tmp_path: Pa
 
 
 def test_registration_finds_half_of_6000_correspondences_and_none_where_none_is_right() -> None:
-    common, nothing = registration.many_correspondences(Config(), rng=np.random.default_rng(0))
-    assert common["inliers"] >= 35
+    half, nothing = registration.many_correspondences(Config(), rng=np.random.default_rng(0))
+    assert half["inliers"] >= 35
     assert nothing["inliers"] < 10
 
 

@@ -48,9 +48,10 @@ def segslam(*words: object) -> None:
 
 
 def write_report(file: Path, figures: Mapping[str, Any]) -> None:
-    """JSON of the figures after the machine and the commit they were measured on."""
-    report = {"machine": machine(), "commit": commit()} | dict(figures)
-    file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    """JSON of the figures, null where they are not finite, after the machine and the commit they were measured on."""
+    report = json.dumps({"machine": machine(), "commit": commit()} | dict(figures))
+    finite = json.loads(report, parse_constant=lambda _: None)
+    file.write_text(json.dumps(finite, indent=1) + "\n", encoding="utf-8")
 
 
 def spread(values: Sequence[float] | np.ndarray) -> dict[str, float]:

@@ -7,6 +7,7 @@ DATA is the folder of real data: `kitti/` with ground-truth labels of scans 0-2,
 were chosen on those scans and pairs of KITTI. KISS-Matcher needs the extra `bench`.
 """
 
+import math
 import time
 from argparse import Namespace
 from collections.abc import Sequence
@@ -30,6 +31,7 @@ from segslam.scans import DataSource, open_dataset
 from tools.benchmarks import common, real_pairs
 
 Figures = dict[str, Any]
+NO_ERROR = math.nan, math.nan
 BANDS_M = ((5.0, 10.0), (10.0, 15.0))
 MIN_GAP = 40
 TUNING_SEED = 1
@@ -151,7 +153,10 @@ def _standing(points: Points) -> Points:
 def tables(results: dict[str, Any]) -> str:
     """The figures as Markdown."""
     iou = results["class_iou"]
-    classes = [{"scans": scans} | {name: f"{iou[scans][name]:.2f}" for name in iou["all"]} for scans in sorted(iou)]
+    classes = [
+        {"scans": scans} | {name: f"{iou[scans].get(name, math.nan):.2f}" for name in iou["all"]}
+        for scans in sorted(iou)
+    ]
     kitti = [{"pairs": name} | _success(found) | _errors(found) for name, found in results["kitti"].items()]
     courtyard = [
         {"apart": band, "method": name}
@@ -178,7 +183,7 @@ def _success(found: dict[str, Any]) -> common.Row:
 def _errors(found: dict[str, Any]) -> common.Row:
     row: common.Row = {}
     for kind in ("coarse", "refined"):
-        (mean_m, worst_m), (mean_deg, worst_deg) = found[f"{kind}_m"], found[f"{kind}_deg"]
+        (mean_m, worst_m), (mean_deg, worst_deg) = (found[f"{kind}_{unit}"] or NO_ERROR for unit in ("m", "deg"))
         row[f"{kind} mean (worst)"] = f"{mean_m:.3f} m {mean_deg:.2f} deg ({worst_m:.3f} m {worst_deg:.2f} deg)"
     return row
 

@@ -26,10 +26,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = "segslam"
 TESTS: dict[str, tuple[str, ...]] = {
-    "odometry": ("odometry",),
-    "registration": ("registration", "verification"),
-    "verification": ("verification", "test_rejections.py"),
-    "graph": ("graph", "core/test_robust.py", "slam/test_slam.py"),
+    "odometry": ("tests/odometry",),
+    "registration": ("tests/registration", "tests/verification"),
+    "verification": ("tests/verification", "tests/test_rejections.py"),
+    "graph": ("tests/graph", "tests/core/test_robust.py", "tests/slam/test_slam.py"),
 }
 """Room of the package -> its tests. What takes least time comes first."""
 SWAPPED_NAMES = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum"}
@@ -102,11 +102,6 @@ def chosen(faults: Sequence[Fault], *, num_lines: int, seed: int) -> list[Fault]
 def files_of(room: str) -> list[Path]:
     """The modules of a room of the package."""
     return sorted((ROOT / SOURCE / room).rglob("*.py"))
-
-
-def tests_of(room: str) -> list[str]:
-    """The folders and files of tests of a room, relative to the root."""
-    return [f"tests/{test}" for test in TESTS[room]]
 
 
 class Copy:
@@ -241,7 +236,14 @@ class _Finder:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    options = _options(arguments)
+    parser = argparse.ArgumentParser(prog="python -m tools.mutation", description=str(__doc__).partition("\n")[0])
+    parser.add_argument("--lines", type=int, default=60, help="number of lines to break, one at a time")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--skip", type=int, default=0, help="leave out the first faults, as after an interruption")
+    parser.add_argument("--rooms", nargs="+", choices=TESTS, default=list(TESTS), help="whose lines are broken")
+    parser.add_argument("--limit-s", type=float, default=300.0, help="time limit of the tests of one fault")
+    parser.add_argument("--out", type=Path, help="JSON file of all outcomes")
+    options = parser.parse_args(arguments)
     faults, room_of = [], {}
     for name in options.rooms:
         for path in files_of(name):
@@ -254,40 +256,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
         copy = Copy(Path(folder))
         for fault in picked:
-            one = copy.outcome(fault, tests_of(room_of[fault.file]), limit_s=options.limit_s)
+            one = copy.outcome(fault, TESTS[room_of[fault.file]], limit_s=options.limit_s)
             outcomes.append(one)
-            print(_row(one), flush=True)
+            state = f"noticed by {one.by}" if one.is_noticed else "SURVIVED"
+            change = f"{fault.file}:{fault.line}: {one.before}  ->  {one.after}"
+            print(f"{change}  {state}  ({one.seconds:.0f} s)", flush=True)
             if options.out:
                 options.out.parent.mkdir(parents=True, exist_ok=True)
                 options.out.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1) + "\n")
-    print(_table(outcomes, room_of))
-
-
-def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m tools.mutation", description=str(__doc__).partition("\n")[0])
-    parser.add_argument("--lines", type=int, default=60, help="number of lines to break, one at a time")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--skip", type=int, default=0, help="leave out the first faults, as after an interruption")
-    parser.add_argument("--rooms", nargs="+", choices=TESTS, default=list(TESTS), help="whose lines are broken")
-    parser.add_argument("--limit-s", type=float, default=300.0, help="time limit of the tests of one fault")
-    parser.add_argument("--out", type=Path, help="JSON file of all outcomes")
-    return parser.parse_args(arguments)
-
-
-def _row(one: Outcome) -> str:
-    state = f"noticed by {one.by}" if one.is_noticed else "SURVIVED"
-    return f"{one.fault.file}:{one.fault.line}: {one.before}  ->  {one.after}  {state}  ({one.seconds:.0f} s)"
-
-
-def _table(outcomes: Sequence[Outcome], room_of: dict[str, str]) -> str:
-    lines = [f"{'room':<14}{'noticed':>8}{'survived':>9}"]
-    for name in dict.fromkeys(room_of.values()):
-        own = [one.is_noticed for one in outcomes if room_of[one.fault.file] == name]
-        if own:
-            lines.append(f"{name:<14}{sum(own):>8}{len(own) - sum(own):>9}")
-    noticed = sum(one.is_noticed for one in outcomes)
-    lines.append(f"{'all':<14}{noticed:>8}{len(outcomes) - noticed:>9}")
-    return "\n".join(lines)
+    print(f"{'room':<14}{'noticed':>8}{'survived':>9}")
+    for name in (*options.rooms, "all"):
+        own = [one.is_noticed for one in outcomes if name in ("all", room_of[one.fault.file])]
+        if own or name == "all":
+            print(f"{name:<14}{sum(own):>8}{len(own) - sum(own):>9}")
 
 
 if __name__ == "__main__":

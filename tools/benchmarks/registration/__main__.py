@@ -23,9 +23,9 @@ from segslam.labels.label_files import computed
 from tools.benchmarks import common, real_pairs
 from tools.benchmarks.common import Row, markdown
 from tools.benchmarks.registration.ablation import Case, ablation
+from tools.benchmarks.registration.attempts import scan_of, simulated
 from tools.benchmarks.registration.real import real, real_negatives
 from tools.benchmarks.registration.scans import BANDS_M, WORLDS, Labelled, SimulatedPlace, real_scan
-from tools.benchmarks.registration.simulated import scan_of, simulated
 from tools.benchmarks.registration.speed import many_correspondences, sizes, stages
 
 Tables = dict[str, list[Row]]

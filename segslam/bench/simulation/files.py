@@ -29,7 +29,7 @@ def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
     An existing sequence is removed if it was simulated and `overwrite` is set. Raises SegslamError, naming the folder,
     otherwise; real data is never removed.
     """
-    if Path(sequence).name != sequence or not sequence:
+    if Path(sequence).name != sequence or sequence in ("", ".."):
         raise SegslamError(f"--sequence {sequence}: must be a plain name such as 00")
     folder, poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
     there = next((path for path in (folder, poses) if path.exists()), None)

@@ -8,7 +8,6 @@ closures are compared with exact ones: at the same places, and for all keyframes
     python -m tools.benchmarks.sequences runs/06 --out sequences.json
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,21 +29,8 @@ LENGTHS = (1, 10, 100)
 """Lengths of chains in keyframes."""
 
 
-@dataclass(frozen=True, eq=False)
-class Recorded(Drive):
-    """A drive that was mapped, with the closures that were found."""
-
-    closures: list[LoopClosure]
-
-    def loops(self) -> dict[str, float]:
-        """False closures, and the recall of revisits."""
-        pairs = np.array([(loop.source_id, loop.target_id) for loop in self.closures], dtype=int).reshape(-1, 2)
-        found = np.array([loop.T_target_source for loop in self.closures]).reshape(-1, 4, 4)
-        return {"closures": len(pairs), **loop_metrics(found, pairs, self.truth)}
-
-
-def read_recorded(run: Path) -> Recorded:
-    """Raises SegslamError for a run without true poses."""
+def read_recorded(run: Path) -> tuple[Drive, list[LoopClosure]]:
+    """A drive that was mapped, and the closures that were found. Raises SegslamError for a run without true poses."""
     log = read_log(run / "log.mcap")
     reference = log.reference()
     if reference is None:
@@ -53,12 +39,12 @@ def read_recorded(run: Path) -> Recorded:
     steps = list(log.steps())
     keyframes = [step.keyframe for step in steps if step.keyframe is not None]
     outcomes = [attempt.outcome for step in steps for attempt in step.attempts]
-    return Recorded(
+    drive = Drive(
         truth=reference.T_world_lidar[[row_of_scan[keyframe.scan_index] for keyframe in keyframes]],
         odometry=np.array([keyframe.T_odom_keyframe for keyframe in keyframes]),
         travel_m=np.array([keyframe.travel_m for keyframe in keyframes]),
-        closures=[outcome for outcome in outcomes if isinstance(outcome, LoopClosure)],
     )
+    return drive, [outcome for outcome in outcomes if isinstance(outcome, LoopClosure)]
 
 
 def exact_everywhere(drive: Drive) -> list[LoopClosure]:
@@ -91,11 +77,11 @@ def odometry_calibration(drive: Drive) -> dict[str, float | None]:
     return found
 
 
-def closure_calibration(drive: Recorded) -> float | None:
+def closure_calibration(drive: Drive, closures: list[LoopClosure]) -> float | None:
     """Mean chi-square of closures with the weights of the graph; None without closures."""
     chi2 = [
         _chi2(loop.T_target_source, drive.true(loop.target_id, loop.source_id), closure_information(loop.information))
-        for loop in drive.closures
+        for loop in closures
     ]
     return float(np.mean(chi2)) if chi2 else None
 
@@ -118,23 +104,25 @@ def _chi2(T_found: np.ndarray, T_true: np.ndarray, information: np.ndarray) -> f
 
 def row_of(run: Path) -> dict[str, Any]:
     """All figures of one run."""
-    drive = read_recorded(run)
+    drive, closures = read_recorded(run)
+    pairs = np.array([(loop.source_id, loop.target_id) for loop in closures], dtype=int).reshape(-1, 2)
+    found = np.array([loop.T_target_source for loop in closures]).reshape(-1, 4, 4)
     row: dict[str, Any] = {
         "run": f"{run.parent.name}/{run.name}",
         "keyframes": len(drive.truth),
         "travel_m": float(drive.travel_m[-1]),
         "odometry": drive.errors(drive.odometry),
-        "loops": drive.loops(),
-        "noise": {**odometry_calibration(drive), "closures": closure_calibration(drive)},
+        "loops": {"closures": len(closures), **loop_metrics(found, pairs, drive.truth)},
+        "noise": {**odometry_calibration(drive), "closures": closure_calibration(drive, closures)},
     }
     kinds = {
-        "found": drive.closures,
-        "exact": [drive.exact(loop.source_id, loop.target_id) for loop in drive.closures],
+        "found": closures,
+        "exact": [drive.exact(*pair) for pair in pairs.tolist()],
         "exact_everywhere": exact_everywhere(drive),
     }
-    for name, closures in kinds.items():
-        estimate, errors, seconds = drive.finished(closures)
-        row[name] = {"closures": len(closures), **errors, "switched_off": len(estimate.rejected), "seconds": seconds}
+    for name, loops in kinds.items():
+        estimate, errors, seconds = drive.finished(loops)
+        row[name] = {"closures": len(loops), **errors, "switched_off": len(estimate.rejected), "seconds": seconds}
     row["ate_by_exact"] = row["found"]["ate_m"] / row["exact"]["ate_m"]
     return row
 

@@ -134,6 +134,13 @@ def test_sequences_reports_errors_of_a_run_with_its_own_and_with_exact_closures(
     assert row["exact"]["ate_m"] < row["odometry"]["ate_m"]
 
 
+def test_sequences_shows_a_run_without_closures() -> None:
+    errors = {"closures": 0, "ate_m": 1.0, "switched_off": 0}
+    row = {"run": "a/run", "odometry": errors, "found": errors, "exact": errors, "exact_everywhere": errors}
+    row |= {"loops": {"closures": 0}, "noise": {"chain_1": 1.0, "chain_10": None, "chain_100": None, "closures": None}}
+    assert sequences.cells(row | {"ate_by_exact": 1.0})["closures, false, off"] == "0, 0, 0"
+
+
 def test_peers_reads_the_poses_and_closures_of_the_other_program(call: Call, tmp_path: Path) -> None:
     made = make_run(tmp_path / "work" / "segslam_scans")
     (tmp_path / "scans").mkdir()

@@ -136,7 +136,7 @@ def cells(row: dict[str, Any]) -> common.Row:
         "ATE": _number(found["ate_m"]),
         "height": _number(found.get("height_m")),
         "KITTI %": _number(found.get("kitti_translation_percent")),
-        "closures, false, off": f"{loops['closures']}, {loops['num_loops_false']}, {found['switched_off']}",
+        "closures, false, off": f"{loops['closures']}, {loops.get('num_loops_false', 0)}, {found['switched_off']}",
         "recall": _number(loops.get("loop_recall")),
         "exact, same places": _number(row["exact"]["ate_m"]),
         "ratio": _number(row["ate_by_exact"]),

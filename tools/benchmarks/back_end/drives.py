@@ -59,7 +59,7 @@ class Drive:
         return graph
 
     def finished(self, closures: Iterable[LoopClosure]) -> tuple[GraphEstimate, dict[str, float], float]:
-        """What the final optimisation says of these closures, the errors after it, and its seconds."""
+        """The result of the final optimisation with these closures, the errors after it, and its seconds."""
         graph = self.graph()
         for loop in closures:
             graph.add_closure(loop)
